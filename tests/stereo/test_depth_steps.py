@@ -10,13 +10,13 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import DepthMap, DisparityMap
-from thesisrecon.stereo.correspondence import PairMatching, brightness_gain, sample_disparity
-from thesisrecon.stereo.depth import DepthCompletion, GeometricConsistency, region_sizes, transfer
-from thesisrecon.stereo.depth_fusion import follow, inverse_depth_of
+from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
+from thesisrecon.stereo.depth import DepthCompletion, GeometricConsistency, _region_sizes, _transfer
+from thesisrecon.stereo.depth_fusion import _concatenated, _inverse_depth_of
 from thesisrecon.stereo.neighbours import (
     NeighbourSelection,
+    _ray_angles_deg,
     pinhole_view,
-    ray_angles_deg,
     shared_projections,
     sparse_points,
 )
@@ -85,7 +85,7 @@ def test_a_view_without_baseline_or_points_is_not_a_neighbour(walled):
     few = replace(points, seen=points.seen & (np.arange(points.seen.shape[1]) < 5))
     assert NeighbourSelection().select(few, views, 0) == []
     centres = [camera_centre(view.P) for view in views.values()]
-    angles = ray_angles_deg(np.zeros((1, 3)), *(c[:3] / c[3] for c in centres[:2]))
+    angles = _ray_angles_deg(np.zeros((1, 3)), *(c[:3] / c[3] for c in centres[:2]))
     assert angles == pytest.approx(11.3, abs=0.1)
 
 
@@ -122,7 +122,7 @@ def test_exact_disparities_give_exact_depth(method):
     walled = make_walled(on_arc((-6.0, 6.0)))
     true = TrueDisparity(walled, (0, 1), method)
     pair = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE))
-    rho, std = inverse_depth_of(walled.reconstruction.P[0], walled.reconstruction.P[1], pair)
+    rho, std = _inverse_depth_of(walled.reconstruction.P[0], walled.reconstruction.P[1], pair)
     known = np.isfinite(rho)
     assert known.mean() > 0.6
     assert np.nanmedian(np.abs(6.0 * rho - 1.0)) < 1e-5
@@ -152,7 +152,7 @@ def test_disparities_are_interpolated_on_a_surface_and_not_across_its_edge():
     places = np.array(
         [[0.5, 1.0], [1.25, 0.5], [2.4, 1.0], [2.6, 1.0], [4.4, 1.0], [4.6, 1.0], [np.nan, 0.0]]
     )
-    values, sure = sample_disparity(found, places)
+    values, sure = _sample_disparity(found, places)
     np.testing.assert_allclose(values, [1.25, 1.625, 2.0, 9.0, 9.5, np.nan, np.nan])
     assert (sure == np.isfinite(values)).all()
 
@@ -161,9 +161,9 @@ def test_brightness_is_made_alike(walled):
     views, points = views_of(walled), sparse_points(walled.reconstruction)
     darker = replace(views[1], rgb=np.rint(views[1].rgb * np.array([0.8, 0.7, 0.9])).astype(np.uint8))
     xy = shared_projections(points, views[0], views[1])
-    gain = brightness_gain(views[0], darker, *xy) / brightness_gain(views[0], views[1], *xy)
+    gain = _brightness_gain(views[0], darker, *xy) / _brightness_gain(views[0], views[1], *xy)
     np.testing.assert_allclose(gain, 1.0 / np.array([0.8, 0.7, 0.9]), rtol=0.02)
-    assert (brightness_gain(views[0], darker, xy[0][:3], xy[1][:3]) == 1.0).all()
+    assert (_brightness_gain(views[0], darker, xy[0][:3], xy[1][:3]) == 1.0).all()
 
 
 def test_links_of_a_chain_lead_from_view_to_view():
@@ -173,7 +173,7 @@ def test_links_of_a_chain_lead_from_view_to_view():
     for i, j in ((0, 1), (1, 2)):
         true = TrueDisparity(walled, (i, j), "metric")
         steps.append(PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (SIZE, SIZE)))
-    linked = follow(*steps)
+    linked = _concatenated(*steps)
     known = linked.known
     assert known.mean() > 0.3
     first = steps[0].xy[known].astype(float)
@@ -233,7 +233,7 @@ def test_seen_through_and_small_pieces_are_removed():
     assert np.isnan(alone.depth).all()
     lonely = np.full((50, 60), np.nan, dtype=np.float32)
     lonely[:20], lonely[30:32, 5:8] = 2.0, 3.0
-    sizes = region_sizes(lonely, 0.02)
+    sizes = _region_sizes(lonely, 0.02)
     assert (sizes[:20] == 1200).all()
     assert (sizes[30:32, 5:8] == 6).all()
     assert sizes[25, 5] == 0
@@ -257,7 +257,7 @@ def test_unconfirmed_depths_stay_if_they_continue_confirmed_ones():
 
 def test_a_pixel_goes_to_another_view_and_back():
     P = on_arc((-6.0, 6.0))
-    to, back = transfer(P[0], P[1]), transfer(P[1], P[0])
+    to, back = _transfer(P[0], P[1]), _transfer(P[1], P[0])
     q = to @ np.array([6.0 * 100.0, 6.0 * 80.0, 6.0, 1.0])
     there = np.append(q, 1.0)
     np.testing.assert_allclose(back @ there, [600.0, 480.0, 6.0], atol=1e-9)

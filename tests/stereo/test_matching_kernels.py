@@ -7,29 +7,29 @@ import pytest
 
 from tests.stereo import twins
 from thesisrecon.stereo.cost_kernels import (
+    _count_ones,
     census,
     cost_volume,
-    count_ones,
     sampled_bounds,
     split_bytes,
     split_channels,
     support_masks,
 )
 from thesisrecon.stereo.path_kernels import (
+    _transpose_back,
+    _transpose_rows,
     adaptive_P2,
     scratch_size,
     sum_paths,
-    transpose_back,
-    transpose_rows,
 )
 from thesisrecon.stereo.postprocessing import (
+    _check_left_right,
+    _edge_preserving_mean,
+    _fill_pinholes,
+    _remove_speckles,
+    _squared_gradient,
     best_disparities,
-    check_left_right,
-    edge_preserving_mean,
-    fill_pinholes,
     final_confidence,
-    remove_speckles,
-    squared_gradient,
 )
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, solve_row
 
@@ -72,7 +72,7 @@ def test_bytes_are_split_as_numbers_are():
 def test_ones_are_counted():
     words = np.random.default_rng(0).integers(0, 2**31 - 1, 100).astype(np.int32)
     expected = [int(word).bit_count() for word in words]
-    assert [count_ones(word) for word in words] == expected
+    assert [_count_ones(word) for word in words] == expected
     assert twins.ones(words).tolist() == expected
 
 
@@ -117,10 +117,10 @@ def test_rows_turn_and_turn_back(shape):
     rows, n, width = shape
     source = np.random.default_rng(4).integers(0, 256, shape).astype(np.uint8)
     turned = np.zeros(((width + 7) // 8 * 8, n, (rows + 7) // 8 * 8), np.uint8)
-    transpose_rows(source, turned)
+    _transpose_rows(source, turned)
     assert (turned[:width, :, :rows] == source.transpose(2, 1, 0)).all()
     back = np.empty_like(source)
-    transpose_back(turned, back)
+    _transpose_back(turned, back)
     assert (back == source).all()
 
 
@@ -179,10 +179,10 @@ def test_sides_that_contradict_each_other():
     right = np.array([[1.0, 1.0, 3.0, 1.0, 1.0, np.nan]], np.float32)
     confidence = np.ones((1, 6), np.float32)
     limits = np.array([1.0, 0.1], np.float32)
-    check_left_right(left, right, confidence, limits)
+    _check_left_right(left, right, confidence, limits)
     np.testing.assert_array_equal(left, np.array([[np.nan, 1, 1, np.nan, np.nan, 3]], np.float32))
     confidence[0, 1] = 0.05
-    check_left_right(left, right, confidence, limits)
+    _check_left_right(left, right, confidence, limits)
     assert np.isnan(left[0, 1])
     assert left[0, 2] == 1.0
 
@@ -192,12 +192,12 @@ def test_peaks_go_and_surfaces_stay_where_there_is_texture():
     disparity[2:4, 2:4] = 5.0
     disparity[:, 8:] += np.arange(1, 5, dtype=np.float32)
     before = disparity.copy()
-    remove_speckles(disparity, np.ones((9, 12), bool), np.float32(1.0), 5)
+    _remove_speckles(disparity, np.ones((9, 12), bool), np.float32(1.0), 5)
     gone = np.isnan(disparity)
     assert gone.sum() == 4
     assert gone[2:4, 2:4].all()
     assert (disparity[~gone] == before[~gone]).all()
-    remove_speckles(disparity, np.zeros((9, 12), bool), np.float32(1.0), 5)
+    _remove_speckles(disparity, np.zeros((9, 12), bool), np.float32(1.0), 5)
     assert np.isnan(disparity).all()
 
 
@@ -214,7 +214,7 @@ def test_pinholes_take_the_median_and_large_holes_stay():
     disparity[2, 2] = np.nan
     disparity[:, 5] = np.nan
     out = np.empty_like(disparity)
-    fill_pinholes(disparity, 5, out)
+    _fill_pinholes(disparity, 5, out)
     assert out[2, 2] == np.nanmedian(disparity[1:4, 1:4])
     assert np.isnan(out[:, 5]).all()
     known = ~np.isnan(disparity)
@@ -226,7 +226,7 @@ def test_smoothing_averages_similar_pixels():
     disparity = np.where(np.arange(11) < 5, 3.0, 9.0) + rng.uniform(-0.4, 0.4, (8, 11))
     disparity[3, 3] = np.nan
     values, out = disparity.astype(np.float32), np.empty((8, 11), np.float32)
-    edge_preserving_mean(values, np.float32(1.0), 2, out)
+    _edge_preserving_mean(values, np.float32(1.0), 2, out)
     for y, x in np.ndindex(8, 11):
         window = values[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
         if np.isnan(values[y, x]):
@@ -239,7 +239,7 @@ def test_smoothing_averages_similar_pixels():
 def test_squared_gradients_over_windows():
     channels = np.random.default_rng(8).integers(0, 1000, (2, 9, 12)).astype(np.int16)
     out = np.empty((9, 12), np.float32)
-    squared_gradient(channels, 2, out)
+    _squared_gradient(channels, 2, out)
     squares = np.zeros((9, 12))
     squares[:, 1:-1] = ((channels[:, :, 2:].astype(float) - channels[:, :, :-2]) ** 2).mean(axis=0)
     padded = np.pad(squares, 2)

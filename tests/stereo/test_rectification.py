@@ -28,7 +28,7 @@ from thesisrecon.stereo.rectification import (
     rectify_cameras,
     rectify_pair,
 )
-from thesisrecon.stereo.resampling import NOT_SHRUNK, STRIP_ROWS, sample_image, warp_image
+from thesisrecon.stereo.resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
 
 PLANAR_METHODS = (
     HartleyRectifier(),
@@ -79,7 +79,7 @@ def test_no_pixel_shrinks_by_more_than_is_stated_and_none_is_mirrored(method, mo
     pair = both_pairs(scene)[1]
     rectified = method.rectify(pair)
     quality = measure_quality(rectified, pair)
-    assert quality.least_scale >= 1.0 / method.limits.max_shrink - 1e-2
+    assert quality.min_scale >= 1.0 / method.limits.max_shrink - 1e-2
     assert quality.size_ratio <= method.limits.max_growth
     for side in (0, 1):
         inside = np.isfinite(rectified.rectified_from_original(side, pair.regions[side])).all(axis=1)
@@ -182,7 +182,7 @@ def test_noise_of_matches_is_the_noise_of_rows():
     pair = both_pairs(scene)[1]
     for method in (*PLANAR_METHODS, PolarRectifier()):
         quality = measure_quality(method.rectify(pair), pair)
-        assert 0.2 < quality.rms_dy_px / np.sqrt(2.0) / quality.greatest_scale + 0.1 < 0.35
+        assert 0.2 < quality.rms_dy_px / np.sqrt(2.0) / quality.max_scale + 0.1 < 0.35
 
 
 @pytest.mark.parametrize("motion", ["forward", "diagonal", "half forward"])
@@ -304,7 +304,7 @@ def cubic(x):
 
 
 def sample_plainly(image, xy, rows):
-    """Twin of ``sample_image`` for lookups of at least two rows and columns, by one weight per pixel."""
+    """Twin of ``_sample_image`` for lookups of at least two rows and columns, by one weight per pixel."""
     height, width = image.shape[:2]
     padded = np.pad(image.astype(np.float64), ((12, 12), (12, 12), (0, 0)), mode="edge")
     down = np.concatenate([np.diff(xy, axis=0), xy[-2:-1] - xy[-1:]])
@@ -341,7 +341,7 @@ def test_the_kernel_is_its_plain_twin(scale, channels):
     image[30:33, 40:44] = np.nan
     xy = a_map(scale).lookup(0, range(51))
     out = np.empty((50, 60, channels), np.float32)
-    sample_image(image, xy, out)
+    _sample_image(image, xy, out)
     plain = sample_plainly(image, xy, 50)
     np.testing.assert_array_equal(np.isnan(out), np.isnan(plain))
     assert np.isfinite(out).mean() > 0.2
@@ -353,7 +353,7 @@ def test_strips_do_not_show_and_grey_is_one_channel():
     H = np.array([[0.8, 0.1, 3.0], [-0.1, 0.7, 20.0], [1e-4, 0.0, 1.0]])
     rectified = PlanarRectification(H, H, (150, 2 * STRIP_ROWS + 1))
     whole = np.empty((rectified.size[1], 150, 1), np.float32)
-    sample_image(image[:, :, None], rectified.lookup(0, range(rectified.size[1])), whole)
+    _sample_image(image[:, :, None], rectified.lookup(0, range(rectified.size[1])), whole)
     grey = rectified.warp(image, 0)
     np.testing.assert_array_equal(grey, whole[:, :, 0])
     colour = rectified.warp(np.repeat(image[:, :, None], 3, axis=2), 1)

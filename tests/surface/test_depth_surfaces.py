@@ -19,7 +19,7 @@ from thesisrecon.surface.linear import (
     surface_normals,
     triangulate_surface,
 )
-from thesisrecon.surface.mesh import connected_parts
+from thesisrecon.surface.mesh import _connected_parts
 
 BOTH = pytest.mark.parametrize("surface", [LinearSurface(), BSplineSurface()], ids=["linear", "b-spline"])
 SHAPE = (60, 80)
@@ -171,7 +171,7 @@ def test_an_edge_is_not_smeared(slant):
     assert np.abs(error).max() < 2.5 * noise
     assert np.sqrt(np.mean(error**2)) < noise / 3.0
     mesh = triangulate_surface(fit)
-    assert len(np.unique(connected_parts(mesh.faces, len(mesh.vertices)))) == 2
+    assert len(np.unique(_connected_parts(mesh.faces, len(mesh.vertices)))) == 2
 
 
 def test_a_cut_may_end_within_the_surface():
@@ -186,7 +186,7 @@ def test_a_cut_may_end_within_the_surface():
     near_the_end = (np.abs(y - 42) < 8) & (np.abs(x - 39.5) < 8)
     assert error[~near_the_end].max() < 5.0 * noise
     mesh = triangulate_surface(fit)
-    assert len(np.unique(connected_parts(mesh.faces, len(mesh.vertices)))) == 1
+    assert len(np.unique(_connected_parts(mesh.faces, len(mesh.vertices)))) == 1
 
 
 def test_small_pieces_become_the_surface_about_them_or_nothing():

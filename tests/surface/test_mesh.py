@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from tests.surface.sphere import ring_of
 from thesisrecon.records import TexturedMesh
-from thesisrecon.surface.bspline import basis, energies
+from thesisrecon.surface.bspline import _energies, basis
 from thesisrecon.surface.bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.mesh import face_areas, simplify_mesh
@@ -235,7 +235,7 @@ def test_energies_are_integrals():
     c = rng.normal(size=16)
     u = (np.arange(200) + 0.5) / 200
     f = {(i, j): basis(u, i) @ c.reshape(4, 4) @ basis(u, j).T for i in range(3) for j in range(3)}
-    bending, gradient = energies()
+    bending, gradient = _energies()
     assert c @ bending @ c == pytest.approx(np.mean(f[2, 0] ** 2 + 2 * f[1, 1] ** 2 + f[0, 2] ** 2), rel=1e-4)
     assert c @ gradient @ c == pytest.approx(np.mean(f[1, 0] ** 2 + f[0, 1] ** 2), rel=1e-4)
     plane = (2.0 + 0.3 * np.arange(4)[:, None] - 0.7 * np.arange(4)).ravel()

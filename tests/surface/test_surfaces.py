@@ -14,7 +14,7 @@ from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion, incidence_cosines
 from thesisrecon.surface.linear import LinearSurface, surface_from_depth
-from thesisrecon.surface.mesh import connected_parts, face_areas, remove_small_parts
+from thesisrecon.surface.mesh import _connected_parts, face_areas, remove_small_parts
 from thesisrecon.surface.model import SurfaceModel
 
 
@@ -121,7 +121,7 @@ def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     centre = -np.linalg.solve(P[:, :3], P[:, 3])
     assert ((np.cross(b - a, c - a) * (centre - a)).sum(1) > 0).all()
-    part = connected_parts(mesh.faces, len(mesh.vertices))
+    part = _connected_parts(mesh.faces, len(mesh.vertices))
     assert len(np.unique(part)) == 2
 
 
@@ -170,7 +170,7 @@ def test_hopeless_sheets_are_refused(ring):
     for maps in ([], [empty], [empty, empty]):
         with pytest.raises(StageFailure, match="no surface"):
             DepthSheets().fuse(maps)
-    for wrong in ({"step": 0}, {"same": -1.0}, {"grazing_deg": 90.0}):
+    for wrong in ({"step": 0}, {"max_relative": -1.0}, {"grazing_deg": 90.0}):
         with pytest.raises(ValueError, match="must be"):
             DepthSheets(**wrong)
 

@@ -12,8 +12,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.mesh import face_neighbours, vertex_normals
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.surface.texture_atlas import TextureAtlas, pack_rectangles
-from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture, equalizing_gains
+from thesisrecon.surface.texture_atlas import TextureAtlas, _pack_rectangles
+from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture, _equalizing_gains
 from thesisrecon.surface.texture_kernels import (
     ViewSurface,
     combine_colors,
@@ -117,7 +117,7 @@ def test_charts_are_large_and_use_views_that_see_them(sphere):
 
 def test_rectangles_do_not_overlap():
     sizes = np.random.default_rng(0).integers(0, 40, (200, 2))
-    places, (width, height) = pack_rectangles(sizes)
+    places, (width, height) = _pack_rectangles(sizes)
     taken = np.zeros((height, width), dtype=int)
     for (x, y), (w, h) in zip(places, sizes, strict=True):
         taken[y : y + h, x : x + w] += 1
@@ -181,7 +181,7 @@ def test_gains_of_views_that_share_nothing_stay():
     weight = np.array([[1, 1, 1, 0, 0], [1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], dtype=np.float32)
     color = np.full((3, 5, 3), 100, dtype=np.float32)
     color[1] = 144.0
-    np.testing.assert_allclose(equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4)
+    np.testing.assert_allclose(_equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4)
 
 
 def test_depths_that_one_image_contradicts_are_removed(sphere):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.textures import texture
+from tests.synthetic import texture
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both

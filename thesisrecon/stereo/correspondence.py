@@ -121,9 +121,9 @@ class PairMatching:
         """
         own = (size_of(reference), size_of(other))
         frame = rectify_cameras(reference.P, other.P, *own, xy1=xy1, xy2=xy2)
-        wanted = searched(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
+        wanted = _searched_range(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
         left = frame.warp(_levels(reference), 0)
-        right = frame.warp(_levels(other) * brightness_gain(reference, other, xy1, xy2), 1)
+        right = frame.warp(_levels(other) * _brightness_gain(reference, other, xy1, xy2), 1)
         found = self.matcher.match(left, right, disparity_range=wanted)
         return self._back(frame, found, own, sizes or own)
 
@@ -139,9 +139,9 @@ class PairMatching:
         deviation = max(sigma_px, self.min_sigma_px)
         for first in range(0, shape[0], STRIP_ROWS):
             rows = slice(first, min(first + STRIP_ROWS, shape[0]))
-            pixels = resized(_pixels(shape[1], rows), wanted[0], own[0])
+            pixels = _resized(_pixels(shape[1], rows), wanted[0], own[0])
             places = frame.rectified_from_original(0, pixels)
-            d, sure = sample_disparity(found, places)
+            d, sure = _sample_disparity(found, places)
             inside: B8 = np.asarray(np.isfinite(d) & (sure >= self.min_confidence))
             where = places[inside]
             right, a, b = (
@@ -150,7 +150,7 @@ class PairMatching:
             )
             scale = np.linalg.norm(b - a, axis=1)
             at = (np.flatnonzero(inside) // shape[1] + first, np.flatnonzero(inside) % shape[1])
-            xy[at] = resized(right, own[1], wanted[1])
+            xy[at] = _resized(right, own[1], wanted[1])
             confidence[at] = sure[inside]
             # Confidence 1/2: the second best disparity costs P1 more on every path.
             sigma[at] = enlarged * deviation * scale * np.sqrt(0.5 / np.clip(sure[inside], 0.05, 0.5))
@@ -172,43 +172,13 @@ def size_of(view: PinholeView) -> Size:
     return view.seen.shape[1], view.seen.shape[0]
 
 
-def resized(xy: F64, size: Size, wanted: Size) -> F64:
-    """Convert pixels between two sizes of an image.
-
-    Parameters
-    ----------
-    xy : ndarray (N, 2)
-        Pixels of the image of ``size``.
-    size, wanted : tuple of int
-        (width, height) before and after.
-
-    Returns
-    -------
-    ndarray (N, 2)
-        Pixels of the image of ``wanted`` size, (x + 0.5) s - 0.5.
-    """
+def _resized(xy: F64, size: Size, wanted: Size) -> F64:
+    """Pixels (N, 2) of an image of ``size`` in the image of ``wanted`` size, (x + 0.5) s - 0.5."""
     return np.asarray((xy + 0.5) * (np.array(wanted) / np.array(size)) - 0.5)
 
 
-def searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:
-    """Restrict a disparity range to the width of the rectified frame.
-
-    Parameters
-    ----------
-    frame : PlanarRectification or PolarRectification
-    wanted : tuple of int
-        First and last disparity.
-
-    Returns
-    -------
-    tuple of int
-        First and last disparity.
-
-    Raises
-    ------
-    StageFailure
-        If the range is empty or too large.
-    """
+def _searched_range(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:
+    """Disparity range within the frame width; ``StageFailure`` if it is empty or too large."""
     reach = frame.size[0] - 1
     first, last = max(wanted[0], -reach), min(wanted[1], reach)
     if not 0 <= last - first < MAX_DISPARITIES:
@@ -220,22 +190,10 @@ def searched(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int
     return first, last
 
 
-def sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
-    """Interpolate disparity and confidence at positions of the rectified frame.
+def _sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
+    """Disparity and confidence (N,) at positions (N, 2) of the rectified frame, NaN where unknown.
 
     Bilinear if the four pixels around lie on one surface, else the nearest pixel.
-
-    Parameters
-    ----------
-    found : DisparityMap
-        Disparities of the frame.
-    places : ndarray (N, 2)
-        Positions in the frame, NaN = none.
-
-    Returns
-    -------
-    tuple of ndarray (N,)
-        Disparity, NaN = unknown, and confidence.
     """
     height, width = found.disparity.shape
     inside: B8 = np.asarray(np.isfinite(places).all(axis=1))
@@ -256,21 +214,10 @@ def sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
     return d, np.where(np.isfinite(d), found.confidence[nearest], 0.0)
 
 
-def brightness_gain(reference: PinholeView, other: PinholeView, xy1: F64, xy2: F64) -> F32:
-    """Estimate the gain per channel that makes ``other`` as bright as ``reference``.
+def _brightness_gain(reference: PinholeView, other: PinholeView, xy1: F64, xy2: F64) -> F32:
+    """Gain (3,) that makes ``other`` as bright as ``reference``: median ratio of patch means at matches.
 
-    The median ratio of patch means compensates exposure and white balance; 1 with fewer than 8 usable points.
-
-    Parameters
-    ----------
-    reference, other : PinholeView
-    xy1, xy2 : ndarray (N, 2)
-        Corresponding pixels.
-
-    Returns
-    -------
-    ndarray (3,) float32
-        Gain per channel.
+    It compensates exposure and white balance; 1 with fewer than 8 usable points.
     """
     levels = [_patch_means(view, xy) for view, xy in ((reference, xy1), (other, xy2))]
     good = np.isfinite(levels[0]).all(axis=1) & np.isfinite(levels[1]).all(axis=1)
@@ -354,7 +301,7 @@ class RectifiedPair:
             rows = places[first : first + STRIP_ROWS]
             y, x = np.indices(rows.shape[:2], dtype=np.float64)
             here = self.frame.rectified_from_original(side, np.stack([x, y + first], axis=-1).reshape(-1, 2))
-            d = sample_disparity(complete, here)[0]
+            d = _sample_disparity(complete, here)[0]
             inside: B8 = np.isfinite(d)
             here = here[inside]
             here[:, 0] += d[inside] if side else -d[inside]
@@ -400,8 +347,8 @@ def match_two_views(
     sizes = [(rgb.shape[1], rgb.shape[0]) for rgb in (rgb1, rgb2)]
     pair = pair_of_fundamental(F, xy1, xy2, sizes[0], sizes[1])
     frame = PLANAR.rectify(pair) if planar else rectify(pair)
-    wanted = searched(frame, disparity_range(frame, xy1, xy2, margin=pairs.range_margin))
-    gain = brightness_gain(views[0], views[1], xy1, xy2)
+    wanted = _searched_range(frame, disparity_range(frame, xy1, xy2, margin=pairs.range_margin))
+    gain = _brightness_gain(views[0], views[1], xy1, xy2)
     left = frame.warp(rgb1.astype(np.float32), 0)
     right = frame.warp(rgb2.astype(np.float32) * gain, 1)
     match = partial(pairs.matcher.match, disparity_range=wanted)

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo.correspondence import (
     Correspondence,
@@ -22,7 +21,7 @@ from thesisrecon.stereo.correspondence import (
     match_two_views,
     size_of,
 )
-from thesisrecon.stereo.depth_fusion import InverseDepth, RobustFusion, SequenceLinking
+from thesisrecon.stereo.depth_fusion import InverseDepth, RobustFusion, SequenceLinking, pixel_transfer
 from thesisrecon.stereo.depth_kernels import DepthStd, count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo.neighbours import (
     NeighbourSelection,
@@ -53,9 +52,9 @@ class GeometricConsistency:
     reprojection_px : float
         Largest reprojection error.
     max_relative : float
-        Largest relative depth difference ...
+        Largest relative depth difference.
     max_sigmas : float
-        ... in addition to so many standard deviations.
+        Standard deviations added to that limit.
     min_views : int
         Views that must confirm a pixel.
     min_region_ratio : float
@@ -96,31 +95,19 @@ class GeometricConsistency:
         for other in others:
             count_agreement(
                 DepthStd(depth_map.depth, depth_map.std),
-                transfer(depth_map.P, other.P),
+                _transfer(depth_map.P, other.P),
                 DepthStd(other.depth, other.std),
-                transfer(other.P, depth_map.P),
+                _transfer(other.P, depth_map.P),
                 limits,
                 agree,
                 contradict,
             )
         keep = (agree >= self.min_views) & (agree > contradict)
-        keep |= (contradict == 0) & self.continues_surface(depth_map, keep)
+        keep |= (contradict == 0) & self._continues_surface(depth_map, keep)
         return self.remove_small_regions(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
 
-    def continues_surface(self, depth_map: DepthMap, sure: B8) -> B8:
-        """Find pixels that continue the surface of reliable neighbours.
-
-        Parameters
-        ----------
-        depth_map : DepthMap
-        sure : ndarray (H, W) bool
-            Reliable pixels.
-
-        Returns
-        -------
-        ndarray (H, W) bool
-            Continuing pixels.
-        """
+    def _continues_surface(self, depth_map: DepthMap, sure: B8) -> B8:
+        """(H, W) pixels that continue the surface of those that are ``sure``."""
         with np.errstate(divide="ignore"):
             rho = (1.0 / depth_map.depth).astype(np.float32)
         joins = np.zeros(sure.shape, dtype=np.uint8)
@@ -141,40 +128,18 @@ class GeometricConsistency:
             The other depths.
         """
         least = self.min_region_ratio * depth_map.depth.size
-        return _kept(depth_map, region_sizes(depth_map.depth, self.step) >= least)
+        return _kept(depth_map, _region_sizes(depth_map.depth, self.step) >= least)
 
 
-def transfer(P: F64, P_other: F64) -> F64:
-    """Return the transform between the pixels and depths of two cameras.
-
-    Parameters
-    ----------
-    P, P_other : ndarray (3, 4)
-        Cameras whose third coordinate is the depth.
-
-    Returns
-    -------
-    ndarray (3, 4)
-        Maps (z x, z y, z, 1) to z' (x', y', 1).
-    """
-    M = np.linalg.inv(P[:, :3])
-    centre = camera_centre(P)
-    return np.column_stack([P_other[:, :3] @ M, P_other @ (centre / centre[3])])
+def _transfer(P: F64, P_other: F64) -> F64:
+    """(3, 4) from (z x, z y, z, 1) of one camera to z' (x', y', 1) of the other; z is the depth."""
+    return np.column_stack(pixel_transfer(P, P_other))
 
 
-def region_sizes(depth: F32, step: float) -> F64:
-    """Count the pixels of the connected region of each pixel.
+def _region_sizes(depth: F32, step: float) -> F64:
+    """(H, W) pixels of each pixel's connected region, 0 where unknown.
 
-    Parameters
-    ----------
-    depth : ndarray (H, W) float32
-    step : float
-        Largest relative depth step between connected neighbours.
-
-    Returns
-    -------
-    ndarray (H, W)
-        Number of pixels, 0 where unknown.
+    Neighbours are connected if their depths differ by at most the share ``step``.
     """
     number = np.arange(depth.size).reshape(depth.shape)
     log = np.log(depth)
@@ -250,7 +215,7 @@ class DepthCompletion:
         offers = []
         for other in others:
             offer = np.full_like(own.depth, np.nan)
-            splat_depths(other.depth, transfer(other.P, own.P), offer)
+            splat_depths(other.depth, _transfer(other.P, own.P), offer)
             offers.append(np.where(unknown, offer, np.float32(np.nan)))
         worth = [int(np.isfinite(offer).sum()) for offer in offers]
         best = [k for k in sorted(range(len(offers)), key=lambda k: (-worth[k], k)) if worth[k]][

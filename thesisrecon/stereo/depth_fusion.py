@@ -40,7 +40,7 @@ class InverseDepth:
 
     @property
     def contradictory(self) -> B8:
-        """(H, W) pixels with several measurements none of which agree."""
+        """(H, W) pixels with several contradictory measurements."""
         return np.asarray((self.views < 2) & (self.conflicts > 0))
 
     def where(self, keep: B8) -> InverseDepth:
@@ -118,7 +118,7 @@ class RobustFusion:
         for other in neighbours:
             pair = correspond(view, other)
             if pair is not None:
-                found.append(inverse_depth_of(views[view].P, views[other].P, pair))
+                found.append(_inverse_depth_of(views[view].P, views[other].P, pair))
         shape = views[view].seen.shape
         result = _nothing(shape)
         if found:
@@ -229,27 +229,17 @@ class SequenceLinking:
             step = correspond(previous, following)
             if step is None:
                 break
-            linked = step if linked is None else follow(linked, step)
-            new = inverse_depth_of(reference.P, views[following].P, linked)
+            linked = step if linked is None else _concatenated(linked, step)
+            new = _inverse_depth_of(reference.P, views[following].P, linked)
             update_kalman(state.value, state.std, *new, self.gate, alive, state.views)
         return state
 
 
-def follow(first: Correspondence, second: Correspondence) -> Correspondence:
-    """Concatenate the correspondences of views i to j and j to k.
+def _concatenated(first: Correspondence, second: Correspondence) -> Correspondence:
+    """Correspondence of view i in k from those of i in j and of j in k.
 
     The positions of the four pixels around in j are interpolated if they are consistent, else that of the
     nearest is shifted. Variances add up.
-
-    Parameters
-    ----------
-    first, second : Correspondence
-        Correspondence of i in j and of j in k.
-
-    Returns
-    -------
-    Correspondence
-        Correspondence of i in k.
     """
     height, width = second.sigma.shape
     at = first.xy
@@ -277,26 +267,32 @@ def follow(first: Correspondence, second: Correspondence) -> Correspondence:
     return Correspondence(*(part.astype(np.float32) for part in (xy, sigma, confidence)))
 
 
-def inverse_depth_of(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
-    """Compute inverse depths from the correspondence with another camera.
+def _inverse_depth_of(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
+    """Inverse depth and standard deviation (H, W) from the correspondence with another camera."""
+    rho, std = np.empty_like(pair.sigma), np.empty_like(pair.sigma)
+    inverse_depths(pair.xy, pair.sigma, *pixel_transfer(P, P_other), rho, std)
+    return rho, std
+
+
+def pixel_transfer(P: F64, P_other: F64) -> tuple[F64, F64]:
+    """Return the transfer of pixels and inverse depths to another camera.
+
+    A pixel (x, y, 1) of inverse depth rho is at H (x, y, 1) + rho e in the other view.
 
     Parameters
     ----------
     P, P_other : ndarray (3, 4)
-        Cameras of both views.
-    pair : Correspondence
-        Positions of the pixels in the other view.
+        Cameras whose third coordinate is the depth.
 
     Returns
     -------
-    tuple of ndarray (H, W) float32
-        Inverse depth and standard deviation, NaN = unknown.
+    H : ndarray (3, 3)
+        Homography of the plane at infinity.
+    e : ndarray (3,)
+        Epipole of the other view.
     """
-    M = np.linalg.inv(P[:, :3])
     centre = camera_centre(P)
-    rho, std = np.empty_like(pair.sigma), np.empty_like(pair.sigma)
-    inverse_depths(pair.xy, pair.sigma, P_other[:, :3] @ M, P_other @ (centre / centre[3]), rho, std)
-    return rho, std
+    return P_other[:, :3] @ np.linalg.inv(P[:, :3]), P_other @ (centre / centre[3])
 
 
 def _nothing(shape: tuple[int, ...]) -> InverseDepth:

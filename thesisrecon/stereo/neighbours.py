@@ -156,7 +156,7 @@ class NeighbourSelection:
         common = points.seen[view] & points.seen[other]
         if other == view or int(common.sum()) < self.min_points:
             return None
-        angle = ray_angles_deg(points.X[common], centre, _centre(views[other].P))
+        angle = _ray_angles_deg(points.X[common], centre, _centre(views[other].P))
         if int(np.sum(angle >= self.min_angle_deg)) < self.min_points:
             return None
         off = angle - self.best_deg
@@ -166,20 +166,8 @@ class NeighbourSelection:
         return weights
 
 
-def ray_angles_deg(X: F64, first: F64, second: F64) -> F64:
-    """Compute the angles between the rays of points to two centres.
-
-    Parameters
-    ----------
-    X : ndarray (N, 3)
-    first, second : ndarray (3,)
-        Camera centres.
-
-    Returns
-    -------
-    ndarray (N,)
-        Angles in degrees.
-    """
+def _ray_angles_deg(X: F64, first: F64, second: F64) -> F64:
+    """Angles (N,) in degrees between the rays of points (N, 3) to two centres (3,)."""
     a, b = X - first, X - second
     return np.asarray(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))))
 

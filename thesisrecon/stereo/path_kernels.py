@@ -226,18 +226,11 @@ def _store(square: Word8, words: U64, first: int, column: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def transpose_rows(source: U8, out: U8) -> None:
-    """Transpose rows and columns, (N, D, W) to (W', D, N') with N <= BLOCK.
+def _transpose_rows(source: U8, out: U8) -> None:
+    """Transpose (N, D, W) to (W', D, N'), N <= BLOCK; W' and N' are the next multiples of 8.
 
-    W' and N' are the next multiples of 8; the additional entries are arbitrary. Tiles avoid cache conflicts
-    of row lengths that are multiples of a large power of two.
-
-    Parameters
-    ----------
-    source : ndarray (N, D, W) uint8
-        Rows.
-    out : ndarray (W', D, N') uint8
-        Receives the columns.
+    Additional entries are arbitrary. Tiles avoid cache conflicts of row lengths that are multiples of a large
+    power of two.
     """
     rows, n, width = source.shape
     words = out.view(np.uint64)
@@ -255,16 +248,8 @@ def transpose_rows(source: U8, out: U8) -> None:
 
 
 @njit(cache=True, nogil=True)
-def transpose_back(source: U8, out: U8) -> None:
-    """Invert :func:`transpose_rows`.
-
-    Parameters
-    ----------
-    source : ndarray (W', D, N') uint8
-        Columns.
-    out : ndarray (N, D, W) uint8
-        Receives the rows.
-    """
+def _transpose_back(source: U8, out: U8) -> None:
+    """Inverse of :func:`_transpose_rows`."""
     rows, n, width = out.shape
     words = source.view(np.uint64)
     tile = np.zeros((BLOCK, TILE // 8 + 1), np.uint64)
@@ -319,11 +304,11 @@ def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
         wide, high = (width + 7) // 8 * 8, (rows + 7) // 8 * 8
         transposed = scratch[0, : wide * n * high].reshape((wide, n, high))
         summed = scratch[1, : wide * n * high].reshape((wide, n, high))
-        transpose_rows(costs[start : start + rows], transposed)
+        _transpose_rows(costs[start : start + rows], transposed)
         p2 = np.zeros((width, high), np.uint8)
         p2[:, :rows] = P2[0, start : start + rows].T
         _sum_opposite(transposed[:width], p2, P1, 0, summed[:width])
-        transpose_back(summed, total[0, start : start + rows])
+        _transpose_back(summed, total[0, start : start + rows])
     _sum_opposite(costs, P2[1], P1, 0, total[1])
     if len(total) == 4:
         _sum_opposite(costs, P2[2], P1, -1, total[2])

@@ -159,11 +159,11 @@ def _window_samples(gray: F32, u: int, v: int, window: PatchWindow, samples: F32
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _carry(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, way: F64) -> bool:
-    """Fill ``way`` (8,) with the homography of the plane from offsets (dx, dy) of pixel ``at`` to view k.
+def _plane_homography(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, warp: F64) -> bool:
+    """Fill ``warp`` (8,) with the homography of the plane from offsets (dx, dy) of pixel ``at`` to view k.
 
-    (way[0] + dx way[1] + dy way[2], way[3] + dx way[4] + dy way[5]) / (1 + dx way[6] + dy way[7]). Returns
-    False if the point is behind the camera.
+    (warp[0] + dx warp[1] + dy warp[2], warp[3] + dx warp[4] + dy warp[5]) / (1 + dx warp[6] + dy warp[7]).
+    Returns False if the point is behind the camera.
     """
     u, v = at
     z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + plane[0] * e[k, 2]
@@ -171,24 +171,24 @@ def _carry(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, way: F64) ->
         return False
     s = 1.0 / z
     for row in range(2):
-        way[3 * row] = s * (H[k, row, 0] * u + H[k, row, 1] * v + H[k, row, 2] + plane[0] * e[k, row])
-        way[3 * row + 1] = s * (H[k, row, 0] + plane[1] * e[k, row])
-        way[3 * row + 2] = s * (H[k, row, 1] + plane[2] * e[k, row])
-    way[6], way[7] = s * (H[k, 2, 0] + plane[1] * e[k, 2]), s * (H[k, 2, 1] + plane[2] * e[k, 2])
+        warp[3 * row] = s * (H[k, row, 0] * u + H[k, row, 1] * v + H[k, row, 2] + plane[0] * e[k, row])
+        warp[3 * row + 1] = s * (H[k, row, 0] + plane[1] * e[k, row])
+        warp[3 * row + 2] = s * (H[k, row, 1] + plane[2] * e[k, row])
+    warp[6], warp[7] = s * (H[k, 2, 0] + plane[1] * e[k, 2]), s * (H[k, 2, 1] + plane[2] * e[k, 2])
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS, inline="always", forceinline=True)
 def _cost_inside(
-    squares: U32, start: int, width: int, way: F64, offsets: F32, samples: F32, variance: float
+    squares: U32, start: int, width: int, warp: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
     """1 - weighted NCC of a window that lies inside the other view, -1 if a pixel of it is unknown.
 
     The packed pixels of that view begin at ``start``.
     """
-    x0, x1, x2 = np.float32(way[0]), np.float32(way[1]), np.float32(way[2])
-    y0, y1, y2 = np.float32(way[3]), np.float32(way[4]), np.float32(way[5])
-    z1, z2, one, byte = np.float32(way[6]), np.float32(way[7]), np.float32(1.0), np.uint32(255)
+    x0, x1, x2 = np.float32(warp[0]), np.float32(warp[1]), np.float32(warp[2])
+    y0, y1, y2 = np.float32(warp[3]), np.float32(warp[4]), np.float32(warp[5])
+    z1, z2, one, byte = np.float32(warp[6]), np.float32(warp[7]), np.float32(1.0), np.uint32(255)
     sb, sbb, sab, unknown = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.int32(0)
     for k in range(offsets.shape[1]):
         dx, dy = offsets[0, k], offsets[1, k]
@@ -223,17 +223,17 @@ def _cost_of(variance: float, other_variance: float, covariance: float) -> float
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cost_at_border(
-    squares: U32, start: int, size: tuple[int, int], way: F64, offsets: F32, samples: F32
+    squares: U32, start: int, size: tuple[int, int], warp: F64, offsets: F32, samples: F32
 ) -> float:
     """1 - weighted NCC of the part of a window inside the other view, -1 if that is too small."""
     width, height = size
     held, sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(offsets.shape[1]):
         dx, dy, w = offsets[0, k], offsets[1, k], np.float64(samples[0, k])
-        z = 1.0 + dx * way[6] + dy * way[7]
+        z = 1.0 + dx * warp[6] + dy * warp[7]
         if not z > 0.0:
             return -1.0
-        x, y = (way[0] + dx * way[1] + dy * way[2]) / z, (way[3] + dx * way[4] + dy * way[5]) / z
+        x, y = (warp[0] + dx * warp[1] + dy * warp[2]) / z, (warp[3] + dx * warp[4] + dy * warp[5]) / z
         if not (w > 0.0 and 0.0 <= x < width - 1 and 0.0 <= y < height - 1):
             continue
         i, j = int(x), int(y)
@@ -255,20 +255,20 @@ def _cost_at_border(
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
 def _view_cost(
-    squares: U32, layout: I64, k: int, way: F64, offsets: F32, samples: F32, variance: float
+    squares: U32, layout: I64, k: int, warp: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
     """1 - weighted NCC of a window with its image in view ``k``, -1 if it is not visible there."""
     start, width, height = layout[k, 0], layout[k, 1], layout[k, 2]
     # The first and last sample are opposite corners of the window.
     reach = -offsets[0, 0]
-    sx, sy = reach * (abs(way[1]) + abs(way[2])), reach * (abs(way[4]) + abs(way[5]))
-    sz = 1.0 - reach * (abs(way[6]) + abs(way[7]))
-    inside = sz > 0.5 and sx <= way[0] and sy <= way[3]
-    if inside and way[0] + sx < sz * (width - 1.01) and way[3] + sy < sz * (height - 1.01):
-        cost: float = _cost_inside(squares, start, width, way, offsets, samples, variance)
+    sx, sy = reach * (abs(warp[1]) + abs(warp[2])), reach * (abs(warp[4]) + abs(warp[5]))
+    sz = 1.0 - reach * (abs(warp[6]) + abs(warp[7]))
+    inside = sz > 0.5 and sx <= warp[0] and sy <= warp[3]
+    if inside and warp[0] + sx < sz * (width - 1.01) and warp[3] + sy < sz * (height - 1.01):
+        cost: float = _cost_inside(squares, start, width, warp, offsets, samples, variance)
         if cost >= 0.0:
             return cost
-    return _cost_at_border(squares, start, (width, height), way, offsets, samples)
+    return _cost_at_border(squares, start, (width, height), warp, offsets, samples)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
@@ -279,20 +279,20 @@ def _plane_cost(
     offsets: F32,
     samples: F32,
     variance: float,
-    way: F64,
+    warp: F64,
 ) -> float:
     """Mean of the two smallest costs, the second at most ``HIDDEN`` above the first.
 
-    A neighbour in which the pixel is occluded has limited influence. ``way`` (8,) is work space.
+    A neighbour in which the pixel is occluded has limited influence. ``warp`` (8,) is work space.
     """
     _, squares, layout, H, e = views
     if not plane[0] > 0.0:
         return UNKNOWN
     least, second = UNKNOWN, UNKNOWN
     for k in range(layout.shape[0]):
-        if not _carry(H, e, k, at, plane, way):
+        if not _plane_homography(H, e, k, at, plane, warp):
             continue
-        cost = _view_cost(squares, layout, k, way, offsets, samples, variance)
+        cost = _view_cost(squares, layout, k, warp, offsets, samples, variance)
         if cost >= 0.0:
             if cost < least:
                 least, second = cost, least
@@ -364,7 +364,7 @@ def sweep_planes(
     """
     gray, H, e, offsets = views.gray, views.H, views.e, window.offsets
     height, width = gray.shape
-    samples, way = np.empty((2, offsets.shape[1]), np.float32), np.empty(8)
+    samples, warp = np.empty((2, offsets.shape[1]), np.float32), np.empty(8)
     plane, trial = np.empty(3), np.empty(3)
     reach = -float(offsets[0, 0])
     back = -1 if backward else 1
@@ -395,7 +395,7 @@ def sweep_planes(
                     for d in range(3):
                         trial[d] = plane[d]
                     trial[k // 2 - 1] += by if k < 4 else by / reach
-                tried = _plane_cost(views, (u, v), trial, offsets, samples, variance, way)
+                tried = _plane_cost(views, (u, v), trial, offsets, samples, variance, warp)
                 if tried < least:
                     least = tried
                     for d in range(3):
@@ -435,7 +435,7 @@ def rate_planes(
     gray, squares, layout, H, e = views
     offsets = window.offsets
     height, width = gray.shape
-    samples, way, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
+    samples, warp, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
     for v in range(height):
         for u in range(width):
             least[v, u], support[v, u], slope[v, u] = UNKNOWN, 0, 0.0
@@ -446,9 +446,9 @@ def rate_planes(
                 plane[d] = planes[v, u, d]
             total = 0.0
             for k in range(layout.shape[0]):
-                if not _carry(H, e, k, (u, v), plane, way):
+                if not _plane_homography(H, e, k, (u, v), plane, warp):
                     continue
-                one = _view_cost(squares, layout, k, way, offsets, samples, variance)
+                one = _view_cost(squares, layout, k, warp, offsets, samples, variance)
                 if 0.0 <= one < least[v, u]:
                     least[v, u] = one
                 if 0.0 <= one <= max_cost:
@@ -477,7 +477,7 @@ def begin_planes(
     """
     gray, offsets = views.gray, window.offsets
     height, width = gray.shape
-    samples, way, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
+    samples, warp, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
     for v in range(height):
         for u in range(width):
             cost[v, u] = UNKNOWN
@@ -485,4 +485,4 @@ def begin_planes(
                 variance = _window_samples(gray, u, v, window, samples)
                 for d in range(3):
                     plane[d] = planes[v, u, d]
-                cost[v, u] = _plane_cost(views, (u, v), plane, offsets, samples, variance, way)
+                cost[v, u] = _plane_cost(views, (u, v), plane, offsets, samples, variance, warp)

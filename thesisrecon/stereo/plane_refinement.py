@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, U8
-from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.records import PinholeView
-from thesisrecon.stereo.depth_fusion import InverseDepth
+from thesisrecon.stereo.depth_fusion import InverseDepth, pixel_transfer
 from thesisrecon.stereo.depth_kernels import surface_continuation
 from thesisrecon.stereo.plane_kernels import (
     UNKNOWN,
@@ -213,10 +212,7 @@ class _Setting:
         squares = [np.empty(one.shape, dtype=np.uint32) for one in gray[1:]]
         for one, words in zip(gray[1:], squares, strict=True):
             pack_squares(one, words)
-        M = np.linalg.inv(reference.P[:, :3])
-        centre = camera_centre(reference.P)
-        H = np.stack([other.P[:, :3] @ M for other in others])
-        e = np.stack([other.P @ (centre / centre[3]) for other in others])
+        H, e = map(np.stack, zip(*(pixel_transfer(reference.P, other.P) for other in others), strict=True))
         table = np.exp(-np.arange(256.0) / intensity_scale).astype(np.float32)
         packed = np.concatenate([words.ravel() for words in squares])
         return cls(PatchViews(gray[0], packed, layout, H, e), PatchWindow(offsets, table))

@@ -16,7 +16,7 @@ UNREACHED = np.uint16(65535)
 MIN_FACTOR = np.float32(0.05)
 """Factor of the confidence without texture."""
 MIN_TEXTURED = 20
-"""A region needs texture in at least one of so many pixels."""
+"""One textured pixel is required for every so many pixels of a region."""
 
 
 @njit(cache=True, nogil=True)
@@ -116,17 +116,10 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
 
 
 @njit(cache=True, nogil=True)
-def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
-    """Invalidate disparities that fail the left-right check or the confidence threshold.
+def _check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
+    """Set disparities to NaN that differ from their partner's by more than ``limits[0]``.
 
-    Parameters
-    ----------
-    left, right : ndarray (H, W) float32
-        Disparities of both images; ``left`` is set to NaN where rejected.
-    confidence : ndarray (H, W) float32
-        Confidence of the left disparities.
-    limits : ndarray (2,) float32
-        Largest difference in pixels, and least confidence.
+    Also those whose confidence is less than ``limits[1]``.
     """
     height, width = left.shape
     for y in range(height):
@@ -173,17 +166,8 @@ def _add_squares(before: I16, after: I16, sign: int, out: I32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def squared_gradient(channels: I16, radius: int, out: F32) -> None:
-    """Compute the mean squared horizontal difference I(x + 1) - I(x - 1) in a window.
-
-    Parameters
-    ----------
-    channels : ndarray (K, H, W) int16
-    radius : int
-        Radius of the square window; zeros outside the image.
-    out : ndarray (H, W) float32
-        Receives the mean over window and channels.
-    """
+def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
+    """Mean of (I(x + 1) - I(x - 1))^2 over channels and a square window, (H, W); zeros outside the image."""
     n, height, width = channels.shape
     columns = np.zeros(width, np.int32)
     share = np.float32(1.0) / np.float32(n * (2 * radius + 1) ** 2)
@@ -205,19 +189,11 @@ def squared_gradient(channels: I16, radius: int, out: F32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
-    """Invalidate small or untextured connected regions.
+def _remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
+    """Set connected regions to NaN that have fewer than ``smallest`` pixels, or too few ``textured`` ones.
 
-    Parameters
-    ----------
-    disparity : ndarray (H, W) float32
-        Disparities; set to NaN where removed.
-    textured : ndarray (H, W) bool
-        Pixels with texture; a region needs one in twenty, in or next to it.
-    step : float32
-        Largest disparity difference of connected neighbours.
-    smallest : int
-        Regions of fewer pixels are removed.
+    A region needs one textured pixel, in or next to it, in twenty. Neighbours are connected if their
+    disparities differ by at most ``step``.
     """
     height, width = disparity.shape
     # Padding with unknown pixels gives every pixel four neighbours; one column serves both sides.
@@ -257,18 +233,8 @@ def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: in
 
 
 @njit(cache=True, nogil=True)
-def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
-    """Fill unknown pixels with the median of their 8 neighbours.
-
-    Parameters
-    ----------
-    disparity : ndarray (H, W) float32
-        Disparities, NaN = unknown.
-    least : int
-        Known neighbours required.
-    out : ndarray (H, W) float32
-        Receives the result.
-    """
+def _fill_pinholes(disparity: F32, least: int, out: F32) -> None:
+    """Fill unknown pixels that have ``least`` known ones among 8 neighbours with their median, (H, W)."""
     height, width = disparity.shape
     around = np.empty(8, np.float32)
     out[:] = disparity
@@ -307,20 +273,8 @@ def _gather_similar(centre: F32, other: F32, step: np.float32, total: F32, count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
-    """Average the disparities of a window that differ little from the centre.
-
-    Parameters
-    ----------
-    disparity : ndarray (H, W) float32
-        Disparities, NaN = unknown.
-    step : float32
-        Largest difference to the centre.
-    radius : int
-        Radius of the square window.
-    out : ndarray (H, W) float32
-        Receives the means.
-    """
+def _edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
+    """Mean of the disparities in a square window that differ from the centre by at most ``step``, (H, W)."""
     height, width = disparity.shape
     total, count = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(height):
@@ -402,13 +356,13 @@ class DisparityPostprocessing:
             Disparities of the left image.
         """
         limits = np.array([self.left_right_px, self.min_confidence], np.float32)
-        check_left_right(left, right, confidence, limits)
-        remove_speckles(left, texture > TEXTURED, STEP_PX, self.min_region_px)
+        _check_left_right(left, right, confidence, limits)
+        _remove_speckles(left, texture > TEXTURED, STEP_PX, self.min_region_px)
         closed = np.empty_like(left)
-        fill_pinholes(left, MIN_NEIGHBOURS, closed)
+        _fill_pinholes(left, MIN_NEIGHBOURS, closed)
         closed[np.isnan(texture)] = np.nan
         smooth = np.empty_like(left)
-        edge_preserving_mean(closed, STEP_PX, self.radius, smooth)
+        _edge_preserving_mean(closed, STEP_PX, self.radius, smooth)
         final_confidence(confidence, left, smooth, texture)
         return DisparityMap(smooth, confidence, _noise(closed, smooth))
 
@@ -428,7 +382,7 @@ def texture_of(image: StereoImage, noise: float) -> F32:
         Squared horizontal gradient relative to that of pure noise: 1 = no texture, NaN = no pixel.
     """
     out = np.empty(image.valid.shape, np.float32)
-    squared_gradient(image.channels, TEXTURE_RADIUS, out)
+    _squared_gradient(image.channels, TEXTURE_RADIUS, out)
     out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, QUANTISATION) ** 2)
     out[image.valid == 0] = np.nan
     return out

@@ -60,7 +60,7 @@ class RectificationQuality:
         Share of each image inside the frame.
     size_ratio : float
         Pixels of the frame relative to the larger image.
-    least_scale, greatest_scale : float
+    min_scale, max_scale : float
         Extreme local scales along any direction.
     stretch : float
         Typical local scale change: exp of the standard deviation of the log singular values; 1 for
@@ -76,8 +76,8 @@ class RectificationQuality:
     aspect: tuple[float, float]
     coverage: tuple[float, float]
     size_ratio: float
-    least_scale: float
-    greatest_scale: float
+    min_scale: float
+    max_scale: float
     stretch: float
     disparity_slope: float
     disparities: tuple[float, float]
@@ -125,8 +125,8 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
         aspect=(midlines[0][1], midlines[1][1]),
         coverage=(coverage[0], coverage[1]),
         size_ratio=width * height / max(w * h for w, h in pair.sizes),
-        least_scale=float(found[:, 1].min()),
-        greatest_scale=float(found[:, 0].max()),
+        min_scale=float(found[:, 1].min()),
+        max_scale=float(found[:, 0].max()),
         stretch=float(np.exp(np.std(logs))),
         disparity_slope=disparity_slope,
         disparities=disparities,

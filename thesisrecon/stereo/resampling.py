@@ -55,21 +55,13 @@ def _spread(xy: F64, i: int, j: int, axis: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def sample_image(image: F32, xy: F64, out: F32) -> None:
-    """Sample an image by cubic convolution.
+def _sample_image(image: F32, xy: F64, out: F32) -> None:
+    """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C).
 
-    The kernel is widened along each axis of the image where neighbouring positions are more than a pixel
-    apart, which prevents aliasing. NaN where the position is NaN or outside the pixel centres, or one of the
-    four pixels around is NaN; other NaN pixels are left out.
-
-    Parameters
-    ----------
-    image : ndarray (H, W, C) float32
-        The image, NaN = no pixel.
-    xy : ndarray (>= n, m, 2)
-        Positions of adjacent output pixels; may have one row more than ``out``.
-    out : ndarray (n, m, C) float32
-        Receives the samples.
+    ``xy`` are the positions of adjacent output pixels and may have one row more than ``out``. The kernel is
+    widened along each axis of the image where they are more than a pixel apart, which prevents aliasing. NaN
+    where the position is NaN or outside the pixel centres, or one of the four pixels around is NaN; other NaN
+    pixels are left out.
     """
     height, width, channels = image.shape
     wx, wy = np.empty(MOST_TAPS), np.empty(MOST_TAPS)
@@ -170,7 +162,7 @@ def warp_image(source: Lookup, image: F32, side: int) -> F32:
         start = first - 1 if last == height and last - first == 1 and first > 0 else first
         places = source.lookup(side, range(start, min(last + 1, height)))
         strip = out[start:last] if start == first else np.empty((last - start, *out.shape[1:]), np.float32)
-        sample_image(pixels, places, strip)
+        _sample_image(pixels, places, strip)
         out[first:last] = strip[first - start :]
     return out[:, :, 0] if image.ndim == 2 else out
 

@@ -48,14 +48,11 @@ def basis(u: F64, derivative: int = 0) -> F64:
     return np.asarray(np.power(u[:, None], np.arange(row.shape[1])) @ row.T)
 
 
-def energies() -> tuple[F64, F64]:
-    """Compute the quadratic forms of the bending and the gradient energy of a unit cell.
+def _energies() -> tuple[F64, F64]:
+    """Quadratic forms (16, 16) of the bending and the gradient energy of a unit cell.
 
-    Returns
-    -------
-    tuple of ndarray (16, 16)
-        Integrals of f_xx^2 + 2 f_xy^2 + f_yy^2 and of the squared gradient; node (i, j) has the index 4 i +
-        j.
+    They are the integrals of f_xx^2 + 2 f_xy^2 + f_yy^2 and of the squared gradient; node (i, j) has the
+    index 4 i + j.
     """
     nodes, weights = np.polynomial.legendre.leggauss(4)
     values = [basis(0.5 * (nodes + 1.0), d) for d in (0, 1, 2)]
@@ -91,7 +88,7 @@ class _NormalEquations:
         code = (own[:, None, :] * count + own[:, :, None]).reshape(-1)
         places, place = np.unique(code, return_inverse=True)
         starts = np.searchsorted(places, np.arange(count + 1) * count).astype(np.int32)
-        bending, gradient = energies()
+        bending, gradient = _energies()
         along = basis((np.arange(cell) + 0.5) / cell)
         rows = (places % count).astype(np.int32)
         return cls(

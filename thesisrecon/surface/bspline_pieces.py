@@ -40,24 +40,12 @@ def _join(parent: I64, a: int, b: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def number_coefficients(first: I64, columns: int, start: I64, linked: I64, coefficient: I64) -> int:
-    """Assign a coefficient to every node and connected set of pieces within its sixteen cells.
+def _number_coefficients(first: I64, columns: int, start: I64, linked: I64, coefficient: I64) -> int:
+    """Number a coefficient for every node and connected set of pieces within its sixteen cells.
 
-    Parameters
-    ----------
-    first : ndarray (cells + 1,)
-        First piece of each cell.
-    columns : int
-        Cells per row.
-    start, linked : ndarray
-        ``linked[start[k]:start[k + 1]]`` are the pieces of other cells connected to piece k.
-    coefficient : ndarray (N, 16)
-        Receives the coefficient of node (i, j) of each piece's cell at 4 i + j.
-
-    Returns
-    -------
-    int
-        Number of coefficients.
+    ``first`` (cells + 1,) is the first piece of each cell; ``linked[start[k]:start[k + 1]]`` are the pieces
+    of other cells connected to piece k. ``coefficient`` (N, 16) receives the number at node (i, j) of each
+    piece's cell at 4 i + j. Returns the number of coefficients.
     """
     rows = (len(first) - 1) // columns
     parent = np.arange(len(coefficient))
@@ -323,7 +311,7 @@ def pieces_of(domain: Domain, cell: int) -> SplinePieces:
     first = np.searchsorted(cells, np.arange(shape[0] * shape[1] + 1))
     start, linked = _links(piece, domain, len(cells))
     coefficient = np.empty((len(cells), 16), dtype=np.int64)
-    total = number_coefficients(first, shape[1], start, linked, coefficient)
+    total = _number_coefficients(first, shape[1], start, linked, coefficient)
     return SplinePieces(piece, coefficient, cells, shape, total)
 
 

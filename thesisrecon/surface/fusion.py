@@ -166,7 +166,7 @@ class _FusionMap:
 def _measured(depth_map: DepthMap, grazing_deg: float) -> _FusionMap:
     K = decompose_camera(depth_map.P)[0]
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
-    slope = float(1.0 / (focal * np.tan(np.radians(grazing_deg))))
+    slope = max_depth_slope(depth_map.P, grazing_deg)
     facing = _facing(depth_map, slope)
     return _FusionMap(
         facing.P, focal, MapSamples(facing.depth, facing.std, incidence_cosines(facing.depth, K), slope)
@@ -297,7 +297,7 @@ class DepthSheets:
     ----------
     step : int
         Row and column step of the triangulation.
-    same : float
+    max_relative : float
         Relative depth difference, or three standard deviations, up to which a point is already shown.
     grazing_deg : float
         Surfaces break where they are seen at a smaller angle.
@@ -306,15 +306,15 @@ class DepthSheets:
     """
 
     step: int = 2
-    same: float = 0.02
+    max_relative: float = 0.02
     grazing_deg: float = 10.0
     min_part_share: float = 0.0005
 
     def __post_init__(self) -> None:
-        if self.step < 1 or not self.same >= 0.0 or not 0.0 < self.grazing_deg < 90.0:
+        if self.step < 1 or not self.max_relative >= 0.0 or not 0.0 < self.grazing_deg < 90.0:
             raise ValueError(
-                "step must be >= 1, same >= 0 and grazing_deg in (0, 90); got "
-                f"{self.step}, {self.same} and {self.grazing_deg}"
+                "step must be >= 1, max_relative >= 0 and grazing_deg in (0, 90); got "
+                f"{self.step}, {self.max_relative} and {self.grazing_deg}"
             )
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:  # noqa: ARG002
@@ -375,7 +375,7 @@ class DepthSheets:
             (x, y), (u, v) = np.stack([x, y])[:, n], place[n].T % 1.0
             a, b, c, d = (1.0 / depth[y + k, x + m] for k in (0, 1) for m in (0, 1))
             there = 1.0 / ((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
-            inside[n] = np.abs(there - z[n]) <= np.maximum(self.same * z[n], 3.0 * std[y, x])
+            inside[n] = np.abs(there - z[n]) <= np.maximum(self.max_relative * z[n], 3.0 * std[y, x])
             return np.asarray(inside)
 
         return shown

@@ -88,21 +88,8 @@ def vertex_normals(mesh: TexturedMesh) -> F64:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
 
 
-def connected_parts(faces: I64, vertices: int) -> I64:
-    """Label the connected parts of a mesh; faces are connected by common vertices.
-
-    Parameters
-    ----------
-    faces : ndarray (M, 3)
-        Vertex indices.
-    vertices : int
-        Number of vertices.
-
-    Returns
-    -------
-    ndarray (M,)
-        Part of each face.
-    """
+def _connected_parts(faces: I64, vertices: int) -> I64:
+    """(M,) connected part of each face; faces are connected by common vertices."""
     if not len(faces):
         return np.zeros(0, dtype=np.int64)
     row, column = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
@@ -153,7 +140,7 @@ def remove_small_parts(mesh: TexturedMesh, min_share: float = 0.002) -> Textured
     """
     if not len(mesh.faces):
         return mesh
-    part = connected_parts(mesh.faces, len(mesh.vertices))
+    part = _connected_parts(mesh.faces, len(mesh.vertices))
     area = np.bincount(part, face_areas(mesh.vertices, mesh.faces))
     return select_faces(mesh, area[part] >= min_share * area.sum())
 

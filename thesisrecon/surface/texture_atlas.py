@@ -104,7 +104,7 @@ class TextureAtlas:
             smaller = [_reduced(view, scale) for view in views]
             faces = _AtlasFaces(_corners(mesh, smaller, label), label, chart)
             rectangles = _rectangles(faces, smaller)
-            offsets, size = pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
+            offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
             if size[0] * size[1] <= self.max_texels:
                 break
             if scale <= MIN_SCALE:
@@ -161,20 +161,10 @@ def _rectangles(faces: _AtlasFaces, views: Sequence[PinholeView]) -> I64:
     return np.concatenate([low, high], axis=1)
 
 
-def pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
-    """Pack rectangles on shelves of decreasing height.
+def _pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
+    """Positions (C, 2) of rectangles of ``sizes`` (C, 2), and (width, height) of their bounding box.
 
-    Parameters
-    ----------
-    sizes : ndarray (C, 2)
-        Width and height of the rectangles.
-
-    Returns
-    -------
-    ndarray (C, 2)
-        Positions of the upper left corners.
-    tuple of int
-        (width, height) of the bounding box, roughly square.
+    They are packed on shelves of decreasing height; the bounding box is roughly square.
     """
     width = max(
         int(np.ceil(1.05 * np.sqrt(float(sizes.prod(axis=1).sum())))), int(sizes[:, 0].max(initial=1))

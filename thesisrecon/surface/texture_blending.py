@@ -160,7 +160,7 @@ class BlendedTexture:
         stride = max(1, len(mesh.vertices) // GAIN_POINTS)
         normals = vertex_normals(mesh)
         weight, color = blending.observe(mesh.vertices[::stride], normals[::stride])
-        return ViewBlender(self, tuple(prepared), equalizing_gains(weight, color))
+        return ViewBlender(self, tuple(prepared), _equalizing_gains(weight, color))
 
 
 def _points_of_rows(mesh: TexturedMesh, normals: F64, charts: Charts, rows: slice) -> tuple[I64, F64, F64]:
@@ -266,22 +266,11 @@ def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> ViewS
     return ViewSurface(view.P, depth, trust.astype(np.float32), tolerance, view.rgb, np.ones(3, np.float32))
 
 
-def equalizing_gains(weight: F32, color: F32) -> F32:
-    """Estimate gains that equalise the brightness of the views.
+def _equalizing_gains(weight: F32, color: F32) -> F32:
+    """Gains (V, 3) that equalise the brightness of the views, with geometric mean 1.
 
-    Least squares over the median log ratios of all pairs of views, with geometric mean 1.
-
-    Parameters
-    ----------
-    weight : ndarray (V, N)
-        Weights, 0 where a view does not show a point.
-    color : ndarray (V, N, 3)
-        Colours.
-
-    Returns
-    -------
-    ndarray (V, 3) float32
-        Gains.
+    Least squares over the median log ratios of all pairs of views; ``weight`` (V, N) is 0 where a view does
+    not show a point, ``color`` (V, N, 3).
     """
     views = len(weight)
     usable = (weight[..., None] > 0.0) & (color > DARK) & (color < BRIGHT)

@@ -198,7 +198,7 @@ QUANTITIES: tuple[tuple[str, str, Callable[[Measured], float], float | None, boo
     ("stretch", "", lambda m: m.quality.stretch, None, True),
     ("slant of disparities", "", lambda m: m.quality.disparity_slope, None, True),
     ("distortion", "", lambda m: m.quality.distortion, None, True),
-    ("least scale", "", lambda m: m.quality.least_scale, None, False),
+    ("least scale", "", lambda m: m.quality.min_scale, None, False),
     ("pixels over the image's", "", lambda m: m.quality.size_ratio, None, True),
     ("range of disparities", "px", lambda m: float(np.ptp(m.quality.disparities)), None, True),
     ("time", "ms", lambda m: 1e3 * m.seconds, None, True),
