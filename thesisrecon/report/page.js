@@ -34,12 +34,12 @@
     const fields = [FIELD * element.clientWidth / Math.max(element.clientHeight, 1), FIELD];
     // Positions of the eye along axis d from which everything lies within the field of view.
     function bounds(distance, d) {
-      function ends(seen, strays) {
+      function ends(seen, outliers) {
         const low = seen.map(function (p) { return p[d] - fields[d] * (distance - p[2]); });
         const high = seen.map(function (p) { return p[d] + fields[d] * (distance - p[2]); });
         low.sort(function (a, b) { return b - a; });
         high.sort(function (a, b) { return a - b; });
-        return seen.length > 0 ? [low[strays], high[strays]] : [-Infinity, Infinity];
+        return seen.length > 0 ? [low[outliers], high[outliers]] : [-Infinity, Infinity];
       }
       const a = ends(points, Math.floor(0.01 * points.length)), b = ends(pyramids, 0);
       return [Math.max(a[0], b[0]), Math.min(a[1], b[1])];

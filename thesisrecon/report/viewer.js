@@ -4,7 +4,7 @@
   const data = JSON.parse(document.getElementById("model-data").textContent);
   const stage = document.getElementById("model-figure"), canvas = stage.querySelector("canvas");
   const select = document.getElementById("model-viewpoint");
-  const sides = Array.from(document.querySelectorAll("button[data-paint]"));
+  const paintButtons = Array.from(document.querySelectorAll("button[data-paint]"));
   const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
   if (gl === null) {
     return fail("This browser cannot show the model: it has no WebGL 2. Open the file model.glb beside this page in a 3D viewer.");
@@ -32,9 +32,9 @@
       // Back faces are translucent, so that a courtyard can be seen from outside.
       shown = gl_FrontFacing ? vec4(colour, 1.0) : vec4(vec3(0.42, 0.52, 0.62) * lit, 0.25);
     }`;
-  const EYES = Math.tan(Math.PI / 8);  // tangent of half the vertical field of view
-  const calm = window.matchMedia("(prefers-reduced-motion: reduce)");
-  const samples = sampled(3000), radius = reach();
+  const TAN_HALF_FIELD = Math.tan(Math.PI / 8);  // tangent of half the vertical field of view
+  const reducedMotion = window.matchMedia("(prefers-reduced-motion: reduce)");
+  const samples = sampleVertices(3000), radius = modelRadius();
   let pose = null, shape = false, textured = false, ready = false, waiting = false, moving = 0;
   let place = null;
 
@@ -48,7 +48,7 @@
   function towards(direction) {
     return { yaw: Math.atan2(direction[1], direction[0]), pitch: Math.asin(direction[2] / Math.hypot(...direction)) };
   }
-  function between(value, low, high) { return Math.min(Math.max(value, low), high); }
+  function clamp(value, low, high) { return Math.min(Math.max(value, low), high); }
   function quantile(values, share) {
     values.sort(function (a, b) { return a - b; });
     return values[Math.round(share * (values.length - 1))];
@@ -61,7 +61,7 @@
     for (let n = 0; n < raw.length; n += 1) { out[n] = raw.charCodeAt(n); }
     return out;
   }
-  function sampled(most) {
+  function sampleVertices(most) {
     const q = new Uint16Array(bytes(data.positions).buffer), found = [];
     const step = Math.max(1, Math.floor(q.length / 3 / most));
     for (let n = 0; n < q.length; n += 3 * step) {
@@ -69,7 +69,7 @@
     }
     return found;
   }
-  function reach() {
+  function modelRadius() {
     const spans = [0, 1, 2].map(function (d) { return share(samples, d, 0.99) - share(samples, d, 0.01); });
     return Math.hypot(...spans) / 2 || 1;
   }
@@ -114,11 +114,11 @@
     gl.uniform3fv(place.extent, data.high.map(function (v, d) { return v - data.low[d]; }));
     if (!data.texture) { ready = true; return redraw(); }
     const image = new Image();
-    image.onload = function () { paper(image); ready = textured = true; redraw(); };
+    image.onload = function () { uploadTexture(image); ready = textured = true; redraw(); };
     image.onerror = function () { fail("This browser could not read the texture of the model."); };
     image.src = data.texture;
   }
-  function paper(image) {
+  function uploadTexture(image) {
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     let source = image;
     if (Math.max(image.width, image.height) > most) {
@@ -145,7 +145,7 @@
   }
   // Fit nearly all of the model into the view from a direction.
   function fitted(direction) {
-    const p = towards(direction), a = axes(p), fields = [EYES * aspect(), EYES];
+    const p = towards(direction), a = axes(p), fields = [TAN_HALF_FIELD * aspect(), TAN_HALF_FIELD];
     const seen = samples.map(function (v) { return [dot(v, a.right), dot(v, a.up), dot(v, a.back)]; });
     const middle = [0, 1, 2].map(function (d) { return (share(seen, d, 0.01) + share(seen, d, 0.99)) / 2; });
     let distance = 0;
@@ -161,15 +161,15 @@
       [0, 1].forEach(function (d) { middle[d] += distance * (share(flat, d, 0.01) + share(flat, d, 0.99)) / 2; });
     }
     const target = add(add(add([0, 0, 0], a.right, middle[0]), a.up, middle[1]), a.back, middle[2]);
-    return Object.assign({ target: target, distance: 1.04 * distance, field: EYES }, p);
+    return Object.assign({ target: target, distance: 1.04 * distance, field: TAN_HALF_FIELD }, p);
   }
-  function go(end) {
+  function moveTo(end) {
     cancelAnimationFrame(moving);
-    if (calm.matches || pose === null) { pose = end; return redraw(); }
+    if (reducedMotion.matches || pose === null) { pose = end; return redraw(); }
     const from = pose, began = performance.now();
     const turn = Math.atan2(Math.sin(end.yaw - from.yaw), Math.cos(end.yaw - from.yaw));
     function step(now) {
-      const t = between((now - began) / 450, 0, 1), s = t * t * (3 - 2 * t);
+      const t = clamp((now - began) / 450, 0, 1), s = t * t * (3 - 2 * t);
       pose = {
         target: from.target.map(function (v, d) { return v + s * (end.target[d] - v); }),
         yaw: from.yaw + s * turn, pitch: from.pitch + s * (end.pitch - from.pitch),
@@ -180,20 +180,20 @@
     }
     moving = requestAnimationFrame(step);
   }
-  function changed(change) {
+  function applyChange(change) {
     cancelAnimationFrame(moving);
     select.value = "";
     const next = Object.assign({}, pose, change);
-    next.pitch = between(next.pitch, -1.55, 1.55);
-    next.distance = between(next.distance, 0.02 * radius, 12 * radius);
+    next.pitch = clamp(next.pitch, -1.55, 1.55);
+    next.distance = clamp(next.distance, 0.02 * radius, 12 * radius);
     pose = next;
     redraw();
   }
-  function turn(dx, dy) { changed({ yaw: pose.yaw - 0.006 * dx, pitch: pose.pitch + 0.006 * dy }); }
-  function zoom(factor) { changed({ distance: pose.distance * factor }); }
+  function turn(dx, dy) { applyChange({ yaw: pose.yaw - 0.006 * dx, pitch: pose.pitch + 0.006 * dy }); }
+  function zoom(factor) { applyChange({ distance: pose.distance * factor }); }
   function shift(dx, dy) {
     const a = axes(pose), s = 2 * pose.field * pose.distance / Math.max(stage.clientHeight, 1);
-    changed({ target: add(add(pose.target, a.right, -s * dx), a.up, s * dy) });
+    applyChange({ target: add(add(pose.target, a.right, -s * dx), a.up, s * dy) });
   }
 
   // ---- drawing, only when something changed ----
@@ -236,12 +236,12 @@
     stage.textContent = words;
     document.querySelectorAll(".of-model").forEach(function (element) { element.hidden = true; });
   }
-  function dress(bare) {
+  function setShape(bare) {
     shape = bare;
-    sides.forEach(function (button) { button.setAttribute("aria-pressed", String((button.dataset.paint === "shape") === bare)); });
+    paintButtons.forEach(function (button) { button.setAttribute("aria-pressed", String((button.dataset.paint === "shape") === bare)); });
     redraw();
   }
-  function reset() { select.value = String(data.start); dress(false); go(poseOf(data.viewpoints[data.start])); }
+  function reset() { select.value = String(data.start); setShape(false); moveTo(poseOf(data.viewpoints[data.start])); }
 
   // ---- input: until the canvas is clicked, the wheel and vertical swipes scroll the page ----
   const down = new Map();
@@ -269,13 +269,13 @@
   canvas.addEventListener("wheel", function (event) {
     if (!stage.classList.contains("awake")) { return; }
     event.preventDefault();
-    zoom(Math.exp(between((event.deltaMode === 0 ? 1 : 30) * event.deltaY, -200, 200) * 0.0015));
+    zoom(Math.exp(clamp((event.deltaMode === 0 ? 1 : 30) * event.deltaY, -200, 200) * 0.0015));
   }, { passive: false });
   const KEYS = {
     ArrowLeft: function () { turn(-25, 0); }, ArrowRight: function () { turn(25, 0); },
     ArrowUp: function () { turn(0, -25); }, ArrowDown: function () { turn(0, 25); },
     "+": function () { zoom(0.87); }, "=": function () { zoom(0.87); }, "-": function () { zoom(1.15); },
-    Home: reset, "0": reset, t: function () { dress(!shape); },
+    Home: reset, "0": reset, t: function () { setShape(!shape); },
   };
   canvas.addEventListener("keydown", function (event) {
     if (event.ctrlKey || event.metaKey || event.altKey || !KEYS[event.key]) { return; }
@@ -283,10 +283,10 @@
     KEYS[event.key]();
   });
   document.querySelectorAll("button[data-direction]").forEach(function (button) {
-    button.addEventListener("click", function () { select.value = ""; go(fitted(data.directions[Number(button.dataset.direction)].from)); });
+    button.addEventListener("click", function () { select.value = ""; moveTo(fitted(data.directions[Number(button.dataset.direction)].from)); });
   });
-  sides.forEach(function (button) { button.addEventListener("click", function () { dress(button.dataset.paint === "shape"); }); });
-  select.addEventListener("change", function () { if (select.value !== "") { go(poseOf(data.viewpoints[Number(select.value)])); } });
+  paintButtons.forEach(function (button) { button.addEventListener("click", function () { setShape(button.dataset.paint === "shape"); }); });
+  select.addEventListener("change", function () { if (select.value !== "") { moveTo(poseOf(data.viewpoints[Number(select.value)])); } });
   document.getElementById("model-reset").addEventListener("click", reset);
   canvas.addEventListener("webglcontextlost", function (event) { event.preventDefault(); ready = false; });
   canvas.addEventListener("webglcontextrestored", upload);

@@ -23,7 +23,7 @@ LEVELS = 65535
 MAX_TEXELS = 2100 * 2100
 """Larger textures are reduced: with 150,000 faces they then add less than 8 MB to the page."""
 
-_STRAY = 8.0
+_OUTLIER = 8.0
 """Largest distance of a face from the median, relative to the 95 % quantile."""
 
 _PLAIN = (200, 200, 200)
@@ -58,7 +58,7 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
         of the images, the most central one as ``start``; ``directions``.
         Faces farther from the median than 8 times the 95 % quantile are left out.
     """
-    mesh = _without_strays(mesh)
+    mesh = _without_outliers(mesh)
     views = np.flatnonzero(reconstruction.registered).tolist()
     rotations = np.stack([decompose_camera(reconstruction.P[i])[1] for i in views])
     upright = upright_rotation(rotations)
@@ -82,10 +82,10 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     }
 
 
-def _without_strays(mesh: TexturedMesh) -> TexturedMesh:
+def _without_outliers(mesh: TexturedMesh) -> TexturedMesh:
     """Remove far faces, which would leave few quantization levels for the rest."""
     distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
-    keep = (distance <= _STRAY * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
+    keep = (distance <= _OUTLIER * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
     return replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
 
 
