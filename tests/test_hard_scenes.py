@@ -134,16 +134,16 @@ def test_no_depths_are_one_sentence_and_the_cameras_stay(name, base, tmp_path):
     assert result.mesh is None
     reported = [w for w in result.warnings if "No surface model was built" in w]
     assert len(reported) == 1
-    assert "no depths were found" in reported[0]
+    assert "no depth was found" in reported[0]
     assert summary(tmp_path)["registered"] == len(MADE[name].images)
     assert not (tmp_path / "model.glb").exists()
     assert (tmp_path / "report.html").exists()
 
 
 def test_a_requested_model_without_depths_is_a_failure(tmp_path):
-    with pytest.raises(StageFailure, match="no depths were found"):
+    with pytest.raises(StageFailure, match="no depth was found"):
         run("no texture", tmp_path, until="model")
-    assert "no depths" in summary(tmp_path)["failure"]
+    assert "no depth" in summary(tmp_path)["failure"]
 
 
 @pytest.mark.parametrize(("name", "base"), [*((n, "default") for n in PARTLY), ("a fence", "thesis")])
@@ -155,7 +155,7 @@ def test_partly_visible_scenes_become_models(name, base, tmp_path):
     scene = trimesh.load(tmp_path / "model.glb")
     assert len(scene.geometry) == 1
     without = {f"{m.view:02d}.png" for m in result.depth_maps if not np.isfinite(m.depth).any()}
-    assert {w.split()[0] for w in result.warnings if w.endswith("has no depths")} == without
+    assert {w.split()[1] for w in result.warnings if w.endswith("has no depth values")} == without
     if name == "a view of elsewhere":
         assert without == {"03.png"}
 

@@ -109,7 +109,7 @@ def test_cameras_with_skew_are_written_where_they_can_be(tmp_path):
     config = fake_config(intrinsics=knowledge, selfcalibration=fakes.FakeCalibrator(skew_px=2.0))
     result = run(tmp_path, config=config, overwrite=True)
     (sentence,) = (w for w in result.summary["warnings"] if "sparse/0" in w)
-    assert "COLMAP has no camera with skew" in sentence
+    assert "COLMAP has no camera model with skew" in sentence
     assert sentence in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not (tmp_path / "sparse").exists()
     assert (tmp_path / "points.ply").is_file()
@@ -177,10 +177,10 @@ def test_a_run_stopped_between_depth_maps_goes_on(tmp_path):
 
 def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path):
     config = fake_config(dense=fakes.FakeDense(confirmed=False))
-    with pytest.raises(StageFailure, match="no depths were found"):
+    with pytest.raises(StageFailure, match="no depth was found"):
         run(tmp_path, until="model", config=config)
     assert (tmp_path / "cameras.json").exists()
-    assert "no depths" in read(tmp_path / "summary.json")["failure"]
+    assert "no depth" in read(tmp_path / "summary.json")["failure"]
 
 
 def test_cameras_suffice_when_no_surface_is_requested(tmp_path):
@@ -190,7 +190,7 @@ def test_cameras_suffice_when_no_surface_is_requested(tmp_path):
     summary = read(tmp_path / "summary.json")
     assert (summary["failure"], summary["model"], summary["registered"]) == (None, None, 4)
     assert any(
-        warning.startswith("No surface model was built: no depths were found")
+        warning.startswith("No surface model was built: no depth was found")
         for warning in summary["warnings"]
     )
 
@@ -224,7 +224,7 @@ def test_a_damaged_result_is_computed_again(tmp_path):
     assert called == ["detect 03.png", "match (0, 1)", "match (1, 2)"]
     assert kept_bytes(tmp_path) == before
     reported = "02-matches/00000-00001.npz and 1 more were damaged or changed by another program"
-    assert f"{reported}, and are computed again" in result.warnings
+    assert f"{reported} and were computed again" in result.warnings
 
 
 @pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 3}, {"threads": 2, "executor": "processes"}])
@@ -304,7 +304,7 @@ def test_an_earlier_end_leaves_the_finished_result(tmp_path):
     early = run(tmp_path, until="features")
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
     assert early.summary["until"] == "features"
-    assert any("up to metric: its summary and page are kept" in warning for warning in early.warnings)
+    assert any("up to metric: its summary and report are kept" in warning for warning in early.warnings)
 
 
 def test_an_earlier_end_of_another_run_replaces_the_finished_result(tmp_path):
@@ -353,7 +353,7 @@ def test_a_distrusted_result_is_tried_from_other_pairs(tmp_path):
 def test_an_untrusted_result_is_written_with_its_warning(tmp_path):
     result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=9)))
     assert sum(c.startswith("projective") for c in CALLS) == 3
-    assert any("not to be trusted: odd focal" in warning for warning in result.warnings)
+    assert any("cannot be trusted: odd focal" in warning for warning in result.warnings)
     assert read(tmp_path / "summary.json")["trusted"] is False
     assert (tmp_path / "sparse" / "0" / "images.bin").exists()
     assert "odd focal" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -1,11 +1,4 @@
-"""What the front end finds: photographs, corners, matches, pairs with their epipolar geometry.
-
-Cameras and points, what is assumed of the cameras, and what calibration says of them.
-
-Disparities, depths, views without distortion, surfaces and renderings.
-
-What one run did and found.
-"""
+"""The records that stages take and return, from images to the result of a run."""
 
 from __future__ import annotations
 
@@ -22,9 +15,16 @@ from thesisrecon.arrays import B8, F32, F64, I64, Stratum
 
 @dataclass(frozen=True)
 class Image:
-    """One photograph at working size.
+    """One image at working size.
 
-    ``rgb`` (H, W, 3) uint8; ``original_size`` (width, height) of the file after EXIF rotation.
+    Parameters
+    ----------
+    name : str
+        File name.
+    rgb : ndarray (H, W, 3) uint8
+        Pixels.
+    original_size : tuple of int
+        (width, height) of the file after EXIF rotation.
     """
 
     name: str
@@ -288,13 +288,35 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Cameras and points in one stratum, with the tracks they explain.
+    """Cameras and points in one stratum, with their tracks.
 
-    ``P`` (V, 3, 4) (zeros where not ``registered``), ``X`` (N, 4) homogeneous (zeros where not ``valid``);
-    ``inlier`` (K,) bool per observation; ``reasons`` per view, empty where registered. In the metric stratum
-    ``P = K [R t]`` before distortion, with ``K`` (V, 3, 3) and the coefficients k1, k2, k3 of the lens in
-    ``radial`` (V, 3), no distortion where that is None: a normalised image point (x, y) is seen at (x, y) (1
-    + k1 r^2 + k2 r^4 + k3 r^6), r^2 = x^2 + y^2, before K; ``X[:, 3] = 1`` where valid.
+    Parameters
+    ----------
+    stratum : {"projective", "affine", "metric"}
+        Stratum of the frame.
+    P : ndarray (V, 3, 4)
+        Camera matrices, zeros where not registered; K [R t] before distortion in the metric stratum.
+    X : ndarray (N, 4)
+        Homogeneous points, zeros where not valid; last coordinate 1 in the metric stratum.
+    registered : ndarray (V,) of bool
+        Registered views.
+    valid : ndarray (N,) of bool
+        Reconstructed points.
+    inlier : ndarray (K,) of bool
+        Inlier observations.
+    tracks : Tracks
+        The K observations.
+    sizes : ndarray (V, 2) of int
+        Image sizes (width, height).
+    sigma_px : float
+        Noise of one image coordinate.
+    reasons : tuple of str
+        Per view why it is not registered; empty where it is.
+    K : ndarray (V, 3, 3), optional
+        Calibration matrices (metric stratum).
+    distortion : ndarray (V, 3), optional
+        Radial coefficients k1, k2, k3; a normalised point (x, y) is imaged at
+        (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6). None: no distortion.
     """
 
     stratum: Stratum
@@ -313,8 +335,18 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class Upgrade:
-    """One candidate answer of self-calibration: ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) (zeros
-    where not registered), the ``cost`` it reached and the ``method`` it came from.
+    """One candidate of self-calibration.
+
+    Parameters
+    ----------
+    metric_from_projective : ndarray (4, 4)
+        Upgrading transform.
+    K : ndarray (V, 3, 3)
+        Calibration matrices, zeros where not registered.
+    cost : float
+        Value of the criterion.
+    method : str
+        The method it came from.
     """
 
     metric_from_projective: F64
@@ -325,14 +357,22 @@ class Upgrade:
 
 @dataclass(frozen=True)
 class IdentifiabilityReport:
-    """Whether the photographs determine the calibration under what is assumed, and the critical motion that
-    the cameras come nearest to.
+    """Whether the views determine the calibration under the prior, and the nearest critical motion.
 
-    ``motion`` is its name ("pure translation", "turntable", ...; empty where nothing could be measured);
-    ``critical`` True where the cameras cannot be told from it by what a photographer does anyhow. A critical
-    motion may still be ``identifiable``: what it leaves open, the assumptions may settle. ``evidence`` maps
-    the name of each measure to its number; ``sentences`` say what was found, what it means and what to do;
-    ``undetermined`` are views whose own focal length is not determined.
+    Parameters
+    ----------
+    identifiable : bool
+        Whether the calibration is determined; the prior may resolve a critical motion.
+    motion : str
+        Nearest critical motion ("pure translation", "turntable", ...), empty if not measurable.
+    critical : bool
+        Whether the cameras cannot be distinguished from that motion.
+    evidence : mapping
+        Measure -> number.
+    sentences : tuple of str
+        What was found, what it means and what to do.
+    undetermined : tuple of int
+        Views whose own focal length is not determined.
     """
 
     identifiable: bool
@@ -345,13 +385,25 @@ class IdentifiabilityReport:
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """The answer of chapter 7: the best upgrade, its rivals (best first, the best included), and how sure it
-    is.
+    """Result of self-calibration (chapter 7).
 
-    ``K_std`` (V, 3, 3) standard deviations of the entries of K by the method's own residuals: 0 where an
-    entry is known, that of the assumption where the method left it as assumed, NaN where nothing is known of
-    it. ``identifiable`` False where the motion does not determine the answer, with ``reasons``; ``identifiability``
-    is the evidence for that, None where none was gathered.
+    Parameters
+    ----------
+    metric_from_projective : ndarray (4, 4)
+        Upgrading transform of the best candidate.
+    K : ndarray (V, 3, 3)
+        Calibration matrices, zeros where not registered.
+    K_std : ndarray (V, 3, 3)
+        Standard deviations of the entries of K: 0 if known, that of the prior if not estimated, NaN if
+        unknown.
+    identifiable : bool
+        Whether the views determine the calibration.
+    reasons : tuple of str
+        Why they do not.
+    candidates : tuple of Upgrade
+        All candidates, best first.
+    identifiability : IdentifiabilityReport, optional
+        The evidence; None if not tested.
     """
 
     metric_from_projective: F64
@@ -364,14 +416,22 @@ class SelfCalibration:
 
     @property
     def plane_at_infinity(self) -> F64:
-        """Unit (4,) plane at infinity in the projective frame: what the upgrade takes to (0, 0, 0, 1)."""
+        """Plane at infinity in the projective frame (4,), unit norm."""
         plane = self.metric_from_projective[3]
         return np.asarray(plane / np.linalg.norm(plane), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class IntrinsicInterval:
-    """One intrinsic of one view: value and standard deviation (px, or a pure number) and where it is from."""
+    """One intrinsic of one view.
+
+    Parameters
+    ----------
+    value, std : float
+        Value and standard deviation, in pixels or dimensionless.
+    source : str
+        Where they come from.
+    """
 
     value: float
     std: float
@@ -380,14 +440,23 @@ class IntrinsicInterval:
 
 @dataclass(frozen=True)
 class MetricResult:
-    """The end of the metric stage: the reconstruction, the intrinsics of each view with intervals, the
-    self-check.
+    """Result of the metric stage.
 
-    ``intrinsics[i]`` maps "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px",
-    "k1", "k2" and "k3" to an interval (empty where view i is not registered; std 0: as assumed).
-    ``self_check`` holds measured numbers; ``trusted`` False with ``failed_checks`` where it failed; ``warnings``
-    what should be known of a result that is trusted all the same (a focal that is borrowed, a prior that the
-    photographs contradict).
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Metric cameras and points.
+    intrinsics : tuple of mapping
+        Per view "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px", "k1", "k2",
+        "k3" -> :class:`IntrinsicInterval` (std 0: as assumed); empty where not registered.
+    self_check : mapping
+        Name -> measured number.
+    trusted : bool
+        Whether the self-check passed.
+    failed_checks : tuple of str
+        A sentence for each failed check.
+    warnings : tuple of str
+        Sentences about a trusted result, such as focal lengths that rest on other cameras.
     """
 
     reconstruction: Reconstruction
@@ -400,11 +469,16 @@ class MetricResult:
 
 @dataclass(frozen=True)
 class DisparityMap:
-    """Which pixel of the right image of a rectified pair each pixel of the left one is.
+    """Disparity of the left image of a rectified pair.
 
-    ``disparity`` (H, W) float32: x_right = x_left - d; NaN where it is unknown or the pixel is hidden in the
-    right image. ``confidence`` (H, W) float32 in [0, 1], 0 where unknown. ``sigma_px`` is the deviation of a
-    confident disparity.
+    Parameters
+    ----------
+    disparity : ndarray (H, W) float32
+        x_right = x_left - d; NaN where unknown or occluded.
+    confidence : ndarray (H, W) float32
+        In [0, 1], 0 where unknown.
+    sigma_px : float
+        Standard deviation of a confident disparity.
     """
 
     disparity: F32
@@ -412,8 +486,14 @@ class DisparityMap:
     sigma_px: float
 
     def filled(self) -> F32:
-        """(H, W): unknown pixels take the smaller disparity of the nearest known ones left and right in their
-        row, for what is hidden is behind; a row without any stays NaN."""
+        """Return the disparity with holes filled from the same row.
+
+        Returns
+        -------
+        ndarray (H, W)
+            Unknown pixels get the smaller (farther) of their left and right neighbours; rows without any
+            disparity stay NaN.
+        """
         known = np.isfinite(self.disparity)
         columns = np.arange(self.disparity.shape[1])
         left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
@@ -427,11 +507,20 @@ class DisparityMap:
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of the pixels of one view, distortion removed.
+    """Depth map of one view, distortion removed.
 
-    ``P`` = K [R t] (3, 4) projects into this map's own pixels, which may be fewer than the photograph's.
-    ``depth`` (H, W) float32 is z in the camera frame, NaN where unknown; ``std`` (H, W) float32 its
-    deviation; ``views`` (H, W) uint8 how many other views confirm it.
+    Parameters
+    ----------
+    view : int
+        View number.
+    P : ndarray (3, 4)
+        K [R t] for the pixels of this map, which may be fewer than those of the image.
+    depth : ndarray (H, W) float32
+        z in the camera frame, NaN where unknown.
+    std : ndarray (H, W) float32
+        Standard deviation.
+    views : ndarray (H, W) uint8
+        Number of other views that confirm it.
     """
 
     view: int
@@ -443,8 +532,19 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class PinholeView:
-    """A photograph with its distortion removed: ``P`` = K [R t] (3, 4), ``rgb`` (H, W, 3) uint8, ``seen``
-    (H, W) the pixels that the photograph has."""
+    """An image with its distortion removed.
+
+    Parameters
+    ----------
+    view : int
+        View number.
+    P : ndarray (3, 4)
+        K [R t].
+    rgb : ndarray (H, W, 3) uint8
+        Pixels.
+    seen : ndarray (H, W) of bool
+        Pixels inside the original image.
+    """
 
     view: int
     P: F64
@@ -454,12 +554,22 @@ class PinholeView:
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """A triangulated surface, by itself or with colours.
+    """A triangle mesh with vertex colours, a texture or neither.
 
-    ``vertices`` (N, 3); ``faces`` (M, 3) int64, anticlockwise seen from outside. ``colors`` (N, 3) uint8 of
-    the vertices, or a texture: ``texture`` (H, W, 3) uint8 with ``uv`` (M, 3, 2) of every corner of every
-    face, in texels, x right, y down, (0, 0) the centre of the top-left texel. Either may be None.
-    ``untextured`` (M,) marks faces that no view sees.
+    Parameters
+    ----------
+    vertices : ndarray (N, 3)
+        Points.
+    faces : ndarray (M, 3) int64
+        Vertex indices, counter-clockwise seen from outside.
+    colors : ndarray (N, 3) uint8, optional
+        Vertex colours.
+    uv : ndarray (M, 3, 2), optional
+        Texture coordinates of the corners in texels, x right, y down, (0, 0) = centre of the top-left texel.
+    texture : ndarray (H, W, 3) uint8, optional
+        Texture.
+    untextured : ndarray (M,) of bool, optional
+        Faces that no view sees.
     """
 
     vertices: F64
@@ -472,8 +582,17 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What a camera sees of a mesh: ``color`` (H, W, 3) uint8, ``depth`` (H, W) float32 (z in the camera
-    frame, NaN where nothing is), ``valid`` (H, W) where there is a surface."""
+    """A rendered mesh.
+
+    Parameters
+    ----------
+    color : ndarray (H, W, 3) uint8
+        Image.
+    depth : ndarray (H, W) float32
+        z in the camera frame, NaN where empty.
+    valid : ndarray (H, W) of bool
+        Pixels with a surface.
+    """
 
     color: NDArray[np.uint8]
     depth: F32
@@ -482,16 +601,25 @@ class RenderedView:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """A photograph that gave the model no texture, beside the model as its camera sees it.
+    """Comparison of a held-out image with the rendered model.
 
-    ``view`` its number; ``real, rendered`` (H, W, 3) uint8, the photograph without its distortion and the
-    picture of the model; ``compared`` (H, W) the pixels that both have and the numbers are of; ``psnr_db``
-    peak signal-to-noise ratio in dB; ``ssim`` structural similarity, 1 = the same.
+    Parameters
+    ----------
+    view : int
+        View number.
+    real, rendered : ndarray (H, W, 3) uint8
+        The image without distortion, and the model.
+    compared : ndarray (H, W) of bool
+        Pixels that both cover.
+    psnr_db : float
+        Peak signal-to-noise ratio in dB.
+    ssim : float
+        Structural similarity, 1 = identical.
 
     Raises
     ------
     ValueError
-        where the pictures and the mask are not of one size.
+        If the sizes differ.
     """
 
     view: int
@@ -504,17 +632,29 @@ class HeldOut:
     def __post_init__(self) -> None:
         shapes = (self.real.shape, self.rendered.shape, (*self.compared.shape, 3))
         if len(set(shapes)) > 1:
-            raise ValueError(f"a held-out comparison needs pictures and a mask of one size; got {shapes}")
+            raise ValueError(f"a held-out comparison needs images and a mask of one size; got {shapes}")
 
     @property
     def share(self) -> float:
-        """Part of the pixels that were compared."""
+        """Fraction of the pixels that were compared."""
         return float(self.compared.mean()) if self.compared.size else 0.0
 
 
 @dataclass(frozen=True)
 class StageReport:
-    """What one stage did: seconds, counts, metrics (name -> number), warnings (sentences)."""
+    """Report of one stage.
+
+    Parameters
+    ----------
+    stage : str
+        Name.
+    seconds : float
+        Computing time.
+    counts, metrics : mapping
+        Name -> number.
+    warnings : tuple of str
+        Sentences.
+    """
 
     stage: str
     seconds: float
@@ -525,16 +665,52 @@ class StageReport:
 
 @dataclass(frozen=True)
 class RunResult:
-    """Everything one run found; what lies beyond ``until`` or could not be made is None.
+    """All results of one run; None or empty beyond the last stage.
 
-    ``images`` are the V views at working size, ``features`` one per view, ``pairs`` every pair that was
-    matched, accepted or not, and ``pair_choice`` how these were chosen. ``refused`` maps the photographs
-    that never became a view to the reason; a view that was not registered has its reason in
-    ``metric.reconstruction.reasons``. ``groups`` (V,) is the camera number of each view. ``reports`` holds
-    one record per stage, ``settings`` the configuration as plain tables (stage -> field -> value),
-    ``summary`` what ``summary.json`` says. All coordinates are pixels at working size; ``summary`` and the
-    exported model are in original pixels. ``failure`` is the sentence that ended the run early, empty
-    otherwise.
+    Coordinates are pixels at working size; ``summary`` and the exported files are in original pixels.
+
+    Parameters
+    ----------
+    out : Path
+        Output folder.
+    images : tuple of Image
+        The V views at working size.
+    refused : mapping
+        File name -> reason of unreadable images.
+    features : tuple of Features
+        One per view.
+    pairs : tuple of TwoView
+        All matched pairs, accepted or not.
+    groups : ndarray (V,) of int
+        Camera number of each view.
+    settings : mapping
+        Stage -> field -> value.
+    pair_choice : PairChoice, optional
+        How the pairs were selected.
+    tracks : Tracks, optional
+        Tracks.
+    projective : Reconstruction, optional
+        Projective reconstruction.
+    calibration : SelfCalibration, optional
+        Self-calibration.
+    metric : MetricResult, optional
+        Metric result.
+    views : tuple of PinholeView
+        Undistorted images.
+    depth_maps : tuple of DepthMap
+        Depth maps.
+    mesh : TexturedMesh, optional
+        Surface model.
+    held_out : HeldOut, optional
+        Comparison with a held-out image.
+    reports : tuple of StageReport
+        One per stage.
+    warnings : tuple of str
+        All warnings.
+    summary : mapping
+        Content of ``summary.json``.
+    failure : str
+        The failure that ended the run, empty otherwise.
     """
 
     out: Path

@@ -169,7 +169,7 @@ def test_missing_arguments_are_named(run, tmp_path, capsys):
     (run / "model.glb").unlink()
     assert "has no model yet (model.glb)" in (said := reported(run))
     assert "without --until" in said
-    reason = "No surface model was built: no depths were found; none of 4 views agrees with another."
+    reason = "No surface model was built: no depth was found; none of 4 views agrees with another."
     (run / "summary.json").write_text(json.dumps({"warnings": ["something else", reason]}))
     assert f"has cameras but no model: {reason}" in reported(run)
 

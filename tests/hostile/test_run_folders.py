@@ -13,7 +13,7 @@ import pytest
 from tests.hostile import files
 from tests.hostile.files import FEATURES, links, pipe, sparse, writes
 
-CHANGED = "01-features/00000.npz was damaged or changed by another program, and is computed again"
+CHANGED = "01-features/00000.npz was damaged or changed by another program and was computed again"
 
 
 def finished_run(tmp_path, run_cli):
