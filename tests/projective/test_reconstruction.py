@@ -355,15 +355,15 @@ def test_a_camera_that_wrong_matches_placed_is_discarded_with_its_reason():
 def test_the_view_that_contradicts_its_pairs_is_named():
     scene = make_scene(seed=6)
     pairs, registered = true_pairs(scene), np.ones(8, dtype=bool)
-    assert (_epipolar_inlier_ratios(scene.P, registered, pairs, gate_px=1.0) == 1.0).all()
-    assert find_inconsistent_view(scene.P, registered, pairs, gate_px=1.0, min_ratio=0.5) is None
+    assert (_epipolar_inlier_ratios(scene.P, registered, pairs, threshold_px=1.0) == 1.0).all()
+    assert find_inconsistent_view(scene.P, registered, pairs, threshold_px=1.0, min_ratio=0.5) is None
     P = scene.P.copy()
     P[3] = P[3] + 0.05 * np.random.default_rng(0).normal(size=(3, 4)) * np.abs(P[3])
-    found = find_inconsistent_view(P, registered, pairs, gate_px=1.0, min_ratio=0.5)
+    found = find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=0.5)
     assert found is not None
     assert found[0] == 3
     registered[3] = False
-    shares = _epipolar_inlier_ratios(P, registered, pairs, gate_px=1.0)
+    shares = _epipolar_inlier_ratios(P, registered, pairs, threshold_px=1.0)
     assert np.isnan([share for share, pair in zip(shares, pairs, strict=True) if 3 in (pair.i, pair.j)]).all()
 
 

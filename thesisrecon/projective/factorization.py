@@ -385,7 +385,7 @@ def _complete_tracks(xy: F64, tree: Sequence[Edge]) -> tuple[F64, list[Edge]]:
     return table[:, np.isfinite(table).all(axis=(0, 2))], [(place[i], place[j]) for i, j in tree]
 
 
-def _is_planar(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
+def _is_planar(xy: F64, edges: Sequence[Edge], threshold_px: float) -> bool:
     """Return whether a homography explains nearly all points (V, N, 2) in every pair of ``edges``.
 
     Then the scene is planar or the camera only rotated: rank 4 would be fitted to noise.
@@ -398,8 +398,8 @@ def _is_planar(xy: F64, edges: Sequence[Edge], gate_px: float) -> bool:
         for _ in range(3):
             H = estimate_homography(xy[i, within], xy[j, within])
             distance = np.linalg.norm(homography_sampson_residuals(H, xy[i], xy[j]), axis=1)
-            within = distance <= max(gate_px, 2.0 * float(np.median(distance)))
-        shares.append(np.mean(distance <= gate_px))
+            within = distance <= max(threshold_px, 2.0 * float(np.median(distance)))
+        shares.append(np.mean(distance <= threshold_px))
     return bool(min(shares) >= NO_PARALLAX)
 
 

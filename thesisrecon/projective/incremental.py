@@ -153,8 +153,8 @@ def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
     return np.where(np.isfinite(spread), spread, np.inf)
 
 
-def _epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float) -> F64:
-    """Return the share (M,) of verified matches of each pair within ``gate_px`` (Sampson) of the cameras' F.
+def _epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float) -> F64:
+    """Return the share (M,) of verified matches of each pair within ``threshold_px`` (Sampson) of F.
 
     NaN for pairs that are not accepted, not registered, or have one camera centre.
     """
@@ -168,12 +168,12 @@ def _epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *,
             continue
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.abs(sampson_residuals(F, pair.xy1, pair.xy2))
-        shares[n] = float(np.mean(distance < gate_px))
+        shares[n] = float(np.mean(distance < threshold_px))
     return shares
 
 
 def find_inconsistent_view(
-    P: F64, registered: B8, pairs: Sequence[TwoView], *, gate_px: float, min_ratio: float
+    P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float, min_ratio: float
 ) -> tuple[int, float] | None:
     """Find the registered view that agrees least with the verified matches of its pairs.
 
@@ -187,7 +187,7 @@ def find_inconsistent_view(
         Views with a camera.
     pairs : sequence of TwoView
         Verified pairs.
-    gate_px : float
+    threshold_px : float
         Largest Sampson distance of an inlier.
     min_ratio : float
         Required inlier ratio over all matches of a view with registered views.
@@ -197,7 +197,7 @@ def find_inconsistent_view(
     tuple of (int, float) or None
         The view and its ratio; None if all views reach ``min_ratio``.
     """
-    shares = _epipolar_inlier_ratios(P, registered, pairs, gate_px=gate_px)
+    shares = _epipolar_inlier_ratios(P, registered, pairs, threshold_px=threshold_px)
     total, agreed = np.zeros(len(P)), np.zeros(len(P))
     for pair, share in zip(pairs, shares, strict=True):
         if np.isfinite(share):
@@ -477,10 +477,10 @@ class IncrementalProjective:
         view = int(np.argmin(shares))
         reason = f"only {counts[view]} of its points are inliers of the finished model ({shares[view]:.0%})"
         if shares[view] >= _MIN_INLIER_RATIO:
+            threshold, ratio = self.outlier_sigmas[0] * model.sigma_px, self.min_epipolar_inlier_ratio
             found = find_inconsistent_view(
-                model.P, model.registered, pairs,
-                gate_px=self.outlier_sigmas[0] * model.sigma_px, min_ratio=self.min_epipolar_inlier_ratio,
-            )  # fmt: skip
+                model.P, model.registered, pairs, threshold_px=threshold, min_ratio=ratio
+            )
             if found is None:
                 return False
             view, share = found

@@ -64,12 +64,12 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     left = sorted((pair for pair in pairs if pair.accepted), key=lambda pair: (pair.i, pair.j))
     scores = np.array([score(pair) for pair in left])
     views = np.array([(pair.i, pair.j) for pair in left]).reshape(-1, 2)
-    begun, ranked = np.zeros(tracks.n_views), []
+    uses, ranked = np.zeros(tracks.n_views), []
     for _ in range(len(left)):
-        worth = np.where(scores >= 0.0, scores * 0.5 ** begun[views].sum(axis=1), -1.0)
-        best = int(np.argmax(worth))
+        discounted = np.where(scores >= 0.0, scores * 0.5 ** uses[views].sum(axis=1), -1.0)
+        best = int(np.argmax(discounted))
         ranked.append(left[best])
-        begun[views[best]] += 1
+        uses[views[best]] += 1
         scores[best] = -1.0
     return ranked
 

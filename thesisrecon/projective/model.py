@@ -194,7 +194,7 @@ def _triangulate(model: ProjectiveModel, chosen: B8) -> None:
     model.X = np.where(found[:, None], X, model.X)
 
 
-def consistent_observations(model: ProjectiveModel, chosen: B8, gate_px: float) -> B8:
+def consistent_observations(model: ProjectiveModel, chosen: B8, threshold_px: float) -> B8:
     """Find the observations of each point that agree with its best two-view triangulation.
 
     A wrong observation can shift a least-squares point so far that right ones look wrong. Each point is
@@ -206,7 +206,7 @@ def consistent_observations(model: ProjectiveModel, chosen: B8, gate_px: float) 
         Model.
     chosen : ndarray (K,) of bool
         Observations to test.
-    gate_px : float
+    threshold_px : float
         Largest accepted distance.
 
     Returns
@@ -228,7 +228,7 @@ def consistent_observations(model: ProjectiveModel, chosen: B8, gate_px: float) 
         apart = np.where(counts <= 5, h // counts % (counts - 1), h * (counts - 1) // _HYPOTHESES)
         pair = np.concatenate([first + one, first + (one + 1 + apart) % counts])
         X = triangulate_observations(model.P, view[pair], place, xy[pair], len(number))
-        squared = np.minimum(_residuals(P, X[point], xy) / gate_px, 1.0) ** 2
+        squared = np.minimum(_residuals(P, X[point], xy) / threshold_px, 1.0) ** 2
         cost = np.bincount(point, squared)
         better = cost < best
         best = np.where(better, cost, best)
@@ -247,7 +247,7 @@ def _residuals(P: F64, X: F64, xy: F64) -> F64:
 
 
 def update_inliers(model: ProjectiveModel, sigmas: float) -> None:
-    """Orient the points with their cameras and mark inliers: in front and within the gate (6.5).
+    """Orient the points with their cameras and mark inliers: in front and within the threshold (6.5).
 
     Parameters
     ----------

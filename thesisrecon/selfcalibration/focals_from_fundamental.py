@@ -136,22 +136,11 @@ def _terms_near(F0: F64, F: F64) -> F64:
     return _bougnoux_terms(F, e2, e1)
 
 
-@dataclass(frozen=True)
-class _PairForms:
-    """Matrices of the Kruppa equations of M pairs and their derivatives by vec(F).
+def _forms(F: F64) -> tuple[F64, F64, F64, F64]:
+    """Return L, N (M, 2, 3) of the Kruppa equations L w*_i L' ~ N w*_j N' and their derivatives by vec(F).
 
-    S_i = L w*_i L' and S_j = N w*_j N' with L, N (M, 2, 3); dL, dN (M, 9, 2, 3) for a fixed basis (u1, u2) of
-    image 2.
+    L = U2'F and N = U2'[e]x with U2 = (u1, u2), e = u3; dL, dN (M, 9, 2, 3) for fixed U2, de = -(F')^+ dF'e.
     """
-
-    L: F64
-    N: F64
-    dL: F64
-    dN: F64
-
-
-def _forms(F: F64) -> _PairForms:
-    """Return L = U2'F and N = U2'[e]x with U2 = (u1, u2), e = u3; de = -(F')^+ dF'e."""
     U, s, Vt = np.linalg.svd(F)
     U2 = U[:, :, :2].swapaxes(1, 2)
     e = U[:, :, 2]
@@ -160,7 +149,7 @@ def _forms(F: F64) -> _PairForms:
     dL = np.einsum("mak,lb->mklab", U2, np.eye(3)).reshape(-1, 9, 2, 3)
     de = -np.einsum("mk,mal->mkla", e, pseudo).reshape(-1, 9, 3)
     dN = U2[:, None] @ cross_matrix(de)
-    return _PairForms(U2 @ F, U2 @ cross_matrix(e), dL, dN)
+    return U2 @ F, U2 @ cross_matrix(e), dL, dN
 
 
 def _directions(rows: F64, w: F64, d_rows: F64, d_w: F64) -> tuple[F64, F64]:
@@ -188,13 +177,11 @@ def _kruppa_chi_square(
     Propagates F, principal points off 0 by ``principal_std`` (in the unit of F) and focal lengths anywhere in
     a cell of width ``cell`` of log f. About chi-square with two degrees of freedom at the truth.
     """
-    forms = _forms(pairs.F)
     out = np.empty((len(pairs.i), len(log_f_i)))
     duals = _dual_with_changes(log_f_i), _dual_with_changes(log_f_j)
     for m in range(len(pairs.i)):
-        one = _PairForms(forms.L[m][None], forms.N[m][None], forms.dL[m][None], forms.dN[m][None])
-        variance = _variances(pairs.covariance[m][None], cell, principal_std)
-        g, C = _residual_with_covariance(one, *duals, variance)
+        one = _some(pairs, np.arange(len(pairs.i)) == m)
+        g, C = _residual_with_covariance(one.F, *duals, _variances(one.covariance, cell, principal_std))
         out[m] = np.einsum("ba,bac,bc->b", g, _inverse_root(C, power=-1.0), g)
     return out
 
@@ -203,7 +190,7 @@ def _kruppa_whitening(pairs: PairGeometry, log_f: F64, *, principal_std: float) 
     """Return C^-1/2 (M, 3, 3) for the covariance C of the Kruppa residuals at log focal lengths (R,)."""
     duals = _dual_with_changes(log_f[pairs.i]), _dual_with_changes(log_f[pairs.j])
     variance = _variances(pairs.covariance, 0.0, principal_std)
-    return _inverse_root(_residual_with_covariance(_forms(pairs.F), *duals, variance)[1], power=-0.5)
+    return _inverse_root(_residual_with_covariance(pairs.F, *duals, variance)[1], power=-0.5)
 
 
 def _variances(covariance: F64, cell: float, principal_std: float) -> F64:
@@ -214,10 +201,11 @@ def _variances(covariance: F64, cell: float, principal_std: float) -> F64:
     return full
 
 
-def _residual_with_covariance(forms: _PairForms, dual_i: F64, dual_j: F64, noise: F64) -> tuple[F64, F64]:
+def _residual_with_covariance(F: F64, dual_i: F64, dual_j: F64, noise: F64) -> tuple[F64, F64]:
     """Return the cross products (B, 3) of the two unit triples and their covariances (B, 3, 3)."""
-    n1, d1 = _directions(forms.L, dual_i[:, 0], forms.dL, dual_i[:, 1:])
-    n2, d2 = _directions(forms.N, dual_j[:, 0], forms.dN, dual_j[:, 1:])
+    L, N, dL, dN = _forms(F)
+    n1, d1 = _directions(L, dual_i[:, 0], dL, dual_i[:, 1:])
+    n2, d2 = _directions(N, dual_j[:, 0], dN, dual_j[:, 1:])
     by_first, by_second = np.cross(d1, n2[:, None]), np.cross(n1[:, None], d2)
     J = np.concatenate([by_first[:, :9] + by_second[:, :9], by_first[:, 9:], by_second[:, 9:]], axis=1)
     return np.cross(n1, n2), np.asarray(np.swapaxes(J, 1, 2) @ noise @ J)
