@@ -12,7 +12,7 @@ from validation.studies.projective import (
     ITERATED,
     PLAIN,
     check_noise,
-    complete_table,
+    complete_tracks,
     projective_error_pct,
     residual_rms_px,
 )
@@ -42,6 +42,6 @@ def test_the_error_in_space_does_not_know_the_frame():
 def test_only_points_of_every_view_are_in_a_complete_table():
     rig = cube_rig().subset(np.array([0, 4, 13]))
     tracks = noisy_tracks(rig, 0.5, np.random.default_rng(0))
-    xy, seen = complete_table(tracks)
+    xy, seen = complete_tracks(tracks)
     assert xy.shape == (3, int(seen.sum()), 2)
     assert np.isfinite(xy).all()
