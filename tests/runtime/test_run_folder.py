@@ -366,8 +366,8 @@ def test_a_run_stopped_by_a_full_disk_resumes(share, whole, tmp_path):
     with disk_ends(1 + round(share * (count - 1)), errno.ENOSPC), pytest.raises(OutputError) as refused:
         run(out)
     assert str(refused.value).endswith(
-        "cannot be written: No space left on device; free space there, then repeat the command to resume from "
-        f"{out}"
+        "cannot be written: No space left on device; free space there, then repeat the command to resume "
+        f"from {out}"
     )
     there = outputs(out)
     assert {name: wanted.get(name) for name in there} == there
@@ -387,7 +387,7 @@ def test_a_file_in_the_place_of_a_folder_of_the_run(whole, tmp_path):
 
 
 def test_the_results_of_a_whole_run_stay_until_they_are_replaced(whole, tmp_path):
-    """Written anew over a full disk, no good file is lost or cut."""
+    """Rewritten on a full disk, no good file is lost or truncated."""
     out = tmp_path / "out"
     run(out)
     shutil.rmtree(out / "08-model")

@@ -1,6 +1,6 @@
-"""Every limit of ``validation/gates.toml``, held against what the stages find on fixtures and photographs.
+"""Every limit of ``validation/gates.toml`` is checked on fixtures and real images.
 
-All numbers come from the harness, which runs each stage as a process of its own and recomputes what it says.
+All numbers come from the harness, which runs each stage as a process and recomputes its results.
 Gates of scenes whose photographs are not on this machine are skipped.
 """
 
@@ -61,7 +61,7 @@ def test_every_gate_holds(gate, results):
         pytest.skip(f"{scene} is not on this machine (THESISRECON_DATA)")
     reported = results(scene in ALWAYS)
     found = [row for row in reported.rows if row.key == gate.key]
-    assert found, f"nobody told this number; what did not run: {dict(reported.failures)}"
+    assert found, f"no stage reported this number; failures: {dict(reported.failures)}"
     assert gate.holds(found[0].value), f"{found[0].value} {found[0].unit}, {gate.reason}"
 
 

@@ -110,7 +110,7 @@ def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
         return _Verdict("open", "Nothing promised here", words)
     told = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
     reasons = tuple(f"{r.key}: {short(r.value)} {r.unit}, {r.direction} {short(r.limit)}" for r in broken)
-    reasons += tuple(f"{key}: nobody told this number" for key in missing)
+    reasons += tuple(f"{key}: no method reported this number" for key in missing)
     if reasons:
         return _Verdict("bad", "Broken", f"{told}.", reasons)
     return _Verdict("good", "Reached", f"{told}; {counted(len(rows), 'number')} in all.")

@@ -82,7 +82,7 @@ def collect(
     judged: Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]],
     gates: Mapping[str, Gate],
 ) -> Results:
-    """All rows of a run; the gates whose numbers nobody told are ``missing``."""
+    """All rows of a run; gates without a reported number are ``missing``."""
     rows = []
     for (stage, _), (judgement, _outcomes) in judged.items():
         rows += [row_of(stage, m, gates.get(key_of(stage, m))) for m in judgement.metrics]

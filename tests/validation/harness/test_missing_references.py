@@ -107,7 +107,7 @@ def test_report_and_check_run_without_any(stub, tmp_path):
     promised = [key for key in read_gates() if key.startswith("bundle/street/")]
     assert done.returncode == int(bool(promised))
     for key in promised:
-        assert f"missed   {key}: nobody told this number ({not_installed('pycolmap')})" in done.stdout
+        assert f"missed   {key}: no method reported this number ({not_installed('pycolmap')})" in done.stdout
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "bundle/street/Ceres" in page
     assert not_installed("pycolmap") in page
