@@ -90,7 +90,7 @@ def test_listed_pairs_in_any_order_and_without_those_left_out():
         ((("00.jpg", "nope.jpg"),), r"names 'nope.jpg', which is not among the 5 images"),
         ((("zz", "nope.jpg"), ("x", "y")), r"names 'nope.jpg' and 3 more"),
         ((), "leaves no pair to match"),
-        ((("00.jpg", "blank.jpg"),), "photographs were left out"),
+        ((("00.jpg", "blank.jpg"),), "images were left out"),
     ],
 )
 def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
@@ -104,7 +104,7 @@ def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
         (lambda: ListedPairs((("a", "a"),)), "pairs 'a' with itself"),
         (lambda: ListedPairs((("a", "b"), ("b", "a"))), "'b', 'a' twice"),
         (lambda: SequenceWindow(0), "window .* must be at least 1"),
-        (lambda: SequenceWindow(-3), "a window of -3"),
+        (lambda: SequenceWindow(-3), "must be at least 1; got -3"),
         (lambda: OverlapEstimate(nearest=0), "nearest must be at least 1"),
         (lambda: OverlapEstimate(words=0), "words must be at least 1"),
     ],
