@@ -1,8 +1,28 @@
 """Shared fixtures; files with slow tests start first, so that workers finish together."""
 
-from tests.clusters import dask_cluster
+import logging
 
-__all__ = ["dask_cluster"]
+import pytest
+
+
+@pytest.fixture(scope="module")
+def dask_cluster():
+    """A scheduler and two worker processes on loopback."""
+    distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address=":0",
+        worker_dashboard_address=None,
+        silence_logs=logging.ERROR,
+    ) as running:
+        yield running
+
+
+def address(running):
+    """What the command line calls it."""
+    return str(running.scheduler_address).replace("tcp://", "dask://")
 
 
 def pytest_collection_modifyitems(items):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests import fake_stages as fakes
-from tests.clusters import address
+from tests.conftest import address
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import ImageOptions, PipelineConfig

@@ -166,7 +166,7 @@ TABLE = {"scenes": ["a"], "axes": {"epipolar.threshold_px": [2.0]}, "task": "rec
         ({"preset": "defalt"}, "unknown preset 'defalt'; did you mean default"),
         ({"config": {"images": {"max_size_px": 10}}}, "max_size_px must be at least 64"),
         ({"axis": {}}, "unknown key of a study 'axis'; did you mean axes"),
-        ({"title": 5}, "title takes a text"),
+        ({"title": 5}, "title takes text"),
         ({"axes": {"features": ["mine.py:Corners"]}}, r"there is no file .*mine\.py to read Corners from"),
     ],
 )  # fmt: skip

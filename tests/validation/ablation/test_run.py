@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.clusters import address
+from tests.conftest import address
 from tests.validation.ablation.toy import Darts, Steps, area, marks
 from thesisrecon.errors import OutputError, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows

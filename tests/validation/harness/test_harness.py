@@ -21,7 +21,7 @@ from validation.harness.stages import STAGES as REPORTED
 LIMIT_S = 8.0
 GATES = {
     "toy/yard/wheels-lost": Gate("toy/yard/wheels-lost", 1.0, True, "a toy needs wheels"),
-    "toy/yard/never-told": Gate("toy/yard/never-told", 1.0, True, "nobody tells this"),
+    "toy/yard/never-reported": Gate("toy/yard/never-reported", 1.0, True, "no stage reports this"),
     "other/yard/wheels": Gate("other/yard/wheels", 1.0, True, "of a stage that did not run"),
 }
 
@@ -72,7 +72,7 @@ def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran):
         "reached",
     )
     assert row.reference["good"] == 2.0
-    assert results.missing == ["toy/yard/never-told"]
+    assert results.missing == ["toy/yard/never-reported"]
     assert set(results.failures) == {f"toy/yard/{n}" for n in ("missing", "failing", "crashing", "hanging")}
     strict = {row.key: dataclasses.replace(GATES[row.key], limit=0.4)}
     assert collect(wishes, judged, strict).broken[0].key == row.key

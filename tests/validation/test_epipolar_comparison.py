@@ -1,14 +1,34 @@
-"""The pure parts of the comparison of F on photographs: errors, shares, truth from cameras, and the seeds."""
+"""The comparison of F on real images: errors, degeneracy and the accuracy of the default estimator."""
+
+from collections import Counter
+from itertools import islice
 
 import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
+from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.metrics.epipolar import NONE_PX, precision_recall, rms_epipolar_distance, rms_sampson_distance
 from validation.references.fundamental import MINIMAL, OURS, SOLVERS, Estimate, estimate_with
-from validation.scenes.real_pairs import RealPair, exact_correspondences
+from validation.scenes.real import load_real_scene
+from validation.scenes.real_pairs import (
+    RealPair,
+    adelaide_pairs,
+    camera_pairs,
+    exact_correspondences,
+    kusvod2_pairs,
+)
 from validation.studies.epipolar_real import called_sure, check_cameras, least
+from validation.studies.epipolar_synthetic import (
+    certainty_metrics,
+    certainty_table,
+    check_degeneracy,
+    facade_pairs,
+    judge_pairs,
+    named_rightly,
+)
 
 
 def test_errors_of_a_shifted_rectified_pair():
@@ -112,3 +132,98 @@ def test_rows_of_a_scene_judge_ours_against_poselib():
     assert rows["**pairs off by > 1 px**, of 2"].verdict == "reached"
     assert rows["runs > 1 px and called sure"].values[OURS] == 0.0
     assert check_cameras([], [OURS], 2, verbose=True) == []
+
+
+def test_no_wrong_f_of_a_facade_is_called_sure():
+    cells, ratios = judge_pairs(facade_pairs(25), 1)
+    everything = sum(cells.values(), Counter())
+    assert everything.total() == 25
+    assert everything["wrong and sure"] == 0
+    assert everything["wrong and unsure"] > 0
+    assert len(ratios) == 25 - everything["refused"]
+    table = certainty_table(cells).splitlines()
+    assert len(table) == 2 + len(cells)
+    assert table[0].count("|") == table[2].count("|")
+
+
+def test_shares_are_of_the_right_groups():
+    cells = {
+        "scene, i + 1": Counter({"right and sure": 19, "right and unsure": 1}),
+        "scene, i + 4": Counter({"right and unsure": 50, "wrong and unsure": 9, "wrong and sure": 1}),
+    }
+    wrong, unsure = certainty_metrics(cells)
+    assert wrong.values["ours"] == 0.1
+    assert wrong.verdict == "missed"
+    assert unsure.values["ours"] == 0.05
+    assert unsure.verdict == "reached"
+
+
+def test_names_are_counted():
+    assert named_rightly(Configuration.PLANE, 0.25, 100, 5, wrong=0.3) == 1.0
+    rows = check_degeneracy(60, 1, wrong=0.0)
+    assert len(rows) == 20
+    assert {row.verdict for row in rows} == {"reported"}
+
+
+# Each limit is about 1.5 times the largest value of any seed; sampling without refinement fails most.
+# Hand-made correspondences are good to about half a pixel, so their limits differ.
+SEEDS = (0, 1, 2)
+
+
+ORDERS = (0, 1, 2, 3, 4)
+
+
+HAND_MADE_PX = {"Leuven1": 0.65, "booksh": 1.5, "corr": 0.35, "head": 1.3, "plant": 1.05}
+
+
+CAMERAS_PX = {"fountain-P11": 0.2, "Herz-Jesus-P8": 0.25}
+
+
+LABELLED = {"biscuit": (0.93, 0.9), "book": (0.93, 0.82)}
+
+
+"""Least precision and recall at a threshold of 1 px."""
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("matches")
+
+
+def pairs_or_skip(pairs):
+    found = list(pairs)
+    if not found:
+        pytest.skip("the real photographs are not on this machine (THESISRECON_DATA)")
+    return found
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", HAND_MADE_PX)
+def test_hand_made_correspondences_lie_on_their_lines(name, cache):
+    (pair,) = pairs_or_skip(kusvod2_pairs(cache, (name,)))
+    fits = (estimate_fundamental(pair.xy1, pair.xy2, seed=seed) for seed in ORDERS)
+    errors = np.array([rms_epipolar_distance(fit.F, pair.truth) for fit in fits])
+    # "head" has two geometries that explain nearly as much: every method ends in the other one now and then.
+    assert np.count_nonzero(errors >= HAND_MADE_PX[name]) <= 1, errors
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", CAMERAS_PX)
+def test_correspondences_of_the_true_cameras_lie_on_their_lines(name, cache):
+    for pair in pairs_or_skip(islice(camera_pairs(load_real_scene(name), cache), 2)):
+        assert len(pair.truth) > 300
+        assert rms_epipolar_distance(pair.F, pair.truth) < 1e-6
+        for seed in SEEDS:
+            fit = estimate_fundamental(pair.xy1, pair.xy2, seed=seed)
+            assert rms_epipolar_distance(fit.F, pair.truth) < CAMERAS_PX[name]
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", LABELLED)
+def test_inliers_are_the_matches_labelled_right(name):
+    (pair,) = [p for p in pairs_or_skip(adelaide_pairs()) if p.name == name]
+    for seed in SEEDS:
+        fit = estimate_fundamental(pair.xy1, pair.xy2, seed=seed)
+        precision, recall = precision_recall(fit.inliers, pair.right)
+        assert precision > LABELLED[name][0]
+        assert recall > LABELLED[name][1]
