@@ -80,7 +80,7 @@ def test_missing_and_foreign_files_of_a_wheel_are_reported():
     assert reported[0] == "thesisrecon/py.typed is missing"
     assert reported[1:3] == [f"{name} does not belong there" for name in strangers]
     assert "9.00 MB" in reported[3]
-    assert wheel_faults(good[: len(NEEDED)], 1) == [f"0 photographs instead of {DEMO_IMAGES}"]
+    assert wheel_faults(good[: len(NEEDED)], 1) == [f"0 images instead of {DEMO_IMAGES}"]
 
 
 def test_a_run_writes_only_into_its_folder_and_opens_no_connection(tmp_path):
