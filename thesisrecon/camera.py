@@ -25,8 +25,8 @@ class Camera:
     size : tuple of int
         Image (width, height) in pixels.
     distortion : ndarray (C,), optional
-        Radial coefficients k1, k2, ...: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 + ...).
-        None: no distortion.
+        Radial coefficients k1, k2, ...: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 +
+        ...). None: no distortion.
 
     Raises
     ------

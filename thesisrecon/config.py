@@ -1,8 +1,7 @@
-"""What the pipeline runs: one field per stage, each holding the variant that does its work.
+"""The configuration: one field per stage, each holding the object that does its work.
 
-The presets are ``default`` (the best path we have) and ``thesis`` (the pipeline as the thesis describes it).
-In text (TOML, ``--set``) a stage is a table; its ``kind`` picks the variant, the rest are the variant's
-fields.
+Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis). In TOML and ``--set`` a stage
+is a table: ``kind`` selects the method, the other keys are its fields.
 """
 
 from __future__ import annotations
@@ -73,22 +72,22 @@ from thesisrecon.surface.fusion import DepthSheets
 from thesisrecon.surface.model import SurfaceModel
 
 PRECISE_SIGMAS = 2.5
-"""Matches in the tail of the noise are right, but tracks are made of precise ones."""
+"""Inlier gate of the default estimator: tracks are built from precise matches only."""
 
-DEEPEST = 16
-"""Names of a setting, from its stage to its field."""
+MAX_DEPTH = 16
+"""Maximum nesting of a setting, from its stage to its field."""
 
 EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
 
 class Detector(Protocol):
-    """Section 4.2.1: corners of one photograph."""
+    """Detect the features of one image (4.2.1)."""
 
     def detect(self, image: Image) -> Features: ...
 
 
 class PairSelector(Protocol):
-    """Which pairs of photographs are matched; ``check`` refuses a wrong wish before anything is computed."""
+    """Select the pairs of images to match; ``check`` refuses invalid settings before anything is computed."""
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None: ...
 
@@ -103,7 +102,7 @@ class PairSelector(Protocol):
 
 
 class Matcher(Protocol):
-    """Section 4.2.2: corners of two photographs that show the same scene point."""
+    """Match the features of two images (4.2.2); ``prepare`` does the work that depends on one image."""
 
     def prepare(self, image: Image, features: Features) -> Any: ...
 
@@ -119,19 +118,19 @@ class Matcher(Protocol):
 
 
 class FundamentalEstimator(Protocol):
-    """Chapter 5: F from matches of which some are wrong."""
+    """Estimate F from matches with outliers (chapter 5)."""
 
     def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit: ...
 
 
 class Verifier(Protocol):
-    """Whether a pair and its F enter the tracks."""
+    """Decide whether a pair and its F are accepted, and which matches are inliers."""
 
     def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView: ...
 
 
 class TrackBuilder(Protocol):
-    """Matches of pairs joined into observations of scene points."""
+    """Join pairwise matches to tracks."""
 
     def build(
         self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator
@@ -139,7 +138,7 @@ class TrackBuilder(Protocol):
 
 
 class ProjectiveReconstructor(Protocol):
-    """Chapter 6: cameras and points up to a projective transform; ``attempt`` picks the initial pair."""
+    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
 
     def reconstruct(
         self,
@@ -185,14 +184,27 @@ class SelfCalibrator(Protocol):
         """
 
 
-def with_images(variant: SelfCalibrator, photographs: Sequence[Image]) -> SelfCalibrator:
-    """The variant with the photographs, where it looks at them (for parallel lines); else as it is."""
-    given = getattr(variant, "with_images", None)
-    return variant if given is None else cast(SelfCalibrator, given(photographs))
+def with_images(method: SelfCalibrator, images: Sequence[Image]) -> SelfCalibrator:
+    """Give the images to a self-calibration method that detects parallel lines in them.
+
+    Parameters
+    ----------
+    method : SelfCalibrator
+        Any method.
+    images : sequence of Image
+        One per view.
+
+    Returns
+    -------
+    SelfCalibrator
+        The method with the images, or unchanged if it does not use them.
+    """
+    given = getattr(method, "with_images", None)
+    return method if given is None else cast(SelfCalibrator, given(images))
 
 
 class MetricRefiner(Protocol):
-    """After chapter 7: the postponed cameras, bundle adjustment, intervals and the self-check."""
+    """Refine the metric model: missing cameras, bundle adjustment, intervals and self-check."""
 
     def refine(
         self,
@@ -205,11 +217,12 @@ class MetricRefiner(Protocol):
 
 
 class DepthEstimator(Protocol):
-    """Section 2.5: depth of every pixel of every view; one view at a time, so that a run can go on.
+    """Estimate depth maps one view at a time (2.5).
 
-    ``match_rectified`` is its matcher alone, on a rectified pair of arrays; ``match_two_views`` rectifies two
-    photographs by their F, by homographies where ``planar``, and matches them from either side.
-    ``required_views`` are the views that the map of a view takes, itself among them."""
+    ``match_rectified`` matches a rectified pair; ``match_two_views`` rectifies two images by their F (by
+    homographies if ``planar``) and matches both directions. ``required_views`` returns the views that the map
+    of one view needs, including itself.
+    """
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap: ...
 
@@ -227,7 +240,7 @@ class DepthEstimator(Protocol):
 
 
 class ModelBuilder(Protocol):
-    """Section 2.6: a surface with the graphics of the photographs."""
+    """Fuse depth maps to a textured surface (2.6)."""
 
     def build(
         self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
@@ -245,7 +258,13 @@ class ModelBuilder(Protocol):
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """How photographs are read: a long side above ``max_size_px`` is reduced to it."""
+    """How images are read.
+
+    Parameters
+    ----------
+    max_size_px : int
+        Larger images are reduced to this long side.
+    """
 
     max_size_px: int = 1600
 
@@ -260,7 +279,45 @@ def _precise_ransac() -> LocallyOptimisedRansac:
 
 @dataclass(frozen=True)
 class PipelineConfig:
-    """The whole pipeline as values; the defaults are the preset ``default``."""
+    """Settings of the whole pipeline; the defaults are the preset ``default``.
+
+    Parameters
+    ----------
+    images : ImageOptions
+        Image size.
+    intrinsics : IntrinsicsOptions
+        Prior knowledge of the cameras.
+    features : Detector
+        Feature detection.
+    pairs : PairSelector
+        Selection of the pairs to match.
+    matching : Matcher
+        Matching of two images.
+    epipolar : FundamentalEstimator
+        Robust estimation of F.
+    verification : Verifier
+        Acceptance of pairs.
+    tracks : TrackBuilder
+        Tracks.
+    projective : ProjectiveReconstructor
+        Projective reconstruction.
+    selfcalibration : SelfCalibrator
+        Self-calibration.
+    metric : MetricRefiner
+        Metric refinement.
+    dense : DepthEstimator
+        Depth maps.
+    model : ModelBuilder
+        Surface model.
+
+    Examples
+    --------
+    >>> from thesisrecon import PipelineConfig
+    >>> from thesisrecon.config import ImageOptions
+    >>> config = PipelineConfig(images=ImageOptions(max_size_px=800))
+    >>> type(config.epipolar).__name__
+    'LocallyOptimisedRansac'
+    """
 
     images: ImageOptions = ImageOptions()
     intrinsics: IntrinsicsOptions = field(default_factory=IntrinsicsOptions)
@@ -277,7 +334,7 @@ class PipelineConfig:
     model: ModelBuilder = field(default_factory=SurfaceModel)
 
 
-# One table per stage: the word of the text and the class it means. A new variant is one line here.
+# Stage -> word in text -> class. A new method is one line here.
 KINDS: Mapping[str, Mapping[str, type[Any]]] = {
     "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
     "pairs": {
@@ -321,7 +378,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
         projective=SequentialProjective(),
         selfcalibration=Stratified(),
         dense=MultiViewStereo(
-            # It has an opinion of blank walls too, and says how little that is worth.
+            # This matcher also assigns disparities to textureless regions, with low confidence.
             pairs=PairMatching(matcher=MaximumLikelihoodScanline(), min_confidence=0.25),
             linker=SequenceLinking(),
             refinement=None,
@@ -329,28 +386,72 @@ PRESETS: Mapping[str, PipelineConfig] = {
         ),
         # "By fitting parametric surfaces through the points ... sampled in a fine scale triangular pattern".
         model=SurfaceModel(surface=BSplineSurface(), fusion=DepthSheets()),
-        # The thesis knows no distortion, and its self-calibration keeps the principal point in the centre.
+        # The thesis has no distortion model and fixes the principal point at the image centre.
         intrinsics=IntrinsicsOptions(principal_point="known", k1="known"),
     ),
 }
 
 
 def preset(name: Any) -> PipelineConfig:
-    """The configuration of that name; :class:`UsageError` names the known ones."""
+    """Return a preset configuration.
+
+    Parameters
+    ----------
+    name : str
+        "default" or "thesis".
+
+    Returns
+    -------
+    PipelineConfig
+        The configuration.
+
+    Raises
+    ------
+    UsageError
+        If the name is unknown.
+
+    Examples
+    --------
+    >>> from thesisrecon.config import preset
+    >>> type(preset("thesis").features).__name__
+    'HarrisCorners'
+    """
     if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(unknown_word("preset", name, PRESETS))
     return PRESETS[name]
 
 
 def kind_of(stage: str, variant: Any) -> str:
-    """The word that means this variant; its class name where the table has none (a variant of the
-    caller).
+    """Return the word for a method in text.
+
+    Parameters
+    ----------
+    stage : str
+        Field of the config.
+    variant : object
+        The method.
+
+    Returns
+    -------
+    str
+        Its word in :data:`KINDS`, else its class name.
     """
     return next((k for k, cls in KINDS[stage].items() if cls is type(variant)), type(variant).__name__)
 
 
 def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
-    """The configuration as plain tables, stage -> field -> value, complete."""
+    """Return the complete configuration as plain tables.
+
+    Parameters
+    ----------
+    config : PipelineConfig
+        The configuration.
+
+    Returns
+    -------
+    dict
+        Stage -> field -> value.
+    """
     tables = {}
     for item in dataclasses.fields(config):
         value = getattr(config, item.name)
@@ -360,7 +461,18 @@ def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
 
 
 def toml_from_config(config: PipelineConfig) -> str:
-    """The configuration as TOML; :func:`config_from_toml` reads back an equal one."""
+    """Return the configuration as TOML, which :func:`config_from_toml` reads back.
+
+    Parameters
+    ----------
+    config : PipelineConfig
+        The configuration.
+
+    Returns
+    -------
+    str
+        TOML text.
+    """
     return toml_from_tables(tables_from_config(config))
 
 
@@ -371,19 +483,44 @@ def config_from_toml(
     fixed_preset: bool = False,
     changes: Sequence[Mapping[str, Any]] = (),
 ) -> PipelineConfig:
-    """``base`` (else the preset ``default``) changed by the tables of the text, then by ``changes``.
+    """Read a configuration.
 
-    A line ``preset = "thesis"`` at its top takes that preset for the base, unless ``fixed_preset``. All
-    tables are merged before a value is checked, so settings that need each other may come from different
-    ones. Raises :class:`UsageError` for text that is no TOML, unknown stages, kinds and settings (naming the
-    nearest known), and values of another type.
+    All tables are merged before values are checked, so settings that need each other may come from different
+    tables.
+
+    Parameters
+    ----------
+    text : str
+        TOML. A line ``preset = "thesis"`` at its top selects the base.
+    base : PipelineConfig, optional
+        Base; None: the preset ``default``.
+    fixed_preset : bool
+        Ignore the preset of the text.
+    changes : sequence of mapping
+        Further tables, later ones override.
+
+    Returns
+    -------
+    PipelineConfig
+        The configuration.
+
+    Raises
+    ------
+    UsageError
+        For invalid TOML, unknown stages, kinds or settings, and values of the wrong type.
+
+    Examples
+    --------
+    >>> from thesisrecon.config import config_from_toml
+    >>> config_from_toml("[images]\\nmax_size_px = 800").images.max_size_px
+    800
     """
     try:
         tables = tomllib.loads(text)
     except ValueError as error:
         raise UsageError(f"the configuration is not TOML: {error}") from None
     except RecursionError:
-        raise UsageError("the configuration is no table of settings: its lists are too deep") from None
+        raise UsageError("the configuration is nested too deeply") from None
     name = tables.pop("preset", None)
     if name is not None and not fixed_preset:
         base = preset(name)
@@ -395,7 +532,7 @@ def config_from_toml(
 
 
 def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
-    """``over`` laid on ``under``; a table that picks another kind drops the settings of the kind before."""
+    """``over`` merged into ``under``; another kind drops the settings of the old one."""
     merged = dict(under)
     for stage, table in over.items():
         old = under.get(stage)
@@ -408,7 +545,7 @@ def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: Pipe
 
 
 def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``over`` laid on ``under``, table by table."""
+    """``over`` merged into ``under``, table by table."""
     merged = dict(under)
     for key, value in over.items():
         old = merged.get(key)
@@ -418,8 +555,24 @@ def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
 
 
 def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = None) -> PipelineConfig:
-    """``base`` (else the preset ``default``) changed by plain tables; refuses as :func:`config_from_toml`
-    does.
+    """Change a configuration by plain tables.
+
+    Parameters
+    ----------
+    tables : mapping
+        Stage -> field -> value.
+    base : PipelineConfig, optional
+        Base; None: the preset ``default``.
+
+    Returns
+    -------
+    PipelineConfig
+        The configuration.
+
+    Raises
+    ------
+    UsageError
+        As :func:`config_from_toml`.
     """
     config = base or PipelineConfig()
     stages = [item.name for item in dataclasses.fields(config)]
@@ -450,16 +603,37 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
 
 
 def tables_from_settings(settings: Sequence[str]) -> dict[str, Any]:
-    """The tables that ``stage.field=value`` texts (``stage.field.field=value`` for a nested one) mean
-    together; of two values of one field the later one counts.
+    """Parse the values of ``--set``.
+
+    Parameters
+    ----------
+    settings : sequence of str
+        ``stage.field=value``, or ``stage.field.field=value`` for nested ones; later ones override.
+
+    Returns
+    -------
+    dict
+        Tables for :func:`config_from_tables`.
+
+    Raises
+    ------
+    UsageError
+        If a text has another form.
+
+    Examples
+    --------
+    >>> from thesisrecon.config import tables_from_settings
+    >>> tables_from_settings(["features.kind=harris-corners", "images.max_size_px=800"])
+    {'features': {'kind': 'harris-corners'}, 'images': {'max_size_px': 800}}
     """
     tables: dict[str, Any] = {}
     for setting in settings:
         place, equals, text = setting.partition("=")
         path = place.strip().split(".")
-        if not equals or not 2 <= len(path) <= DEEPEST or not all(path):
+        if not equals or not 2 <= len(path) <= MAX_DEPTH or not all(path):
             raise UsageError(
-                f"--set takes stage.field=value, as in features.kind=harris-corners; got {in_words(setting)}"
+                "--set takes stage.field=value, for example features.kind=harris-corners; "
+                f"got {in_words(setting)}"
             )
         value = parse_word(text)
         for key in reversed(path):

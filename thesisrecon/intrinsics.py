@@ -1,7 +1,7 @@
 """Prior knowledge of the intrinsics: the user's options and the per-view table that every stage reads.
 
-:class:`IntrinsicsOptions` (settings) -> :func:`prior_from_options` -> :class:`IntrinsicsPrior` (one row per view
-or camera). Self-calibration and bundle adjustment derive their unknowns from the latter.
+:class:`IntrinsicsOptions` (settings) -> :func:`prior_from_options` -> :class:`IntrinsicsPrior` (one row per
+view or camera). Self-calibration and bundle adjustment derive their unknowns from the latter.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class IntrinsicsPrior:
     Attributes
     ----------
     mean, std : ndarray (V, C)
-        C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3. Pixels at working size for focal, skew and
-        principal point; the focal's std is relative (the prior acts on log f). std 0: known, the value does not
-        move; std inf: unknown, and the mean is only a starting value (NaN for a focal without one).
+        C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3. Pixels at working size for focal, skew
+        and principal point; the focal's std is relative (the prior acts on log f). std 0: known, the value
+        does not move; std inf: unknown, and the mean is only a starting value (NaN for a focal without one).
     shared : ndarray (V, C) of int
         Rows with equal numbers in a column have one value there. Bundle adjustment takes the sharing from its
         cameras instead.
@@ -66,7 +66,18 @@ class IntrinsicsPrior:
     def unshared(
         cls, mean: F64, std: F64, *, kind: I64 | None = None, spread: F64 | None = None
     ) -> IntrinsicsPrior:
-        """Return a prior whose rows share no value, by default without kinds."""
+        """Return a prior whose rows share no value.
+
+        Parameters
+        ----------
+        mean, std, kind, spread
+            As the attributes; ``kind`` None: no kinds.
+
+        Returns
+        -------
+        IntrinsicsPrior
+            The prior.
+        """
         shared = np.repeat(np.arange(len(mean))[:, None], mean.shape[1], axis=1)
         return cls(mean, std, shared, np.full(len(mean), -1) if kind is None else kind, spread)
 
@@ -86,8 +97,8 @@ class IntrinsicsOptions:
     """Prior knowledge of the cameras as the user sets it.
 
     Each intrinsic has a mode (:data:`Mode`), a value and, unless it is known, the standard deviation of the
-    value (None: the value is only a starting value). The defaults: unknown focal length, square pixels, no skew,
-    a principal point within about 1 % of the long side of the image centre, moderate radial distortion.
+    value (None: the value is only a starting value). The defaults: unknown focal length, square pixels, no
+    skew, a principal point within about 1 % of the long side of the image centre, moderate radial distortion.
 
     Parameters
     ----------
@@ -169,8 +180,8 @@ class IntrinsicsOptions:
                 raise ValueError(f"{name} = {value} has no effect with {intrinsic} = known: leave one out")
         if self.focal_std_rel is not None and not focal_given:
             raise ValueError(
-                f"focal_std_rel = {self.focal_std_rel} has no effect without a focal length: set focal_px, or "
-                "exif = true"
+                f"focal_std_rel = {self.focal_std_rel} has no effect without a focal length: set focal_px, "
+                "or exif = true"
             )
 
     @property

@@ -1,7 +1,7 @@
-"""Frozen dataclasses as plain tables and TOML text: types checked, unknown keys refused with a sentence.
+"""Frozen dataclasses as plain tables and TOML: types are checked, unknown keys refused.
 
-Nothing here knows a stage: a variant is any frozen dataclass whose fields are numbers, words, tuples of
-those or further dataclasses. ``None`` is written as the word ``none``, since TOML has no empty value.
+Fields are numbers, text, tuples of these or dataclasses. ``None`` is written as the word ``none``, since TOML
+has no null.
 """
 
 from __future__ import annotations
@@ -21,16 +21,24 @@ T = TypeVar("T")
 Table = dict[str, Any]
 NONE = "none"
 KIND = "kind"
-LONGEST_WORDS = 120
-"""Characters of a value that a sentence repeats."""
+MAX_SHOWN = 120
+"""Maximum length of a value in a message."""
 GIVEN = {"given": True}
-"""Metadata of a field that the composer fills with data: it is no setting."""
+"""Metadata of a field that the pipeline fills with data: not a setting."""
 
 
 def table_from_dataclass(value: Any) -> Table:
-    """The fields of a dataclass as a table of plain values (numbers, text, lists, tables).
+    """Convert a dataclass to a table of plain values.
 
-    Where a field may hold one of several dataclasses, its table begins with the ``kind``.
+    Parameters
+    ----------
+    value : dataclass
+        The dataclass.
+
+    Returns
+    -------
+    dict
+        Field -> number, text, list or table; a table of one of several dataclasses begins with ``kind``.
     """
     hints = typing.get_type_hints(type(value))
     table = {}
@@ -46,12 +54,34 @@ def _settings_of(kind: type[Any]) -> list[str]:
 
 
 def word_of(kind: type[Any]) -> str:
-    """The word of a class in text: ``ModulusConstraint`` is "modulus-constraint"."""
+    """Return the word of a class in text.
+
+    Parameters
+    ----------
+    kind : type
+        The class.
+
+    Returns
+    -------
+    str
+        Its name in kebab case: "modulus-constraint" for ``ModulusConstraint``.
+    """
     return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()
 
 
 def alternatives(union: Iterable[Any]) -> dict[str, type[Any]]:
-    """Word -> class where several members of a union are dataclasses, else nothing."""
+    """Return the dataclasses among the members of a union, if there are several.
+
+    Parameters
+    ----------
+    union : iterable
+        Members of the union.
+
+    Returns
+    -------
+    dict
+        Word -> class; empty with fewer than two.
+    """
     classes = [a for a in union if isinstance(a, type) and dataclasses.is_dataclass(a)]
     return {word_of(a): a for a in classes} if len(classes) > 1 else {}
 
@@ -65,10 +95,28 @@ def _plain(value: Any) -> Any:
 
 
 def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, base: T | None = None) -> T:
-    """A ``kind`` whose fields are those of ``table`` and, for the rest, of ``base`` (or the defaults).
+    """Build a dataclass from a table.
 
-    ``where`` is the dotted place of the table, for the sentence. Raises :class:`UsageError` for an unknown
-    key, a value of another type, and whatever the dataclass itself refuses.
+    Parameters
+    ----------
+    kind : type
+        The dataclass.
+    table : mapping
+        Field -> plain value.
+    where : str
+        Dotted name of the table, for messages.
+    base : dataclass, optional
+        Supplies the other fields; None: the defaults.
+
+    Returns
+    -------
+    dataclass
+        An instance of ``kind``.
+
+    Raises
+    ------
+    UsageError
+        If a key is unknown, or a value has the wrong type or is refused by the dataclass.
     """
     hints = typing.get_type_hints(kind)
     names = _settings_of(kind)
@@ -85,12 +133,30 @@ def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, ba
 
 
 def coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
-    """``value`` as the annotated type: bool, int, float, str, Literal, tuple, dataclass, or one of those or
-    None.
+    """Convert a plain value to an annotated type.
 
-    An int stands for a float, never the other way round, and text is never taken for a number. ``current``
-    is the value a dataclass' table starts from. Raises :class:`UsageError` that names the place and what it
-    takes.
+    An int is accepted for a float, never the reverse; text is never accepted for a number.
+
+    Parameters
+    ----------
+    value : object
+        Plain value.
+    annotation : type
+        bool, int, float, str, Literal, tuple, dataclass, or an optional of these.
+    where : str
+        Dotted name of the setting, for messages.
+    current : object, optional
+        Base of a dataclass.
+
+    Returns
+    -------
+    object
+        The value.
+
+    Raises
+    ------
+    UsageError
+        If the value has the wrong type.
     """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
@@ -113,7 +179,7 @@ def coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
 
 
 def _fits(number: int) -> bool:
-    """Whether arrays can hold it."""
+    """Whether it fits in 64 bits."""
     return abs(number) < 2**63
 
 
@@ -133,7 +199,7 @@ def _coerce_optional(value: Any, arguments: tuple[Any, ...], where: str, current
 
 
 def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str, current: Any) -> Any:
-    """One of several dataclasses: its word alone, or a table whose ``kind`` is the word (else as before)."""
+    """One of several dataclasses from its word, or from a table with ``kind`` (default: unchanged)."""
     table = {KIND: value} if isinstance(value, str) else value
     if not isinstance(table, Mapping):
         one_of = f"one of {', '.join(several)} or a table of settings"
@@ -157,24 +223,50 @@ def _coerce_tuple(
 
 
 def _type_words(annotation: Any) -> str:
-    words = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+    words = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
     if annotation in words:
         return words[annotation]
     return "a list" if typing.get_origin(annotation) is tuple else "a table of settings"
 
 
 def in_words(value: Any) -> str:
-    """A value as it was written, or how it begins where that is long."""
+    """Return a value as text for a message, shortened to ``MAX_SHOWN``.
+
+    Parameters
+    ----------
+    value : object
+        Any value.
+
+    Returns
+    -------
+    str
+        Its ``repr``.
+    """
     try:
         text = repr(value)
     except (ValueError, RecursionError):
-        # Python prints no number of thousands of digits and no endless nest of tables.
-        text = f"{type(value).__name__} beyond measure"
-    return text if len(text) <= LONGEST_WORDS else text[: LONGEST_WORDS - 3] + "..."
+        # Python refuses to print numbers of thousands of digits and infinite nesting.
+        text = f"{type(value).__name__} too large to print"
+    return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 3] + "..."
 
 
 def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
-    """The refusal of a key that the table at ``where`` does not have; it names the nearest of ``names``."""
+    """Return the error for an unknown key, with the nearest known ones.
+
+    Parameters
+    ----------
+    where : str
+        Dotted name of the table.
+    key : str
+        The unknown key.
+    names : iterable of str
+        Its known keys.
+
+    Returns
+    -------
+    UsageError
+        The error.
+    """
     near = difflib.get_close_matches(key, names := list(names), n=3, cutoff=0.6)
     known = " or ".join(f"{where}.{name}" for name in near)
     hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
@@ -182,7 +274,27 @@ def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
 
 
 def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
-    """'unknown <what> <word>; did you mean ...?': the nearest known words, or all where none is near."""
+    """Return a message about an unknown word with the nearest known ones, or all.
+
+    Parameters
+    ----------
+    what : str
+        Kind of word.
+    word : object
+        The unknown word.
+    known : iterable of str
+        Known words.
+
+    Returns
+    -------
+    str
+        The message.
+
+    Examples
+    --------
+    >>> unknown_word("preset", "tesis", ["default", "thesis"])
+    "unknown preset 'tesis'; did you mean thesis?"
+    """
     known = list(known)
     near = difflib.get_close_matches(word, known, n=3, cutoff=0.6) if isinstance(word, str) else []
     hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known)}"
@@ -190,10 +302,26 @@ def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
 
 
 def parse_word(text: str) -> Any:
-    """The value of ``--set key=value``: true, false, a number, a list ``[a, b]``, else the text itself."""
+    """Parse the value of ``--set key=value``.
+
+    Parameters
+    ----------
+    text : str
+        The value.
+
+    Returns
+    -------
+    bool, int, float, list or str
+        true, false, a number, a flat list ``[a, b]``, else the text.
+
+    Examples
+    --------
+    >>> parse_word("[1, 2.5, none]"), parse_word("true")
+    ([1, 2.5, 'none'], True)
+    """
     text = text.strip()
     if text.startswith("[") and text.endswith("]"):
-        # Lists of lists are no settings.
+        # No setting is a list of lists.
         return [_parse_plain(part.strip()) for part in text[1:-1].split(",") if part.strip()]
     return _parse_plain(text)
 
@@ -210,7 +338,18 @@ def _parse_plain(text: str) -> Any:
 
 
 def toml_from_tables(tables: Mapping[str, Any]) -> str:
-    """TOML text of nested tables; ``tomllib`` reads back the same tables."""
+    """Write nested tables as TOML, which ``tomllib`` reads back.
+
+    Parameters
+    ----------
+    tables : mapping
+        Nested tables of plain values.
+
+    Returns
+    -------
+    str
+        TOML text.
+    """
     return "\n".join(_toml_lines(tables, ())).strip() + "\n"
 
 

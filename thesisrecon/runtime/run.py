@@ -413,7 +413,7 @@ def start_run(
     if until not in get_args(Until):
         raise UsageError(unknown_word("stage", str(until), get_args(Until)))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise UsageError(f"the seed must be an integer of at least 0; got {seed!r}")
+        raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
     threads = options.get("threads") or available_threads()
     workers = Workers(threads, options.get("executor", "local"))
     if not str(out).strip():
