@@ -10,6 +10,8 @@ pytest.importorskip("pycolmap")
 from tests.numerics.bundle_scenes import make_block
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.records import Reconstruction, Tracks
+from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
+from validation.scenes.streets import SIZE, make_walk
 from validation.studies.bundle import (
     FOCAL_K1,
     Case,
@@ -20,8 +22,6 @@ from validation.studies.bundle import (
     timed_often,
     walk_rows,
 )
-from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
-from validation.scenes.streets import SIZE, make_walk
 
 
 @pytest.mark.parametrize("kind", ["street", "loop"])
@@ -75,7 +75,7 @@ def test_a_model_is_perturbed_and_taken_several_times():
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_one_problem_is_told_with_costs_times_and_steps(shared):
+def test_one_problem_is_reported_with_cost_time_and_steps(shared):
     block = make_block(k1=0.02, points=150)
     rows = check_same_problem(_model(block, 0.3), Case(1, "squared", True, 1, shared), repeats=2)
     named = {row.name: row for row in rows}
@@ -91,7 +91,7 @@ def test_covariances_are_those_of_colmap():
     assert rows["f, c, k1: largest difference to COLMAP's"].verdict == "reached"
 
 
-def test_short_work_is_repeated_and_the_first_answer_kept():
+def test_short_work_is_repeated_and_the_first_result_kept():
     count = itertools.count()
     answer, wall, cpu = timed_often(lambda: (next(count), 1e-3, 2e-3))
     assert (answer, wall, cpu, next(count)) == (0, 1e-3, 2e-3, 25)

@@ -24,7 +24,10 @@ def pair() -> tuple[InterpolatedPair, tuple[np.ndarray, np.ndarray], np.ndarray]
     turns = [Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix() for _ in range(2)]
     first, second = (camera_from_centre(K, R, C) for R, C in zip(turns, centres, strict=True))
     frame = rectify_cameras(first, second, SIZE, SIZE, method="least-distortion")
-    image, nothing = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), with_full_confidence(np.zeros((9, 9), np.float32))
+    image, nothing = (
+        np.zeros((SIZE[1], SIZE[0], 3), np.uint8),
+        with_full_confidence(np.zeros((9, 9), np.float32)),
+    )
     H = np.stack([frame.H1, frame.H2])
     return InterpolatedPair((image, image), H, nothing, nothing), (first, second), centres
 

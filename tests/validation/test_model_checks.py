@@ -1,4 +1,4 @@
-"""What measures depth maps, surfaces and views of the model, on scenes whose answer is known."""
+"""Measures of depth maps, surfaces and views of the model on scenes with known truth."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_points_are_spread_evenly() -> None:
     np.testing.assert_array_equal(points, surfaces.points_on(mesh, 9000))
 
 
-def test_what_two_photographs_could_show_is_asked_for() -> None:
+def test_expected_points_are_those_visible_in_two_images() -> None:
     scene = load_fixture_scene("courtyard")
     assert scene.K is not None
     assert scene.R is not None

@@ -22,7 +22,7 @@ def test_rows_hold_both_methods_and_judge_ours() -> None:
     assert rows["mean camera-centre error"].unit == "mm"
     assert rows["wall time"].target == 10.0
     assert rows["wall time"].verdict == "reached"
-    # The residuals here are zero, so whoever claims a pixel is far off.
+    # The residuals here are zero, so a claim of one pixel is far off.
     assert rows["rms it claims off by"].verdict == "missed"
     assert rows["points"].verdict == "reported"
 

@@ -9,8 +9,8 @@ pytest.importorskip("cv2")
 
 from tests.stereo.rectification_scenes import make_pair
 from thesisrecon.stereo.epipolar_pair import pair_of_cameras, pair_of_fundamental
-from validation.studies.rectification import BEST_F, METHODS, RealPair, check_scene, measure, seen_by_other
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
+from validation.studies.rectification import BEST_F, METHODS, RealPair, check_scene, measure, seen_by_other
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_rows_of_opencv_are_epipolar_lines():
         assert np.abs(left - right)[:, 1].max() < 1e-3
 
 
-def test_what_the_other_photograph_cannot_show_does_not_count(pair):
+def test_pixels_outside_the_other_image_do_not_count(pair):
     seen = seen_by_other(pair.metric, 0)
     # The second camera stands to the right, 1.5 off with a focal of 700: at depth 11 it sees from 95 px on.
     assert 50.0 < seen[:, 0].min() < 110.0

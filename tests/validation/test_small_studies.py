@@ -356,5 +356,5 @@ def test_missing_data_and_unknown_names_end_with_code_2(capsys, monkeypatch):
 
 def test_a_call_in_a_process_of_its_own_returns_its_answer():
     assert call_apart(exponent, [1.0, 10.0], [1.0, 100.0])[0] == pytest.approx(2.0)
-    with pytest.raises(RuntimeError, match="ZeroDivisionError|ValueError"):
+    with pytest.raises(RuntimeError, match=r"ZeroDivisionError|ValueError"):
         call_apart(exponent, [], [])

@@ -9,7 +9,7 @@ from thesisrecon.views.virtual_camera import CalibratedPair
 from validation.studies.tensor_views import Measured, Place, draw, linear_range
 
 
-def test_places_are_as_far_from_the_baseline_as_they_say():
+def test_positions_have_the_stated_distance_from_the_baseline():
     K = np.array([[900.0, 0.0, 511.5], [0.0, 900.0, 383.5], [0.0, 0.0, 1.0]])
     pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
     for place, centre, distance in (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics.levenberg_marquardt import LossName
+from thesisrecon.numerics.losses import LossName
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from validation.references.colmap_model import cameras_from_colmap, colmap_model

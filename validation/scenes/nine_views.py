@@ -14,7 +14,7 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
 from thesisrecon.views.trilinear_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
-from thesisrecon.views.virtual_camera import CalibratedPair, guessed_intrinsics
+from thesisrecon.views.virtual_camera import CalibratedPair, default_intrinsics
 from validation.scenes.real import data_root
 
 ENDS = (2, 6)
@@ -81,7 +81,7 @@ def synthesis_of_disparities(
         y, x = np.indices(d.shape, dtype=np.float32)
         filled = DisparityMap(d, np.zeros_like(d), 0.0).filled()
         places.append(np.stack([x + np.float32(sign) * filled, y], axis=-1))
-    K = guessed_intrinsics((width, height))
+    K = default_intrinsics((width, height))
     pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
     return prepare_synthesis(pair, (left, right), (places[0], places[1]), agree_px=agree_px)
 

@@ -10,7 +10,7 @@ import PIL.Image
 
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.view_interpolation import rectified_pair
+from thesisrecon.view_interpolation import prepare_rectified_pair
 from thesisrecon.views.virtual_camera import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
 from validation.metrics.pictures import psnr_db, ssim
@@ -154,7 +154,7 @@ def _pictures(method: str, cones: NineViews) -> dict[int, U8]:
         return {k: dissolved(left, right, cones.share(k)) for k in BETWEEN}
     maps = _disparities(method.removesuffix(BY_TENSOR), cones, left, right)
     if not method.endswith(BY_TENSOR):
-        pair = rectified_pair(left, right, disparity=maps)
+        pair = prepare_rectified_pair(left, right, disparity=maps)
         return {k: pair.view(cones.share(k)) for k in BETWEEN}
     of_left, of_right = (m.disparity if isinstance(m, DisparityMap) else m for m in maps)
     # The true disparities are known of hidden pixels, too, which need not agree.

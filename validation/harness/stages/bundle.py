@@ -13,7 +13,6 @@ from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bund
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import Reconstruction
-from validation.studies.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, model_as_bundle, perturbed_model
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS
@@ -22,6 +21,7 @@ from validation.metrics.record import Metric
 from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
 from validation.references.ceres_covariance import ceres_covariances
 from validation.scenes.streets import SIZE, make_walk
+from validation.studies.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, model_as_bundle, perturbed_model
 
 OURS, CERES = "ours", "Ceres"
 STREET = "street"

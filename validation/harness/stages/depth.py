@@ -13,7 +13,7 @@ import PIL.Image
 from thesisrecon.arrays import F32
 from thesisrecon.config import preset
 from thesisrecon.io.files import write_text
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.neighbours import pinhole_view
@@ -118,7 +118,7 @@ def stereo_of(method: str, wishes: Wishes) -> MultiViewStereo:
 
 def images_of(photographs: Scene) -> list[Image]:
     """The photographs as they are, in the order of the scene."""
-    read = read_photographs(list(photographs.image_paths), max_size_px=10_000)
+    read = read_images(list(photographs.image_paths), max_size_px=10_000)
     by_name = {image.name: image for image in read.images}
     return [by_name[path.name] for path in photographs.image_paths]
 

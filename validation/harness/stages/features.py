@@ -14,9 +14,8 @@ from thesisrecon.config import preset
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.io.images import read_photographs
+from thesisrecon.io.images import read_images
 from thesisrecon.records import Image
-from validation.studies.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
 from validation.harness.records import Judgement, Outcome, Task, Wishes
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.fundamental import MATCHES
@@ -26,6 +25,7 @@ from validation.references.corners import harris_corners, sift_corners
 from validation.references.libraries import NoReference
 from validation.scenes.real import Scene, load_fixture_depth
 from validation.scenes.real_pairs import RealPair, camera_pairs
+from validation.studies.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
 
 OURS, THESIS, SIFT, HARRIS = "ours", "ours (thesis)", "SIFT", "cv2.cornerHarris"
 FRONT_ENDS = {OURS: "ours", THESIS: "thesis", SIFT: "SIFT"}
@@ -63,7 +63,7 @@ class FeaturesStage:
 
     def run(self, task: Task, wishes: Wishes) -> None:
         scene = load_photographs(task.scene, wishes)
-        images = read_photographs(scene.image_paths, max_size_px=MAX_SIZE_PX).images
+        images = read_images(scene.image_paths, max_size_px=MAX_SIZE_PX).images
         place = wishes.place(task.stage, task.scene, task.method)
         if task.scene in WITH_DEPTH:
             corners: dict[str, Any] = {f"{i}": _corners(task.method, m) for i, m in enumerate(images)}

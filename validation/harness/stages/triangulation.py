@@ -15,11 +15,11 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_midpoint, triangulate_optimal
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
-from validation.studies.triangulation import SCENES, cameras_of, frame_of, squared_distances
 from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
 from validation.metrics.record import Metric
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.rigs import Rig
+from validation.studies.triangulation import SCENES, cameras_of, frame_of, squared_distances
 
 OURS = "ours (polynomial, optimal)"
 DESCENT = 40
