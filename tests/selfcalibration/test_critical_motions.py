@@ -11,10 +11,6 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.records import Tracks, Upgrade
 from thesisrecon.selfcalibration.critical_motions import (
-    MAX_FOCAL_STD,
-    MAX_NOISE_RATIO,
-    MIN_INFINITY_SHIFT,
-    MIN_ROTATION_SIGNIFICANCE,
     UpgradedCameras,
     infinite_homography_shift,
     measure_motion,
@@ -25,6 +21,10 @@ from thesisrecon.selfcalibration.critical_motions import (
 from thesisrecon.selfcalibration.frame import normalized_frame
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.identifiability import (
+    MAX_FOCAL_STD,
+    MAX_NOISE_RATIO,
+    MIN_INFINITY_SHIFT,
+    MIN_ROTATION_SIGNIFICANCE,
     check_identifiability,
     excess_equations,
     identifiability_without_calibration,

@@ -435,7 +435,7 @@ def _homographies(frame: ReferenceFrame, plane: F64) -> F64:
     if not np.isfinite(H).all():
         raise StageFailure(
             "the plane at infinity passes through a camera centre",
-            f"view {int(frame.views[~np.isfinite(H).all(axis=(1, 2))][0])} has no infinite homography",
+            f"image #{int(frame.views[~np.isfinite(H).all(axis=(1, 2))][0])} has no infinite homography",
         )
     return np.asarray(H, dtype=np.float64)
 

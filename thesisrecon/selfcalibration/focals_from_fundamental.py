@@ -491,9 +491,9 @@ class FocalsFromFundamental:
         open_views = frame.views[std >= self.max_std]
         if not len(open_views):
             return replace(found, K_std=K_std)
-        names = ", ".join(str(v) for v in open_views[:10])
+        names = ", ".join(f"#{v}" for v in open_views[:10])
         reason = (
             f"fundamental matrices do not determine the focal length of {len(open_views)} of "
-            f"{len(frame.views)} images to {self.max_std:.0%} (view {names})"
+            f"{len(frame.views)} images to {self.max_std:.0%} (image {names})"
         )
         return replace(found, K_std=K_std, identifiable=False, reasons=(*found.reasons, reason))

@@ -9,6 +9,7 @@ ratio undetermined; square pixels resolve both.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,17 +22,32 @@ from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import IdentifiabilityReport, Reconstruction, Upgrade
 from thesisrecon.selfcalibration.critical_motions import (
-    MAX_FOCAL_STD,
-    MAX_NOISE_RATIO,
-    MIN_INFINITY_SHIFT,
-    MIN_ROTATION_SIGNIFICANCE,
+    OPTICAL_AXIS,
+    PARALLEL_AXES,
+    PLANAR,
+    PLANE,
+    ROTATION,
+    TRANSLATION,
+    TURNTABLE,
     UpgradedCameras,
     measure_motion,
-    motion_sentences,
     nearest_critical_motion,
     projective_infinity_shifts,
 )
 from thesisrecon.selfcalibration.frame import build_frame
+
+# A focal length with a larger relative standard deviation is undetermined.
+MAX_FOCAL_STD = 0.15
+# Image noise can be mistaken for a small rotation, which makes the covariance too small: a rotation counts if
+# it exceeds its standard deviation by this factor.
+MIN_ROTATION_SIGNIFICANCE = 4.0
+# Noise of metric over projective cameras: a larger ratio means a wrong prior. A principal point or distortion
+# that the projective cameras absorbed costs less.
+MAX_NOISE_RATIO = 3.0
+# In long sides. Unmodelled lens errors (resampling, focus breathing) move images by about 1e-4, alike in all
+# parts of the scene, so that no covariance contains them. A rotation that moves the image by s determines f
+# by its second-order part s (x / f)^2, about s / 10: for f to 15 %, 2 (s / 10) 0.15 must exceed 1e-4.
+MIN_INFINITY_SHIFT = 0.003
 
 # Localisation of corners; a few of them may agree better by chance.
 _NOISE_FLOOR_PX = 0.05
@@ -106,7 +122,7 @@ def identifiability_without_calibration(
     }
     focal_std = prior.std[reconstruction.registered, 0]
     given = float(focal_std.max()) if len(focal_std) else float("inf")
-    sentences = motion_sentences(motion, evidence, identifiable=False, focal_std=given)
+    sentences = _sentences(motion, evidence, identifiable=False, focal_std=given)
     return IdentifiabilityReport(False, motion, distance < 1.0, evidence, sentences)
 
 
@@ -321,7 +337,7 @@ def _report(
         and evidence["noise_ratio_to_projective"] < MAX_NOISE_RATIO
     )
     given = float(problem.prior.std[:, 0].max())
-    sentences = motion_sentences(motion, evidence, identifiable=identifiable, focal_std=given)
+    sentences = _sentences(motion, evidence, identifiable=identifiable, focal_std=given)
     return IdentifiabilityReport(
         identifiable, motion, distance < 1.0, evidence, sentences, tuple(int(v) for v in undetermined)
     )
@@ -366,3 +382,151 @@ def rotation_significance(R: F64, covariance: F64 | None) -> float:
     tilt = (R @ (mean / max(float(np.linalg.norm(mean)), 1e-12)))[:, :2]
     variance = float(np.mean(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]))
     return float(np.sqrt(np.mean(tilt**2) / max(variance, 1e-300))) if np.isfinite(variance) else 0.0
+
+
+_FOUND: Mapping[str, str] = {
+    PLANE: (
+        "the scene is planar: the points lie in one plane to {scene_planarity_ratio:.1%} of its width, which "
+        "hardly determines the cameras"
+    ),
+    ROTATION: (
+        "close to a pure rotation: the camera moved by only {centre_spread_over_distance:.1%} of the "
+        "distance "
+        "to the scene, which determines the focal length but hardly any depth"
+    ),
+    TRANSLATION: (
+        "close to a pure translation: the camera rotated by at most {largest_rotation_deg:.1f} degrees, "
+        "which "
+        "does not determine the focal length"
+    ),
+    OPTICAL_AXIS: (
+        "the camera rotated about its optical axis only and looked in one direction, which does not "
+        "determine "
+        "the focal length"
+    ),
+    TURNTABLE: (
+        "turntable motion: all views rotate about one axis (to within {rotation_axis_spread_deg:.1f} "
+        "degrees), "
+        "which does not determine the scale along the axis unless the aspect ratio of the pixels is known"
+    ),
+    PLANAR: (
+        "planar motion: the camera moved in a plane and rotated about one direction (to within "
+        "{rotation_axis_spread_deg:.1f} degrees), which does not determine the scale across the plane unless "
+        "the aspect ratio of the pixels is known"
+    ),
+    PARALLEL_AXES: (
+        "all rotation axes are parallel (to within {rotation_axis_spread_deg:.1f} degrees), which does not "
+        "determine the scale along the axes unless the aspect ratio of the pixels is known"
+    ),
+}
+_FOUND_PROJECTIVE: Mapping[str, str] = {
+    TRANSLATION: (
+        "the projective cameras fit a pure translation, which does not determine the focal length (points at "
+        "infinity move by {infinity_shift:.1%} of the image)"
+    ),
+    OPTICAL_AXIS: (
+        "the projective cameras fit a rotation about the optical axis, which does not determine the focal "
+        "length (points at infinity move by {infinity_shift_beyond_roll:.1%} of the image)"
+    ),
+}
+_ROTATE = "rotate the camera by at least 10 degrees between images, about the vertical and a horizontal axis"
+_HEIGHTS = "take some images from higher or lower positions, or with the camera rolled by 90 degrees"
+_ADVICE: Mapping[str, str] = {
+    PLANE: "include objects at different depths",
+    ROTATION: "walk around the scene between images",
+    TRANSLATION: _ROTATE,
+    OPTICAL_AXIS: "point the camera in different directions",
+    TURNTABLE: _HEIGHTS,
+    PLANAR: _HEIGHTS,
+    PARALLEL_AXES: "tilt the camera up and down too, or roll it by 90 degrees",
+}
+_RESOLVED_BY_FOCAL = (_ROTATE, _ADVICE[OPTICAL_AXIS])
+_RESOLVED_BY_ASPECT = (TURNTABLE, PLANAR, PARALLEL_AXES)
+
+
+def _sentences(
+    motion: str, evidence: Mapping[str, float], *, identifiable: bool, focal_std: float
+) -> tuple[str, ...]:
+    """Return what was found, what it means and what to do; empty for a general motion.
+
+    ``focal_std`` is the largest standard deviation of the given focal lengths, inf if one was not given.
+    Clauses without a capital or full stop, which the report and the summary join.
+    """
+    is_critical = bool(motion) and evidence["critical_motion_distance"] < 1.0
+    calibrated = "focal_std_rel" in evidence
+    sentences = []
+    if evidence["excess_equations"] < 0:
+        sentences.append(
+            f"too few images for the unknown intrinsics: {-evidence['excess_equations']:.0f} equations are "
+            f"missing; "
+            "add images, or let them share one camera"
+        )
+    if is_critical:
+        found = (_FOUND if calibrated else _FOUND_PROJECTIVE)[motion]
+        sentences.append(found.format(**evidence))
+    if _has_excess_noise(evidence):
+        sentences.append(
+            f"metric cameras with the given prior leave {evidence['noise_ratio_to_projective']:.1f} times "
+            f"the noise "
+            "of projective ones: images were zoomed or cropped individually, or come from different cameras; "
+            "estimate each camera separately (cameras = per-image)"
+        )
+    if identifiable:
+        return (*sentences, *_resolution(motion, evidence)) if is_critical else tuple(sentences)
+    return (*sentences, *_failure(motion, evidence, is_critical, focal_std))
+
+
+def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
+    """Return what determines the focal length in spite of the critical motion."""
+    std, free_std = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
+    if motion in _RESOLVED_BY_ASPECT and free_std > 2.0 * std:
+        return [
+            f"square pixels and a central principal point resolve it if the cameras are as assumed: the "
+            f"focal "
+            f"length is known to {_percent(std)} with them and to {_percent(free_std)} without; to depend "
+            f"less on "
+            f"them, {_ADVICE[motion]}"
+        ]
+    if motion in (PLANE, ROTATION):
+        return [
+            f"the focal length is known to {_percent(std)} if the cameras are as assumed; for reliable "
+            f"depths, "
+            f"{_ADVICE[motion]}"
+        ]
+    return [
+        f"if the cameras are as assumed, the departure from this motion determines the focal length to "
+        f"{_percent(std)}"
+    ]
+
+
+def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, focal_std: float) -> list[str]:
+    """Return why the focal length is not determined, and what to do."""
+    advice = _ADVICE.get(motion, _ROTATE) if is_critical else _ROTATE
+    if advice in _RESOLVED_BY_FOCAL and focal_std > 0.0:
+        given = " more exactly" if focal_std < float("inf") else ""
+        advice += f", or give the focal length{given}"
+    if "focal_std_rel" not in evidence:
+        return [advice]
+    std = evidence["focal_std_rel_median"]
+    if evidence["rotation_significance"] < MIN_ROTATION_SIGNIFICANCE and std < MAX_FOCAL_STD:
+        return [f"the rotations are within image noise and do not determine the focal length; {advice}"]
+    if evidence["infinity_shift_beyond_roll"] < MIN_INFINITY_SHIFT and std < MAX_FOCAL_STD:
+        return [
+            f"the rotations move points at infinity by only {evidence['infinity_shift_beyond_roll']:.2%} of "
+            f"the "
+            f"image, within the errors of a lens model, and do not determine the focal length; {advice}"
+        ]
+    if std >= MAX_FOCAL_STD:
+        return [f"the cameras determine the focal length only to {_percent(std)}; {advice}"]
+    # Rotating the camera does not help against a wrong prior of the intrinsics.
+    return [] if _has_excess_noise(evidence) else [advice]
+
+
+def _has_excess_noise(evidence: Mapping[str, float]) -> bool:
+    return evidence.get("noise_ratio_to_projective", 0.0) >= MAX_NOISE_RATIO
+
+
+def _percent(share: float) -> str:
+    if share < 0.001:
+        return "better than 0.1 %"
+    return f"{100.0 * share:.1f} %" if share < 0.1 else f"{100.0 * min(share, 9.99):.0f} %"
