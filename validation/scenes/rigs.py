@@ -99,14 +99,14 @@ def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) ->
     G = random_transform("projective", rng)
     P = P @ np.linalg.inv(G) * (rng.uniform(0.5, 2.0, n) * rng.choice([-1.0, 1.0], n))[:, None, None]
     X = X @ G.T * rng.choice([-1.0, 1.0], len(X))[:, None]
-    fit_to_size = refine_projective_bundle(
+    fitted = refine_projective_bundle(
         P, X, tracks.view_index[use], tracks.point_index[use], tracks.xy[use], loss_px=10.0, max_iterations=30
     )
     valid = np.bincount(tracks.point_index[use], minlength=len(X)) >= 2
-    sigma = float(np.sqrt(np.mean(fit_to_size.residual_px**2)))
+    sigma = float(np.sqrt(np.mean(fitted.residual_px**2)))
     reasons = tuple("" if r else "sees a single plane" for r in registered)
     return Reconstruction(
-        "projective", np.where(registered[:, None, None], fit_to_size.P, 0.0),
-        np.where(valid[:, None], fit_to_size.X, 0.0), registered, valid, use, tracks,
+        "projective", np.where(registered[:, None, None], fitted.P, 0.0),
+        np.where(valid[:, None], fitted.X, 0.0), registered, valid, use, tracks,
         np.tile(rig.size, (n, 1)).astype(np.int64), max(sigma, 1e-6), reasons,
     )  # fmt: skip

@@ -129,9 +129,9 @@ def _model(
 ) -> TexturedMesh:
     """A model with colours; ours leaves its ``surface`` for the methods that start from it."""
     if method == OURS:
-        without_texture = SurfaceModel().surface_of(maps)
-        np.savez(surface, vertices=without_texture.vertices, faces=without_texture.faces)
-        return SurfaceModel().color(without_texture, views)
+        surface_model = SurfaceModel().surface_of(maps)
+        np.savez(surface, vertices=surface_model.vertices, faces=without_texture.faces)
+        return SurfaceModel().color(surface_model, views)
     if method == SINGLE:
         return TextureAtlas(painter=SeamLeveledTexture()).texture(_read_surface(surface), views)
     if method == LEVELLED:
