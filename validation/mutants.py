@@ -27,7 +27,7 @@ from validation.harness.planting import CopiedTree, imports_of
 from validation.harness.process import own_cores, run_process
 from validation.scenes.real import ROOT
 
-PACKAGES = ("geometry", "epipolar", "selfcalibration", "optimize")
+PACKAGES = ("geometry", "epipolar", "selfcalibration", "numerics")
 LEAST_SCORE = 0.85
 LIMIT_S = 420.0
 """A test run that takes longer hangs in the fault."""
