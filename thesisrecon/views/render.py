@@ -279,6 +279,14 @@ def render(
     ------
     ValueError
         If ``samples`` is below 1 or the mesh arrays are inconsistent.
+
+    Examples
+    --------
+    >>> triangle = TexturedMesh(np.array([[-1.0, -1, 2], [1, -1, 2], [0, 1, 2]]), np.array([[0, 1, 2]]))
+    >>> K = np.array([[20.0, 0, 9.5], [0, 20, 9.5], [0, 0, 1]])
+    >>> view = render(triangle, Camera(K, np.eye(3), np.zeros(3), (20, 20)))
+    >>> view.color.shape, bool(view.valid[5, 10]), float(view.depth[5, 10])
+    ((20, 20, 3), True, 2.0)
     """
     if samples < 1:
         raise ValueError(f"render needs at least one sample a side; got {samples}")
