@@ -62,7 +62,7 @@ def test_one_image(folder, reconstruct):
     shutil.copy(courtyard(1)[0], folder)
     answer = reconstruct()
     assert answer.code == 3
-    assert "1 usable photograph; at least two different ones are needed" in answer.sentence
+    assert "1 usable image; at least two different ones are needed" in answer.sentence
     assert answer.summary["images"] == 1
 
 
@@ -130,7 +130,7 @@ def test_noise_images(folder, reconstruct):
         PIL.Image.fromarray(rng.integers(0, 256, (300, 400, 3), dtype=np.uint8)).save(folder / f"{k}.png")
     answer = reconstruct()
     assert answer.code == 3
-    assert "no two photographs could be matched" in answer.sentence
+    assert "no two images could be matched" in answer.sentence
     assert answer.summary["pairs"]["matched"] == 3
 
 
@@ -143,7 +143,7 @@ def test_almost_featureless_images(folder, reconstruct):
         )
     answer = reconstruct()
     assert answer.code == 3
-    assert "no two photographs could be matched" in answer.sentence
+    assert "no two images could be matched" in answer.sentence
     assert "the best of 1 pair has 0 verified matches" in answer.sentence
 
 

@@ -54,7 +54,7 @@ def test_files_that_are_not_images_are_rejected(name, make, words, tmp_path, run
     (tmp_path / "in").mkdir()
     make(tmp_path / "in" / name)
     said = run_cli(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
-    assert "no usable photographs; at least one is needed; " in said
+    assert "no usable images; at least one is needed; " in said
     assert f"{name} {words}" in said
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert [entry["name"] for entry in summary["refused"]] == [name]
@@ -131,7 +131,7 @@ def test_odd_photographs_are_read(name, content, tmp_path, run_cli):
     said = run_cli(
         ["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES, *knowledge], 0
     )
-    assert "corners in 1 photograph" in said or "1 of 1 photograph read" in said
+    assert "corners in 1 image" in said or "1 of 1 image read" in said
 
 
 def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, run_cli):
@@ -148,8 +148,8 @@ def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, run_
     only.mkdir()
     (only / "sub").symlink_to(folder)
     said = run_cli(["reconstruct", str(only), "-o", str(tmp_path / "other"), *FEATURES], 2)
-    assert "no photographs in" in said
-    assert "folders in it are not searched" in said
+    assert "no images in" in said
+    assert "subfolders are not searched" in said
 
 
 def test_thousands_of_tiny_files_are_one_sentence(tmp_path, run_cli):

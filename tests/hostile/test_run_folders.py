@@ -136,7 +136,7 @@ def test_an_invalid_manifest_is_rewritten(make, tmp_path, run_cli):
 RUN_FILES = [
     ("another version", writes('{"version": 2, "seed": 0}'), "version was 2 and is now 1"),
     ("a list", writes("[1, 2]"), "holds another run"),
-    ("wrong types", writes('{"version": 1, "seed": {}, "settings": []}'), "seed was {} there"),
+    ("wrong types", writes('{"version": 1, "seed": {}, "settings": []}'), "seed was {} and is now 0"),
     ("wrong photographs", writes('{"version": 1, "photographs": [3]}'), "holds another run"),
 ]
 
@@ -149,7 +149,7 @@ def test_the_folder_of_another_version(make, words, tmp_path, run_cli):
     command = ["reconstruct", str(folder), "-o", str(out), *FEATURES]
     said = run_cli(command, 2)
     assert words in said
-    assert "choose another folder, or --overwrite" in said
+    assert "choose another folder, or use --overwrite" in said
     run_cli([*command, "--overwrite"], 0)
 
 

@@ -8,7 +8,7 @@ images carry their whole poses. Numbers in text have 17 significant digits, so b
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -376,7 +376,9 @@ def _parse_binary(table: _Table, data: bytes, path: Path) -> Iterator[_Record]:
 
 
 def _parse_text(table: _Table, data: bytes, path: Path) -> Iterator[_Record]:
-    types = [float if field == "d" else str if field in "MN" else int for field in table.fields]
+    types: list[Callable[[str], Any]] = [
+        float if field == "d" else str if field in "MN" else int for field in table.fields
+    ]
     lines = iter(data.decode("utf-8", "surrogateescape").split("\n"))
     for line in (line.strip() for line in lines if line.strip() and not line.startswith("#")):
         words = line.split(maxsplit=len(types) - 1 if table.second_line else -1)
@@ -384,10 +386,16 @@ def _parse_text(table: _Table, data: bytes, path: Path) -> Iterator[_Record]:
         listed = next(lines, "").split() if table.second_line else words[len(types) :]
         try:
             head = tuple(parse(word) for parse, word in zip(types, words[: len(types)], strict=True))
-            yield head, _entries(table, listed)
-        except (ValueError, OverflowError) as error:
+            entries = _entries(table, listed)
+        except ValueError as error:
             reason = f"the line {shortened(line)!r} is not a record of {path.stem}"
             raise _damaged(path, reason) from error
+        except OverflowError:
+            entries = None
+        unsigned = [value for value, field in zip(head, table.fields, strict=True) if field in "IQB"]
+        if entries is None or min(unsigned) < 0:
+            raise _damaged(path, f"the line {shortened(line)!r} holds a number out of range")
+        yield head, entries
 
 
 def _entries(table: _Table, words: list[str]) -> NDArray[Any]:
