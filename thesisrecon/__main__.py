@@ -6,7 +6,7 @@ from thesisrecon.runtime.signals import install_signal_handlers
 
 
 def main() -> None:
-    """The entry point of the command; the rest is loaded when Ctrl-C is already obeyed."""
+    """Run the command; the rest is imported after the signal handlers are installed."""
     install_signal_handlers("thesisrecon")
     from thesisrecon.cli.main import main as run
 

@@ -284,7 +284,6 @@ class PipelineConfig:
     Parameters
     ----------
     images : ImageOptions
-        Image size.
     intrinsics : IntrinsicsOptions
         Prior knowledge of the cameras.
     features : Detector
@@ -298,7 +297,6 @@ class PipelineConfig:
     verification : Verifier
         Acceptance of pairs.
     tracks : TrackBuilder
-        Tracks.
     projective : ProjectiveReconstructor
         Projective reconstruction.
     selfcalibration : SelfCalibrator
@@ -403,7 +401,6 @@ def preset(name: Any) -> PipelineConfig:
     Returns
     -------
     PipelineConfig
-        The configuration.
 
     Raises
     ------
@@ -445,7 +442,6 @@ def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
     Parameters
     ----------
     config : PipelineConfig
-        The configuration.
 
     Returns
     -------
@@ -466,7 +462,6 @@ def toml_from_config(config: PipelineConfig) -> str:
     Parameters
     ----------
     config : PipelineConfig
-        The configuration.
 
     Returns
     -------
@@ -502,7 +497,6 @@ def config_from_toml(
     Returns
     -------
     PipelineConfig
-        The configuration.
 
     Raises
     ------
@@ -567,7 +561,6 @@ def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = 
     Returns
     -------
     PipelineConfig
-        The configuration.
 
     Raises
     ------

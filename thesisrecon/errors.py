@@ -30,7 +30,6 @@ def counted(number: int, noun: str, shown: str = "") -> str:
     Parameters
     ----------
     number : int
-        The number.
     noun : str
         Singular noun.
     shown : str

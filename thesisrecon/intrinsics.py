@@ -76,7 +76,6 @@ class IntrinsicsPrior:
         Returns
         -------
         IntrinsicsPrior
-            The prior.
         """
         shared = np.repeat(np.arange(len(mean))[:, None], mean.shape[1], axis=1)
         return cls(mean, std, shared, np.full(len(mean), -1) if kind is None else kind, spread)
@@ -246,7 +245,6 @@ def prior_from_options(
     Parameters
     ----------
     options : IntrinsicsOptions
-        The user's settings.
     original_sizes : sequence of (width, height)
         Sizes of the original images.
     exif_focal_px : ndarray (V,)
@@ -316,7 +314,6 @@ def check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, 
     Parameters
     ----------
     options : IntrinsicsOptions
-        The user's settings.
     original_sizes : sequence of (width, height)
         Sizes of the original images.
 
@@ -366,7 +363,6 @@ def prior_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
     Parameters
     ----------
     options : IntrinsicsOptions
-        The user's settings.
     exif_focal_px : ndarray (V,)
         Focal lengths from EXIF, NaN if missing.
 

@@ -33,7 +33,6 @@ def table_from_dataclass(value: Any) -> Table:
     Parameters
     ----------
     value : dataclass
-        The dataclass.
 
     Returns
     -------
@@ -59,7 +58,6 @@ def word_of(kind: type[Any]) -> str:
     Parameters
     ----------
     kind : type
-        The class.
 
     Returns
     -------
@@ -100,7 +98,6 @@ def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, ba
     Parameters
     ----------
     kind : type
-        The dataclass.
     table : mapping
         Field -> plain value.
     where : str
@@ -151,7 +148,6 @@ def coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
     Returns
     -------
     object
-        The value.
 
     Raises
     ------
@@ -235,7 +231,6 @@ def in_words(value: Any) -> str:
     Parameters
     ----------
     value : object
-        Any value.
 
     Returns
     -------
@@ -265,7 +260,6 @@ def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
     Returns
     -------
     UsageError
-        The error.
     """
     near = difflib.get_close_matches(key, names := list(names), n=3, cutoff=0.6)
     known = " or ".join(f"{where}.{name}" for name in near)
@@ -288,7 +282,6 @@ def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
     Returns
     -------
     str
-        The message.
 
     Examples
     --------
@@ -307,7 +300,6 @@ def parse_word(text: str) -> Any:
     Parameters
     ----------
     text : str
-        The value.
 
     Returns
     -------

@@ -91,7 +91,6 @@ class BundleAdjustment:
         Parameters
         ----------
         model : MetricEstimate
-            The model.
 
         Returns
         -------
@@ -124,7 +123,6 @@ class BundleAdjustment:
         Parameters
         ----------
         model : MetricEstimate
-            The model.
 
         Returns
         -------
@@ -163,7 +161,7 @@ class BundleAdjustment:
         result = refine_metric_bundle(
             model.cameras,
             model.X,
-            inlier_observations(model),
+            _inlier_observations(model),
             free=moves if free is None else moves & free,
             prior=prior,
             options=self.options(model, iterations=iterations),
@@ -171,7 +169,7 @@ class BundleAdjustment:
         norms = np.linalg.norm(result.residual_px, axis=1)
         sigma = max(noise_from_distances(norms), self.noise_floor_px)
         model = replace(model, cameras=result.cameras, X=result.X, sigma_px=sigma)
-        loss = best_loss(result.residual_px, sigma)
+        loss = _best_loss(result.residual_px, sigma)
         return replace(model, loss_sigmas=loss, tail=tail_width(norms, sigma)), result
 
     def scatter(self, model: MetricEstimate) -> BlockScatter:
@@ -180,7 +178,6 @@ class BundleAdjustment:
         Parameters
         ----------
         model : MetricEstimate
-            An adjusted model.
 
         Returns
         -------
@@ -190,7 +187,7 @@ class BundleAdjustment:
         return block_scatter(
             model.cameras,
             model.X,
-            inlier_observations(model),
+            _inlier_observations(model),
             free=self.free(model),
             prior=self.row_prior(model),
             noise=(self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px),
@@ -204,24 +201,8 @@ class BundleAdjustment:
         return np.asarray(views[lens] >= MIN_VIEWS_PER_LENS)
 
 
-def inlier_observations(model: MetricEstimate) -> Observations:
-    """Return the inlier observations.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        The model.
-
-    Returns
-    -------
-    Observations
-        Table of the inliers.
-
-    Raises
-    ------
-    StageFailure
-        If there are fewer than ``MIN_OBSERVATIONS``.
-    """
+def _inlier_observations(model: MetricEstimate) -> Observations:
+    """Return the inlier observations."""
     t, k = model.tracks, np.flatnonzero(model.inlier)
     if len(k) < MIN_OBSERVATIONS:
         raise StageFailure(
@@ -233,21 +214,8 @@ def inlier_observations(model: MetricEstimate) -> Observations:
     return Observations(t.view_index[k], t.point_index[k], t.xy[k])
 
 
-def best_loss(residual_px: F64, sigma: float) -> float:
-    """Return the width of Huber's loss with the least predicted variance.
-
-    Parameters
-    ----------
-    residual_px : ndarray (K, 2)
-        Residuals.
-    sigma : float
-        Their noise (px).
-
-    Returns
-    -------
-    float
-        Width in sigmas.
-    """
+def _best_loss(residual_px: F64, sigma: float) -> float:
+    """Return the width of Huber's loss with the least predicted variance."""
     width = best_huber_width(np.abs(residual_px).ravel(), sigma)
     return min(width / sigma, MAX_LOSS_SIGMAS)
 

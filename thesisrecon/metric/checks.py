@@ -65,14 +65,12 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     Parameters
     ----------
     model : MetricEstimate
-        The final model.
     sigmas : float
         Gate of inliers in noise sigmas.
 
     Returns
     -------
     PerViewChecks
-        The measurements.
     """
     t = model.tracks
     n = t.n_views
@@ -86,7 +84,7 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
         _share(t.view_index, agree, near, n),
         _share(t.view_index, agree, near & fixed, n),
         _share(t.view_index, depth <= 0, known, n),
-        noise_per_view(model, agree),
+        _noise_per_view(model, agree),
         *(np.array(column) for column in zip(*own, strict=True)),
     )
 
@@ -97,7 +95,6 @@ def triangulable_observations(model: MetricEstimate) -> B8:
     Parameters
     ----------
     model : MetricEstimate
-        The model.
 
     Returns
     -------
@@ -138,25 +135,8 @@ def _fixed_by_others(model: MetricEstimate, agree: B8) -> B8:
     return np.asarray(count[t.point_index] - agree >= 2)
 
 
-def noise_per_view(model: MetricEstimate, agree: B8) -> F64:
-    """Estimate the noise of one coordinate in each view.
-
-    A point seen by few views is fitted to their noise. Each residual is therefore divided by the root of its
-    redundancy 1 - (B V^-1 B')_cc, the share of its variance that is left after fitting the point, with
-    B = dx / dX and V = sum B'B.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        The model.
-    agree : ndarray (K,) of bool
-        Inlier observations.
-
-    Returns
-    -------
-    ndarray (V,)
-        Noise (px), NaN with fewer than ``MIN_OBSERVATIONS`` coordinates.
-    """
+def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
+    """Estimate the noise of one coordinate in each view."""
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero(agree)
     view, point = t.view_index[k], t.point_index[k]
@@ -240,7 +220,6 @@ def self_check(
     Parameters
     ----------
     model : MetricEstimate
-        The final model.
     calibration : SelfCalibration
         The self-calibration it came from.
     intervals : sequence of mapping

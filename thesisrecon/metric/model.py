@@ -25,7 +25,6 @@ class MetricEstimate:
     Attributes
     ----------
     tracks : Tracks
-        All K observations.
     sizes : ndarray (V, 2)
         Image sizes (width, height).
     cameras : MetricCameras
@@ -75,7 +74,6 @@ class MetricEstimate:
         Returns
         -------
         MetricEstimate
-            The copy.
         """
         return replace(
             self, cameras=cameras, registered=self.registered if registered is None else registered
@@ -90,7 +88,6 @@ def reproject_observations(cameras: MetricCameras, X: F64, view: I64, point: I64
     cameras : MetricCameras
         Cameras of all views.
     X : ndarray (N, 3)
-        Points.
     view, point : ndarray (K,) of int
         View and point of each observation.
 
@@ -248,7 +245,6 @@ def residual_norms(model: MetricEstimate) -> F64:
     Parameters
     ----------
     model : MetricEstimate
-        The model.
 
     Returns
     -------
@@ -269,7 +265,6 @@ def truncated_cost(model: MetricEstimate, gate_px: float) -> float:
     Parameters
     ----------
     model : MetricEstimate
-        The model.
     gate_px : float
         Truncation in pixels.
 
@@ -289,7 +284,6 @@ def inlier_ratios(model: MetricEstimate) -> F64:
     Parameters
     ----------
     model : MetricEstimate
-        The model.
 
     Returns
     -------

@@ -108,7 +108,6 @@ class MetricRefinement:
         prior : IntrinsicsPrior
             Prior of the views.
         rng : numpy.random.Generator
-            Random numbers.
 
         Returns
         -------

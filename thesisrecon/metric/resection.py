@@ -32,13 +32,11 @@ def resect_calibrated(
     Parameters
     ----------
     X : ndarray (M, 3)
-        Points.
     normalized : ndarray (M, 2)
         Their normalised image points.
     threshold : float
         Inlier threshold in the same unit.
     rng : numpy.random.Generator
-        Random numbers.
     samples : int
         Number of three-point samples.
 
@@ -68,7 +66,7 @@ def _squared(R: F64, t: F64, X: F64, xy: F64) -> F64:
     return np.where((Y[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
 
 
-def register_missing_cameras(
+def _register_missing_cameras(
     model: MetricEstimate,
     *,
     sigmas: float,
@@ -76,31 +74,7 @@ def register_missing_cameras(
     rng: np.random.Generator,
     allowed: B8 | None = None,
 ) -> tuple[MetricEstimate, dict[int, str]]:
-    """Register every view that sees enough of the model by calibrated resection.
-
-    Views are tried in order of their number of points. Shared intrinsics are kept; a focal length that no
-    registered view shares is refined with the pose.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        The model.
-    sigmas : float
-        Gate in noise sigmas.
-    min_points : int
-        Smallest number of points and inliers.
-    rng : numpy.random.Generator
-        Random numbers.
-    allowed : ndarray (V,) of bool, optional
-        Views that may be registered; None: all.
-
-    Returns
-    -------
-    model : MetricEstimate
-        The model with the new cameras.
-    rejected : dict
-        View -> reason for every view that was not registered.
-    """
+    """Register every view that sees enough of the model by calibrated resection."""
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
     rejected: dict[int, str] = {}
@@ -205,9 +179,7 @@ class MissingCameraRegistration:
         model : MetricEstimate
             The upgraded core.
         adjustment : BundleAdjustment
-            Settings of the adjustments.
         rng : numpy.random.Generator
-            Random numbers.
 
         Returns
         -------
@@ -232,7 +204,7 @@ class MissingCameraRegistration:
         share = 0.0
         for n in range(MAX_ROUNDS):
             before = int(model.registered.sum())
-            model, rejected = register_missing_cameras(
+            model, rejected = _register_missing_cameras(
                 model, sigmas=early, min_points=self.min_points, rng=rng, allowed=allowed
             )
             joined = int(model.registered.sum()) > before

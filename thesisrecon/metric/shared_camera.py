@@ -29,19 +29,8 @@ ITERATIONS = 30
 """A deformed model lies in a long valley of the cost: a dozen iterations do not suffice."""
 
 
-def subsample_inliers(model: MetricEstimate) -> I64:
-    """Return the inliers of every n-th point, at most about ``MAX_OBSERVATIONS``.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        The model.
-
-    Returns
-    -------
-    ndarray of int
-        Numbers of observations.
-    """
+def _subsample_inliers(model: MetricEstimate) -> I64:
+    """Return the inliers of every n-th point, at most about ``MAX_OBSERVATIONS``."""
     index = np.flatnonzero(model.inlier)
     point = model.tracks.point_index[index]
     chosen = np.zeros(model.tracks.n_points, dtype=bool)
@@ -50,18 +39,8 @@ def subsample_inliers(model: MetricEstimate) -> I64:
 
 
 @dataclass(frozen=True)
-class PerViewFit:
-    """Bundle adjustments of the registered views with own intrinsics per view.
-
-    Attributes
-    ----------
-    model : MetricEstimate
-        The model.
-    adjustment : BundleAdjustment
-        Its settings.
-    views : ndarray of int
-        Registered views; rows of the results are in this order.
-    """
+class _PerViewFit:
+    """Bundle adjustments of the registered views with own intrinsics per view."""
 
     model: MetricEstimate
     adjustment: BundleAdjustment
@@ -83,7 +62,7 @@ class PerViewFit:
             The adjustment with covariances.
         """
         model, views, adjustment = self.model, self.views, replace(self.adjustment, hierarchical=None)
-        t, cameras, index = model.tracks, model.cameras, subsample_inliers(model)
+        t, cameras, index = model.tracks, model.cameras, _subsample_inliers(model)
         assert cameras.shared is not None
         rows = cameras.group[views]
         shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
@@ -160,9 +139,7 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
     Parameters
     ----------
     model : MetricEstimate
-        The final model.
     adjustment : BundleAdjustment
-        Its settings.
 
     Returns
     -------
@@ -174,7 +151,7 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
     focals, centres = _sets(model, adjustment, views, FOCAL), _sets(model, adjustment, views, CENTRE[0])
     if not focals and not centres:
         return SharedCameraTest((), (), focal_std)
-    fit = PerViewFit(model, adjustment, views)
+    fit = _PerViewFit(model, adjustment, views)
     freed: tuple[int, ...] = (FOCAL,) if focals else ()
     before, failed_checks, warnings = fit.adjusted(()), list[str](), list[str]()
     if focals:
@@ -231,7 +208,7 @@ def _focals_apart(alone: MetricBundleResult, s: _Set) -> bool:
     return bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE)
 
 
-def _std_of_a_kind(model: MetricEstimate, fit: PerViewFit, s: _Set) -> float:
+def _std_of_a_kind(model: MetricEstimate, fit: _PerViewFit, s: _Set) -> float:
     """Relative standard deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
     # Standard deviations are inflated afterwards, the assumed scatter must not be.
     scattered = fit.adjusted((FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
@@ -295,9 +272,7 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustmen
     Parameters
     ----------
     model : MetricEstimate
-        The final model.
     adjustment : BundleAdjustment
-        Its settings.
 
     Returns
     -------
@@ -336,9 +311,7 @@ def inconsistent_principal_point(
     Parameters
     ----------
     model : MetricEstimate
-        The final model.
     adjustment : BundleAdjustment
-        Its settings.
     scatter : BlockScatter
         Scatter of the last adjustment.
 
@@ -378,7 +351,7 @@ def _numbers_when_free(model: MetricEstimate, adjustment: BundleAdjustment) -> I
 def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment, number: I64) -> tuple[F64, F64]:
     """Focals (V,) and relative standard deviations (V,) without prior; equal ``number``: shared."""
     t, cameras = model.tracks, model.cameras
-    index = subsample_inliers(model)
+    index = _subsample_inliers(model)
     assert cameras.shared is not None
     shared = cameras.shared.copy()
     shared[:, FOCAL] = number

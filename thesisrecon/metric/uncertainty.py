@@ -56,26 +56,8 @@ def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
     return max(float(np.clip((value - low) / (high - low), 0.0, 1.0)) for value, (low, high) in measured)
 
 
-def std_floor(model: MetricEstimate, scatter: BlockScatter, floor_rel: float) -> F64:
-    """Return the lower bound of the standard deviations due to model error.
-
-    A value that one image determines alone has a higher floor than one shared by all, by the square root of
-    the ratio of their standard deviations (lens errors are common, matching errors are not).
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        The model.
-    scatter : BlockScatter
-        Scatter of its last adjustment.
-    floor_rel : float
-        Floor of a camera shared by all images, relative to the focal length; k1 has the same.
-
-    Returns
-    -------
-    ndarray (G, 8)
-        Standard deviations (relative for the focal).
-    """
+def _std_floor(model: MetricEstimate, scatter: BlockScatter, floor_rel: float) -> F64:
+    """Return the lower bound of the standard deviations due to model error."""
     with np.errstate(divide="ignore", invalid="ignore"):
         alone = np.maximum(np.nan_to_num(scatter.variance / scatter.shared_variance), 1.0) ** 0.25
     units = np.ones_like(model.cameras.intrinsics)
@@ -126,7 +108,6 @@ def per_camera_estimates(
     model : MetricEstimate
         The model, adjusted without hierarchical prior.
     adjustment : BundleAdjustment
-        Its settings.
     scatter : BlockScatter
         Scatter of the adjustment.
     floor_rel : float
@@ -146,7 +127,7 @@ def per_camera_estimates(
     inflation = np.sqrt(np.maximum(scatter.median_ratio, 1.0))
     kind = np.where(registered, kind, -1)
     std = inflation * np.sqrt(np.maximum(scatter.variance, 0.0))
-    return PerCameraEstimates(value, std, std_floor(model, scatter, floor_rel), kind)
+    return PerCameraEstimates(value, std, _std_floor(model, scatter, floor_rel), kind)
 
 
 def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> HierarchicalPrior | None:
@@ -240,18 +221,14 @@ def apply_hierarchical_prior(
     Parameters
     ----------
     model : MetricEstimate
-        The model.
     adjustment : BundleAdjustment
-        Its settings.
     hierarchical : HierarchicalPrior
-        The prior.
 
     Returns
     -------
     model : MetricEstimate
         The model with new sharing.
     adjustment : BundleAdjustment
-        The settings with the prior.
     """
     assert model.cameras.shared is not None
     shared = model.cameras.shared.copy()
@@ -284,7 +261,6 @@ class FocalShrinkage:
         Parameters
         ----------
         view : int
-            The view.
         std : float
             Relative standard deviation stated for its focal length.
 
@@ -376,7 +352,6 @@ def intrinsic_intervals(
     Parameters
     ----------
     model : MetricEstimate
-        The final model.
     scatter : BlockScatter
         Scatter of its last adjustment.
     prior : IntrinsicsPrior
@@ -393,7 +368,7 @@ def intrinsic_intervals(
     tuple of mapping
         Per view the entries of ``MetricResult.intrinsics``; empty where not registered.
     """
-    floors = std_floor(model, scatter, floor_rel)
+    floors = _std_floor(model, scatter, floor_rel)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for view in range(len(model.registered)):
         if not model.registered[view]:
@@ -411,6 +386,8 @@ def intrinsic_intervals(
             measured = float(inflation * np.sqrt(variance))
             std = min(float(np.hypot(measured, floor)), float(prior.std[g, column]))
             how = _source(measured, floor, inflation * noise_inflation)
+            if column == FOCAL and floor > measured:
+                how += f" of {floor:.1%}"
             if column == FOCAL and shrinkage.is_shrunk(view, std):
                 how = (
                     "shrunk towards the other cameras of its kind; own matches alone: "
@@ -437,7 +414,6 @@ def widen_unverified_focals(
     Returns
     -------
     tuple of mapping
-        The new intervals.
     """
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own, rel in zip(intervals, focal_std, strict=True):

@@ -62,9 +62,7 @@ def detect_features(config: PipelineConfig, image: Image) -> Features:
     Parameters
     ----------
     config : PipelineConfig
-        Settings.
     image : Image
-        The image.
 
     Returns
     -------
@@ -188,7 +186,6 @@ def match_pair(
     config : PipelineConfig, optional
         Settings; None: the preset ``default``.
     seed : int
-        Random seed.
 
     Returns
     -------
@@ -228,13 +225,11 @@ def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int,
     Parameters
     ----------
     config : PipelineConfig
-        Settings.
     view1, view2 : object
         Views prepared by ``config.matching``.
     pair : tuple of int
         Their numbers.
     seed : int
-        Random seed.
 
     Returns
     -------

@@ -81,7 +81,6 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
     Parameters
     ----------
     run : Run
-        The run.
     result : RunResult
         Its results.
     until : str

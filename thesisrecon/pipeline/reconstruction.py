@@ -12,7 +12,7 @@ from thesisrecon.io.images import ImageSet, ImageSource, list_images, read_image
 from thesisrecon.pipeline.cameras import reconstruct_metric, reconstruct_projective
 from thesisrecon.pipeline.features_to_tracks import build_tracks, find_features, match_pairs, select_pairs
 from thesisrecon.pipeline.outputs import RESULT_FILES, write_outputs
-from thesisrecon.pipeline.state import PipelineState
+from thesisrecon.pipeline.state import PipelineState, name_images
 from thesisrecon.pipeline.surface import build_model, estimate_depth_maps
 from thesisrecon.records import RunResult
 from thesisrecon.runtime.run import Progress, Run, RunOptions, start_run
@@ -99,8 +99,10 @@ def reconstruct(
             state.require_images()
             _run_steps(state, surface_required=options.get("until") is not None)
         except StageFailure as failure:
+            parts = (failure.reason, failure.evidence, failure.advice)
+            failure = StageFailure(*(name_images(part, state.names) for part in parts))
             write_outputs(run, state.result, until=until, failure=failure)
-            raise
+            raise failure from None
         return write_outputs(run, state.result, until=until, failure=None)
 
 

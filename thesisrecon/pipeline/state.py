@@ -88,12 +88,10 @@ class PreparedViews(Sequence[Any]):
         Parameters
         ----------
         views : iterable of int
-            The views.
 
         Returns
         -------
         PreparedViews
-            The subset.
         """
         return PreparedViews(self._matching, {view: self._given[view] for view in views})
 
@@ -227,4 +225,7 @@ def name_images(text: str, names: Sequence[str]) -> str:
     >>> name_images("Images #0 and #2: too few inliers", ["a.jpg", "b.jpg", "c.jpg"])
     'Images a.jpg and c.jpg: too few inliers'
     """
-    return re.sub(r"#(\d+)", lambda m: names[int(m[1])] if int(m[1]) < len(names) else m[0], text)
+    # A file name such as "a #1.jpg" in the sentence is left alone.
+    return re.sub(
+        r"(?<![^\s(])#(\d+)(?!\.?\w)", lambda m: names[int(m[1])] if int(m[1]) < len(names) else m[0], text
+    )

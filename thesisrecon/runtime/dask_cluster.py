@@ -73,7 +73,6 @@ class Cluster:
     address : str
         HOST:PORT.
     client : distributed.Client
-        The connection.
     executor : concurrent.futures.Executor
         Its executor.
     """
@@ -117,7 +116,6 @@ class Cluster:
         Returns
         -------
         WorkersLost
-            The error.
         """
         return WorkersLost(f"the Dask scheduler at {self.address} is gone")
 
@@ -142,7 +140,6 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
     Yields
     ------
     Cluster
-        The connection.
 
     Raises
     ------

@@ -104,7 +104,6 @@ def read_record(path: Path, key: str) -> Any:
     Parameters
     ----------
     path : Path
-        Its file.
     key : str
         The expected key.
 

@@ -76,14 +76,12 @@ def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
     seed : int
         Seed of the run.
     stage : str
-        Name of the stage.
     *ids : int
         Numbers of the task, such as view or pair.
 
     Returns
     -------
     numpy.random.Generator
-        The generator.
 
     Examples
     --------
@@ -110,11 +108,8 @@ class Run:
     Attributes
     ----------
     config : PipelineConfig
-        Settings.
     seed : int
-        Random seed.
     workers : Workers
-        The workers.
     directory : RunDirectory
         Output folder.
     progress : callable
@@ -155,7 +150,6 @@ class Run:
         Parameters
         ----------
         stage : str
-            Name of the stage.
 
         Yields
         ------
@@ -199,7 +193,6 @@ class Run:
         Returns
         -------
         object
-            The record.
         """
         with self.clock(stage) as log:
             log.keys[item] = key
@@ -240,7 +233,6 @@ class Run:
         Parameters
         ----------
         stage : str
-            Name of the stage.
         keys : mapping
             Item -> key.
         function : callable
@@ -287,7 +279,6 @@ class Run:
         Parameters
         ----------
         stage : str
-            Name of the stage.
 
         Raises
         ------
@@ -329,7 +320,6 @@ class Run:
         Parameters
         ----------
         stage : str
-            Name of the stage.
         counts, metrics : mapping
             Name -> number.
         warnings : sequence of str
@@ -360,14 +350,12 @@ class Run:
         Parameters
         ----------
         stage : str
-            Name of the stage.
         *parts : object
             Everything the item depends on: settings, code and inputs.
 
         Returns
         -------
         str
-            The key.
         """
         return key_of(FOLDERS[stage], *parts)
 
@@ -382,9 +370,7 @@ def start_run(
     out : path
         Output folder.
     config : PipelineConfig
-        Settings.
     seed : int
-        Random seed.
     progress : callable or None
         See :data:`Progress`.
     options : mapping
@@ -395,7 +381,6 @@ def start_run(
     until : str
         Last stage.
     run : Run
-        The run.
     overwrite : bool
         Whether another run may be replaced.
 

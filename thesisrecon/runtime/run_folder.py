@@ -106,7 +106,6 @@ class StageFolder:
     Parameters
     ----------
     path : Path
-        The folder.
     shared : Path, optional
         Folder of results of several runs, named by their keys.
     """
@@ -156,7 +155,6 @@ class StageFolder:
         item, key : str
             Name and key of the item.
         record : object
-            The record.
         """
         own = self.path / f"{item}.npz"
         write_atomically(own, bytes_from_record(record, key))
@@ -171,7 +169,6 @@ class StageFolder:
         report : StageReport
             Report of the stage.
         settings : mapping
-            Its settings.
         keys : mapping
             Item -> key.
 
@@ -228,7 +225,6 @@ class RunDirectory:
     Parameters
     ----------
     path : Path
-        The folder.
     shared : Path, optional
         Folder of results shared with other runs.
     """
@@ -247,7 +243,6 @@ class RunDirectory:
         Returns
         -------
         StageFolder
-            The folder.
         """
         return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
 
