@@ -36,7 +36,7 @@ KNEE = 0.25
 PRIOR = (100.0, 5.0)
 # Smallest width of the loss in units of the frame, for matches without noise.
 EXACT = 1e-9
-# Searches that share the minimum number of samples; one of them sees a sample without outliers.
+# Searches that share the minimum number of samples; one of them draws a sample without outliers.
 SEARCHES = 6
 # Sums of truncated squares of N matches that differ by less than this times sqrt(N) are of one minimum.
 SAME_SCORE = 0.03
@@ -72,7 +72,7 @@ class LocallyOptimisedRansac:
     threshold_px : float
         Sampson distance of an inlier during the search.
     confidence : float
-        Probability that one of six searches sees a sample without outliers.
+        Probability that one of six searches draws a sample without outliers.
     starts : int
         Number of searches that must end at the same score.
     max_starts : int

@@ -1,4 +1,4 @@
-"""Section 5.5: the covariance of F, what it means for epipolar lines and epipoles, and its lower bound."""
+"""Section 5.5: covariance of F, of epipolar lines and of epipoles, and its lower bound."""
 
 from __future__ import annotations
 
