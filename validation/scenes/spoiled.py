@@ -57,7 +57,9 @@ def _placed(model: MetricEstimate, R: F64, C: F64) -> MetricEstimate:
     return model.with_cameras(replace(model.cameras, R=R, t=t))
 
 
-def move_cameras(model: MetricEstimate, rng: np.random.Generator, views: I64, degrees: float) -> MetricEstimate:
+def move_cameras(
+    model: MetricEstimate, rng: np.random.Generator, views: I64, degrees: float
+) -> MetricEstimate:
     """Views turned by up to ``degrees`` (at least a quarter) and moved by a fifth to a half of the path."""
     R, C = model.cameras.R.copy(), centres(model)
     for v in views:

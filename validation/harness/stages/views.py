@@ -130,7 +130,7 @@ def _model(
     """A model with colours; ours leaves its ``surface`` for the methods that start from it."""
     if method == OURS:
         surface_model = SurfaceModel().surface_of(maps)
-        np.savez(surface, vertices=surface_model.vertices, faces=without_texture.faces)
+        np.savez(surface, vertices=surface_model.vertices, faces=surface_model.faces)
         return SurfaceModel().color(surface_model, views)
     if method == SINGLE:
         return TextureAtlas(painter=SeamLeveledTexture()).texture(_read_surface(surface), views)
