@@ -243,8 +243,8 @@ class InterpolatedPair:
 
     Each pixel of either image moves along its row by a share of its disparity and out of the rectified frame
     in one step, so that colours are sampled once. Nearer pixels occlude farther ones, which also handles
-    violations of monotonicity. What only one image shows is taken from it, with the disparity of the adjacent
-    background; what neither shows is filled from behind.
+    violations of monotonicity. A pixel seen in one image only is taken from it, with the disparity of the adjacent
+    background; a pixel seen in neither is filled from behind.
 
     Parameters
     ----------

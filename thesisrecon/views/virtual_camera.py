@@ -198,7 +198,7 @@ def pair_from_fundamental(
 
     The fundamental matrix of the result is F exactly. The first camera has K1; of all second cameras
     that F allows, the left part is nearest to K2 R K1^-1 (least squares in coordinates of K2 and K1)
-    with R from the essential matrix. Its intrinsics differ from K2 as far as F contradicts them.
+    with R from the essential matrix. Its intrinsics differ from K2 where F contradicts them.
 
     Parameters
     ----------
