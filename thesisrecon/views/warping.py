@@ -1,7 +1,8 @@
 """Forward warping of an image, nearer pixels in front (thesis, sections 1.2 and 1.3).
 
 McMillan and Bishop (1995) order the pixels so that nearer ones overwrite farther ones. Here the inverse
-depth of each pixel is compared, which gives the same image in any order. Each kernel has a NumPy twin in the tests.
+depth of each pixel is compared, which gives the same image in any order. Each kernel has a NumPy
+twin in the tests.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def _draw_footprint(
     n_down = _slope(target, inverse_depth, at, (1, 0), limits, down)
     if n_across == 2 and n_down == 2:
         return
-    # A pixel without neighbours keeps its shape, as far as it is known.
+    # A pixel without neighbours keeps its known shape.
     if n_across == 0:
         across[0], across[1] = (down[1], -down[0]) if n_down else (1.0, 0.0)
     if n_down == 0:
