@@ -11,7 +11,7 @@ import thesisrecon
 from tests import fake_stages as fakes
 from tests.synthetic import reconstruction_of
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io.exports import _original_from_working
 from thesisrecon.records import Image, TexturedMesh, Tracks
@@ -126,9 +126,9 @@ def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path):
         PIL.Image.fromarray(image).save(tmp_path / f"{name}.png")
     again = thesisrecon.match_rectified(tmp_path / "left.png", tmp_path / "right.png", max_disparity_px=12)
     np.testing.assert_array_equal(again.disparity, found.disparity)
-    with pytest.raises(StageFailure, match="nothing"):
+    with pytest.raises(UsageError, match="nothing"):
         thesisrecon.match_rectified(tmp_path / "nothing.png", right, max_disparity_px=12)
-    with pytest.raises(ValueError, match="one shape"):
+    with pytest.raises(ValueError, match="same shape"):
         thesisrecon.match_rectified(left, right[:-2], max_disparity_px=12)
 
 

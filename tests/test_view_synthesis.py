@@ -66,7 +66,7 @@ def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
         thesisrecon.synthesize_view("no.jpg", "file.jpg", -np.eye(3), np.zeros(3))
     with pytest.raises(ValueError, match="three finite"):
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), [0.0, 1.0])
-    with pytest.raises(ValueError, match="K is"):
+    with pytest.raises(ValueError, match="K must be"):
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3), K=np.eye(4))
     with pytest.raises(UsageError, match=r"there is no image file no\.jpg"):
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3))

@@ -68,6 +68,8 @@ def match_rectified(
 
     Raises
     ------
+    UsageError
+        If a file does not exist.
     StageFailure
         If a file cannot be read.
     ValueError

@@ -195,6 +195,8 @@ def match_pair(
 
     Raises
     ------
+    UsageError
+        If a file does not exist.
     StageFailure
         If an image cannot be read or the images do not match.
 
