@@ -1,9 +1,5 @@
 """The studies of chapter 5 in small: what they claim of the methods holds, and their tables are whole."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,7 +10,7 @@ pytest.importorskip("pycolmap")
 from thesisrecon.errors import StageFailure
 from validation.scenes.cube import make_cube
 from validation.studies import epipolar_cube, epipolar_methods
-from validation.studies.epipolar_cube import BOUND, CubeRow, cube_pairs, run_cube
+from validation.studies.epipolar_cube import BOUND, cube_pairs, run_cube
 from validation.studies.epipolar_methods import (
     DEFAULT,
     GOLD,
@@ -40,35 +36,33 @@ CRITERIA = ("gradient (5.4)", "epipolar distance (5.6)", "gold standard")
 
 
 @pytest.fixture(scope="module")
-def clean() -> dict[str, Result]:
+def clean():
     """Every method at 1 px and 60 matches, 40 trials, by its label."""
     return {r.label: r for r in run_methods([Setting(1.0, 60)], METHODS, 40)}
 
 
 @pytest.fixture(scope="module")
-def cube() -> dict[tuple[str, float], CubeRow]:
+def cube():
     """The methods of the cube study on 12 of its pairs."""
     methods = [BY_NAME[name] for name in epipolar_cube.CUBE_METHODS]
     rows = run_cube(cube_pairs(make_cube())[::12], methods, (0.0, 0.5, 2.0))
     return {(r.method, r.sigma_px): r for r in rows}
 
 
-def test_the_gold_standard_is_at_the_bound_and_nothing_is_far_below_it(clean: dict[str, Result]) -> None:
+def test_the_gold_standard_is_at_the_bound_and_nothing_is_far_below_it(clean):
     assert clean[GOLD].rms_ratio < 1.15
     assert clean[f"{DEFAULT}, 3 sigma"].rms_ratio < 1.15
     assert min(r.rms_ratio for r in clean.values()) > 0.85
     assert all(r.failures == 0 and r.time_ms > 0.0 for r in clean.values())
 
 
-def test_normalised_pixels_are_better_than_raw_ones_and_a_criterion_better_than_both(
-    clean: dict[str, Result],
-) -> None:
+def test_normalised_pixels_are_better_than_raw_ones_and_a_criterion_better_than_both(clean):
     assert clean[GOLD].rms_ratio < clean[NORMALISED].rms_ratio < 0.5 * clean[RAW].rms_ratio
     assert clean[NORMALISED].rms_ratio == pytest.approx(clean["OpenCV FM_8POINT"].rms_ratio, rel=1e-3)
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)
-def test_both_parameterisations_reach_one_minimum(criterion: str) -> None:
+def test_both_parameterisations_reach_one_minimum(criterion):
     for seed in range(10):
         trial = make_trial(Setting(0.5, 50), seed)
         rows, orthonormal = (
@@ -80,7 +74,7 @@ def test_both_parameterisations_reach_one_minimum(criterion: str) -> None:
         assert min(np.linalg.norm(rows - s * orthonormal) for s in (1.0, -1.0)) < 1e-6
 
 
-def test_wrong_matches_are_for_robust_methods_alone() -> None:
+def test_wrong_matches_are_for_robust_methods_alone():
     setting = Setting(0.5, 100, 0.2)
     trial = make_trial(setting, 0)
     assert len(trial.xy1) == 100
@@ -94,8 +88,8 @@ def test_wrong_matches_are_for_robust_methods_alone() -> None:
     assert measure(BY_NAME[GOLD], [trial], setting).rms_ratio > 5.0
 
 
-def test_a_method_without_a_result_is_counted() -> None:
-    def refuse(*_: object) -> None:
+def test_a_method_without_a_result_is_counted():
+    def refuse(*_):
         raise StageFailure("no")
 
     result = measure(Method("none", refuse), [make_trial(Setting(1.0, 20), 0)], Setting(1.0, 20))
@@ -104,7 +98,7 @@ def test_a_method_without_a_result_is_counted() -> None:
     assert "1 none" in epipolar_methods.report([result])
 
 
-def test_results_are_kept_and_renewed(tmp_path: Path, clean: dict[str, Result]) -> None:
+def test_results_are_kept_and_renewed(tmp_path, clean):
     path = tmp_path / "new" / "results.json"
     write_results(path, list(clean.values()))
     assert read_results(path) == list(clean.values())
@@ -118,7 +112,7 @@ def test_results_are_kept_and_renewed(tmp_path: Path, clean: dict[str, Result]) 
     assert all(f"| {label} |" in table for label in clean)
 
 
-def test_pairs_of_the_cube_share_more_than_a_face() -> None:
+def test_pairs_of_the_cube_share_more_than_a_face():
     sequence = make_cube()
     pairs = cube_pairs(sequence)
     assert 100 < len(pairs) < 27 * 26 / 2
@@ -126,13 +120,13 @@ def test_pairs_of_the_cube_share_more_than_a_face() -> None:
         assert min(np.ptp(pair.X, axis=0)) > 0.5
 
 
-def test_perfect_projections_give_perfect_epipolar_lines(cube: dict[tuple[str, float], CubeRow]) -> None:
+def test_perfect_projections_give_perfect_epipolar_lines(cube):
     for name in epipolar_cube.CUBE_METHODS:
         assert cube[name, 0.0].worst_px < 1e-8
         assert cube[name, 0.0].failures == 0
 
 
-def test_the_cube_orders_the_methods(cube: dict[tuple[str, float], CubeRow]) -> None:
+def test_the_cube_orders_the_methods(cube):
     for sigma in (0.5, 2.0):
         gold, linear, raw = (cube[m, sigma] for m in (GOLD_FROM_DEFAULT, NORMALISED, RAW))
         assert gold.ratio < 1.25
@@ -144,7 +138,7 @@ def test_the_cube_orders_the_methods(cube: dict[tuple[str, float], CubeRow]) -> 
     assert cube["Algorithm 2, seven-point search alone", 2.0].ratio > 2.0
 
 
-def test_tables_and_plot_of_the_cube(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_and_plot_of_the_cube(tmp_path, capsys):
     some = ["--methods", NORMALISED, GOLD, "--every", "40", "--noise", "0", "1"]
     assert run_study("epipolar-cube", [*some, "-o", str(tmp_path)]) == 0
     text = (tmp_path / "epipolar-cube.md").read_text(encoding="utf-8")
@@ -155,9 +149,7 @@ def test_tables_and_plot_of_the_cube(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert 'src="http' not in page
 
 
-def test_the_command_states_if_the_bound_was_reached(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_states_if_the_bound_was_reached(tmp_path, capsys):
     out = tmp_path / "r.json"
     base = ["--trials", "30", "--points", "100", "--noise", "0.5", "--wrong", "0", "--results", str(out)]
     assert run_study("epipolar-methods", [*base, "--methods", NORMALISED]) == 0

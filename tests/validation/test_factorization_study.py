@@ -1,7 +1,5 @@
 """The study of factorisation in small: what its tables claim holds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

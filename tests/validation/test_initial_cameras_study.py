@@ -1,7 +1,5 @@
 """The study of the plane of the initial cameras in small."""
 
-from __future__ import annotations
-
 import pytest
 
 from validation.studies.projective import IDENTITY, KINDS, ROTATION, check_kind

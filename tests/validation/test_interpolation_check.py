@@ -1,7 +1,5 @@
 """The check of interpolated views: its cameras are right, and on real photographs its targets are reached."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,7 +14,7 @@ SIZE = (160, 120)
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[InterpolatedPair, tuple[np.ndarray, np.ndarray], np.ndarray]:
+def pair():
     """Two turned cameras, rectified; their photographs do not matter."""
     rng = np.random.default_rng(0)
     K = np.array([[150.0, 0.0, 82.0], [0.0, 150.0, 57.0], [0.0, 0.0, 1.0]])
@@ -32,9 +30,7 @@ def pair() -> tuple[InterpolatedPair, tuple[np.ndarray, np.ndarray], np.ndarray]
     return InterpolatedPair((image, image), H, nothing, nothing), (first, second), centres
 
 
-def test_points_are_seen_where_the_camera_between_sees_them(
-    pair: tuple[InterpolatedPair, tuple[np.ndarray, np.ndarray], np.ndarray],
-) -> None:
+def test_points_are_seen_where_the_camera_between_sees_them(pair):
     X = np.random.default_rng(1).uniform([-2, -2, 4], [2, 2, 9], (100, 3))
     found, P, centres = pair
     for s in (0.0, 0.2, 0.5, 1.0):
@@ -48,7 +44,7 @@ def test_points_are_seen_where_the_camera_between_sees_them(
     assert nearest_place(found, P, camera_centre_of(found, P, 0.37)) == pytest.approx(0.37)
 
 
-def test_pictures_are_turned_as_their_points_are() -> None:
+def test_pictures_are_turned_as_their_points_are():
     rng = np.random.default_rng(2)
     H = np.array([[1.02, 0.01, 3.0], [-0.02, 0.99, -2.0], [1e-5, 2e-5, 1.0]])
     xy = rng.uniform(0, 100, (80, 2))

@@ -1,9 +1,6 @@
 """Measures of depth maps, surfaces and views of the model on scenes with known truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,7 @@ except NoReference as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
 
-def courtyard_map(view: int, factor: float, std: float) -> DepthMap:
+def courtyard_map(view, factor, std):
     """The true depth of a view, ``factor`` times too far, in a world of half the size."""
     scene = load_fixture_scene("courtyard")
     assert scene.K is not None
@@ -35,7 +32,7 @@ def courtyard_map(view: int, factor: float, std: float) -> DepthMap:
     return DepthMap(view, P, wrong, np.full_like(wrong, std), np.ones(wrong.shape, np.uint8))
 
 
-def test_a_depth_that_is_too_far_is_measured() -> None:
+def test_a_depth_that_is_too_far_is_measured():
     scene = load_fixture_scene("courtyard")
     maps = {view: courtyard_map(view, 1.002, 0.01) for view in (0, 5, 9)}
     align = depth.true_from_maps(maps, scene)
@@ -53,7 +50,7 @@ def test_a_depth_that_is_too_far_is_measured() -> None:
         depth.together([])
 
 
-def test_depth_is_read_where_sparse_points_are_seen() -> None:
+def test_depth_is_read_where_sparse_points_are_seen():
     z = np.full((20, 30), 4.0, np.float32)
     z[:, 15:] = np.nan
     P = np.array([[10.0, 0.0, 15.0, 0.0], [0.0, 10.0, 10.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
@@ -71,7 +68,7 @@ def test_depth_is_read_where_sparse_points_are_seen() -> None:
     assert one.right == pytest.approx(1 / 3)
 
 
-def test_points_are_spread_evenly() -> None:
+def test_points_are_spread_evenly():
     vertices = np.array([[0.0, 0, 0], [4, 0, 0], [4, 1, 0], [0, 1, 0], [0, 0, 5], [1, 0, 5], [1, 1, 5]])
     mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]]))
     points = surfaces.points_on(mesh, 9000)
@@ -82,7 +79,7 @@ def test_points_are_spread_evenly() -> None:
     np.testing.assert_array_equal(points, surfaces.points_on(mesh, 9000))
 
 
-def test_expected_points_are_those_visible_in_two_images() -> None:
+def test_expected_points_are_those_visible_in_two_images():
     scene = load_fixture_scene("courtyard")
     assert scene.K is not None
     assert scene.R is not None
@@ -96,7 +93,7 @@ def test_expected_points_are_those_visible_in_two_images() -> None:
     assert count[3] == 0  # behind the wall
 
 
-def test_ours_is_held_against_the_grid_of_open3d() -> None:
+def test_ours_is_held_against_the_grid_of_open3d():
     near, far = np.full(10, 0.1), np.full(10, 0.7)
     judged = {surface_stage.OURS: (near, far), surface_stage.TSDF: (far, near), "missing": None}
     rows = {row.name: row for row in surface_stage._metrics("courtyard", judged)}
@@ -106,7 +103,7 @@ def test_ours_is_held_against_the_grid_of_open3d() -> None:
     assert rows["accuracy, mean"].values["missing"] is None
 
 
-def test_a_photograph_is_left_out(tmp_path: Path) -> None:
+def test_a_photograph_is_left_out(tmp_path):
     maps = {m.view: m for m in ring_of(12)}
     views = {i: photograph(m, 0.9 if i % 2 else 1.1) for i, m in maps.items()}
     others = [i for i in maps if i != 3]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -9,11 +7,11 @@ from validation.metrics.record import Metric, markdown_table
 from validation.studies.main_job import COLMAP, OURS, Outcome, check_reconstruction
 
 
-def _rows(scene: str, outcomes: dict[str, Outcome], *, n_views: int = V) -> dict[str, Metric]:
+def _rows(scene, outcomes, *, n_views=V):
     return {row.name: row for row in check_reconstruction(scene, n_views, _truth(), outcomes)}
 
 
-def test_rows_hold_both_methods_and_judge_ours() -> None:
+def test_rows_hold_both_methods_and_judge_ours():
     model = _reconstruction(_truth())
     ours, colmap = Outcome(model, 9.0, 500.0, 12.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0, 15.0)
     rows = _rows("fountain-P11", {OURS: ours, COLMAP: colmap})
@@ -27,7 +25,7 @@ def test_rows_hold_both_methods_and_judge_ours() -> None:
     assert rows["points"].verdict == "reported"
 
 
-def test_a_failure_misses_its_targets_and_breaks_nothing() -> None:
+def test_a_failure_misses_its_targets_and_breaks_nothing():
     failed = Outcome(None, 3.0, 100.0, 5.0, failure="no pair was found")
     rows = _rows(
         "fountain-P11", {OURS: failed, COLMAP: Outcome(_reconstruction(_truth()), 10.0, 300.0, 15.0)}
@@ -38,7 +36,7 @@ def test_a_failure_misses_its_targets_and_breaks_nothing() -> None:
     assert "| focal error, % | - |" in markdown_table(list(rows.values()))
 
 
-def test_kermit_may_miss_cameras_only_with_reasons() -> None:
+def test_kermit_may_miss_cameras_only_with_reasons():
     ours = Outcome(_reconstruction(_truth()), 3.0, 100.0, 5.0)
     few = {f"{n}.jpg": "too few points in common" for n in range(11 - V)}
     name = "cameras registered of 11"
@@ -53,5 +51,5 @@ def test_kermit_may_miss_cameras_only_with_reasons() -> None:
     ("value", "at_most", "verdict"),
     [(1.0, True, "reached"), (1.1, True, "missed"), (1.1, False, "reached"), (0.9, False, "missed")],
 )
-def test_a_target_has_a_side(value: float, at_most: bool, verdict: str) -> None:
+def test_a_target_has_a_side(value, at_most, verdict):
     assert Metric("s", "n", "", {"ours": value}, "ours", 1.0, at_most).verdict == verdict

@@ -1,7 +1,5 @@
 """The rectification check: OpenCV's homographies are rows too, and the table judges what it should."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The study of self-calibration: its scenes are what they say, its bound behaves as one, its tables count."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 
@@ -30,7 +28,7 @@ from validation.studies.selfcalibration import (
 
 @pytest.mark.parametrize("scene", ["cube", "cloud"])
 @pytest.mark.parametrize("mode", ["constant", "zooming"])
-def test_projective_cameras_of_exact_pixels_reproject_exactly(scene: str, mode: str) -> None:
+def test_projective_cameras_of_exact_pixels_reproject_exactly(scene, mode):
     rng = np.random.default_rng(0)
     rig = make_rig(Cell(scene, mode, 0.0, 6), rng)
     rec = projective_from_truth(rig, noisy_tracks(rig, 0.0, rng), rng)
@@ -44,7 +42,7 @@ def test_projective_cameras_of_exact_pixels_reproject_exactly(scene: str, mode: 
     assert assumptions(rig, mode).group.max() == (5 if mode == "zooming" else 0)
 
 
-def test_cameras_of_one_face_are_left_out_of_the_projective_stage() -> None:
+def test_cameras_of_one_face_are_left_out_of_the_projective_stage():
     rng, rig = np.random.default_rng(0), cube_rig()
     rec = projective_from_truth(rig, noisy_tracks(rig, 1.0, rng), rng)
     assert rig.flat is not None
@@ -53,7 +51,7 @@ def test_cameras_of_one_face_are_left_out_of_the_projective_stage() -> None:
     assert rec.sigma_px == pytest.approx(0.9, abs=0.1)
 
 
-def test_the_bound_grows_with_noise_and_shrinks_with_cameras_and_priors() -> None:
+def test_the_bound_grows_with_noise_and_shrinks_with_cameras_and_priors():
     rig = make_cloud(9, np.random.default_rng(1), points=80)
     std = focal_bound(rig, 1.0, zooming=False, principal_std_px=15.0)
     np.testing.assert_allclose(std, std[0])
@@ -68,7 +66,7 @@ def test_the_bound_grows_with_noise_and_shrinks_with_cameras_and_priors() -> Non
     np.testing.assert_allclose(focal_bound(scaled, 1.0, zooming=False, principal_std_px=15.0), std, rtol=1e-4)
 
 
-def test_a_cell_measures_every_method_on_the_same_draws(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_cell_measures_every_method_on_the_same_draws(tmp_path):
     cell = Cell("cloud", "constant", 0.0, 5)
     trials = run_cell(cell, ("scanned-quadric", "focal-scan", BOUND), range(2))
     assert [t.method for t in trials] == ["scanned-quadric", "focal-scan", BOUND] * 2
@@ -82,8 +80,8 @@ def test_a_cell_measures_every_method_on_the_same_draws(tmp_path) -> None:  # ty
     assert len(read_trials([file])) == len(trials)
 
 
-def test_refusals_count_as_failures_and_targets_are_judged() -> None:
-    def trial(seed: int, mode: str, median: float, worst: float) -> Trial:
+def test_refusals_count_as_failures_and_targets_are_judged():
+    def trial(seed, mode, median, worst):
         return Trial("cube", mode, 1.0, 27, seed, WITH_BUNDLE, median, worst, True, 1.0)
 
     some = [
@@ -97,14 +95,14 @@ def test_refusals_count_as_failures_and_targets_are_judged() -> None:
     assert "worst camera within 5 %, % of trials | 50 | >= 90 | missed" in text
 
 
-def test_cells_cross_at_one_pixel_and_the_most_cameras() -> None:
+def test_cells_cross_at_one_pixel_and_the_most_cameras():
     places = cells(["cube"], ["constant"], (0.5, 1.0, 2.0), (3, 27))
     assert [(c.sigma_px, c.views) for c in places] == [(0.5, 27), (1.0, 27), (2.0, 27), (1.0, 3)]
     whole = cells(["cube"], ["constant"], (0.5, 1.0), (3, 27), grid=True)
     assert [(c.sigma_px, c.views) for c in whole] == [(0.5, 3), (0.5, 27), (1.0, 3), (1.0, 27)]
 
 
-def test_the_report_crosses_at_one_pixel_and_adds_other_noises_over_cameras() -> None:
+def test_the_report_crosses_at_one_pixel_and_adds_other_noises_over_cameras():
     places = [(1.0, 3), (1.0, 27), (0.5, 3), (0.5, 27), (2.0, 27)]
     text = report([Trial("cloud", "zooming", s, v, 0, "focal-scan", 0.2, 6.0, True, 1.0) for s, v in places])
     cross, other = text.split("\n\n")

@@ -1,7 +1,5 @@
 """Dense matching of real pairs stays as good as it was measured to be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,17 +9,12 @@ from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
 from validation.studies.stereo import DEFAULT, THESIS, bad_pixels, check_pair
 
-LIMITS_PCT = {
-    "Tsukuba": (3.13, 4.1),
-    "Teddy": (8.4, 14.0),
-    "Cones": (4.1, 10.5),
-    "Motorcycle": (5.6, 16.0),
-}
+LIMITS_PCT = {"Tsukuba": (3.13, 4.1), "Teddy": (8.4, 14.0), "Cones": (4.1, 10.5), "Motorcycle": (5.6, 16.0)}
 """Of pixels off by more than one: OpenCV's better mode for the default, the literature's scanline program for
 the thesis variant (the motorcycle, which it has not: what was reached)."""
 
 
-def pair_or_skip(name: str) -> StereoPair:
+def pair_or_skip(name):
     pair = load_stereo_pair(name)
     if pair is None:
         pytest.skip(f"the pair {name} is not on this machine (THESISRECON_DATA, or scikit-image)")
@@ -30,7 +23,7 @@ def pair_or_skip(name: str) -> StereoPair:
 
 @pytest.mark.real
 @pytest.mark.parametrize("name", LIMITS_PCT)
-def test_real_pairs_are_matched_as_well_as_the_references_do(name: str) -> None:
+def test_real_pairs_are_matched_as_well_as_the_references_do(name):
     pair = pair_or_skip(name)
     limits = (0, pair.disparities - 1)
     for variant, limit in zip(
@@ -45,7 +38,7 @@ def test_real_pairs_are_matched_as_well_as_the_references_do(name: str) -> None:
         assert np.median(confidence[~wrong]) > np.median(confidence[wrong])
 
 
-def small_pair() -> StereoPair:
+def small_pair():
     """A textured plane at disparity 5, a nearer square at 9."""
     colors = [[texture(60, 120, 3 * kind + k) for k in range(3)] for kind in range(2)]
     base, square = (np.stack(channels, axis=2).astype(np.uint8) for channels in colors)
@@ -56,7 +49,7 @@ def small_pair() -> StereoPair:
     return StereoPair("small", left, right, truth, seen_by_both(truth, None), 16)
 
 
-def test_pixels_hidden_by_the_square_or_beyond_the_image_are_not_judged() -> None:
+def test_pixels_hidden_by_the_square_or_beyond_the_image_are_not_judged():
     judged = small_pair().judged
     assert not judged[:, :5].any()
     # At the left of the square lie the four columns of the plane that it covers in the right image.
@@ -65,7 +58,7 @@ def test_pixels_hidden_by_the_square_or_beyond_the_image_are_not_judged() -> Non
     assert judged[:20, 5:].all()
 
 
-def test_rows_of_a_pair_name_every_method() -> None:
+def test_rows_of_a_pair_name_every_method():
     rows, maps = check_pair(small_pair(), 1)
     off = rows[0]
     assert off.name == "off by more than 1 px"

@@ -1,7 +1,5 @@
 """Views by the trilinear tensor beside real photographs and rendered truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

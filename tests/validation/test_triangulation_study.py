@@ -1,7 +1,5 @@
 """The study of triangulation methods in small: what its tables claim holds."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("cv2")
