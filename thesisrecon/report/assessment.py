@@ -364,7 +364,20 @@ def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tupl
 
 
 def count_of(number: int, noun: str) -> str:
-    """Format a count with its noun: "1 file", "2 files"."""
+    """Format a count with its noun.
+
+    Parameters
+    ----------
+    number : int
+        The count.
+    noun : str
+        Singular noun.
+
+    Returns
+    -------
+    str
+        As "1 file" or "2 files".
+    """
     return counted(number, noun, grouped(number))
 
 
