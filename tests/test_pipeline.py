@@ -20,6 +20,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions, camera_groups, prior_warnings
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.pipeline.state import name_images
 from thesisrecon.records import Image
 from thesisrecon.runtime.executors import Workers
 from thesisrecon.runtime.run import stream
@@ -505,3 +506,12 @@ def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(
     with pytest.raises(UsageError, match=r"'9\.png', which is not among the 4 images"):
         run(tmp_path, config=fake_config(pairs=ListedPairs((("00.png", "9.png"),))))
     assert CALLS == []
+
+
+def test_sentences_name_images_by_file():
+    names = ["a.jpg", "b #0.jpg"]
+    assert name_images("Images #0 and #1: few inliers (image #0).", names) == (
+        "Images a.jpg and b #0.jpg: few inliers (image a.jpg)."
+    )
+    for kept in ("b #0.jpg is left out", "no image #7", "x#0", "#0b"):
+        assert name_images(kept, names) == kept
