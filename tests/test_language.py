@@ -4,7 +4,6 @@ import ast
 import io
 import re
 import tokenize
-from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -22,7 +21,7 @@ ODD_WORDS = re.compile(
 """Words and sentences that readers of the field would not use."""
 
 
-def strings_of(text: str) -> Iterator[tuple[int, str]]:
+def strings_of(text):
     """Yield all strings with spaces (messages and docstrings) and comments of a module, with their lines."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
@@ -32,7 +31,7 @@ def strings_of(text: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string.lstrip("# ")
 
 
-def offenders(path: Path) -> list[str]:
+def offenders(path):
     text = path.read_text(encoding="utf-8")
     pieces = strings_of(text) if path.suffix == ".py" else [(1, re.sub(r"(?s)```.*?```|`[^`\n]*`", "", text))]
     found = []
@@ -43,11 +42,11 @@ def offenders(path: Path) -> list[str]:
     return found
 
 
-def test_strings_comments_and_guides_are_plain_english() -> None:
+def test_strings_comments_and_guides_are_plain_english():
     assert [found for path in FILES for found in offenders(path)] == []
 
 
-def test_the_rule_finds_odd_sentences() -> None:
+def test_the_rule_finds_odd_sentences():
     assert ODD_WORDS.search("What no camera sees is left out.")
     assert ODD_WORDS.search("It is told what to do.")
     assert not ODD_WORDS.search("What is a view? Two views, one of which is recommended.")
