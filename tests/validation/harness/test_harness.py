@@ -169,8 +169,8 @@ def test_no_gate_without_its_reason(tmp_path):
         (["report", "-o", "OUT", "--scenes", "nowhere"], "no scene is called nowhere"),
         (["report", "-o", "OUT", "--images", "nowhere"], "the folder of images nowhere does not exist"),
         (["report", "-o", "OUT", "--against", "nowhere"], "nowhere holds no report to compare with"),
-        (["check", "-o", "OUT", "--threads", "0"], "more than zero"),
-        (["report", "-o", "OUT", "--max-side", "10"], "--max-side is at least 64 px"),
+        (["check", "-o", "OUT", "--threads", "0"], "must be positive"),
+        (["report", "-o", "OUT", "--max-side", "10"], "--max-side must be at least 64 px"),
     ],
 )
 def test_wrong_options_are_named(arguments, words, tmp_path, capsys):
