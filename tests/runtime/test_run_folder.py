@@ -423,7 +423,7 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
 
 
 def test_the_check_names_the_fault():
-    said = "thesisrecon: a cannot be written: no; make room there, then the same command goes on\n"
+    said = "thesisrecon: a cannot be written: no; free space there, then repeat the command\n"
     well = Refusal("file 1: No space left on device", 2, said, (), ())
     bad = Refusal("a disk of 3 KiB", 1, "Traceback\nOSError\n", ("points.ply",), ("model.glb",))
     assert well.wrong == ""
