@@ -241,6 +241,14 @@ def match_rectified(
     ------
     ValueError
         If the image shapes are invalid or differ, or max_disparity_px is negative or not finite.
+
+    Examples
+    --------
+    >>> blocks = np.random.default_rng(0).uniform(0.0, 255.0, (10, 20))
+    >>> right = np.kron(blocks, np.ones((4, 4)))
+    >>> found = match_rectified(np.roll(right, 5, axis=1), right, max_disparity_px=8)
+    >>> round(float(np.nanmedian(found.disparity)), 1)
+    5.0
     """
     if not 0.0 <= max_disparity_px < np.inf:
         raise ValueError(f"max_disparity_px must be finite and not negative; got {max_disparity_px}")
