@@ -55,14 +55,14 @@ def _compare_held_out(
     compared = covered_pixels(rendered) & view.seen
     if not compared.any():
         return None
-    picture = match_exposure(view.rgb, rendered.color, compared)
+    matched = match_exposure(view.rgb, rendered.color, compared)
     return HeldOut(
         view.view,
         view.rgb,
-        picture,
+        matched,
         compared,
-        psnr_db(view.rgb, picture, compared),
-        ssim(view.rgb, picture, compared),
+        psnr_db(view.rgb, matched, compared),
+        ssim(view.rgb, matched, compared),
     )
 
 
