@@ -76,7 +76,7 @@ class Setting:
             cost[v, u] = self.cost(u, v, planes[v, u].astype(float))
         return cost
 
-    def final_confidence(self, planes, accepted):
+    def rate(self, planes, accepted):
         """Least cost, support and slope (H, W)."""
         least, support, slope = np.full(self.gray.shape, UNKNOWN), np.zeros(self.gray.shape, int), None
         slope = np.zeros(self.gray.shape)
