@@ -1,1 +1,1 @@
-"""Cross-checks of thesisrecon against reference tools and truth."""
+"""Validation of thesisrecon against ground truth and reference programs."""

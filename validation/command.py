@@ -17,7 +17,7 @@ from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
 from validation.harness.process import own_cores
-from validation.harness.records import Wishes
+from validation.harness.records import ReportOptions
 from validation.harness.results import Results, collect, compare, read_results, write_results
 from validation.harness.scenes import load_photographs
 from validation.harness.schedule import run_tasks
@@ -29,35 +29,35 @@ LEAST_SIDE_PX = 64
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command: 0 if all is well, 1 if a gate or a bound is missed, 2 for a wrong option."""
-    options = _parser().parse_args(arguments)
-    if options.command == "ablate":
-        return ablation.run_command(options)
+    parsed = _parser().parse_args(arguments)
+    if parsed.command == "ablate":
+        return ablation.run_command(parsed)
     try:
-        wishes = _wishes(options)
-        other = read_results(options.against) if getattr(options, "against", None) else None
+        options = _report_options(parsed)
+        other = read_results(parsed.against) if getattr(parsed, "against", None) else None
         gates = read_gates()
-        for name in wishes.folders:
-            load_photographs(name, wishes)
+        for name in options.folders:
+            load_photographs(name, options)
     except (ValueError, StageFailure) as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
-    with with_resume_advice("the same command begins again"):
-        for words in ask_canaries(wishes).values():
+    with with_resume_advice("run the same command to start again"):
+        for words in ask_canaries(options).values():
             print(f"validation: {words}", file=sys.stderr)
         try:
-            judged = run_tasks(wishes, STAGES, _print_progress)
+            judged = run_tasks(options, STAGES, _print_progress)
         except ValueError as error:
             print(f"validation: {error}", file=sys.stderr)
             return 2
-    results = collect(wishes, judged, gates)
-    write_results(wishes.out, results)
+    results = collect(options, judged, gates)
+    write_results(options.out, results)
     changes = None if other is None else compare(other, results)
-    page = write_pages(wishes, STAGES, judged, results, changes)
-    if options.command == "check":
+    page = write_pages(options, STAGES, judged, results, changes)
+    if parsed.command == "check":
         _print_gates(results)
     broken = counted(len(results.broken) + len(results.missing), "gate")
     print(f"{broken} broken; the page is {page}")
-    return int(options.command == "check" and bool(results.broken or results.missing))
+    return int(parsed.command == "check" and bool(results.broken or results.missing))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--scenes", nargs="+", metavar="SCENE", help="default: all on this machine")
         command.add_argument("--stages", nargs="+", choices=list(STAGES), help="default: all")
         command.add_argument("--images", type=Path, help="folder of your own images")
-        command.add_argument("--quick", action="store_true", help="few scenes and few repetitions")
+        command.add_argument("--quick", action="store_true", help="few scenes and repetitions")
         command.add_argument("--seed", type=int, default=0)
         command.add_argument("--threads", type=int, default=len(own_cores()), help="tasks that run at a time")
         command.add_argument(
@@ -92,39 +92,39 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _wishes(options: argparse.Namespace) -> Wishes:
+def _report_options(parsed: argparse.Namespace) -> ReportOptions:
     """Return the options as a record; ``ValueError`` names what does not exist."""
     folders = {}
-    if options.images is not None:
-        if not options.images.is_dir():
-            raise ValueError(f"the folder of images {options.images} does not exist")
-        folders[options.images.resolve().name] = str(options.images.resolve())
-    here = available_scenes(quick=options.quick)
-    scenes = options.scenes or ([*folders] if folders else here)
+    if parsed.images is not None:
+        if not parsed.images.is_dir():
+            raise ValueError(f"the folder of images {parsed.images} does not exist")
+        folders[parsed.images.resolve().name] = str(parsed.images.resolve())
+    here = available_scenes(quick=parsed.quick)
+    scenes = parsed.scenes or ([*folders] if folders else here)
     unknown = [s for s in scenes if s not in (*available_scenes(quick=False), *folders)]
     if unknown:
         raise ValueError(
             f"no scene is called {unknown[0]}; choose from {', '.join(available_scenes(quick=False))}"
         )
-    if options.methods and options.resume is None:
+    if parsed.methods and parsed.resume is None:
         raise ValueError("--methods needs --resume: name the folder of the earlier run")
-    if options.threads < 1 or options.time_limit <= 0:
+    if parsed.threads < 1 or parsed.time_limit <= 0:
         raise ValueError("--threads and --time-limit must be positive")
-    if options.max_side and options.max_side < LEAST_SIDE_PX:
+    if parsed.max_side and parsed.max_side < LEAST_SIDE_PX:
         raise ValueError(f"--max-side must be at least {LEAST_SIDE_PX} px")
-    return Wishes(
-        out=options.out.resolve(),
+    return ReportOptions(
+        out=parsed.out.resolve(),
         scenes=tuple(dict.fromkeys([*scenes, *folders])),
-        stages=tuple(options.stages or STAGES),
+        stages=tuple(parsed.stages or STAGES),
         folders=folders,
-        quick=options.quick,
-        gates_only=options.command == "check",
-        seed=options.seed,
-        threads=min(options.threads, len(own_cores())),
-        limit_s=options.time_limit,
-        methods=tuple(options.methods or ()),
-        resume="" if options.resume is None else str(options.resume.resolve()),
-        side_px=options.max_side,
+        quick=parsed.quick,
+        gates_only=parsed.command == "check",
+        seed=parsed.seed,
+        threads=min(parsed.threads, len(own_cores())),
+        limit_s=parsed.time_limit,
+        methods=tuple(parsed.methods or ()),
+        resume="" if parsed.resume is None else str(parsed.resume.resolve()),
+        side_px=parsed.max_side,
     )
 
 

@@ -1,12 +1,10 @@
-"""Proof that the tests notice: ``python -m validation.mutants -o OUT [--sample 25] [--packages ...]``.
+"""Mutation testing: ``python -m validation.mutants -o OUT [--sample 25] [--packages ...]``.
 
-Small faults are drawn at random from all that can be made of a package's functions by changing one thing: an
-operator, a comparison, a condition, a number, a function for its opposite, or leaving a statement out. Each
-is put into a copy of the tree, where the tests of its package run, those of its module first; what survives
-them meets the tests of the modules that import it. Numbers of modules and classes are settings, which
-ablations are about, and are left alone. OUT gets ``mutants.md`` and ``mutants.json``; the exit code is 1
-where fewer than 85 % are caught. ``--again`` judges those of OUT once more that nobody caught, where their
-files are what they were: after tests were written for them.
+Draws random faults from all single changes in the functions of a package: an operator, comparison, condition,
+number, an opposite function, or a removed statement. Each is planted in a copy of the tree. The tests of its
+package run first, then those of modules that import it. Constants of modules and classes are not changed. OUT
+gets ``mutants.md`` and ``mutants.json``; the exit code is 1 if fewer than 85 % are caught. ``--again``
+repeats the uncaught faults of OUT.
 """
 
 from __future__ import annotations
@@ -30,9 +28,9 @@ from validation.scenes.real import ROOT
 PACKAGES = ("geometry", "epipolar", "selfcalibration", "numerics")
 LEAST_SCORE = 0.85
 LIMIT_S = 420.0
-"""A test run that takes longer hangs in the fault."""
+"""Time limit of a test run (s)."""
 COLD_S = 3600.0
-"""The same without a fault, where every kernel is compiled."""
+"""Time limit without a fault, when all kernels are compiled (s)."""
 SIGNS: dict[type[ast.AST], tuple[str, str]] = {
     ast.Add: ("+", "-"),
     ast.Sub: ("-", "+"),
@@ -62,7 +60,7 @@ BORDERS: dict[type[ast.AST], tuple[str, str]] = {
     ast.Gt: (">", ">="),
     ast.GtE: (">=", ">"),
 }
-"""Of whole numbers; between numbers with a fraction nothing ever stands on the border."""
+"""Opposites of integer comparisons; equality of floats is too rare to test."""
 OPPOSITES = {
     a: b
     for pair in (
@@ -85,13 +83,13 @@ class Mutant:
     end: int
 
     def apply(self, text: str) -> str:
-        """The text of the file with the fault."""
+        """Return the text with the fault."""
         return text[: self.start] + self.new + text[self.end :]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a fault: ``by`` says who caught it, empty where nobody did."""
+    """Result of a fault: ``by`` names the failing test, empty if it was not caught."""
 
     mutant: Mutant
     by: str
@@ -99,7 +97,7 @@ class Verdict:
 
 
 def mutants_of(root: Path, package: str) -> list[Mutant]:
-    """All faults of a package of the library, file by file."""
+    """Return all faults of a package, file by file."""
     found = []
     for path in sorted((root / "thesisrecon" / package).rglob("*.py")):
         text = path.read_text(encoding="utf-8")
@@ -124,7 +122,7 @@ class _Finder(ast.NodeVisitor):
         self._starts, self._lines = starts, text.splitlines()
 
     def _place(self, line: int, column: int) -> int:
-        """Characters before a place that is given in bytes of its line."""
+        """Return the character offset of a byte position of a line."""
         return self._starts[line - 1] + len(self._lines[line - 1].encode()[:column].decode())
 
     def _span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
@@ -137,7 +135,7 @@ class _Finder(ast.NodeVisitor):
         self.found.append(Mutant(self.file, line, self.text[start:end], new, start, end))
 
     def _between(self, left: ast.expr, right: ast.expr, signs: tuple[str, str]) -> None:
-        """The operator between two operands; brackets and line ends may stand beside it."""
+        """Add the operator between two operands, ignoring brackets and line ends."""
         start, end = self._span(left)[1], self._span(right)[0]
         at = self.text.find(signs[0], start, end)
         if at >= 0 and "#" not in self.text[start:end]:
@@ -216,24 +214,24 @@ class _Finder(ast.NodeVisitor):
             self.visit(node.value)
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        """One inside another is visited on its own."""
+        """Skip nested functions; they are visited separately."""
 
     def visit_Raise(self, node: ast.Raise) -> None:
-        """What is said of an error is not counted."""
+        """Skip error messages."""
 
     def visit_Assert(self, node: ast.Assert) -> None:
-        """For the types."""
+        """Skip assertions for types."""
 
 
 def _is_whole(node: ast.expr) -> bool:
-    """Whether an operand is certainly a whole number."""
+    """Return whether an operand is certainly an integer."""
     if isinstance(node, ast.Constant):
         return isinstance(node.value, int)
     return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len"
 
 
 def draw(root: Path, package: str, count: int, seed: int) -> list[Mutant]:
-    """``count`` faults of a package, or all where there are fewer, in the order of the files."""
+    """Draw ``count`` faults of a package (or all) in file order."""
     everything = mutants_of(root, package)
     rng = np.random.default_rng([seed, PACKAGES.index(package)])
     chosen = rng.permutation(len(everything))[:count]
@@ -247,8 +245,7 @@ class Bench(CopiedTree):
     copied: tuple[str, ...] = ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml")
 
     def judges(self, file: str) -> list[list[str]]:
-        """Test files to run one list after the other: those of the module and of its package; then those of
-        the modules that import it."""
+        """Return two lists of test files: those of the module's package, then those of its importers."""
         package = Path(file).parts[1]
         tests = sorted((self.tree / "tests").rglob("test_*.py"))
         own = [t for t in tests if (self.tree / "tests" / package) in t.parents]
@@ -264,7 +261,7 @@ class Bench(CopiedTree):
     def run_tests(
         self, files: Sequence[str], kernels: Path, name: str, *, limit_s: float = LIMIT_S
     ) -> tuple[int, float, str]:
-        """The exit code of pytest, 99 where its time was up, seconds, and the first test that failed."""
+        """Return the exit code of pytest (99 on time-out), seconds and the first failed test."""
         log = self.out / "logs" / f"{name}.log"
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no"]
         command += ["-m", "not slow and not browser and not real", *files]
@@ -288,9 +285,9 @@ def _module(file: str) -> str:
 
 
 def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterator[Verdict]:
-    """The verdict on each fault, in order.
+    """Yield the verdict of each fault in order.
 
-    Raises ``ValueError`` where a test fails without any fault.
+    Raises ``ValueError`` if a test fails without a fault.
     """
     bench.set_up()
     judges = {file: bench.judges(file) for file in dict.fromkeys(m.file for m in mutants)}
@@ -309,13 +306,13 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterato
                 code, spent, failed = bench.run_tests(files, kernels, f"{number:03d}")
                 seconds += spent
                 if code not in (0, 5):
-                    by = failed or ("its time was up" if code == 99 else f"pytest ended with {code}")
+                    by = failed or ("time-out" if code == 99 else f"pytest ended with {code}")
                     break
         yield Verdict(mutant, by, seconds)
 
 
 def table(verdicts: Sequence[Verdict]) -> str:
-    """Markdown: the score of each package, then every fault."""
+    """Return Markdown: the score of each package, then every fault."""
     lines = ["| package | faults | caught | score |", "| --- | --- | --- | --- |"]
     for package in PACKAGES:
         own = [v for v in verdicts if Path(v.mutant.file).parts[1] == package]
@@ -325,13 +322,13 @@ def table(verdicts: Sequence[Verdict]) -> str:
     lines += ["", "| file | line | was | became | caught by |", "| --- | --- | --- | --- | --- |"]
     for v in verdicts:
         words = [" ".join(text.split()).replace("|", "\\|")[:60] for text in (v.mutant.old, v.mutant.new)]
-        by = v.by.replace("|", "\\|") or "**nobody**"
+        by = v.by.replace("|", "\\|") or "**not caught**"
         lines.append(f"| {v.mutant.file} | {v.mutant.line} | `{words[0]}` | `{words[1]}` | {by} |")
     return "\n".join(lines)
 
 
 def read_verdicts(path: Path) -> list[Verdict]:
-    """The verdicts that :func:`main` wrote."""
+    """Read the verdicts written by :func:`main`."""
     return [
         Verdict(Mutant(**found["mutant"]), found["by"], found["seconds"])
         for found in json.loads(path.read_text(encoding="utf-8"))
@@ -339,36 +336,36 @@ def read_verdicts(path: Path) -> list[Verdict]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """0: enough faults were caught; 1: too few, or a test fails without any."""
+    """Run; exit code 0: enough faults were caught, 1: too few, or a test fails without a fault."""
     parser = argparse.ArgumentParser(prog="python -m validation.mutants", description=__doc__)
     parser.add_argument("-o", "--out", type=Path, default=Path("out/mutants"))
     parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=PACKAGES)
-    parser.add_argument("--sample", type=int, default=25, help="faults of each package")
+    parser.add_argument("--sample", type=int, default=25, help="number of faults of each package")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--warm", action="store_true", help="the tests have run here without faults before")
-    parser.add_argument("--again", action="store_true", help="those of OUT that nobody caught")
-    told = parser.parse_args(arguments)
-    told.out.mkdir(parents=True, exist_ok=True)
+    parser.add_argument("--warm", action="store_true", help="skip the test run without faults")
+    parser.add_argument("--again", action="store_true", help="repeat the uncaught faults of OUT")
+    parsed = parser.parse_args(arguments)
+    parsed.out.mkdir(parents=True, exist_ok=True)
     results: dict[Mutant, Verdict] = {}
-    if told.again:
-        results = {v.mutant: v for v in read_verdicts(told.out / "mutants.json")}
+    if parsed.again:
+        results = {v.mutant: v for v in read_verdicts(parsed.out / "mutants.json")}
         everything = {m for package in PACKAGES for m in mutants_of(ROOT, package)}
         mutants = [m for m, verdict in results.items() if not verdict.by and m in everything]
     else:
-        mutants = [m for package in told.packages for m in draw(ROOT, package, told.sample, told.seed)]
+        mutants = [m for package in parsed.packages for m in draw(ROOT, package, parsed.sample, parsed.seed)]
     try:
-        for count, verdict in enumerate(judge_all(Bench(told.out.resolve()), mutants, warm=told.warm)):
+        for count, verdict in enumerate(judge_all(Bench(parsed.out.resolve()), mutants, warm=parsed.warm)):
             results[verdict.mutant] = verdict
             print(f"{count + 1} of {len(mutants)}: {table([verdict]).splitlines()[-1]}", flush=True)
             verdicts = list(results.values())
-            (told.out / "mutants.md").write_text(table(verdicts) + "\n", encoding="utf-8")
-            (told.out / "mutants.json").write_text(json.dumps([asdict(v) for v in verdicts], indent=1))
+            (parsed.out / "mutants.md").write_text(table(verdicts) + "\n", encoding="utf-8")
+            (parsed.out / "mutants.json").write_text(json.dumps([asdict(v) for v in verdicts], indent=1))
     except ValueError as error:
         print(f"mutants: {error}", file=sys.stderr)
         return 1
     score = sum(bool(v.by) for v in results.values()) / max(len(results), 1)
     faults = counted(len(results), "fault")
-    print(f"{faults}, {100.0 * score:.0f} % caught; the table is {told.out / 'mutants.md'}")
+    print(f"{faults}, {100.0 * score:.0f} % caught; the table is {parsed.out / 'mutants.md'}")
     return int(score < LEAST_SCORE)
 
 

@@ -1,9 +1,9 @@
-"""Proof that the gates notice: ``python -m validation.mutations -o OUT [--only NAME ...]``.
+"""Fault injection for the gates: ``python -m validation.mutations -o OUT [--only NAME ...]``.
 
-``mutations.toml`` lists planted faults. The tree is copied once and checked as it is; then one fault at a
-time is put into the copy and ``python -m validation check`` runs on the stages and scenes that it says, from
-the references of the first check. OUT gets ``mutations.md`` and ``mutations.json``; the exit code is 1 where
-a fault survives or the tree itself breaks a gate, 2 where the list is wrong.
+``mutations.toml`` lists planted faults. The tree is copied and checked once; then each fault is planted in
+the copy and ``python -m validation check`` runs on its stages and scenes with the references of the first
+check. OUT gets ``mutations.md`` and ``mutations.json``; the exit code is 1 if a fault survives or the tree
+breaks a gate, 2 if the list is invalid.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ TASK_LIMIT_S = 900
 
 @dataclass(frozen=True)
 class Mutation:
-    """A planted fault: in ``file``, ``old`` (which stands there once) becomes ``new``; the gates of one of
-    ``check`` ("stage/scene") must notice, of ``methods`` of ours (all where it is empty)."""
+    """A planted fault: in ``file``, ``old`` (present exactly once) becomes ``new``; a gate of ``check``
+    ("stage/scene") must fail when ``methods`` of ours (all if empty) run again."""
 
     name: str
     file: str
@@ -45,35 +45,34 @@ class Mutation:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The stages whose gates should notice."""
+        """Return the stages of ``check``."""
         return tuple(dict.fromkeys(where.split("/")[0] for where in self.check))
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """The scenes on which they should."""
+        """Return the scenes of ``check``."""
         return tuple(dict.fromkeys(where.split("/")[1] for where in self.check))
 
     def apply(self, root: Path) -> str:
-        """The text of the file with the fault.
+        """Return the text with the fault.
 
-        Raises ``ValueError`` where ``old`` does not stand in the file exactly once.
+        Raises ``ValueError`` if ``old`` is not in the file exactly once.
         """
         path = root / self.file
         text = path.read_text(encoding="utf-8") if path.is_file() else ""
         found = text.count(self.old)
         if found != 1:
             raise ValueError(
-                f'"{self.name}": its old text must stand in {self.file} once, it stands there {found} times; '
-                "name more of the text around it"
+                f'"{self.name}": its old text must occur in {self.file} once, it occurs {found} times; '
+                "quote more of the text around it"
             )
         return text.replace(self.old, self.new)
 
 
 @dataclass(frozen=True)
 class Fate:
-    """What became of a fault: the gates that ``caught`` it, and the seconds (wall) of the check; ``ended``
-    says why methods of ours did not end well, which leaves their numbers untold; ``skipped`` why it was not
-    planted."""
+    """Result of a fault: the gates that ``caught`` it, the wall seconds of the check, the failures of methods
+    (``ended``), and why it was ``skipped``."""
 
     name: str
     file: str
@@ -84,27 +83,26 @@ class Fate:
 
     @property
     def survived(self) -> bool:
-        """Whether no gate noticed."""
+        """Return whether no gate caught the fault."""
         return not (self.caught or self.skipped)
 
 
 def read_mutations(path: Path = MUTATIONS_FILE) -> list[Mutation]:
-    """The list of faults, in order.
+    """Read the list of faults in order.
 
-    Raises ``ValueError`` for one that lacks a field, changes nothing, has a name twice, or names a stage and
-    scene that no gate judges.
+    Raises ``ValueError`` for missing fields, no change, a repeated name, or a stage and scene without gates.
     """
     judged = {key.rsplit("/", 1)[0] for key in read_gates()}
     found: list[Mutation] = []
-    for told in tomllib.loads(path.read_text(encoding="utf-8"))["mutation"]:
-        told.setdefault("methods", [])
-        whole = set(told) == {*FIELDS, "methods"} and all(told[name] for name in FIELDS if name != "new")
-        if not whole or told["old"] == told["new"]:
-            raise ValueError(f"a mutation has {', '.join(FIELDS)}, old unlike new; one has {told}")
-        wrong = [where for where in told["check"] if where not in judged]
+    for entry in tomllib.loads(path.read_text(encoding="utf-8"))["mutation"]:
+        entry.setdefault("methods", [])
+        whole = set(entry) == {*FIELDS, "methods"} and all(entry[name] for name in FIELDS if name != "new")
+        if not whole or entry["old"] == entry["new"]:
+            raise ValueError(f"a mutation has {', '.join(FIELDS)}, and old differs from new; one has {entry}")
+        wrong = [where for where in entry["check"] if where not in judged]
         if wrong:
-            raise ValueError(f'"{told["name"]}": no gate is called {wrong[0]}/...')
-        found.append(Mutation(**{**told, **{name: tuple(told[name]) for name in ("check", "methods")}}))
+            raise ValueError(f'"{entry["name"]}": no gate is called {wrong[0]}/...')
+        found.append(Mutation(**{**entry, **{name: tuple(entry[name]) for name in ("check", "methods")}}))
     twice = [m.name for n, m in enumerate(found) if m.name in {other.name for other in found[:n]}]
     if twice:
         raise ValueError(f'two mutations are called "{twice[0]}"')
@@ -113,12 +111,12 @@ def read_mutations(path: Path = MUTATIONS_FILE) -> list[Mutation]:
 
 @dataclass(frozen=True)
 class Bench(CopiedTree):
-    """The copied tree and the checks in it."""
+    """The copied tree and its checks."""
 
     def check(self, name: str, wanted: Sequence[Mutation], kernels: Path, resume: str = "") -> Checked:
-        """``python -m validation check`` in the tree, on what these faults ask for.
+        """Run ``python -m validation check`` in the tree for these faults.
 
-        Raises ``ValueError`` where it ends without results.
+        Raises ``ValueError`` if it ends without results.
         """
         stages = _all(m.stages for m in wanted)
         if not resume:
@@ -144,7 +142,7 @@ class Bench(CopiedTree):
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found where ("stage/scene") it was asked, and the seconds it took."""
+    """Result and seconds of a check of the ``asked`` "stage/scene" items."""
 
     results: Results
     asked: tuple[str, ...]
@@ -152,12 +150,12 @@ class Checked:
 
     @property
     def ended(self) -> tuple[str, ...]:
-        """Why methods of ours did not end well."""
+        """Return the failures of our methods."""
         found = self.results.failures.items()
         return tuple(dict.fromkeys(words for key, words in found if key.split("/")[2].startswith("ours")))
 
     def broken(self, gates: Mapping[str, Gate]) -> tuple[str, ...]:
-        """The gates whose number is on the wrong side, or was told by nobody."""
+        """Return the gates whose number misses the limit or is missing."""
         found = {row.key: row.value for row in self.results.rows}
         judged = {*self.asked, *(key.rsplit("/", 1)[0] for key in found)}
         return tuple(
@@ -178,9 +176,9 @@ def _needed(stages: Sequence[str]) -> set[str]:
 
 
 def plant_all(bench: Bench, mutations: Sequence[Mutation], *, sound: bool = False) -> Iterator[Fate]:
-    """The fate of each fault, in order; where ``sound``, the first check stands there of an earlier run.
+    """Yield the result of each fault in order; ``sound`` reuses the first check of an earlier run.
 
-    Raises ``ValueError`` where the tree without faults breaks a gate.
+    Raises ``ValueError`` if the tree without faults breaks a gate.
     """
     here, gates = available_scenes(quick=False), read_gates()
     possible = [m for m in mutations if set(m.scenes) <= set(here)]
@@ -200,7 +198,7 @@ def plant_all(bench: Bench, mutations: Sequence[Mutation], *, sound: bool = Fals
 
 
 def table(fates: Sequence[Fate]) -> str:
-    """Markdown: a row for each fault."""
+    """Return Markdown: a row for each fault."""
     lines = ["| fault | file | caught by | s |", "| --- | --- | --- | --- |"]
     for fate in fates:
         caught = ", ".join(fate.caught) or (f"not planted: {fate.skipped}" if fate.skipped else "**nothing**")
@@ -210,21 +208,21 @@ def table(fates: Sequence[Fate]) -> str:
 
 
 def write_fates(out: Path, fates: Sequence[Fate]) -> None:
-    """``mutations.md`` and ``mutations.json`` in ``out``."""
+    """Write ``mutations.md`` and ``mutations.json`` into ``out``."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "mutations.md").write_text(table(fates) + "\n", encoding="utf-8")
     (out / "mutations.json").write_text(json.dumps([asdict(f) for f in fates], indent=1), encoding="utf-8")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """0: all faults were caught; 1: one survives, or the tree breaks a gate without any; 2: a wrong list."""
+    """Run; exit code 0: all faults caught, 1: one survives or the tree breaks a gate, 2: invalid list."""
     parser = argparse.ArgumentParser(prog="python -m validation.mutations", description=__doc__)
     parser.add_argument("-o", "--out", type=Path, default=Path("out/mutations"))
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="by default all of mutations.toml")
-    parser.add_argument("--sound", action="store_true", help="keep the first check of an earlier run in OUT")
-    told = parser.parse_args(arguments)
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="default: all of mutations.toml")
+    parser.add_argument("--sound", action="store_true", help="reuse the first check of an earlier run in OUT")
+    parsed = parser.parse_args(arguments)
     try:
-        mutations = _chosen({m.name: m for m in read_mutations()}, told.only)
+        mutations = _chosen({m.name: m for m in read_mutations()}, parsed.only)
         for mutation in mutations:
             mutation.apply(ROOT)
     except ValueError as error:
@@ -232,15 +230,15 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     fates: list[Fate] = []
     try:
-        for fate in plant_all(Bench(told.out.resolve()), mutations, sound=told.sound):
+        for fate in plant_all(Bench(parsed.out.resolve()), mutations, sound=parsed.sound):
             fates.append(fate)
             print(table([fate]).splitlines()[-1], flush=True)
-            write_fates(told.out, fates)
+            write_fates(parsed.out, fates)
     except ValueError as error:
         print(f"mutations: {error}", file=sys.stderr)
         return 1
     survived = sum(fate.survived for fate in fates)
-    print(f"{counted(len(fates), 'fault')}, {survived} survived; the table is {told.out / 'mutations.md'}")
+    print(f"{counted(len(fates), 'fault')}, {survived} survived; the table is {parsed.out / 'mutations.md'}")
     return int(survived > 0)
 
 

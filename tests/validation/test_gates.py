@@ -10,7 +10,7 @@ import pytest
 
 from validation.harness.gates import read_gates
 from validation.harness.process import own_cores
-from validation.harness.records import Wishes
+from validation.harness.records import ReportOptions
 from validation.harness.results import collect
 from validation.harness.scenes import PHOTOGRAPHS, available_scenes
 from validation.harness.schedule import run_tasks
@@ -40,10 +40,10 @@ def results(tmp_path_factory):
         scenes = tuple(s for s in here if any(scene == s for _, scene in wanted))
         stages = tuple(name for name in STAGES if any(stage == name for stage, _ in wanted))
         out = tmp_path_factory.mktemp("gates")
-        wishes = Wishes(
+        options = ReportOptions(
             out, scenes, stages, quick=True, gates_only=True, threads=len(own_cores()), limit_s=LIMIT_S
         )
-        return collect(wishes, run_tasks(wishes, STAGES, lambda _: None), GATES)
+        return collect(options, run_tasks(options, STAGES, lambda _: None), GATES)
 
     return run
 

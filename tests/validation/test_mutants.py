@@ -82,7 +82,7 @@ def test_the_table_has_the_score_of_each_package_and_every_fault():
     verdicts = [Verdict(fault, "tests/geometry/test_a.py::test", 1.0), Verdict(fault, "", 2.0)]
     text = table(verdicts)
     assert "| geometry | 2 | 1 | 50 % |" in text
-    assert "| thesisrecon/geometry/a.py | 3 | `a \\| b` | `a & b` | **nobody** |" in text
+    assert "| thesisrecon/geometry/a.py | 3 | `a \\| b` | `a & b` | **not caught** |" in text
 
 
 def test_surviving_faults_are_tested_again_and_the_rest_is_kept(monkeypatch, tmp_path, capsys):

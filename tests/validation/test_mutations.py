@@ -51,7 +51,7 @@ def test_the_faults_are_many_and_everywhere():
 
 WRONG = {
     'file = "a.py"\nold = "a"\nnew = "b"\ncheck = ["bundle/street"]': "a mutation has",
-    'name = "n"\nfile = "a.py"\nold = "a"\nnew = "a"\ncheck = ["bundle/street"]': "old unlike new",
+    'name = "n"\nfile = "a.py"\nold = "a"\nnew = "a"\ncheck = ["bundle/street"]': "old differs from new",
     'name = "n"\nfile = "a.py"\nold = "a"\nnew = "b"\ncheck = ["a/moon"]': "no gate is called a/moon",
 }
 
@@ -75,7 +75,7 @@ def test_a_name_twice_is_refused(tmp_path):
 def test_an_old_text_that_does_not_stand_there_once_is_refused(text, tmp_path):
     if text:
         (tmp_path / "a.py").write_text(text, encoding="utf-8")
-    with pytest.raises(ValueError, match=r"must stand in a\.py once, it stands there [02] times"):
+    with pytest.raises(ValueError, match=r"must occur in a\.py once, it occurs [02] times"):
         Mutation("n", "a.py", "x = 1", "x = 2", ("bundle/street",)).apply(tmp_path)
 
 

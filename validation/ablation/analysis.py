@@ -1,5 +1,4 @@
-"""What the rows of a study say: differences against the baseline with their uncertainty, ranks, and what
-accuracy costs."""
+"""Analyse the rows of a study: differences from the baseline with intervals, ranks and costs."""
 
 from __future__ import annotations
 
@@ -22,11 +21,11 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class Comparison:
-    """A variant against another under a condition, by one measure.
+    """Comparison of a variant with another under one condition, by one measure.
 
-    ``interval`` is of the differences variant - other, with ``ratio`` of those of the logarithms, which
-    :func:`as_told` makes quotients. ``p`` is adjusted for all comparisons of the measure (Holm), and rules
-    the verdict.
+    ``interval`` holds differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported`
+    returns quotients). ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from
+    it.
     """
 
     measure: Measure
@@ -41,9 +40,8 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Cell:
-    """A variant under a condition: ``mean`` and ``median`` of a measure over its rows that tell it, how many
-    there are, how many rows failed, median cost (s), mean rank among the variants (1 is best) and whether no
-    other variant is both better and cheaper."""
+    """Summary of a variant under a condition: mean and median of a measure over the rows that have it, number
+    of rows and failures, median cost (s), mean rank (1 is best) and whether it is Pareto-optimal."""
 
     measure: Measure
     variant: str
@@ -59,7 +57,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Analysis:
-    """All that is told of a study. ``steps`` are comparisons of each step of a ladder with the one before."""
+    """All results of a study. ``steps`` compares each step of a ladder with the one before."""
 
     plan: Plan
     rows: Rows
@@ -77,7 +75,7 @@ class Analysis:
 def analyse(rows: Rows) -> Analysis:
     """Compare all variants with the baseline on the same scene, seed and condition, and rank them.
 
-    Only pairs count of which both rows tell the measure; the failures of a variant are counted beside.
+    Only pairs with the measure in both rows count; failures of a variant are counted separately.
     """
     plan = rows.plan
     names = [v.name for v in plan.variants]
@@ -147,13 +145,13 @@ def _verdict(found: Comparison, p: float) -> Verdict:
     return "better" if (found.interval.mean < 0.0) == (found.measure.better == "less") else "worse"
 
 
-def as_told(found: Comparison) -> tuple[float, float, float]:
-    """Mean, low and high as they are told: quotients where the comparison is one of quotients."""
-    told = (found.interval.mean, found.interval.low, found.interval.high)
+def as_reported(found: Comparison) -> tuple[float, float, float]:
+    """Return mean, low and high as reported: quotients if the comparison is of quotients."""
+    values = (found.interval.mean, found.interval.low, found.interval.high)
     if not found.ratio:
-        return told
-    # The interval of two differences may have no end that a number could hold.
-    mean, low, high = (float(np.exp(np.clip(v, -700.0, 700.0))) for v in told)
+        return values
+    # The interval of two differences can overflow.
+    mean, low, high = (float(np.exp(np.clip(v, -700.0, 700.0))) for v in values)
     return mean, low, high
 
 
@@ -167,9 +165,9 @@ def _cells(table: _Table, measure: Measure) -> list[Cell]:
         some = blocks[np.isfinite(blocks).any(axis=1)]
         ranks = mean_ranks(sign * some) if len(some) else np.full(len(names), np.nan)
         rows = [table.rows(name, condition.name) for name in names]
-        # The first rows of a process compile kernels, or read them: no part of what a variant costs.
+        # The first rows of a process compile or load kernels; exclude them from the cost.
         cost = np.array([float(np.median([r.cost_s for r in own])) if own else np.nan for own in rows])
-        # A variant that fails where others do not is judged on easier rows than they are.
+        # A variant that fails on hard rows is ranked on easier rows than the others.
         whole = np.isfinite(some).all(axis=0)
         loss = np.array([sign * _mean(b[np.isfinite(b)]) for b in blocks.T])
         front = on_front(cost, np.where(whole, loss, np.nan))
@@ -199,7 +197,7 @@ def _mean(values: Sequence[float] | F64) -> float:
 
 
 def _warnings(rows: Rows) -> list[str]:
-    """What a reader must know before believing the tables."""
+    """Return warnings about the tables."""
     plan, found = rows.plan, []
     missing = len(plan.rows) - len(rows)
     if missing:
@@ -208,8 +206,8 @@ def _warnings(rows: Rows) -> list[str]:
         here = [r for r in rows if (r.scene, r.condition) == (scene, condition.name)]
         if here and all(r.failure for r in here):
             where = f"{scene} ({condition.name})" if condition.name else scene
-            found.append(f"every row of {where} failed, so that it says nothing: {here[0].failure}")
+            found.append(f"every row of {where} failed: {here[0].failure}")
     for measure in plan.measures:
         if len(rows) and not any(measure.name in r.metrics for r in rows):
-            found.append(f"no row tells {measure.name}")
+            found.append(f"no row has the metric {measure.name}")
     return found

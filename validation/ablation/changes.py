@@ -1,4 +1,4 @@
-"""Dotted paths and values laid on a configuration and a task, with a sentence for whatever does not fit."""
+"""Apply dotted paths and values to a configuration and a task; report invalid ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STAGES = tuple(f.name for f in dataclasses.fields(PipelineConfig))
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What one row runs by."""
+    """Configuration and task of one row."""
 
     config: PipelineConfig
     task: Any
@@ -83,12 +83,12 @@ def _whole_stage(config: PipelineConfig, stage: str, value: Any, folder: Path) -
 def _own_variant(word: str, fields: Mapping[str, Any], stage: str, folder: Path) -> Any:
     kind = load_own(word, stage, folder)
     if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        raise UsageError(f"{stage}: a variant is a frozen dataclass, which {word} is not")
+        raise UsageError(f"{stage}: {word} is not a frozen dataclass, as a variant must be")
     return dataclass_from_table(kind, fields, stage)
 
 
 def _check_variant(stage: str, value: Any) -> None:
-    """Whether an object can stand at a stage: a dataclass with the methods that the stage is asked for."""
+    """Return whether an object is a dataclass with the methods of its stage."""
     if not _is_object(value):
         raise UsageError(f"{stage} takes a variant: a kind, a table or a frozen dataclass; got {value!r}")
     wanted = typing.get_type_hints(PipelineConfig)[stage]
@@ -99,12 +99,12 @@ def _check_variant(stage: str, value: Any) -> None:
     missing = [n for n in methods_of(wanted) if not callable(getattr(value, n, None))]
     if missing:
         raise UsageError(
-            f"{stage}: a {wanted.__name__} has the method {missing[0]}, which {type(value).__name__} has not"
+            f"{stage}: a {wanted.__name__} must have the method {missing[0]}; {type(value).__name__} has none"
         )
 
 
 def methods_of(protocol: type[Any]) -> list[str]:
-    """The methods that a protocol asks for, by name."""
+    """Return the method names of a protocol."""
     return [n for n, v in vars(protocol).items() if not n.startswith("_") and callable(v)]
 
 
@@ -126,7 +126,7 @@ def _put(whole: Any, path: str, keys: list[str], value: Any) -> Any:
 
 
 def level_name(path: str, value: Any) -> str:
-    """What a value of an axis is called in tables: a variant by its kind, a number with its field."""
+    """Return the name of an axis value in tables: the kind of a variant, a number with its field."""
     field = path.rpartition(".")[2]
     if isinstance(value, Mapping):
         fields = [f"{k} = {_words(v)}" for k, v in value.items() if k not in ("kind", "preset")]
@@ -134,14 +134,14 @@ def level_name(path: str, value: Any) -> str:
         head = str(head).rpartition(":")[2]
         return ", ".join([head, *fields] if head else fields) or field
     if _is_object(value):
-        fields = [f"{k} = {_words(v)}" for k, v in _told(value).items()]
+        fields = [f"{k} = {_words(v)}" for k, v in _non_default_fields(value).items()]
         return ", ".join([type(value).__name__, *fields])
     if isinstance(value, str):
         return value.rpartition(":")[2] if is_own(value) else value
     return f"{field} = {_words(value)}"
 
 
-def _told(value: Any) -> dict[str, Any]:
+def _non_default_fields(value: Any) -> dict[str, Any]:
     """The fields of an object that differ from what it has by default."""
     try:
         usual = type(value)()

@@ -17,7 +17,7 @@ from validation.ablation.progress import progress_view
 from validation.ablation.run import Rows, ablate, parts_of, read_rows
 from validation.ablation.toml import read_study
 
-KEPT = "the same command goes on from the rows that ended, which are in {}"
+KEPT = "run the same command to continue from the finished rows in {}"
 STUDIES = Path(__file__).parent / "studies"
 
 
@@ -26,29 +26,41 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     words = "Compare variants and parameters over scenes and seeds, with intervals."
     command = commands.add_parser("ablate", help=words, description=words)
     shipped = ", ".join(sorted(p.stem for p in STUDIES.glob("*.toml")))
-    command.add_argument("study", metavar="STUDY", help=f"a file of TOML, or one of ours: {shipped}")
-    command.add_argument("-o", "--out", type=Path, required=True, help="kept and gone on with when run again")
+    command.add_argument(
+        "study", metavar="STUDY", help=f"TOML file, or the name of a shipped study: {shipped}"
+    )
+    command.add_argument(
+        "-o", "--out", type=Path, required=True, help="output folder; a rerun continues from its rows"
+    )
     command.add_argument(
         "--executor", default="processes", help="local, processes (default) or dask://HOST:PORT"
     )
-    command.add_argument("--threads", type=int, help="rows at a time; by default one a processor")
-    command.add_argument("--plan", action="store_true", help="say what would run, and run nothing")
-    command.add_argument("--read", action="store_true", help="only analyse the rows that are in OUT")
+    command.add_argument(
+        "--threads", type=int, help="number of parallel rows (default: number of processors)"
+    )
+    command.add_argument("--plan", action="store_true", help="print the plan only")
+    command.add_argument("--read", action="store_true", help="only analyse the rows in OUT")
 
 
-def run_command(told: argparse.Namespace) -> int:
-    """0: done; 2: a wrong wish; 3: every row failed; 130: stopped."""
+def run_command(parsed: argparse.Namespace) -> int:
+    """Run a study; exit code 0: done, 2: wrong option, 3: every row failed, 130: interrupted."""
     try:
-        study = read_study(_path(told.study))
-        if told.plan:
+        study = read_study(_path(parsed.study))
+        if parsed.plan:
             print(plan_words(plan_study(study)))
             return 0
-        if told.read:
-            rows = read_rows(study, told.out)
+        if parsed.read:
+            rows = read_rows(study, parsed.out)
         else:
-            with with_resume_advice(KEPT.format(told.out)), progress_view() as heard:
-                rows = ablate(study, told.out, executor=told.executor, threads=told.threads, heard=heard)
-        page = write_analysis(analyse(rows), told.out)
+            with with_resume_advice(KEPT.format(parsed.out)), progress_view() as on_progress:
+                rows = ablate(
+                    study,
+                    parsed.out,
+                    executor=parsed.executor,
+                    threads=parsed.threads,
+                    on_progress=on_progress,
+                )
+        page = write_analysis(analyse(rows), parsed.out)
     except UsageError as error:
         print(f"ablate: {error}", file=sys.stderr)
         return 2
@@ -59,13 +71,13 @@ def run_command(told: argparse.Namespace) -> int:
     return 3 if rows and all(r.failure for r in rows) else 0
 
 
-def _path(wish: str) -> Path:
-    shipped = STUDIES / f"{wish}.toml"
-    return shipped if not Path(wish).exists() and shipped.is_file() else Path(wish)
+def _path(name: str) -> Path:
+    shipped = STUDIES / f"{name}.toml"
+    return shipped if not Path(name).exists() and shipped.is_file() else Path(name)
 
 
 def plan_words(plan: Plan) -> str:
-    """How much a study is: rows, and the steps that rows share."""
+    """Return the size of a study: rows and shared steps."""
     unique = list({row.key: row for row in plan.rows}.values())
     shared = Counter(part.step for part in parts_of(unique) if part.step)
     steps = ", ".join(f"{step} ({count})" for step, count in shared.items())
@@ -82,5 +94,5 @@ def plan_words(plan: Plan) -> str:
 
 def _last_words(rows: Rows, page: Path) -> str:
     failed = sum(bool(r.failure) for r in rows)
-    told = counted(len(rows), "row") + f", {failed} of them failed" * bool(failed)
-    return f"{told}; the page is {page}"
+    text = counted(len(rows), "row") + f", {failed} of them failed" * bool(failed)
+    return f"{text}; the page is {page}"

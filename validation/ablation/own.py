@@ -1,7 +1,6 @@
-"""Code of the user's own: a class or function of a file of theirs, named as ``path/to/file.py:Name``.
+"""Load user classes and functions named as ``path/to/file.py:Name``.
 
-The text of the file travels with every row that needs it, so that a worker in another process, or on another
-machine, runs the same code without having the file.
+The source text is sent with every row that needs it, so workers need no copy of the file.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ PREFIX = "ablation_own_"
 
 @dataclass(frozen=True)
 class Source:
-    """One file of the user's: the name it has as a module, where it lies and what it says."""
+    """User source file: module name, path and text."""
 
     module: str
     path: str
@@ -36,7 +35,7 @@ class Source:
         if self.module not in sys.modules:
             module = ModuleType(self.module)
             module.__file__ = self.path
-            # A dataclass looks its module up while it is being made.
+            # A dataclass looks up its module during creation.
             sys.modules[self.module] = module
             try:
                 exec(compile(self.text, self.path, "exec"), module.__dict__)
@@ -50,13 +49,13 @@ _SOURCES: dict[str, Source] = {}
 
 
 def is_own(word: str) -> bool:
-    """Whether a word names something of a file: ``corners.py:MyCorners``."""
+    """Return whether a word names something of a file: ``corners.py:MyCorners``."""
     file, colon, name = word.rpartition(":")
     return bool(colon) and file.endswith(".py") and name.isidentifier()
 
 
 def load_own(word: str, where: str, folder: Path = Path()) -> Any:
-    """What ``word`` names; its file is sought from ``folder``.
+    """Return the object named by ``word``, with a file relative to ``folder``.
 
     Raises :class:`UsageError`, beginning with ``where``, for a file that is not there or cannot be run, and a
     name that it does not have.
@@ -81,5 +80,5 @@ def load_own(word: str, where: str, folder: Path = Path()) -> Any:
 
 
 def sources_of(modules: Iterable[str]) -> tuple[Source, ...]:
-    """The sources of those modules that are files of the user's."""
+    """The sources of those modules that are files of the user."""
     return tuple(_SOURCES[m] for m in sorted(set(modules)) if m in _SOURCES)

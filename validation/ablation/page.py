@@ -1,4 +1,4 @@
-"""The page of a study: what was asked, what the rows say, every number with its uncertainty."""
+"""HTML page of a study: question, results and uncertainties."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon import __version__
 from thesisrecon.io.files import write_text
 from thesisrecon.report.page import page_resource, plotly_script, script_hashes, template_environment
-from validation.ablation.analysis import Analysis, Cell, Comparison, as_told
+from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
 from validation.ablation.tables import comparison_text, mean_text, number, write_tables
@@ -27,13 +27,13 @@ SYMBOLS = ("circle", "square", "diamond")
 GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
 _MARGIN = {"l": 70, "r": 20, "t": 10, "b": 50}
 MOST_LEVELS = 40
-"""More rows than this in a picture of intervals and nobody can read it."""
+"""Maximum number of rows in an interval plot."""
 
 
 def write_analysis(analysis: Analysis, out: str | Path) -> Path:
-    """Write ``index.html`` and the tables into ``out``; the path of the page.
+    """Write ``index.html`` and the tables into ``out`` and return the path of the page.
 
-    Raises :class:`~thesisrecon.errors.OutputError` where the folder cannot be written.
+    Raises :class:`~thesisrecon.errors.OutputError` if the folder cannot be written.
     """
     out = Path(out)
     tables = write_tables(analysis, out)
@@ -89,7 +89,7 @@ def _findings(analysis: Analysis) -> list[str]:
     count = len(analysis.plan.conditions)
     found = []
     for measure in analysis.plan.measures:
-        told = []
+        sentences = []
         for verdict in ("better", "worse"):
             where = Counter(
                 c.variant for c in analysis.comparisons if (c.measure, c.verdict) == (measure, verdict)
@@ -97,8 +97,8 @@ def _findings(analysis: Analysis) -> list[str]:
             names = [v if count == 1 else f"{v} (under {n} of {count} conditions)" for v, n in where.items()]
             if count == 1 and len(names) > 2 and len(names) == len(analysis.plan.variants) - 1:
                 names = ["all others"]
-            told += [f"{verdict}: {'; '.join(names)}"] if names else []
-        said = ". ".join(told) or "no difference from the baseline is shown"
+            sentences += [f"{verdict}: {'; '.join(names)}"] if names else []
+        said = ". ".join(sentences) or "no difference from the baseline is shown"
         found.append(f"{measure.name} {said}.")
     return found
 
@@ -147,11 +147,11 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
 
 
 def _about(drawn: Collection[str]) -> str:
-    """What the intervals speak of."""
+    """State the population of the intervals."""
     if drawn == {"scenes"}:
-        return "The intervals speak of scenes like these: the scenes are the sample."
+        return "The intervals generalise to similar scenes: the scenes are the sample."
     if drawn == {"seeds"}:
-        return "The intervals speak of these scenes alone: what is drawn at random are the seeds."
+        return "The intervals apply to these scenes only: the seeds are the sample."
     return ""
 
 
@@ -170,8 +170,8 @@ def _table(
                 {
                     "mean": mean_text(at[place]),
                     "rank": number(at[place].rank),
-                    "against": _told(against.get(place)),
-                    "step": _told(step.get(place)),
+                    "against": _comparison_cells(against.get(place)),
+                    "step": _comparison_cells(step.get(place)),
                     "on_front": at[place].on_front,
                 }
             )
@@ -187,7 +187,7 @@ def _table(
     return found
 
 
-def _told(found: Comparison | None) -> dict[str, str]:
+def _comparison_cells(found: Comparison | None) -> dict[str, str]:
     if found is None:
         return {"text": "", "verdict": "", "more": ""}
     effect, p = found.interval.effect, found.p
@@ -245,18 +245,18 @@ def _forest(
         return None
     ratio = all(c.ratio for c in shown)
     shown = [c for c in shown if c.ratio == ratio]
-    told = [as_told(c) for c in shown]
+    values = [as_reported(c) for c in shown]
     colours = [{"better": GOOD, "worse": BAD}.get(c.verdict, NONE) for c in shown]
     trace = {
         "type": "scatter",
         "mode": "markers",
-        "x": [_finite(mean) for mean, _, _ in told],
+        "x": [_finite(mean) for mean, _, _ in values],
         "y": [_who(c) for c in shown],
         "error_x": {
             "type": "data",
             "symmetric": False,
-            "array": [_finite(high - mean) for mean, _, high in told],
-            "arrayminus": [_finite(mean - low) for mean, low, _ in told],
+            "array": [_finite(high - mean) for mean, _, high in values],
+            "arrayminus": [_finite(mean - low) for mean, low, _ in values],
             "color": "#55636f",
         },
         "marker": {"color": colours, "size": 9},
@@ -317,9 +317,9 @@ def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] 
         "legend": {"orientation": "h", "y": -0.2},
         "height": 420 + 10 * len(known),
     }
-    words = "Filled: nothing is both better and cheaper."
+    words = "Filled: Pareto-optimal (no variant is both better and cheaper)."
     figure = {"data": [line, *points], "layout": layout}
-    return _plot(f"plot-{slug}-cost", f"{measure.name} against what it costs", figure, words)
+    return _plot(f"plot-{slug}-cost", f"{measure.name} against cost", figure, words)
 
 
 def _axis(measure: Measure) -> dict[str, Any]:

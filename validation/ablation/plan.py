@@ -1,4 +1,4 @@
-"""A study worked out before anything runs: variants, conditions and rows, or a sentence of what is wrong."""
+"""Plan a study before anything runs: variants, conditions and rows; report what is invalid."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Levels = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Variant:
-    """One thing that is compared, or one condition under which things are: the level of every axis, and what
+    """A variant or a condition: the level of every axis, and the changes
     it changes."""
 
     name: str
@@ -55,7 +55,7 @@ class PlannedRow:
 
 @dataclass(frozen=True)
 class Plan:
-    """All of a study: its rows in the order in which they run, seed by seed."""
+    """Plan of a study; its rows in execution order, seed by seed."""
 
     study: Study
     measures: tuple[Measure, ...]
@@ -67,16 +67,16 @@ class Plan:
     versions: Mapping[str, str]
 
     def wanted(self, row: PlannedRow) -> list[str]:
-        """The numbers that a row should tell."""
-        missing = untold(row.setting.task, row.scene)
+        """Return the measures of a row."""
+        missing = unavailable(row.setting.task, row.scene)
         return [m.name for m in self.measures if m.name not in missing]
 
 
 def plan_study(study: Study) -> Plan:
-    """The plan of a study.
+    """Return the plan of a study.
 
-    Raises :class:`UsageError` for an unknown path, scene, metric or baseline, a value of another type, an
-    axis without values, and seeds that are no whole numbers.
+    Raises :class:`UsageError` for an unknown path, scene, metric or baseline, a wrong type, an axis without
+    values, and seeds that are not whole numbers.
     """
     task = _task_of(study)
     start = Setting(study.config, task)
@@ -91,12 +91,12 @@ def plan_study(study: Study) -> Plan:
     baseline = study.baseline or variants[0].name
     if baseline not in [v.name for v in variants]:
         raise UsageError(unknown_word("baseline", baseline, [v.name for v in variants]))
-    told = versions()
+    installed = versions()
     scene_keys = {scene: task.scene_key(scene) for scene in scenes}
     identities = {at: identity(setting) for at, setting in settings.items()}
     rows = tuple(
         PlannedRow(
-            key_of("row", identities[v.name, c.name], scene_keys[scene], seed, told),
+            key_of("row", identities[v.name, c.name], scene_keys[scene], seed, installed),
             v.name,
             c.name,
             scene,
@@ -105,31 +105,32 @@ def plan_study(study: Study) -> Plan:
         )
         for seed, scene, c, v in itertools.product(seeds, scenes, conditions, variants)
     )
-    measures = _told_somewhere(study, _measures(study, task), rows)
-    return Plan(study, measures, variants, conditions, seeds, baseline, rows, told)
+    measures = _available_measures(study, _measures(study, task), rows)
+    return Plan(study, measures, variants, conditions, seeds, baseline, rows, installed)
 
 
-def untold(task: Any, scene: str) -> Collection[str]:
-    """The measures of a task that it cannot tell of a scene."""
-    found: Collection[str] = task.untold(scene) if hasattr(task, "untold") else ()
+def unavailable(task: Any, scene: str) -> Collection[str]:
+    """Return the measures that a task cannot compute on a scene."""
+    found: Collection[str] = task.unavailable(scene) if hasattr(task, "unavailable") else ()
     return found
 
 
-def _told_somewhere(
+def _available_measures(
     study: Study, measures: tuple[Measure, ...], rows: Sequence[PlannedRow]
 ) -> tuple[Measure, ...]:
-    """The measures that some row can tell; one that was asked for and cannot be told is refused."""
-    missing = [set(untold(row.setting.task, row.scene)) for row in rows]
+    """Return the measures available in some row; reject requested unavailable ones."""
+    missing = [set(unavailable(row.setting.task, row.scene)) for row in rows]
     never = set.intersection(*missing)
     if study.metrics and (wrong := [m.name for m in measures if m.name in never]):
         raise UsageError(
-            f"no scene of this study can tell {wrong[0]}: its truth is not known, or the task ends before it"
+            f"no scene of this study has the metric {wrong[0]}: "
+            "it has no ground truth, or the task ends before that step"
         )
     return tuple(m for m in measures if m.name not in never)
 
 
 def _applied(start: Setting, variant: Variant, condition: Variant, folder: Path) -> Setting:
-    """The setting of a variant under a condition; what is wrong is told with their names."""
+    """Return the setting of a variant under a condition; errors name both."""
     for part in (variant, condition):
         try:
             start = apply_changes(start, part.changes, folder)
@@ -156,7 +157,7 @@ def _measures(study: Study, task: Any) -> tuple[Measure, ...]:
         if isinstance(metric, str) and known and metric not in known:
             raise UsageError(unknown_word("metric", metric, known))
     if not asked:
-        raise UsageError("a function as a task needs metrics: the names of the numbers that it tells")
+        raise UsageError("a function as a task needs metrics: the names of the numbers it returns")
     return tuple(m if isinstance(m, Measure) else known.get(m, Measure(m)) for m in asked)
 
 
@@ -256,7 +257,7 @@ def _laid(parts: Sequence[Variant], name: str) -> Variant:
     for part in parts:
         for path, value in part.changes.items():
             changes.pop(path, None)
-            # What was set inside a stage is gone once the whole stage is.
+            # Replacing a stage discards earlier changes inside it.
             changes = {k: v for k, v in changes.items() if not k.startswith(f"{path}.")}
             changes[path] = value
     return Variant(name, {"step": name}, changes)
@@ -302,14 +303,14 @@ def _task_identity(task: Any) -> list[Any]:
 
 
 def _own_code(module: str) -> str:
-    """A key for the code of a module of the user's; that of ours is among the versions."""
+    """Return a key of the code of a user module."""
     ours = module.split(".")[0] in ("thesisrecon", "validation")
     return "" if ours or module.startswith(PREFIX) else code_key(module)
 
 
 @cache
 def versions() -> dict[str, str]:
-    """What a row was computed with: versions of what is installed, and a key for our code that rows run."""
+    """Return the installed versions and a key of the code that rows run."""
     content = hashlib.sha256(package_key().encode())
     for root in (ROOT / part for part in _RUN_BY_ROWS):
         for path in sorted(root.rglob("*.py")):

@@ -1,4 +1,4 @@
-"""How far a study is, where somebody looks; silence where nobody does."""
+"""Report the progress of a study on a terminal."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from validation.ablation.run import Heard, State
+from validation.ablation.run import ProgressCallback, State
 
 
 @contextmanager
-def progress_view() -> Iterator[Heard]:
+def progress_view() -> Iterator[ProgressCallback]:
     """Rows done and failed, and an estimate of the time left."""
     if not sys.stderr.isatty():
         yield lambda _: None
@@ -28,23 +28,23 @@ def progress_view() -> Iterator[Heard]:
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("rows", total=None, left="")
 
-        def heard(state: State) -> None:
+        def report(state: State) -> None:
             progress.update(task, total=state.total, completed=state.kept + state.done, left=words_of(state))
 
-        yield heard
+        yield report
 
 
 def words_of(state: State) -> str:
-    """What the bar does not say."""
-    told = [f"{state.steps_done} of {state.steps} shared steps"] if state.steps_done < state.steps else []
-    told += [f"{state.failed} failed"] if state.failed else []
+    """Return the part of the state that the bar does not show."""
+    parts = [f"{state.steps_done} of {state.steps} shared steps"] if state.steps_done < state.steps else []
+    parts += [f"{state.failed} failed"] if state.failed else []
     if state.left_s is not None and state.kept + state.done < state.total:
-        told.append(f"about {duration(state.left_s)} left")
-    return ", ".join(told)
+        parts.append(f"about {duration(state.left_s)} left")
+    return ", ".join(parts)
 
 
 def duration(seconds: float) -> str:
-    """Hours, minutes and seconds as a person says them."""
+    """Format seconds as hours, minutes or seconds."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 5400:

@@ -1,4 +1,4 @@
-"""One row in the process that carries it out, whatever kind of worker that is."""
+"""Compute one row in a worker, of any kind."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from validation.ablation.study import Place
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker is given: ``setting`` as bytes, for a class of the user's is known only once its source
+    """Input of a worker: ``setting`` as bytes, since user classes are known only after their source
     is installed. ``step`` is the shared step to be prepared, empty for the row itself. ``by_thread`` says
     that the worker shares its process with others."""
 
@@ -65,8 +65,8 @@ def _modules(value: Any) -> set[str]:
 
 
 def carry_out(job: Job) -> Outcome:
-    """The row, or the step it is asked for. What goes wrong is told and not raised, but for a full disk
-    (:class:`OutputError`): the row has not failed, it waits for room."""
+    """Compute the row or the requested step. Errors are recorded, not raised, except for a full disk
+    (:class:`OutputError`), because the row itself has not failed."""
     for source in job.sources:
         source.install()
     setting: Setting = pickle.loads(job.setting)
@@ -98,12 +98,12 @@ def carry_out(job: Job) -> Outcome:
 
 def _plain(metrics: Any) -> dict[str, float]:
     if not isinstance(metrics, Mapping):
-        raise TypeError(f"a task tells a table of numbers; got {type(metrics).__name__}")
+        raise TypeError(f"a task returns a table of numbers; got {type(metrics).__name__}")
     return {str(name): float(value) for name, value in metrics.items()}
 
 
 def _where(error: BaseException) -> str:
-    """File and line of an error, for whoever wrote the variant."""
+    """Return file and line of an error, for the author of the variant."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next

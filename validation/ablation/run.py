@@ -1,4 +1,4 @@
-"""Rows computed as workers become free and kept as they end; what several begin with is computed once."""
+"""Compute rows as workers become free and store them; shared first steps run once."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from validation.ablation.study import Study
 from validation.ablation.tasks import FunctionTask
 from validation.ablation.workers import Crew, crew_of
 
-Heard = Callable[["State"], None]
-"""Hears how far a study is, whenever a row or a step has ended."""
-LOST = "the process that carried this row out ended before it did: killed, or out of memory"
+ProgressCallback = Callable[["State"], None]
+"""Called with the state whenever a row or a step has ended."""
+LOST = "the worker process of this row was killed or ran out of memory"
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row that has ended: where it stands in the study, and what came of it.
+    """A finished row: its place in the study and its outcome.
 
-    ``cost_s`` is the processor time (s) of the row with all that it took over from others.
+    ``cost_s`` is the processor time (s) of the row including shared steps.
     """
 
     key: str
@@ -99,28 +99,28 @@ def ablate(
     *,
     executor: str | Executor = "processes",
     threads: int | None = None,
-    heard: Heard | None = None,
+    on_progress: ProgressCallback | None = None,
 ) -> Rows:
     """Compute the rows of a study that are not in ``out`` yet, and return all of them.
 
     Parameters
     ----------
-    study : what is asked.
+    study : the study to run.
     out : the folder of the study. It may be used again, after a kill or for a study that has grown: rows that
         are there under the same setting, scene, seed and versions are not computed again.
     executor : "local" (this process), "processes", "dask://HOST:PORT", or any
         :class:`concurrent.futures.Executor`.
     threads : rows at a time; all processors where None.
-    heard : hears of the progress.
+    on_progress : called with the state after each row.
 
     Raises
     ------
-    UsageError : a study that cannot be (see :func:`plan_study`), a folder that cannot be written, a scheduler
-        that does not answer. What goes wrong in a row is kept in the row.
+    UsageError : an invalid study (see :func:`plan_study`), a folder that cannot be written, a scheduler
+        that does not answer. Errors of a row are stored in the row.
     """
     plan, store = plan_study(study), Store(Path(out).resolve())
     store.prepare()
-    write_json(store.path / "study.json", _told(plan))
+    write_json(store.path / "study.json", _study_record(plan))
     todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
     state = State(len({row.key for row in plan.rows}), waiting=Counter(r.variant for r in todo.values()))
     state.kept = state.total - len(todo)
@@ -128,7 +128,9 @@ def ablate(
     if todo:
         with crew_of(executor, threads) as crew:
             state.width = min(crew.width, len(todo))
-            lost = _Session(plan, store, crew, state, heard or (lambda _: None)).run(list(todo.values()))
+            lost = _Session(plan, store, crew, state, on_progress or (lambda _: None)).run(
+                list(todo.values())
+            )
     shutil.rmtree(store.path / WORK, ignore_errors=True)
     return _rows(plan, store, lost)
 
@@ -221,7 +223,7 @@ class _Session:
     store: Store
     crew: Crew
     state: State
-    heard: Heard
+    on_progress: ProgressCallback
     tries: Counter[str] = field(default_factory=Counter)
     lost: dict[str, Outcome] = field(default_factory=dict)
 
@@ -233,7 +235,7 @@ class _Session:
         self.state.steps = sum(bool(p.step) for p in waiting)
         packed = {p.row.key: pack(p.row.setting) for p in waiting}
         running: dict[Future[Outcome], _Part] = {}
-        self.heard(self.state)
+        self.on_progress(self.state)
         while waiting or running:
             for part in self._ready(waiting, ended, len(running)):
                 waiting.remove(part)
@@ -245,7 +247,7 @@ class _Session:
                 self.crew.cluster.check()
             outcomes = [(running.pop(f), self._outcome(f)) for f in done if not f.cancelled()]
             if self.crew.renew is not None and any(outcome.lost for _, outcome in outcomes):
-                # Of a pool that broke no row ends any more.
+                # No row of a broken pool ends.
                 outcomes += [(part, Outcome(failure=LOST, lost=True)) for part in running.values()]
                 running.clear()
                 self.crew.executor = self.crew.renew()
@@ -256,7 +258,7 @@ class _Session:
                     ended.add(part.name)
                     self._keep(part, outcome)
             if any(future.cancelled() for future in done):
-                # Nothing here cancels rows that were handed out: it was the cluster that went away.
+                # Rows are never cancelled here, so the cluster was lost.
                 raise self._gone()
         return self.lost
 
@@ -295,7 +297,7 @@ class _Session:
         except CancelledError:
             raise self._gone() from None
         except Exception as error:
-            # An executor of the caller's tells in its own way that a worker is gone.
+            # Foreign executors report a lost worker in their own way.
             if type(error).__name__ == "KilledWorker":
                 return Outcome(failure=LOST, lost=True)
             raise
@@ -306,7 +308,7 @@ class _Session:
         return WorkersLost(f"{lost}; the rows that ended are kept, and the same command goes on from there")
 
     def _again(self, part: _Part) -> bool:
-        """Whether a part whose process died is tried once more."""
+        """Return whether a part whose process died is tried once more."""
         self.tries[part.name] += 1
         return self.crew.renew is not None and self.tries[part.name] < 2
 
@@ -314,23 +316,23 @@ class _Session:
         row, state = part.row, self.state
         if part.step:
             state.steps_done += 1
-            told = {"step": part.step, "scene": row.scene, "seed": row.seed}
-            self.store.save(part.key, outcome, told, STEPS)
+            record = {"step": part.step, "scene": row.scene, "seed": row.seed}
+            self.store.save(part.key, outcome, record, STEPS)
         else:
             outcome = replace(outcome, steps=part.after)
             if outcome.lost:
                 self.lost[row.key] = outcome
             else:
-                self.store.save(row.key, outcome, _told_of_row(self.plan, row))
+                self.store.save(row.key, outcome, _row_record(self.plan, row))
             state.done += 1
             failed = outcome.failure or finite(outcome.metrics, self.plan.wanted(row))[1]
             state.failed += bool(failed)
             state.waiting[row.variant] -= 1
             state.spent.setdefault(row.variant, []).append(outcome.seconds)
-        self.heard(state)
+        self.on_progress(state)
 
 
-def _told_of_row(plan: Plan, row: PlannedRow) -> dict[str, Any]:
+def _row_record(plan: Plan, row: PlannedRow) -> dict[str, Any]:
     task = row.setting.task
     return {
         "variant": row.variant,
@@ -343,7 +345,7 @@ def _told_of_row(plan: Plan, row: PlannedRow) -> dict[str, Any]:
     }
 
 
-def _told(plan: Plan) -> dict[str, Any]:
+def _study_record(plan: Plan) -> dict[str, Any]:
     """The study in plain words, beside its rows."""
     study = plan.study
     return {

@@ -1,8 +1,8 @@
-"""Paired differences and what they say: intervals, p-values, effect sizes, all of plain arrays.
+"""Statistics of paired differences: intervals, p-values and effect sizes.
 
-The interval is that of Student for few differences. From :data:`STUDENTISED_FROM` on it is the symmetric
-studentised bootstrap (Hall, The Bootstrap and Edgeworth Expansion, 1992, 3.5): |t| of resamples in the place
-of Student's quantile, which keeps its level for skewed differences nearly, where Student's does not.
+Few differences use Student's interval. From :data:`STUDENTISED_FROM` on it is the symmetric studentised
+bootstrap (Hall, The Bootstrap and Edgeworth Expansion, 1992, 3.5): |t| of resamples replaces Student's
+quantile, which keeps the level for skewed differences.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from thesisrecon.arrays import F64
 Unit = Literal["seeds", "scenes"]
 
 STUDENTISED_FROM = 12
-"""Of fewer differences, too many resamples hold next to no spread, and intervals have no end."""
+"""With fewer differences too many resamples have almost no spread."""
 SCENES_FROM = 6
-"""So many scenes are a sample of scenes; fewer are just these."""
+"""Minimum number of scenes that are treated as a sample of scenes."""
 RESAMPLES = 4999
 _BLOCK = 2_000_000
 
@@ -49,7 +49,7 @@ class Interval:
 def paired_interval(groups: Sequence[F64], *, level: float = 0.95) -> Interval:
     """The interval of the mean of paired differences, grouped by scene.
 
-    All scenes count alike, however many differences they have. Where there are at least ``SCENES_FROM``
+    All scenes have equal weight, however many differences they have. Where there are at least ``SCENES_FROM``
     scenes, or three whose differences do not depend on the seed, the scenes' means are the sample and the
     answer is one for scenes like these. Else only the seeds are drawn at random (a stratified sample, degrees
     of freedom by Welch and Satterthwaite), and the answer is one for these scenes. Resampling is
@@ -76,7 +76,7 @@ def _interval(strata: Sequence[F64], level: float, pairs: int, unit: Unit) -> In
     if min(map(len, strata)) < 2:
         nan = float("nan")
         return Interval(mean, nan, nan, nan, nan, pairs, unit)
-    # Sums of equal numbers leave rounding: what is below it is no spread.
+    # Sums of equal numbers leave rounding errors, which are not spread.
     if error <= 1e-12 * max(abs(mean), 1e-300):
         effect = float(np.copysign(np.inf, mean)) if mean else 0.0
         return Interval(mean, mean, mean, float(mean == 0.0), effect, pairs, unit)
@@ -93,7 +93,7 @@ def _interval(strata: Sequence[F64], level: float, pairs: int, unit: Unit) -> In
 
 
 def _parts(strata: Sequence[F64]) -> F64:
-    """What each stratum adds to the squared standard error of the mean of means."""
+    """Return the contribution of each stratum to the squared standard error of the mean of means."""
     found = [g.var(ddof=1) / len(g) if len(g) > 1 else np.nan for g in strata]
     return np.array(found) / len(strata) ** 2
 
@@ -117,7 +117,7 @@ def resampled_t(strata: Sequence[F64], *, resamples: int = RESAMPLES) -> F64:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """P-values adjusted for being so many (Holm 1979): below alpha, all that are so are right together with a
+    """Adjust p-values for multiple comparisons (Holm 1979): all below alpha are jointly correct with a
     probability of 1 - alpha. NaN stays and does not count."""
     values = np.asarray(p, dtype=np.float64)
     adjusted = np.full(len(values), np.nan)

@@ -1,6 +1,6 @@
-"""Rows on disk: a JSON file each, named by the key of what it was computed from, written whole or not at all.
+"""Store rows on disk, one JSON file each, named by the key of its inputs and written atomically.
 
-Any number of processes may add rows; a row that is there is never computed again.
+Any number of processes may add rows; a stored row is never recomputed.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ ROWS, STEPS, SHARED, WORK = "rows", "steps", "shared", "work"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a row.
+    """Result of a row.
 
-    ``metrics`` are its numbers; ``failure`` is the sentence that says what went wrong, empty where
-    nothing did. ``seconds`` is its own wall time, ``cpu_s`` its own processor time; ``steps`` are the keys of
-    the shared steps that it took over from others. ``lost``: the process ended before the row did.
+    ``metrics`` are its numbers; ``failure`` is the error message or empty. ``seconds`` is its wall time,
+    ``cpu_s`` its processor time; ``steps`` are the keys of reused shared steps. ``lost``: the process ended
+    before the row.
     """
 
     metrics: Mapping[str, float] = field(default_factory=dict)
@@ -49,37 +49,37 @@ class Store:
             raise OutputError(f"the output folder {self.path}", error) from None
 
     def load(self, key: str, kind: str = ROWS) -> Outcome | None:
-        """The outcome kept under this key, None where it is absent or damaged."""
-        told = read_json(self.path / kind / f"{key}.json")
+        """The outcome kept under this key, None if it is absent or damaged."""
+        record = read_json(self.path / kind / f"{key}.json")
         try:
-            numbers = {str(name): float(value) for name, value in told["metrics"].items()}
+            numbers = {str(name): float(value) for name, value in record["metrics"].items()}
             return Outcome(
                 numbers,
-                str(told["failure"]),
-                float(told["seconds"]),
-                float(told["cpu_s"]),
-                tuple(told["steps"]),
+                str(record["failure"]),
+                float(record["seconds"]),
+                float(record["cpu_s"]),
+                tuple(record["steps"]),
             )
         except (TypeError, KeyError, ValueError, AttributeError):
             return None
 
-    def save(self, key: str, outcome: Outcome, told: Mapping[str, Any], kind: str = ROWS) -> None:
-        """Keep an outcome with what is ``told`` of its row."""
+    def save(self, key: str, outcome: Outcome, record: Mapping[str, Any], kind: str = ROWS) -> None:
+        """Store an outcome with the ``record`` of its row."""
         found = {
-            # JSON has no NaN and no infinity: their words are read back as such.
+            # JSON has no NaN and no infinity; store them as words.
             "metrics": {k: v if math.isfinite(v) else str(v) for k, v in outcome.metrics.items()},
             "failure": outcome.failure,
             "seconds": outcome.seconds,
             "cpu_s": outcome.cpu_s,
             "steps": list(outcome.steps),
         }
-        write_json(self.path / kind / f"{key}.json", {**told, **found})
+        write_json(self.path / kind / f"{key}.json", {**record, **found})
 
 
 def finite(metrics: Mapping[str, float], wanted: Collection[str]) -> tuple[dict[str, float], str]:
-    """The finite numbers among ``metrics``, and a sentence of those that are ``wanted`` and are none."""
+    """Return the finite numbers of ``metrics`` and a message about missing ``wanted`` ones."""
     good = {name: float(v) for name, v in metrics.items() if math.isfinite(float(v))}
     missing = [name for name in wanted if name not in metrics]
     broken = [f"{name} is {float(metrics[name])}" for name in wanted if name in metrics and name not in good]
-    told = [f"the task tells no {', no '.join(missing)}"] if missing else []
-    return good, "; ".join([*broken, *told])
+    absent = [f"the task returned no {', no '.join(missing)}"] if missing else []
+    return good, "; ".join([*broken, *absent])

@@ -1,4 +1,4 @@
-"""What a study is: what is varied, on which scenes, how often, and what is measured."""
+"""Definition of a study: axes, scenes, seeds and measures."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Axis = Sequence[Any] | Mapping[str, Changes]
 
 @dataclass(frozen=True)
 class Measure:
-    """A number that rows tell.
+    """A number that rows report.
 
-    ``better`` says on which side the good lies. With ``ratio`` values are compared by their quotients, which
-    suits errors of very different sizes: so long as all are above zero.
+    ``better`` is "less" or "more". With ``ratio`` values are compared by quotients, for errors of different
+    magnitude above zero.
     """
 
     name: str
@@ -32,16 +32,15 @@ class Measure:
 
 
 class Task(Protocol):
-    """What a row runs: a frozen dataclass, its fields the parameters that paths ``task.…`` change.
+    """Work of a row: a frozen dataclass whose fields are the parameters ``task.…``.
 
-    ``measures`` are the numbers it tells. ``check`` raises :class:`UsageError` for a scene that it does not
-    know or that is not on this machine; ``scene_key`` names what the scene holds. ``run`` does the work with
-    a random seed, in an empty folder ``place`` that is removed after it; it tells its numbers by the names of
-    the measures. ``StageFailure`` says that the data could not be worked with.
+    ``measures`` are its numbers. ``check`` raises :class:`UsageError` for an unknown or missing scene;
+    ``scene_key`` identifies the content of a scene. ``run`` works with a random seed in an empty folder
+    ``place``, which is removed afterwards, and returns numbers by measure name. ``StageFailure`` means that
+    the data could not be processed.
 
-    A task that cannot tell each of its numbers everywhere has also a method ``untold(scene)`` that names
-    those it cannot tell of a scene. Tasks that begin alike for several rows have also the methods of
-    :class:`SharingTask`.
+    A task without some measures on some scenes also has ``unavailable(scene)``, which returns their names.
+    Tasks with shared first steps also have the methods of :class:`SharingTask`.
     """
 
     measures: ClassVar[Sequence[Measure]]
@@ -54,11 +53,10 @@ class Task(Protocol):
 
 
 class SharingTask(Task, Protocol):
-    """A task of several steps, the first of which may be alike for many rows.
+    """A task of several steps whose first steps may be shared by many rows.
 
-    ``steps`` names the steps in order with a key each: where two rows have equal keys, the step finds the
-    same. ``prepare`` carries a row out up to and with that step, and leaves what it found in
-    ``place.shared``, from where ``run`` takes it.
+    ``steps`` names the steps in order with a key each: equal keys mean equal results. ``prepare`` runs a row
+    up to and including that step and stores the result in ``place.shared`` for ``run``.
     """
 
     def steps(self, config: PipelineConfig, scene: str, seed: int) -> Sequence[tuple[str, str]]: ...
@@ -68,7 +66,7 @@ class SharingTask(Task, Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a row may write: ``own`` is an empty folder of its own, ``shared`` that of all rows."""
+    """Folders of a row: ``own`` is an empty folder of its own, ``shared`` that of all rows."""
 
     own: Path
     shared: Path
@@ -79,26 +77,26 @@ TaskFunction = Callable[[PipelineConfig, str, int], Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Study:
-    """A question to the library, and how it is asked.
+    """A question to the library and its experimental design.
 
     Parameters
     ----------
-    axes : what is compared: dotted path -> values, or any name -> {level -> changes}. A path begins with a
+    axes : compared settings: dotted path -> values, or any name -> {level -> changes}. A path begins with a
         stage of :class:`PipelineConfig` or with ``task``. A value is a number, a word (the kind of a variant,
         or ``file.py:Class`` for one of your own), a table (``kind`` and fields; ``preset`` for what that
         preset has there), or the object itself.
     scenes : the names of the scenes; a task may also take folders.
     seeds : of the random steps, or how many (then 0, 1, ...).
-    conditions : axes along which nothing is compared, as the noise that all variants meet.
+    conditions : axes that are not compared, such as the noise of all variants.
     mode : "one-at-a-time" changes one thing of the start at a time, "ladder" keeps each change and adds the
         next, "grid" takes every combination.
     baseline : the name of the variant that the others are compared with; the first where empty.
     start : the name of the unchanged configuration in the modes that begin with it.
-    metrics : which of the task's numbers are analysed, all where empty. A plain function as a task says here
+    metrics : the task's numbers to analyse, all if empty. A plain function as a task lists its numbers here.
         what it tells.
     task : what a row runs, a :class:`Task` or a function (config, scene, seed) -> {metric: number}; the
-        reconstruction of photographs where None.
-    config : what the changes start from.
+        reconstruction of images if None.
+    config : the configuration to change.
     """
 
     axes: Mapping[str, Axis]
@@ -114,4 +112,4 @@ class Study:
     title: str = "Ablation"
     words: str = ""
     folder: Path = Path()
-    """From where files named in values are sought."""
+    """Folder of files named in values."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.io.files import write_atomically, write_text
-from validation.ablation.analysis import Analysis, Cell, Comparison, as_told
+from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.study import Measure
 
 Record = Mapping[str, Any]
@@ -23,18 +23,18 @@ def row_records(analysis: Analysis) -> list[Record]:
     levels = {v.name: v.levels for v in plan.variants}
     conditions = {c.name: c.levels for c in plan.conditions}
     axes = list(dict.fromkeys(a for v in (*levels.values(), *conditions.values()) for a in v))
-    told_too = (name for row in analysis.rows for name in row.metrics)
-    names = list(dict.fromkeys([*(m.name for m in plan.measures), *told_too]))
+    other_names = (name for row in analysis.rows for name in row.metrics)
+    names = list(dict.fromkeys([*(m.name for m in plan.measures), *other_names]))
     found: list[Record] = []
     for row in analysis.rows:
-        told = {**levels[row.variant], **conditions[row.condition]}
+        entries = {**levels[row.variant], **conditions[row.condition]}
         found.append(
             {
                 "variant": row.variant,
                 "condition": row.condition,
                 "scene": row.scene,
                 "seed": row.seed,
-                **{f"axis:{a}": told.get(a) for a in axes},
+                **{f"axis:{a}": entries.get(a) for a in axes},
                 **{name: row.metrics.get(name) for name in names},
                 "failure": row.failure,
                 "seconds": row.seconds,
@@ -49,7 +49,7 @@ def comparison_records(comparisons: Iterable[Comparison]) -> list[Record]:
     """One row for each comparison."""
     found: list[Record] = []
     for c in comparisons:
-        mean, low, high = as_told(c)
+        mean, low, high = as_reported(c)
         found.append(
             {
                 "metric": c.measure.name,
@@ -148,9 +148,9 @@ def one_condition(analysis: Analysis, measure: Measure) -> str:
     head += ["this step alone", "cost, s"] if steps else ["cost, s"]
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     for name in (v.name for v in plan.variants):
-        told = [name, mean_text(cells[name]), comparison_text(found.get(name))]
-        told += [comparison_text(steps.get(name))] if steps else []
-        lines.append(f"| {' | '.join([*told, number(cells[name].cost_s)])} |")
+        entries = [name, mean_text(cells[name]), comparison_text(found.get(name))]
+        entries += [comparison_text(steps.get(name))] if steps else []
+        lines.append(f"| {' | '.join([*entries, number(cells[name].cost_s)])} |")
     return "\n".join(lines)
 
 
@@ -164,14 +164,14 @@ def over_conditions(analysis: Analysis, measure: Measure) -> str:
     head = [_title(measure), *(c.name for c in plan.conditions), "cost, s"]
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     for name in (v.name for v in plan.variants):
-        told, cost = [], 0.0
+        entries, cost = [], 0.0
         for condition in plan.conditions:
             at = (name, condition.name)
             mark = marks.get(found.get(at, ""), "")
-            told.append(f"{mark}{mean_text(cells[at])}{mark}")
+            entries.append(f"{mark}{mean_text(cells[at])}{mark}")
             cost += cells[at].cost_s / len(plan.conditions)
         base = " (the baseline)" if name == plan.baseline else ""
-        lines.append(f"| {' | '.join([f'{name}{base}', *told, number(cost)])} |")
+        lines.append(f"| {' | '.join([f'{name}{base}', *entries, number(cost)])} |")
     return "\n".join(lines)
 
 
@@ -189,7 +189,7 @@ def comparison_text(found: Comparison | None) -> str:
     """The difference or quotient with its interval; bold where it is shown to be one."""
     if found is None or not math.isfinite(found.interval.mean):
         return ""
-    mean, low, high = as_told(found)
+    mean, low, high = as_reported(found)
     sign = "x " if found.ratio else "+" if mean > 0 else ""
     text = f"{sign}{number(mean)}"
     if math.isfinite(low) and high > low:

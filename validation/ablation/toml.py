@@ -1,4 +1,4 @@
-"""A study as a file of TOML: read with a sentence for whatever does not fit, before anything runs."""
+"""Read a study from a TOML file; report invalid entries before anything runs."""
 
 from __future__ import annotations
 
@@ -21,61 +21,60 @@ _KEYS = (*_TEXTS, *_TABLES, "task", "preset", "config", "scenes", "seeds", "metr
 
 
 def read_study(path: str | Path) -> Study:
-    """The study of a file.
+    """Read the study of a file.
 
-    Raises :class:`UsageError` that names the file for one that is not there or is no TOML, an unknown key
-    (naming the nearest), and values of another type. Paths, scenes and metrics are checked when the study is
-    planned.
+    Raises :class:`UsageError` naming the file if it is missing, not TOML, or has an unknown key (naming the
+    nearest) or a wrong type. Paths, scenes and metrics are checked by :func:`plan_study`.
     """
     path = Path(path)
     try:
-        told = tomllib.loads(read_bytes(path).decode("utf-8"))
+        table = tomllib.loads(read_bytes(path).decode("utf-8"))
     except OSError as error:
         raise UsageError(f"the study {path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise UsageError(f"the study {path} is not TOML: {error}") from None
     try:
-        return study_from_table(told, path.parent)
+        return study_from_table(table, path.parent)
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
 
 
-def study_from_table(told: Mapping[str, Any], folder: Path = Path()) -> Study:
-    """The study that a table tells; files in it are sought from ``folder``."""
-    for key in told:
+def study_from_table(table: Mapping[str, Any], folder: Path = Path()) -> Study:
+    """Return the study of a table; its files are relative to ``folder``."""
+    for key in table:
         if key not in _KEYS:
             raise UsageError(unknown_word("key of a study", key, _KEYS))
     for key in _TEXTS:
-        if key in told and not isinstance(told[key], str):
-            raise UsageError(f"{key} takes a text; got {told[key]!r}")
+        if key in table and not isinstance(table[key], str):
+            raise UsageError(f"{key} takes text; got {table[key]!r}")
     for key in _TABLES:
-        if not isinstance(told.get(key, {}), Mapping):
-            raise UsageError(f"{key} takes a table, path or name -> levels; got {told[key]!r}")
+        if not isinstance(table.get(key, {}), Mapping):
+            raise UsageError(f"{key} takes a table, path or name -> levels; got {table[key]!r}")
     for key in ("scenes", "axes"):
-        if key not in told:
+        if key not in table:
             raise UsageError(f"a study needs {key}")
-    plain = {key: told[key] for key in (*_TEXTS, *_TABLES, "scenes", "seeds") if key in told}
+    plain = {key: table[key] for key in (*_TEXTS, *_TABLES, "scenes", "seeds") if key in table}
     return Study(
         **plain,
-        metrics=_metrics(told.get("metrics", [])),
-        task=_task(told.get("task", "reconstruction"), folder),
-        config=_config(told),
+        metrics=_metrics(table.get("metrics", [])),
+        task=_task(table.get("task", "reconstruction"), folder),
+        config=_config(table),
         folder=folder,
     )
 
 
-def _config(told: Mapping[str, Any]) -> PipelineConfig:
-    base, changes = preset(told.get("preset", "default")), told.get("config", {})
+def _config(table: Mapping[str, Any]) -> PipelineConfig:
+    base, changes = preset(table.get("preset", "default")), table.get("config", {})
     if not isinstance(changes, Mapping):
         raise UsageError(f"config takes a table of stages; got {changes!r}")
     return config_from_tables(changes, base)
 
 
-def _task(wish: Any, folder: Path) -> Any:
-    """A task by its kind, or of a file of the user's; a table holds its parameters too."""
-    table = {"kind": wish} if isinstance(wish, str) else wish
+def _task(value: Any, folder: Path) -> Any:
+    """A task by its kind, or of a file of the user; a table holds its parameters too."""
+    table = {"kind": value} if isinstance(value, str) else value
     if not isinstance(table, Mapping) or not isinstance(table.get("kind"), str):
-        raise UsageError(f"task takes a kind, or a table with its kind and parameters; got {wish!r}")
+        raise UsageError(f"task takes a kind, or a table with its kind and parameters; got {value!r}")
     kind, fields = table["kind"], {k: v for k, v in table.items() if k != "kind"}
     if not is_own(kind):
         if kind not in TASKS:
@@ -89,11 +88,11 @@ def _task(wish: Any, folder: Path) -> Any:
     return found
 
 
-def _metrics(told: Any) -> list[str | Measure]:
+def _metrics(names: Any) -> list[str | Measure]:
     """Names of the task's measures, or tables that describe one."""
-    if not isinstance(told, list):
-        raise UsageError(f"metrics take a list; got {told!r}")
-    return [_metric(item) for item in told]
+    if not isinstance(names, list):
+        raise UsageError(f"metrics take a list; got {names!r}")
+    return [_metric(item) for item in names]
 
 
 def _metric(item: Any) -> str | Measure:

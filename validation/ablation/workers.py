@@ -1,4 +1,4 @@
-"""Who carries rows out: this process, processes beside it, a Dask cluster, any executor of the caller's."""
+"""Executors of rows: this process, local processes, a Dask cluster or a given executor."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from thesisrecon.settings import unknown_word
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MANY = 64
-"""Rows that wait at an executor of the caller's, who does not say how many workers it has."""
+"""Queued rows of a given executor with an unknown number of workers."""
 
 
 @dataclass
 class Crew:
-    """An executor and how many rows it carries out at a time; ``renew`` makes another where its processes
-    died, None where that is the caller's affair. ``by_thread``: several rows share a process."""
+    """An executor and its number of parallel rows; ``renew`` replaces a pool whose processes died, None for a
+    given executor. ``by_thread``: rows share a process."""
 
     executor: Executor
     width: int
@@ -32,7 +32,7 @@ class Crew:
 
     @property
     def most(self) -> int:
-        """How many rows it is given at a time: one more for each worker, so that none waits for its next."""
+        """Number of submitted rows: one extra for each worker, so that none waits."""
         return 1 if isinstance(self.executor, _Here) else 2 * self.width
 
 
@@ -49,29 +49,29 @@ class _Here(Executor):
 
 
 @contextmanager
-def crew_of(wish: str | Executor, threads: int | None) -> Iterator[Crew]:
-    """The crew for an executor or its word: "local", "processes" or "dask://HOST:PORT".
+def crew_of(executor: str | Executor, threads: int | None) -> Iterator[Crew]:
+    """Yield the crew for an executor or its name: "local", "processes" or "dask://HOST:PORT".
 
-    An executor that was given is left open. Raises :class:`UsageError` for another word, fewer than one
-    thread, and a scheduler that does not answer.
+    A given executor is left open. Raises :class:`UsageError` for an unknown name, fewer than one thread, and
+    a scheduler that does not answer.
     """
     if threads is not None and threads < 1:
         raise UsageError(f"threads must be at least 1; got {threads}")
-    if isinstance(wish, Executor):
-        workers: int = getattr(wish, "_max_workers", MANY)
-        yield Crew(wish, threads or workers, not isinstance(wish, ProcessPoolExecutor))
+    if isinstance(executor, Executor):
+        workers: int = getattr(executor, "_max_workers", MANY)
+        yield Crew(executor, threads or workers, not isinstance(executor, ProcessPoolExecutor))
         return
     count = threads or available_threads()
-    if wish == "local":
+    if executor == "local":
         crew = Crew(ThreadPoolExecutor(count) if count > 1 else _Here(), count, count > 1)
-    elif wish == "processes":
+    elif executor == "processes":
         crew = Crew(_processes(count), count, False, lambda: _processes(count))
-    elif is_dask_address(wish):
-        with connect_dask(wish) as cluster:
+    elif is_dask_address(executor):
+        with connect_dask(executor) as cluster:
             yield Crew(cluster.executor, cluster.parallel(), True, cluster=cluster)
         return
     else:
-        raise UsageError(unknown_word("executor", wish, NAMES))
+        raise UsageError(unknown_word("executor", executor, NAMES))
     try:
         yield crew
     except BaseException:
@@ -84,6 +84,6 @@ def crew_of(wish: str | Executor, threads: int | None) -> Iterator[Crew]:
 
 def _processes(count: int) -> ProcessPool:
     for name in ONE_THREAD:
-        # As many processes as cores: each has one, and NumPy's own threads would fight for them.
+        # One process per core: NumPy's own threads would compete for them.
         os.environ.setdefault(name, "1")
     return ProcessPool(count)

@@ -1,1 +1,1 @@
-"""One way to run every stage of ours and of the references on the same inputs, and to tell of it."""
+"""Run every stage and its references on the same inputs and report the results."""

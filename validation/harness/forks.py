@@ -1,7 +1,7 @@
-"""Tasks as forks of a process that has imported everything once.
+"""Run tasks as forks of a process that has imported everything once.
 
-To import the library and its stages takes two seconds, as long as many a task. Each task is still a process
-of its own, which may crash, hang or be killed, and whose seconds and memory are its own account.
+Importing the library takes two seconds, as long as many tasks. Each task is still a process of its own that
+may crash, hang or be killed, with its own time and memory.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ class Template:
         start = time.perf_counter()
         try:
             print(json.dumps([str(log), limit_s, *arguments]), file=self._child.stdin, flush=True)
-            told = self._read()
+            line = self._read()
         except BrokenPipeError:
-            told = ""
-        if not told:
+            line = ""
+        if not line:
             raise RuntimeError(f"the process that tasks are forks of ended with {self._child.wait()}")
-        code, peak_mb, cpu_s, timed_out = json.loads(told)
+        code, peak_mb, cpu_s, timed_out = json.loads(line)
         return Process(code, time.perf_counter() - start, peak_mb, cpu_s, timed_out)
 
     def _read(self) -> str:
@@ -100,24 +100,24 @@ def serve(main: Callable[[list[str]], int], orders: IO[str], answers: IO[str]) -
 
 
 def _wait(child: int, limit_s: float, orders: IO[str]) -> tuple[int, float, float, bool] | None:
-    """Exit code, peak memory in MB, processor seconds, and whether its time was up; None where nobody wants
+    """Exit code, peak memory in MB, processor seconds, and whether its time was up; None if nothing wants
     to know any more."""
     ended = os.pidfd_open(child)
     either = select.poll()
     either.register(ended, select.POLLIN)
-    # Of a pipe that is told in any case: that its other end is closed.
+    # A closed pipe is always reported.
     either.register(orders, 0)
-    heard = {place for place, _ in either.poll(limit_s * 1000.0)}
-    if ended not in heard:
+    ready = {place for place, _ in either.poll(limit_s * 1000.0)}
+    if ended not in ready:
         with contextlib.suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
             os.killpg(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
     os.close(ended)
-    if heard - {ended}:
+    if ready - {ended}:
         return None
     code = os.waitstatus_to_exitcode(status)
-    return code, usage.ru_maxrss / 1024.0, usage.ru_utime + usage.ru_stime, not heard and code == KILLED
+    return code, usage.ru_maxrss / 1024.0, usage.ru_utime + usage.ru_stime, not ready and code == KILLED
 
 
 def _become(main: Callable[[list[str]], int], arguments: list[str], log: str) -> None:
@@ -134,7 +134,7 @@ def _become(main: Callable[[list[str]], int], arguments: list[str], log: str) ->
         code = main(arguments)
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
-    except BaseException:  # nothing may get back to the loop of the template
+    except BaseException:  # never return to the loop of the template
         traceback.print_exc()
     finally:
         with contextlib.suppress(OSError, ValueError):
@@ -145,8 +145,8 @@ def _become(main: Callable[[list[str]], int], arguments: list[str], log: str) ->
 
 if __name__ == "__main__":
     os.sched_setaffinity(0, {int(sys.argv[1])})
-    # What is imported may print; the answers have a way of their own.
-    told = os.fdopen(os.dup(1), "w")
+    # Imports may print; answers use a separate descriptor.
+    answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     modules = [import_module(name) for name in sys.argv[2:]]
-    serve(modules[0].main, sys.stdin, told)
+    serve(modules[0].main, sys.stdin, answers)

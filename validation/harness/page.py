@@ -1,4 +1,4 @@
-"""The pages of a report: ``index.html`` for the whole and one for each scene, verdict first."""
+"""Write the pages of a report: ``index.html`` and one page for each scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thesisrecon import __version__
 from thesisrecon.errors import counted
 from thesisrecon.io.files import write_text
 from thesisrecon.report.page import page_resource, plotly_script, script_hashes, template_environment
-from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Wishes, key_of, slug
+from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, key_of, slug
 from validation.harness.results import Change, Results, Row
 
 HERE = Path(__file__).parent
@@ -33,21 +33,21 @@ class _Verdict:
 
 
 def write_pages(
-    wishes: Wishes,
+    options: ReportOptions,
     stages: Mapping[str, Stage],
     judged: Judged,
     results: Results,
     changes: Sequence[Change] | None,
 ) -> Path:
     """Write all pages; the path of the first to open."""
-    scenes = [s for s in wishes.scenes if any(scene == s for _, scene in judged)]
+    scenes = [s for s in options.scenes if any(scene == s for _, scene in judged)]
     links = [("All scenes", "index.html"), *((s, f"scene-{slug(s)}.html") for s in scenes)]
     names = {
         key_of(stage, m): m.name for (stage, _), (judgement, _) in judged.items() for m in judgement.metrics
     }
     for scene in scenes:
         sections = [
-            _section(stage, results, names, scene, judgement, wishes)
+            _section(stage, results, names, scene, judgement, options)
             for (name, where), (judgement, _) in judged.items()
             if where == scene
             for stage in [stages[name]]
@@ -56,8 +56,8 @@ def write_pages(
         failures = [(k, why) for k, why in results.failures.items() if k.split("/")[1] == scene]
         missing = [k for k in results.missing if k.split("/")[1] == scene]
         page = _page(scene, links, _verdict(rows, missing), sections, failures, None, None)
-        write_text(wishes.out / f"scene-{slug(scene)}.html", page)
-    whole = [_section(stages[name], results, names) for name in wishes.stages]
+        write_text(options.out / f"scene-{slug(scene)}.html", page)
+    whole = [_section(stages[name], results, names) for name in options.stages]
     page = _page(
         "Ours beside the references",
         links,
@@ -67,8 +67,8 @@ def write_pages(
         list(results.environment.items()),
         changes,
     )
-    write_text(wishes.out / "index.html", page)
-    return wishes.out / "index.html"
+    write_text(options.out / "index.html", page)
+    return options.out / "index.html"
 
 
 def _page(
@@ -106,14 +106,14 @@ def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
     judged = [row for row in rows if row.limit is not None]
     broken = [row for row in judged if row.verdict != "reached"]
     if not judged and not missing:
-        words = f"{counted(len(rows), 'number')} told, none with a limit."
+        words = f"{counted(len(rows), 'number')} reported, none with a limit."
         return _Verdict("open", "Nothing promised here", words)
-    told = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
+    summary = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
     reasons = tuple(f"{r.key}: {short(r.value)} {r.unit}, {r.direction} {short(r.limit)}" for r in broken)
     reasons += tuple(f"{key}: no method reported this number" for key in missing)
     if reasons:
-        return _Verdict("bad", "Broken", f"{told}.", reasons)
-    return _Verdict("good", "Reached", f"{told}; {counted(len(rows), 'number')} in all.")
+        return _Verdict("bad", "Broken", f"{summary}.", reasons)
+    return _Verdict("good", "Reached", f"{summary}; {counted(len(rows), 'number')} in all.")
 
 
 def _section(
@@ -122,7 +122,7 @@ def _section(
     names: Mapping[str, str],
     scene: str | None = None,
     judgement: Judgement | None = None,
-    wishes: Wishes | None = None,
+    options: ReportOptions | None = None,
 ) -> dict[str, Any]:
     rows = [r for r in results.rows if r.key.startswith(f"{stage.name}/")]
     rows = [r for r in rows if scene is None or r.key.split("/")[1] == scene]
@@ -130,8 +130,8 @@ def _section(
     plots: tuple[Any, ...] = ()
     pictures: tuple[Any, ...] = ()
     notes: tuple[str, ...] = ()
-    if judgement is not None and wishes is not None and scene is not None:
-        place = wishes.place(stage.name, scene)
+    if judgement is not None and options is not None and scene is not None:
+        place = options.place(stage.name, scene)
         plots = tuple(_plot(stage.name, n, plot) for n, plot in enumerate(judgement.plots))
         pictures = tuple(_picture(place, picture) for picture in judgement.pictures)
         notes = tuple(judgement.notes)
@@ -158,7 +158,7 @@ def _row(row: Row, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _ratio(row: Row) -> float | None:
-    """Ours over the best reference (variants of ours are none); None where there is nothing to divide by."""
+    """Return ours over the best reference (not a variant of ours), or None."""
     others = [v for name, v in row.reference.items() if v is not None and not name.startswith("ours")]
     if row.value is None or not others:
         return None
@@ -178,7 +178,7 @@ def _plot(stage: str, number: int, plot: Plot) -> dict[str, Any]:
 
 
 def _picture(place: Path, picture: Picture) -> dict[str, Any]:
-    """The picture as a data address, no wider than a page needs."""
+    """The image as a data address, no wider than a page needs."""
     with PIL.Image.open(place / picture.file) as opened:
         rgb = opened.convert("RGB")
     rgb.thumbnail((WIDEST_PX, WIDEST_PX))

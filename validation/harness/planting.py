@@ -1,4 +1,4 @@
-"""A copy of the tree into which faults are put, one at a time, with its compiled kernels."""
+"""A copy of the tree in which one fault at a time is planted, with its compiled kernels."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pathlib import Path
 from validation.scenes.real import ROOT
 
 FAULTY_S = 4_000_000_000
-"""When a file with the first fault was changed, later than any other; a second more for each fault."""
+"""Modification time of the first fault, later than any file; each fault adds a second."""
 
 
 @dataclass(frozen=True)
 class CopiedTree:
-    """What is ``copied`` of the repository, in the folder ``out``."""
+    """The parts ``copied`` from the repository, in the folder ``out``."""
 
     out: Path
     copied: tuple[str, ...] = ("thesisrecon", "validation", "fixtures", "pyproject.toml")
@@ -57,7 +57,7 @@ class CopiedTree:
         shutil.rmtree(kernels, ignore_errors=True)
         shutil.copytree(self.kernels, kernels, copy_function=os.link)
         for module in compiled_from(self.tree, file):
-            # numba knows a change of a kernel's own file, and of no other that it is made of.
+            # numba detects changes of a kernel's own file only.
             for stale in kernels.glob(f"{module.parent.name}_*/{module.stem}.*"):
                 stale.unlink()
         newer = {module: module.stat().st_mtime for module in importers(self.tree, file)}
@@ -74,7 +74,7 @@ class CopiedTree:
 
 
 def importers(root: Path, file: str) -> list[Path]:
-    """The module and all modules of its package that import it, themselves or through others."""
+    """Return the module and its direct and indirect importers in the package."""
     return _reached(root, file, lambda _: True)
 
 
@@ -89,7 +89,7 @@ def compiled_from(root: Path, file: str) -> list[Path]:
 
 
 def has_kernels(path: Path) -> bool:
-    """Whether a module defines compiled functions."""
+    """Return whether a module defines compiled functions."""
     return "njit" in path.read_text(encoding="utf-8")
 
 
@@ -108,7 +108,7 @@ def _reached(root: Path, file: str, passes: Callable[[Path], bool]) -> list[Path
 
 
 def imports_of(path: Path) -> set[str]:
-    """What a file imports, modules and names in them."""
+    """Return the imports of a file: modules and names in them."""
     found = set[str]()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

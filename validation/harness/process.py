@@ -1,4 +1,4 @@
-"""A child process with its own cores, a time limit, and an account of what it used."""
+"""Run a child process with given cores and a time limit, and measure it."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _PIN = (
 
 @dataclass(frozen=True)
 class Process:
-    """How a child ended: exit ``code`` (negative: the signal that ended it), seconds and processor seconds of
-    its life, peak memory, and whether it was ended because its time was up."""
+    """How a child ended: exit ``code`` (negative: signal), wall and processor seconds, peak memory, and
+    whether it timed out."""
 
     code: int
     wall_s: float
@@ -85,7 +85,7 @@ def run_process(
 
 
 def last_words(log: Path) -> str:
-    """The last line that a process wrote, for the sentence that says why it failed."""
+    """Return the last line of a log."""
     try:
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     except OSError:
@@ -94,9 +94,9 @@ def last_words(log: Path) -> str:
 
 
 def failure_of(process: Process, words: str, limit_s: float) -> str:
-    """Why a process did not end well, in a clause; empty where it did. ``words`` are its last."""
+    """Why a process did not end well, in a clause; empty if it did. ``words`` are its last."""
     if process.timed_out:
-        return f"ended after the {limit_s:.0f} s that a task may take"
+        return f"exceeded the time limit of {limit_s:.0f} s"
     if process.code < 0:
         return f"crashed with signal {-process.code}"
     if process.code:

@@ -1,4 +1,4 @@
-"""What travels through the harness: wishes, tasks, what came of them, and what is told of it."""
+"""Records of the harness: report options, tasks, outcomes and judgements."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from validation.metrics.record import Metric
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What a report is asked for.
+class ReportOptions:
+    """Options of a report.
 
-    ``out`` : its folder. ``scenes``, ``stages`` : their names, in order. ``folders`` : scene -> folder, of
-    scenes that the user brought. ``quick`` : less of everything that can be less. ``gates_only`` : no
-    reference that takes long and that no gate needs. ``seed`` : of all random steps. ``threads`` : cores that
-    may be used at once. ``limit_s`` : seconds a single task may take. ``side_px`` : long side of depth maps,
-    0 for what a report has time for. ``resume`` : the folder of another run, whose references are taken as
-    they are; empty for none. ``methods`` : those of ours that run again where a run is resumed; empty for
-    all. ``stages_from`` : the module whose ``STAGES`` hold the stages.
+    ``out``: output folder. ``scenes``, ``stages``: names in order. ``folders``: folder of each user scene.
+    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references that no gate needs.
+    ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s). ``side_px``:
+    long side of depth maps, 0 for the default. ``resume``: folder of an earlier run whose references are
+    reused, or empty. ``methods``: own methods that run again with ``resume``, empty for all. ``stages_from``:
+    module of ``STAGES``.
     """
 
     out: Path
@@ -47,9 +46,9 @@ class Wishes:
         return asdict(self) | {"out": str(self.out)}
 
     @classmethod
-    def from_json(cls, told: Mapping[str, Any]) -> Wishes:
-        tuples = {name: tuple(told.get(name, ())) for name in ("scenes", "stages", "methods")}
-        return cls(**{**told, **tuples, "out": Path(told["out"])})
+    def from_json(cls, record: Mapping[str, Any]) -> ReportOptions:
+        tuples = {name: tuple(record.get(name, ())) for name in ("scenes", "stages", "methods")}
+        return cls(**{**record, **tuples, "out": Path(record["out"])})
 
 
 @dataclass(frozen=True)
@@ -63,8 +62,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a task: the folder where it saved its results, and what it used; ``failure`` is empty
-    where it ended well, else the sentence that says why not."""
+    """Outcome of a task: its result folder and resources; ``failure`` is empty or the error message."""
 
     place: Path
     failure: str = ""
@@ -79,7 +77,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture on the page of a scene: a PNG or JPEG ``file`` in the folder of the judgement."""
+    """A figure on the page of a scene: a PNG or JPEG ``file`` in the folder of the judgement."""
 
     file: str
     title: str
@@ -97,7 +95,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is told of a stage on a scene: numbers first, then plots and pictures."""
+    """Evaluation of a stage on a scene: numbers first, then plots and figures."""
 
     metrics: Sequence[Metric]
     plots: Sequence[Plot] = ()
@@ -108,33 +106,33 @@ class Judgement:
 class Stage(Protocol):
     """A stage of the library beside its references.
 
-    ``name`` and ``title`` say what it is, ``definition`` what is compared, in one sentence. ``takes`` says
-    whether it can work on a scene; ``methods`` what runs there; ``needs`` the (stage, method) whose results
-    on the same scene a method starts from, and the judgement where ``method`` is empty. ``run`` does the work
-    of a task and saves what came of it in its place; ``judge`` reads all of it, recomputes every number and
-    may write pictures into its own place.
+    ``definition`` states the comparison in one sentence. ``takes`` returns whether the stage can work on a
+    scene; ``methods`` the methods there; ``needs`` the (stage, method) results that a method, or the
+    judgement (empty ``method``), reads. ``run`` computes a task and saves its result; ``judge`` reads all
+    results and recomputes every number.
     """
 
     name: str
     title: str
     definition: str
 
-    def takes(self, scene: str, wishes: Wishes) -> bool: ...
+    def takes(self, scene: str, options: ReportOptions) -> bool: ...
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]: ...
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]: ...
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]: ...
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the default)
+        return ()
 
-    def run(self, task: Task, wishes: Wishes) -> None: ...
+    def run(self, task: Task, options: ReportOptions) -> None: ...
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement: ...
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement: ...
 
 
 def slug(text: str) -> str:
-    """A name for files and keys: letters, digits, dots and single dashes."""
+    """Return a name for files and keys: letters, digits, dots and single dashes."""
     return re.sub(r"[^A-Za-z0-9.]+", "-", text).strip("-")
 
 
 def key_of(stage: str, metric: Metric) -> str:
-    """What a gate calls this number."""
+    """Return the gate key of a number."""
     return f"{stage}/{metric.scene}/{slug(metric.name)}"

@@ -18,7 +18,7 @@ import numpy as np
 from thesisrecon.io.files import read_bytes, write_text
 from validation.harness.canaries import read_refused
 from validation.harness.gates import Gate
-from validation.harness.records import Judgement, Outcome, Wishes, key_of
+from validation.harness.records import Judgement, Outcome, ReportOptions, key_of
 from validation.metrics.record import Metric
 from validation.references.libraries import PACKAGES
 
@@ -29,8 +29,8 @@ TIME_UNITS = ("s", "s processor", "s / s", "us", "ms", "MB")
 
 @dataclass(frozen=True)
 class Row:
-    """A number as it is written: ours (``value``) beside those of the references; the good side of the
-    ``limit`` is the ``direction``, which stands without a limit too."""
+    """A reported number: ours (``value``) and the references; ``direction`` is the good side of the
+    ``limit``."""
 
     key: str
     value: float | None
@@ -51,7 +51,7 @@ class Results:
     missing: Sequence[str]
     failures: Mapping[str, str]
     environment: Mapping[str, Any]
-    wishes: Mapping[str, Any]
+    options: Mapping[str, Any]
 
     @property
     def broken(self) -> list[Row]:
@@ -78,30 +78,30 @@ def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
 
 
 def collect(
-    wishes: Wishes,
+    options: ReportOptions,
     judged: Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]],
     gates: Mapping[str, Gate],
 ) -> Results:
-    """All rows of a run; gates without a reported number are ``missing``."""
+    """Collect all rows of a run; gates without a reported number are ``missing``."""
     rows = []
     for (stage, _), (judgement, _outcomes) in judged.items():
         rows += [row_of(stage, m, gates.get(key_of(stage, m))) for m in judgement.metrics]
-    told = {row.key for row in rows}
-    missing = sorted(k for k in gates if tuple(k.split("/")[:2]) in set(judged) and k not in told)
+    reported = {row.key for row in rows}
+    missing = sorted(k for k in gates if tuple(k.split("/")[:2]) in set(judged) and k not in reported)
     failures = {
         f"{stage}/{scene}/{method}": outcome.failure
         for (stage, scene), (_, outcomes) in judged.items()
         for method, outcome in outcomes.items()
         if not outcome.ok
     }
-    return Results(rows, missing, failures, environment(wishes), wishes.to_json())
+    return Results(rows, missing, failures, environment(options), options.to_json())
 
 
-def environment(wishes: Wishes) -> dict[str, Any]:
-    """What the numbers were made with."""
+def environment(options: ReportOptions) -> dict[str, Any]:
+    """Return the environment of the run."""
     versions = {name: _version(name) for name in (*OWN_PACKAGES, *PACKAGES.values())}
-    for library, words in read_refused(wishes.out).items():
-        versions[PACKAGES[library]] += f". Not asked: {words}"
+    for library, words in read_refused(options.out).items():
+        versions[PACKAGES[library]] += f". Not used: {words}"
     return {
         "machine": platform.machine(),
         "processor": _processor(),
@@ -109,8 +109,8 @@ def environment(wishes: Wishes) -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         **versions,
-        "threads": f"{wishes.threads} tasks at a time, one thread each",
-        "seed": wishes.seed,
+        "threads": f"{options.threads} parallel tasks, one thread each",
+        "seed": options.seed,
     }
 
 
@@ -123,14 +123,14 @@ def _version(package: str) -> str:
 
 def write_results(out: Path, results: Results) -> None:
     """``results.json``, and ``tables/STAGE.csv``."""
-    told = {
+    record = {
         "rows": [vars(row) | {"reference": dict(row.reference)} for row in results.rows],
         "missing": list(results.missing),
         "failures": dict(results.failures),
         "environment": dict(results.environment),
-        "wishes": dict(results.wishes),
+        "options": dict(results.options),
     }
-    write_text(out / "results.json", json.dumps(told, indent=1, allow_nan=False))
+    write_text(out / "results.json", json.dumps(record, indent=1, allow_nan=False))
     for stage in dict.fromkeys(row.key.split("/")[0] for row in results.rows):
         _write_csv(
             out / "tables" / f"{stage}.csv", [r for r in results.rows if r.key.startswith(f"{stage}/")]
@@ -143,13 +143,13 @@ def read_results(out: Path) -> Results:
     Raises ``ValueError`` where there is none.
     """
     try:
-        told = json.loads(read_bytes(out / "results.json").decode("utf-8"))
+        record = json.loads(read_bytes(out / "results.json").decode("utf-8"))
         return Results(
-            [Row(**row) for row in told["rows"]],
-            told["missing"],
-            told["failures"],
-            told["environment"],
-            told["wishes"],
+            [Row(**row) for row in record["rows"]],
+            record["missing"],
+            record["failures"],
+            record["environment"],
+            record["options"],
         )
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{out} holds no report to compare with (results.json): {error}") from None
@@ -157,7 +157,7 @@ def read_results(out: Path) -> Results:
 
 @dataclass(frozen=True)
 class Change:
-    """A number that differs between two runs; None where one has it not."""
+    """A number that differs between two runs; None if one has it not."""
 
     key: str
     unit: str
@@ -171,7 +171,7 @@ class Change:
 
 
 def compare(before: Results, now: Results) -> list[Change]:
-    """All numbers of ours and all verdicts that are not the same, times and memory too."""
+    """Return all changed numbers of ours and verdicts, with times and memory."""
     old, new = ({row.key: row for row in r.rows} for r in (before, now))
     changes = []
     for key in dict.fromkeys([*old, *new]):
@@ -179,8 +179,8 @@ def compare(before: Results, now: Results) -> list[Change]:
         values = [None if (row := found.get(key)) is None else row.value for found in (old, new)]
         verdicts = ["absent" if (row := found.get(key)) is None else row.verdict for found in (old, new)]
         if values[0] != values[1] or verdicts[0] != verdicts[1]:
-            told = (verdicts[0], verdicts[1])
-            changes.append(Change(key, rows[-1].unit, values[0], values[1], told))
+            change = (verdicts[0], verdicts[1])
+            changes.append(Change(key, rows[-1].unit, values[0], values[1], change))
     return changes
 
 
@@ -193,8 +193,8 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
     )
     for row in rows:
         others = [row.reference.get(name) for name in references]
-        told = [row.direction, row.limit, row.verdict, row.source, row.reason]
-        writer.writerow([row.key, row.unit, row.value, *others, *told])
+        rest = [row.direction, row.limit, row.verdict, row.source, row.reason]
+        writer.writerow([row.key, row.unit, row.value, *others, *rest])
     write_text(path, sink.getvalue())
 
 

@@ -1,7 +1,7 @@
-"""A run that starts from what another one left: references as they are, ours from files that still hold.
+"""Resume from an earlier run: reuse its references and still valid files of ours.
 
-Ours is every method whose name begins with "ours". Of its results only the numbered folders of a run of the
-library are taken, which it reads itself where neither the settings nor the code of a stage has changed.
+Own methods have names that begin with "ours". Only numbered folders of a library run are taken; the library
+itself checks whether settings and code of a stage have changed.
 """
 
 from __future__ import annotations
@@ -14,71 +14,75 @@ from pathlib import Path
 
 from thesisrecon.runtime.run import FOLDERS
 from thesisrecon.runtime.run_folder import RUN_FILE
-from validation.harness.records import Outcome, Stage, Task, Wishes
+from validation.harness.records import Outcome, ReportOptions, Stage, Task
 from validation.harness.worker import OUTCOMES
 
 OURS = "ours"
 OVER_OURS = ("between", "boards", "surface", "views")
-"""Stages whose references, too, go through code of ours: they run again."""
+"""Stages whose references use our code and run again."""
 ALIKE = ("quick", "gates_only", "seed", "side_px")
-"""Wishes that the results of a task depend on."""
+"""Options that affect the results of a task."""
 
 
-def take_over(wishes: Wishes, tasks: Sequence[Task], stages: Mapping[str, Stage]) -> dict[Task, Outcome]:
-    """The outcomes of tasks that need not run again; their files stand in their places of this run.
+def take_over(
+    options: ReportOptions, tasks: Sequence[Task], stages: Mapping[str, Stage]
+) -> dict[Task, Outcome]:
+    """Return the outcomes of tasks that need not run again; their files are copied to this run.
 
-    Raises ``ValueError`` where the other folder holds no run, or one with other wishes.
+    Raises ``ValueError`` if the other folder holds no run, or one with different options.
     """
-    if not wishes.resume:
+    if not options.resume:
         return {}
-    other = _wishes_of(Path(wishes.resume))
-    unlike = [name for name in ALIKE if getattr(other, name) != getattr(wishes, name)]
-    if unlike:
-        raise ValueError(f"{wishes.resume} is a run with another {', '.join(unlike)}: start from a like one")
+    other = _options_of(Path(options.resume))
+    different = [name for name in ALIKE if getattr(other, name) != getattr(options, name)]
+    if different:
+        raise ValueError(
+            f"{options.resume} is a run with another {', '.join(different)}: use a run with the same options"
+        )
     known = {}
     for task in tasks:
-        if _runs_again(task, wishes):
-            _take_folders(other.place(task.stage, task.scene, task.method) / "run", wishes, task)
+        if _runs_again(task, options):
+            _take_folders(other.place(task.stage, task.scene, task.method) / "run", options, task)
         elif task.method:
             outcome = _outcome(other, task)
             if outcome is not None and outcome.ok:
-                known[task] = _taken(other, wishes, task, outcome)
-        _take_needed(other, wishes, task, stages)
+                known[task] = _taken(other, options, task, outcome)
+        _take_needed(other, options, task, stages)
     return known
 
 
-def _runs_again(task: Task, wishes: Wishes) -> bool:
+def _runs_again(task: Task, options: ReportOptions) -> bool:
     if task.method.startswith(OURS):
-        return not wishes.methods or task.method in wishes.methods
+        return not options.methods or task.method in options.methods
     return bool(task.method) and task.stage in OVER_OURS
 
 
-def _wishes_of(folder: Path) -> Wishes:
+def _options_of(folder: Path) -> ReportOptions:
     try:
-        told = json.loads((folder / "wishes.json").read_text(encoding="utf-8"))
-        return replace(Wishes.from_json(told), out=folder)
+        record = json.loads((folder / "options.json").read_text(encoding="utf-8"))
+        return replace(ReportOptions.from_json(record), out=folder)
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{folder} holds no run to start from (wishes.json): {error}") from None
+        raise ValueError(f"{folder} holds no run to start from (options.json): {error}") from None
 
 
-def _outcome(other: Wishes, task: Task) -> Outcome | None:
+def _outcome(other: ReportOptions, task: Task) -> Outcome | None:
     file = other.place(task.stage, task.scene) / OUTCOMES
     if not file.is_file():
         return None
-    told = json.loads(file.read_text(encoding="utf-8")).get(task.method)
-    return None if told is None else Outcome(**{**told, "place": Path(told["place"])})
+    record = json.loads(file.read_text(encoding="utf-8")).get(task.method)
+    return None if record is None else Outcome(**{**record, "place": Path(record["place"])})
 
 
-def _taken(other: Wishes, wishes: Wishes, task: Task, outcome: Outcome) -> Outcome:
-    place = wishes.place(task.stage, task.scene, task.method)
+def _taken(other: ReportOptions, options: ReportOptions, task: Task, outcome: Outcome) -> Outcome:
+    place = options.place(task.stage, task.scene, task.method)
     shutil.copytree(other.place(task.stage, task.scene, task.method), place, dirs_exist_ok=True)
     return replace(outcome, place=place)
 
 
-def _take_folders(run: Path, wishes: Wishes, task: Task) -> None:
-    place = wishes.place(task.stage, task.scene, task.method) / "run"
+def _take_folders(run: Path, options: ReportOptions, task: Task) -> None:
+    place = options.place(task.stage, task.scene, task.method) / "run"
     if (run / RUN_FILE).is_file():
-        # Without it the library takes the folder for none of its own.
+        # The library accepts only folders with this file.
         place.mkdir(parents=True, exist_ok=True)
         shutil.copy2(run / RUN_FILE, place / RUN_FILE)
     for name in sorted(set(FOLDERS.values())):
@@ -86,9 +90,11 @@ def _take_folders(run: Path, wishes: Wishes, task: Task) -> None:
             shutil.copytree(run / name, place / name, dirs_exist_ok=True)
 
 
-def _take_needed(other: Wishes, wishes: Wishes, task: Task, stages: Mapping[str, Stage]) -> None:
-    """What the task starts from, where the stage that makes it is not asked for."""
+def _take_needed(
+    other: ReportOptions, options: ReportOptions, task: Task, stages: Mapping[str, Stage]
+) -> None:
+    """Return the inputs of a task from stages that are not part of this run."""
     for stage, method in stages[task.stage].needs(task.method):
         place = other.place(stage, task.scene, method)
-        if stage not in wishes.stages and place.is_dir():
-            shutil.copytree(place, wishes.place(stage, task.scene, method), dirs_exist_ok=True)
+        if stage not in options.stages and place.is_dir():
+            shutil.copytree(place, options.place(stage, task.scene, method), dirs_exist_ok=True)

@@ -1,4 +1,4 @@
-"""The scenes of a report by their names, and what kind each is."""
+"""Names and kinds of the scenes of a report."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_files import read_colmap_model
-from validation.harness.records import Wishes
+from validation.harness.records import ReportOptions
 from validation.metrics.cameras import TrueCameras
 from validation.scenes.real import (
     SUFFIXES,
@@ -25,7 +25,7 @@ from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 PHOTOGRAPHS = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
 QUICK = ("courtyard", "boards", "cloud", "street", "Tsukuba")
 SYNTHETIC = ("boards", "cloud", "street")
-"""Made from nothing wherever they are asked for: photographs of a chequered board; points seen by a few
+"""Synthetic scenes, generated on demand: images of a chessboard; points seen by a few
 cameras; a walk of cameras."""
 
 
@@ -40,27 +40,27 @@ def available_scenes(*, quick: bool) -> tuple[str, ...]:
     return tuple(name for name in found if not quick or name in QUICK)
 
 
-def is_photographs(name: str, wishes: Wishes) -> bool:
-    """Whether a scene is a set of photographs of one scene."""
-    return name in PHOTOGRAPHS or name in wishes.folders
+def is_photographs(name: str, options: ReportOptions) -> bool:
+    """Return whether a scene is a set of images of one scene."""
+    return name in PHOTOGRAPHS or name in options.folders
 
 
-def load_photographs(name: str, wishes: Wishes) -> Scene:
-    """The photographs of a scene with their truth, where there is one.
+def load_photographs(name: str, options: ReportOptions) -> Scene:
+    """The images of a scene with their truth, where there is one.
 
-    A folder of the user's holds photographs, or images/ with them; its truth is ``cameras.json`` (as in
-    fixtures) or a COLMAP model in ``sparse/0``. Raises ``ValueError`` where a scene has no photographs.
+    A folder of the user holds images, or images/ with them; its truth is ``cameras.json`` (as in
+    fixtures) or a COLMAP model in ``sparse/0``. Raises ``ValueError`` where a scene has no images.
     """
-    if name in wishes.folders:
-        return _own_scene(Path(wishes.folders[name]), name)
+    if name in options.folders:
+        return _own_scene(Path(options.folders[name]), name)
     scene = load_fixture_scene(name) if name == "courtyard" else load_real_scene(name)
     if scene is None:
-        raise ValueError(f"the photographs of {name} are not on this machine")
+        raise ValueError(f"the images of {name} are not on this machine")
     return scene
 
 
 def truth_of(scene: Scene) -> TrueCameras | None:
-    """The true cameras of a scene, None where nobody knows them."""
+    """Return the true cameras of a scene, or None."""
     if scene.K is None or scene.R is None or scene.C is None:
         return None
     return TrueCameras(scene.K, scene.R, scene.C)
@@ -72,7 +72,7 @@ def _own_scene(folder: Path, name: str) -> Scene:
     else:
         paths = tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES))
         if not paths:
-            raise ValueError(f"there are no photographs in {folder}")
+            raise ValueError(f"there are no images in {folder}")
         scene = Scene(name, paths)
     model = folder / "sparse" / "0"
     if scene.has_truth or not model.is_dir():

@@ -1,7 +1,7 @@
-"""All tasks of a report, as many at a time as there are cores, each in a process of its own.
+"""Run all tasks of a report in parallel, each in a process of its own.
 
-The first task of ours of a stage compiles its kernels. Until it ends no other of that stage begins, nor the
-first of another one, so that nothing is compiled twice; references have the other cores meanwhile.
+The first own task of a stage compiles its kernels. No other task of that stage, nor a first task of another
+stage, starts before it ends; references use the other cores.
 """
 
 from __future__ import annotations
@@ -19,66 +19,66 @@ from typing import Any
 from thesisrecon.io.files import write_text
 from validation.harness.forks import Template
 from validation.harness.process import Process, failure_of, last_words, own_cores
-from validation.harness.records import Judgement, Outcome, Picture, Plot, Stage, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
 from validation.harness.resume import OURS, take_over
 from validation.harness.worker import JUDGEMENT, OUTCOMES
 from validation.metrics.record import Metric
 
-Told = Callable[[str], None]
+Reporter = Callable[[str], None]
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
 JUDGE = ""
 """The method of the task that judges all others of its stage and scene."""
 
 
-def tasks_of(wishes: Wishes, stages: Mapping[str, Stage]) -> list[Task]:
+def tasks_of(options: ReportOptions, stages: Mapping[str, Stage]) -> list[Task]:
     """Every method of every stage on every scene, and the judgement after them."""
     found = []
-    for scene in wishes.scenes:
-        for name in wishes.stages:
+    for scene in options.scenes:
+        for name in options.stages:
             stage = stages[name]
-            if stage.takes(scene, wishes):
-                found += [Task(name, scene, method) for method in stage.methods(scene, wishes)]
+            if stage.takes(scene, options):
+                found += [Task(name, scene, method) for method in stage.methods(scene, options)]
                 found.append(Task(name, scene, JUDGE))
     return found
 
 
 def run_tasks(
-    wishes: Wishes, stages: Mapping[str, Stage], tell: Told
+    options: ReportOptions, stages: Mapping[str, Stage], report: Reporter
 ) -> dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]:
     """The judgement and outcomes of each (stage, scene); nothing that fails stops the others."""
-    shutil.rmtree(wishes.out / "data", ignore_errors=True)
-    wishes.out.mkdir(parents=True, exist_ok=True)
-    write_text(wishes.out / "wishes.json", json.dumps(wishes.to_json()))
-    tasks = tasks_of(wishes, stages)
+    shutil.rmtree(options.out / "data", ignore_errors=True)
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_text(options.out / "options.json", json.dumps(options.to_json()))
+    tasks = tasks_of(options, stages)
     place_of = {task: n for n, task in enumerate(tasks)}
-    ended = take_over(wishes, tasks, stages)
+    ended = take_over(options, tasks, stages)
     behind = tasks_behind(tasks, stages)
-    # Long chains first, so that nobody waits for one at the end.
+    # Start long chains first to finish early.
     waiting = sorted((task for task in tasks if task not in ended), key=lambda task: -behind[task])
     running: dict[Future[Outcome], Task] = {}
-    cores = own_cores()[: wishes.threads]
+    cores = own_cores()[: options.threads]
     total = len(tasks)
-    # Where the main thread is interrupted the processes end first: their threads wait for nothing else.
+    # On an interrupt the processes end first: their threads wait for nothing else.
     with ThreadPoolExecutor(len(cores)) as pool, ExitStack() as stack:
-        free = _Templates(cores, wishes, stack)
+        free = _Templates(cores, options, stack)
         while waiting or running:
             for task in [t for t in waiting if len(running) < len(cores)]:
                 if len(running) < len(cores) and _ready(task, waiting, running.values(), ended, stages):
                     waiting.remove(task)
-                    running[pool.submit(_carry_out, task, wishes, dict(ended), free)] = task
+                    running[pool.submit(_carry_out, task, options, dict(ended), free)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 task = running.pop(future)
                 ended[task] = future.result()
-                # In the order of the tasks, so that no table depends on who was done first.
+                # In task order, so tables do not depend on completion order.
                 ended = dict(sorted(ended.items(), key=lambda item: place_of[item[0]]))
-                tell(f"[{len(ended)}/{total}] {_words(task, ended[task])}")
+                report(f"[{len(ended)}/{total}] {_words(task, ended[task])}")
     judged = [task for task in ended if task.method == JUDGE]
     return {(t.stage, t.scene): (_judgement(ended[t]), _outcomes(t, ended)) for t in judged}
 
 
 def tasks_behind(tasks: list[Task], stages: Mapping[str, Stage]) -> dict[Task, int]:
-    """How many tasks start, directly or through others, from the results of each."""
+    """Return how many tasks depend, directly or indirectly, on each."""
     followers: dict[Task, set[Task]] = {task: set() for task in tasks}
     for task in tasks:
         before = [Task(s, task.scene, method) for s, method in stages[task.stage].needs(task.method)]
@@ -100,8 +100,8 @@ def tasks_behind(tasks: list[Task], stages: Mapping[str, Stage]) -> dict[Task, i
 class _Templates:
     """Processes that no task is running in: one a core."""
 
-    def __init__(self, cores: list[int], wishes: Wishes, stack: ExitStack) -> None:
-        self._modules = ("validation.harness.worker", wishes.stages_from)
+    def __init__(self, cores: list[int], options: ReportOptions, stack: ExitStack) -> None:
+        self._modules = ("validation.harness.worker", options.stages_from)
         self._stack, self._lock = stack, threading.Lock()
         self._free = [(core, self._start(core)) for core in cores]
         self._over = False
@@ -137,7 +137,7 @@ def _ready(
     ended: Collection[Task],
     stages: Mapping[str, Stage],
 ) -> bool:
-    """Whether nothing that the task starts from is still to come, and nobody compiles what it needs."""
+    """Return whether the inputs of the task exist and its kernels are not being compiled."""
     open_tasks = {*waiting, *running}
     own = {t for t in open_tasks - {task} if (t.stage, t.scene) == (task.stage, task.scene)}
     if task.method == JUDGE and own:
@@ -157,24 +157,26 @@ def _is_ours(task: Task) -> bool:
     return task.method.startswith(OURS)
 
 
-def _carry_out(task: Task, wishes: Wishes, ended: Mapping[Task, Outcome], free: _Templates) -> Outcome:
-    place = wishes.place(task.stage, task.scene, task.method)
+def _carry_out(
+    task: Task, options: ReportOptions, ended: Mapping[Task, Outcome], free: _Templates
+) -> Outcome:
+    place = options.place(task.stage, task.scene, task.method)
     place.mkdir(parents=True, exist_ok=True)
-    arguments = [str(wishes.out / "wishes.json"), task.stage, task.scene]
+    arguments = [str(options.out / "options.json"), task.stage, task.scene]
     if task.method == JUDGE:
-        told = {name: asdict(o) | {"place": str(o.place)} for name, o in _outcomes(task, ended).items()}
-        write_text(place / OUTCOMES, json.dumps(told))
+        record = {name: asdict(o) | {"place": str(o.place)} for name, o in _outcomes(task, ended).items()}
+        write_text(place / OUTCOMES, json.dumps(record))
     else:
         arguments.append(task.method)
     # Beside the place of the task, which may empty it.
     log = place.with_name(f"{place.name}.log")
-    process = free.run(arguments, log, wishes.limit_s)
-    failure = failure_of(process, last_words(log), wishes.limit_s)
+    process = free.run(arguments, log, options.limit_s)
+    failure = failure_of(process, last_words(log), options.limit_s)
     return Outcome(place, failure, process.wall_s, process.cpu_s, process.peak_mb)
 
 
 def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
-    """Of the methods beside this judgement, in the order of the tasks."""
+    """Return the outcomes of the methods of this judgement, in task order."""
     return {
         t.method: outcome
         for t, outcome in ended.items()
@@ -185,12 +187,12 @@ def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
 def _judgement(outcome: Outcome) -> Judgement:
     if not outcome.ok:
         return Judgement((), notes=(f"This comparison could not be judged: {outcome.failure}.",))
-    told: dict[str, Any] = json.loads((outcome.place / JUDGEMENT).read_text(encoding="utf-8"))
+    record: dict[str, Any] = json.loads((outcome.place / JUDGEMENT).read_text(encoding="utf-8"))
     return Judgement(
-        [Metric(**metric) for metric in told["metrics"]],
-        [Plot(**plot) for plot in told["plots"]],
-        [Picture(**picture) for picture in told["pictures"]],
-        told["notes"],
+        [Metric(**metric) for metric in record["metrics"]],
+        [Plot(**plot) for plot in record["plots"]],
+        [Picture(**picture) for picture in record["pictures"]],
+        record["notes"],
     )
 
 

@@ -1,6 +1,6 @@
-"""One task, in a process of its own: ``python -m validation.harness.worker WISHES STAGE SCENE [METHOD]``.
+"""Run one task in a process: ``python -m validation.harness.worker OPTIONS STAGE SCENE [METHOD]``.
 
-Without a method, the judgement on the outcomes that stand in ``outcomes.json``.
+Without a method, run the judgement on the outcomes in ``outcomes.json``.
 """
 
 from __future__ import annotations
@@ -15,35 +15,35 @@ from typing import Any
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.files import write_text
 from validation.harness.canaries import read_refused
-from validation.harness.records import Judgement, Outcome, Stage, Task, Wishes
+from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
 from validation.references.libraries import refuse
 
 JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    wishes_file, stage, scene, *method = sys.argv[1:] if arguments is None else arguments
-    wishes = Wishes.from_json(json.loads(Path(wishes_file).read_text(encoding="utf-8")))
-    refuse(read_refused(wishes.out))
-    stages: dict[str, Stage] = importlib.import_module(wishes.stages_from).STAGES
+    options_file, stage, scene, *method = sys.argv[1:] if arguments is None else arguments
+    options = ReportOptions.from_json(json.loads(Path(options_file).read_text(encoding="utf-8")))
+    refuse(read_refused(options.out))
+    stages: dict[str, Stage] = importlib.import_module(options.stages_from).STAGES
     try:
         if method:
-            place = wishes.place(stage, scene, method[0])
+            place = options.place(stage, scene, method[0])
             place.mkdir(parents=True, exist_ok=True)
-            stages[stage].run(Task(stage, scene, method[0]), wishes)
+            stages[stage].run(Task(stage, scene, method[0]), options)
         else:
-            _judge(wishes, stages[stage], scene)
+            _judge(options, stages[stage], scene)
     except (StageFailure, ImportError, ValueError) as error:
         print(error, file=sys.stderr)
         return 3
     return 0
 
 
-def _judge(wishes: Wishes, stage: Stage, scene: str) -> None:
-    place = wishes.place(stage.name, scene)
-    told = json.loads((place / OUTCOMES).read_text(encoding="utf-8"))
-    outcomes = {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in told.items()}
-    judgement = stage.judge(scene, outcomes, wishes)
+def _judge(options: ReportOptions, stage: Stage, scene: str) -> None:
+    place = options.place(stage.name, scene)
+    record = json.loads((place / OUTCOMES).read_text(encoding="utf-8"))
+    outcomes = {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in record.items()}
+    judgement = stage.judge(scene, outcomes, options)
     text = json.dumps(_plain(judgement), default=_plain_number)
     write_text(place / JUDGEMENT, text)
 
@@ -53,10 +53,10 @@ def _plain(judgement: Judgement) -> dict[str, Any]:
 
 
 def _plain_number(value: Any) -> Any:
-    """NumPy's numbers and arrays are none of JSON's."""
+    """Convert NumPy numbers and arrays for JSON."""
     if hasattr(value, "tolist"):
         return value.tolist()
-    raise TypeError(f"{type(value)} is no part of a judgement")
+    raise TypeError(f"{type(value)} cannot be stored in a judgement")
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Cross-checks of thesisrecon against reference tools and truth."""
+"""Error measures of cameras, images and surfaces."""

@@ -1,4 +1,4 @@
-"""How far cameras are from the truth and points from their images: geometry after alignment."""
+"""Errors of cameras against the truth, and of points against their observations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TrueCameras:
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Errors of the registered cameras; None where they are too few to be aligned.
+    """Errors of the registered cameras; None if they are too few to be aligned.
 
     ``focal_error_pct``: median over views of |f / f_true - 1|, f the geometric mean of fx and fy.
     ``principal_point_error_px``: median distance. ``centre_error``: mean distance after the least-squares

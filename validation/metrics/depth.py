@@ -1,4 +1,4 @@
-"""How right depth maps are: against true depths, and at the sparse points of a reconstruction."""
+"""Errors of depth maps against true depths and sparse points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thesisrecon.records import DepthMap, Reconstruction
 from validation.scenes.real import Scene, load_fixture_depth
 
 SAME = 0.01
-"""Relative difference of depths up to which two views see the same place, and a depth is right."""
+"""Maximum relative depth error of a correct depth, and between views of the same point."""
 NORMAL_MEDIAN = 0.6745
 """Median absolute value of a normal variable of deviation 1."""
 NEAR_TO_FAR = np.array(
@@ -23,8 +23,8 @@ NEAR_TO_FAR = np.array(
 
 @dataclass(frozen=True)
 class Judged:
-    """Of one map: relative ``error`` of its known depths (N,), ``deviations`` (N,) the same errors in units
-    of those it states, the share ``known`` and the share ``right`` of what can be known."""
+    """Errors of one map: relative ``error`` of its known depths (N,), ``deviations`` (N,) in units of
+    the stated standard deviation, and the shares ``known`` and ``right`` of the knowable pixels."""
 
     error: F64
     deviations: F64
@@ -34,7 +34,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class JudgedMaps:
-    """Of all maps of a scene together: ``median`` relative error, the shares ``right`` and ``known`` of what
+    """Mean scores of all maps: ``median`` relative error, the shares ``right`` and ``known`` of what
     can be known (means over the maps, and the ``worst`` map's share right), the share ``right_of_known``, and
     the median error in stated ``deviations``, 1 for those that are true."""
 
@@ -63,12 +63,12 @@ def together(judged: Sequence[Judged]) -> JudgedMaps:
 
 
 TrueDepth = tuple[F64, int, B8]
-"""True depth of a view (h, w), its stride in pixels of the photograph, and where another view sees the place
+"""True depth of a view (h, w), its stride in pixels of the image, and where another view sees the place
 too."""
 
 
 def true_depth(scene: Scene, view: int) -> TrueDepth:
-    """Of a view of the courtyard."""
+    """Return the truth of a view of the courtyard."""
     assert scene.K is not None
     assert scene.R is not None
     assert scene.C is not None
@@ -101,7 +101,7 @@ def true_from_maps(maps: Mapping[int, DepthMap], scene: Scene) -> Similarity:
 
 def at_true_places(found: DepthMap, shape: tuple[int, int], stride: int, width_px: int) -> tuple[F64, F64]:
     """Depths and deviations of a map at the samples of a true one of this ``shape`` and ``stride``, nearest
-    pixel; ``width_px`` is that of the photograph whose pixels the stride counts."""
+    pixel; ``width_px`` is that of the image whose pixels the stride counts."""
     shrink = found.depth.shape[1] / width_px
     rows, columns = (
         np.clip(np.rint((stride * np.arange(n) + 0.5) * shrink - 0.5), 0, m - 1).astype(np.int64)

@@ -1,4 +1,4 @@
-"""How far an estimate of F is from the truth, and how well its inliers are told from the wrong matches."""
+"""Error of F against the truth; precision and recall of its inliers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from thesisrecon.geometry.two_view import sampson_residuals, symmetric_residuals
 BoolArray = NDArray[np.bool_]
 
 NONE_PX = 99.0
-"""The error of a method that gave no F, and the largest that is told."""
+"""Error of a missing F, and the maximum reported error."""
 
 
 def rms_epipolar_distance(F: F64 | None, truth: F64) -> float:

@@ -1,7 +1,7 @@
-"""The least standard deviation that any unbiased method can have for the focals of a synthetic rig.
+"""Cramer-Rao bound on the focal lengths of a synthetic rig.
 
-Cramer-Rao: the inverse of J'J / sigma^2 over poses, points, focals and the principal point, whose prior
-counts as an observation. Dense, by finite differences: it judges the library and shares no code with it.
+The inverse of J'J / sigma^2 over poses, points, focal lengths and the principal point, whose prior counts as
+an observation. Dense finite differences, independent of the library.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def focal_bound(rig: Rig, sigma_px: float, *, zooming: bool, principal_std_px: f
     information -= np.einsum("kac,kcd,kbd->ab", W, V, W)
     information /= sigma_px**2
     information[range(size - 2, size), range(size - 2, size)] += principal_std_px**-2
-    # The seven freedoms of the frame are left out by the pseudo-inverse; the focals do not depend on them.
+    # The pseudo-inverse removes the seven gauge freedoms; focal lengths do not depend on them.
     scale = 1.0 / np.sqrt(information.diagonal())
     value, vector = np.linalg.eigh(information * scale * scale[:, None])
     inverse = np.where(np.arange(size) < 7, 0.0, 1.0 / np.maximum(value, 1e-15))
@@ -49,7 +49,7 @@ def focal_bound(rig: Rig, sigma_px: float, *, zooming: bool, principal_std_px: f
 
 
 def _derivatives(rig: Rig, v: int, X: F64) -> tuple[F64, F64]:
-    """Of the pixels of X (M, 3) by (turn, shift, log f, principal point) (M, 2, 9) and by X (M, 2, 3)."""
+    """Derivatives of pixels of X (M, 3) by (rotation, shift, log f, centre) (M, 2, 9) and X (M, 2, 3)."""
 
     def pixels(p: F64) -> F64:
         R = Rotation.from_rotvec(p[:3]).as_matrix() @ rig.R[v]

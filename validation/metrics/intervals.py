@@ -1,4 +1,4 @@
-"""Whether stated intervals hold the truth: deviations in units of the standard deviation that was stated."""
+"""Coverage of stated intervals: errors in units of the stated standard deviation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from thesisrecon.records import MetricResult
 
 NAMES = ("focal_px", "principal_x_px", "principal_y_px")
 LEVEL = 1.96
-"""An interval of so many standard deviations to each side holds the truth in 95 of 100 cases."""
+"""Half width of a 95 % interval in standard deviations."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One measured number beside its reference, its target and the verdict."""
+"""A measured number with its references, target and verdict."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ Verdict = Literal["reached", "missed", "reported"]
 
 @dataclass(frozen=True)
 class Metric:
-    """One row of a table: what was measured on which scene, by ours and the reference, and what was wanted.
+    """One row of a table: a number on a scene, by ours and the references, with its target.
 
-    ``values`` maps the name of a method to its number, None where it has none. ``target`` is the bound for
-    the method ``judged``; ``at_most`` says on which side of it the good lies. Without a target the row is
-    only reported. ``definition`` says in one line what the number is.
+    ``values`` maps methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper
+    one with ``at_most``; without it the row is only reported. ``definition`` states the number in one line.
     """
 
     scene: str
@@ -30,7 +29,7 @@ class Metric:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the judged method reached the target; a number that is missing has not."""
+        """Return whether the judged method reached the target; a number that is missing has not."""
         if self.target is None:
             return "reported"
         value = self.values.get(self.judged)

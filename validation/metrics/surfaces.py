@@ -1,4 +1,4 @@
-"""How far surfaces are from the true one of the courtyard, and it from them; distances are Open3D's."""
+"""Accuracy and completeness of surfaces of the courtyard; distances by Open3D."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene
 SAMPLES = 200_000
 """Points on a surface that distances are taken from."""
 BEHIND = 0.05
-"""How far behind what a photograph truly shows a point may be and still be asked for, in units of depth."""
+"""Relative depth tolerance of visibility."""
 CAPPED = 5.0
 """Percent of the scene's depth beyond which the mean counts no more."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The true ``surface``, true ``points`` (N, 3) that two photographs show, and the scene's depth in
+    """The true ``surface``, true ``points`` (N, 3) that two images show, and the scene's depth in
     metres."""
 
     scene: Scene
@@ -76,7 +76,7 @@ def points_on(mesh: TexturedMesh, count: int = SAMPLES) -> F64:
 
 
 def asked_for(points: F64, scene: Scene) -> I64:
-    """(N,) in how many photographs points are in the frame and not hidden by what is truly there."""
+    """(N,) in how many images points are in the frame and not hidden by what is truly there."""
     assert scene.K is not None
     assert scene.R is not None
     assert scene.C is not None
@@ -97,8 +97,8 @@ def asked_for(points: F64, scene: Scene) -> I64:
 def judge_surface(mesh: TexturedMesh, truth: Truth, samples: int = SAMPLES) -> tuple[F64, F64]:
     """Accuracy and completeness of a surface in the true frame, as distances in percent of the scene's depth.
 
-    Accuracy: from points spread evenly over the surface, where at least two photographs could show them, to
-    the true one. Completeness: from true points that two photographs show to the surface.
+    Accuracy: from points spread evenly over the surface, where at least two images could show them, to
+    the true one. Completeness: from true points that two images show to the surface.
     """
     points = points_on(mesh, samples)
     points = points[asked_for(points, truth.scene) >= 2]

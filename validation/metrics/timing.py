@@ -1,4 +1,4 @@
-"""How long a call takes, warm."""
+"""Time warm calls."""
 
 from __future__ import annotations
 

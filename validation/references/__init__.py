@@ -1,1 +1,1 @@
-"""Cross-checks of thesisrecon against reference tools and truth."""
+"""Adapters to the reference libraries."""

@@ -1,7 +1,7 @@
-"""Small questions to the reference libraries whose answers are known: do their conventions still hold?
+"""Known questions to the reference libraries that check their conventions.
 
-``python -m validation.references.canary LIBRARY`` ends with 3 and a sentence where one is not answered as the
-adapters of this folder expect. A report asks them before it starts, each in a process of its own.
+``python -m validation.references.canary LIBRARY`` ends with 3 and a message if an answer differs from the
+adapters' expectation. A report runs them first, each in a process.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from thesisrecon.arrays import F64
 from validation.references.libraries import NAMES, PACKAGES, NoReference, cv2, load, open3d, poselib, pycolmap
 
 BLOB = 32
-"""Row and column of the pixel in whose centre the picture of :func:`_blob` has its blob."""
+"""Row and column of the pixel in whose centre the image of :func:`_blob` has its blob."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """``ask`` gives what ``words`` name; ``answer`` is what the adapters take it for, up to ``tolerance``."""
+    """``ask`` computes the value named by ``words``; ``answer`` is the expected value up to ``tolerance``."""
 
     words: str
     ask: Callable[[], Any]
@@ -41,9 +41,9 @@ def ask_canary(library: str) -> None:
         who = f"{NAMES[library]} {_version(library)}"
         try:
             found = np.asarray(question.ask(), dtype=np.float64)
-        except Exception as error:  # whatever the library raises, it has changed
+        except Exception as error:  # any exception means a changed library
             raise NoReference(
-                f"{who} does not tell {question.words}, which this harness needs ({error})"
+                f"{who} does not compute {question.words}, which this harness needs ({error})"
             ) from error
         expected = np.asarray(question.answer, dtype=np.float64)
         if found.shape != expected.shape or not np.allclose(
@@ -76,13 +76,13 @@ F_OF_MATCHES = ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 2.0, 0.0))
 
 
 def _scaled(F: Any) -> F64:
-    """Such that the largest entry is 2, as it is in :data:`F_OF_MATCHES`."""
+    """Scale so that the largest entry is 2, as in :data:`F_OF_MATCHES`."""
     F = np.asarray(F, dtype=np.float64)
     return np.asarray(2.0 * F / F.flat[np.argmax(np.abs(F))])
 
 
 def _blob() -> Any:
-    """A picture (64, 64) of one round blob."""
+    """An image (64, 64) of one round blob."""
     y, x = np.indices((2 * BLOB, 2 * BLOB))
     squared = (x - BLOB) ** 2 + (y - BLOB) ** 2
     return (255.0 * np.exp(-squared / 32.0)).astype(np.uint8)
@@ -150,7 +150,7 @@ def _poselib_fundamental() -> Any:
 
 
 def _open3d_depth() -> Any:
-    """Of one pixel of depth 2 of a camera at (0, 0, -1), the pixel at (6, 2) beside a principal point."""
+    """Return the point of a pixel (6, 2) off the principal point, depth 2, camera at (0, 0, -1)."""
     depth = np.zeros((4, 8), np.float32)
     depth[2, 6] = 2.0
     world = np.eye(4)
@@ -187,7 +187,7 @@ QUESTIONS: dict[str, tuple[Question, ...]] = {
             F_OF_MATCHES,
         ),
         Question("a blob in the middle of pixel (32, 32)", _opencv_blob, (BLOB, BLOB), 1e-3),
-        Question("the picture of (1, 0, 2) under k1 = 1/4", _opencv_projection, (84.0, 40.0)),
+        Question("the image of (1, 0, 2) under k1 = 1/4", _opencv_projection, (84.0, 40.0)),
         Question(
             "the rotation vector (0, 0, pi/2)", _opencv_quarter_turn, ((0, -1, 0), (1, 0, 0), (0, 0, 1))
         ),
@@ -202,7 +202,7 @@ QUESTIONS: dict[str, tuple[Question, ...]] = {
         ),
         Question("(1, 0, 0) in the camera [R t]", _colmap_pose, (1.0, 3.0, 3.0)),
         Question("a blob in the middle of pixel (32, 32)", _colmap_blob, (BLOB + 0.5, BLOB + 0.5), 1e-3),
-        Question("the picture of (1, 0, 2) under k1 = 1/4", _colmap_projection, (84.0, 40.0)),
+        Question("the image of (1, 0, 2) under k1 = 1/4", _colmap_projection, (84.0, 40.0)),
         Question("F of matches with y2 = 2 y1", _colmap_fundamental, F_OF_MATCHES),
         Question("the point of two rays", _colmap_triangle, (0.0, 0.0, 2.0)),
     ),

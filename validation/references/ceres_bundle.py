@@ -33,7 +33,7 @@ SOLVERS = {
 
 @dataclass(frozen=True)
 class CeresOptions:
-    """What Ceres is to do: ``principal_point`` frees it; ``function_tolerance`` 0 is COLMAP's default, 1e-6
+    """Options of Ceres: ``principal_point`` frees it; ``function_tolerance`` 0 is COLMAP's default, 1e-6
     Ceres'; ``solver`` a name of :data:`SOLVERS`, or "" for COLMAP's choice."""
 
     loss: LossName = "squared"
@@ -47,7 +47,7 @@ class CeresOptions:
 
 @dataclass(frozen=True)
 class CeresResult:
-    """Where Ceres ended: ``cost`` and ``initial_cost`` 1/2 sum rho in px^2, ``steps`` linear systems solved,
+    """Result of Ceres: ``cost`` and ``initial_cost`` 1/2 sum rho in px^2, ``steps`` linear systems solved,
     ``wall_s`` of everything from the model in memory to the refined model, ``cpu_s`` processor time."""
 
     cameras: MetricCameras
@@ -68,12 +68,12 @@ def refine_with_ceres(
     wall, cpu = time.perf_counter(), time.process_time()
     summary: Any = bundle_adjuster(model, options).solve()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    told = summary.ceres_summary
+    report = summary.ceres_summary
     refined, points = cameras_from_colmap(model, cameras)
     moved = X.copy()
     moved[np.bincount(seen.point_index, minlength=len(X)) > 0] = points
-    steps = told.num_successful_steps + told.num_unsuccessful_steps
-    return CeresResult(refined, moved, told.final_cost, told.initial_cost, steps, wall, cpu)
+    steps = report.num_successful_steps + report.num_unsuccessful_steps
+    return CeresResult(refined, moved, report.final_cost, report.initial_cost, steps, wall, cpu)
 
 
 def bundle_adjuster(
@@ -87,10 +87,10 @@ def bundle_adjuster(
         config.set_constant_rig_from_world_pose(model.images[view + 1].frame_id)
     if not fixed:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    wishes = pycolmap.BundleAdjustmentOptions()
-    wishes.refine_principal_point = options.principal_point
-    wishes.print_summary = False
-    ceres = wishes.ceres
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.refine_principal_point = options.principal_point
+    adjustment.print_summary = False
+    ceres = adjustment.ceres
     ceres.loss_function_type = getattr(pycolmap.LossFunctionType, LOSSES[options.loss])
     ceres.loss_function_scale = options.loss_px
     ceres.min_num_residuals_for_cpu_multi_threading = 0
@@ -102,4 +102,4 @@ def bundle_adjuster(
         solver.mergedict(
             {"linear_solver_type": SOLVERS[options.solver], "preconditioner_type": "SCHUR_JACOBI"}
         )
-    return pycolmap.create_default_ceres_bundle_adjuster(wishes, config, model)
+    return pycolmap.create_default_ceres_bundle_adjuster(adjustment, config, model)

@@ -1,4 +1,4 @@
-"""OpenCV's corners of a chequered board, and its calibration from them."""
+"""OpenCV's corners of a chessboard, and its calibration from them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class BoardCalibration:
 
 def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
     """(N, 2) inner corners, ``size`` along and across, row by row from the corner that comes first on the
-    picture's diagonal; :class:`StageFailure` where OpenCV does not find them."""
+    image's diagonal; :class:`StageFailure` where OpenCV does not find them."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     found, corners = cv2.findChessboardCorners(grey, size)
     if not found:
         raise StageFailure(
-            "OpenCV finds no board", "a picture without all corners", "keep the board in the frame"
+            "OpenCV finds no board", "an image without all corners", "keep the board in the frame"
         )
     until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
     fine = cv2.cornerSubPix(grey, corners, (HALF_WINDOW_PX, HALF_WINDOW_PX), (-1, -1), until)
@@ -42,7 +42,7 @@ def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
 
 
 def calibrate_from_corners(X: F64, corners: Sequence[F64], size: tuple[int, int]) -> BoardCalibration:
-    """``cv2.calibrateCamera`` of board points X (N, 3) and what each photograph of ``size`` shows of them;
+    """``cv2.calibrateCamera`` of board points X (N, 3) and what each image of ``size`` shows of them;
     free are fx, fy, cx, cy and k1."""
     points = [X.astype(np.float32)] * len(corners)
     places = [np.ascontiguousarray(xy, dtype=np.float32) for xy in corners]

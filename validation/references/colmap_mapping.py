@@ -25,7 +25,7 @@ from validation.references.libraries import pycolmap
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """What COLMAP made of a folder of photographs: ``names[i]`` is view i of ``reconstruction`` (its largest
+    """Result of COLMAP: ``names[i]`` is view i of ``reconstruction`` (its largest
     model, in our pixel convention), ``seconds`` of "extract", "match" and "map"."""
 
     names: tuple[str, ...]
@@ -35,9 +35,9 @@ class ReferenceRun:
 
 @dataclass(frozen=True)
 class Start:
-    """What COLMAP starts from and refines: a focal length of ``focal_rel`` long sides, and the principal
-    point only where that is wished; or ``K`` (3, 3) by the name of the photograph, pixels as ours, taken for
-    exact (the cameras of the photographs must be their own then)."""
+    """Start of COLMAP: a focal length of ``focal_rel`` long sides, and optionally the principal
+    point; or ``K`` (3, 3) by the name of the image, pixels as ours, taken for
+    exact (the cameras of the images must be their own then)."""
 
     refine_principal_point: bool = False
     focal_rel: float = DEFAULT_FOCAL_REL
@@ -78,10 +78,10 @@ def map_with_pycolmap(
 
 
 def read_run(images: Path, out: Path) -> ReferenceRun:
-    """What a mapping left in ``out``; :class:`StageFailure` without a model."""
+    """Return the mapping in ``out``; :class:`StageFailure` without a model."""
     folders = sorted(path for path in (out / "sparse").glob("*") if path.is_dir())
     if not folders:
-        raise StageFailure("COLMAP made no model of these photographs")
+        raise StageFailure("COLMAP made no model of these images")
     largest = max((read_colmap_model(path) for path in folders), key=lambda model: len(model.images))
     names = tuple(sorted(path.name for path in images.iterdir() if path.is_file()))
     seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
@@ -89,7 +89,7 @@ def read_run(images: Path, out: Path) -> ReferenceRun:
 
 
 def mapper_options(threads: int, refine_principal_point: bool = False) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's defaults for so many threads, the principal point refined where that is wished."""
+    """COLMAP's defaults for so many threads, optionally with the principal point."""
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads, ba_refine_principal_point=refine_principal_point
     )
@@ -100,7 +100,7 @@ def mapper_options(threads: int, refine_principal_point: bool = False) -> pycolm
 def map_database(
     database: Path, images: Path, out: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> int:
-    """Incremental mapping of a database into folders of models in ``out``; photographs in the largest."""
+    """Incremental mapping of a database into folders of models in ``out``; images in the largest."""
     pycolmap.set_random_seed(0)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     models = pycolmap.incremental_mapping(database, images, out, options)

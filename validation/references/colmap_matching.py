@@ -1,7 +1,6 @@
 """COLMAP's SIFT and exhaustive matching through pycolmap, into a database.
 
-Prior-free: the focal length in a photograph's EXIF is forgotten and COLMAP's default guess, 1.2 times the
-long side, takes its place, to be refined freely.
+Prior-free: EXIF focal lengths are replaced by COLMAP's default, 1.2 times the long side, and refined.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ def match_with_pycolmap(
 ) -> dict[str, float]:
     """SIFT and exhaustive matching of all pairs with their verification; the seconds of both.
 
-    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database and
+    ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database and
     the times.
     """
     shutil.rmtree(out, ignore_errors=True)

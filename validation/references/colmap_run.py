@@ -1,4 +1,4 @@
-"""COLMAP from photographs to cameras: ``python -m validation.references.colmap_run IMAGES OUT``."""
+"""COLMAP from images to cameras: ``python -m validation.references.colmap_run IMAGES OUT``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def reconstruct_with_pycolmap(
 ) -> ReferenceRun:
     """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
 
-    ``images`` is a folder of photographs, ``out`` a folder that is emptied first and keeps the database, the
+    ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database, the
     models and the times. Raises :class:`StageFailure` where COLMAP makes no model.
     """
     match_with_pycolmap(images, out, shared_camera=shared_camera, threads=threads)
@@ -34,15 +34,15 @@ def main() -> None:
     parser.add_argument("--refine-principal-point", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--only-matches", action="store_true", help="end before the mapping")
-    wishes = parser.parse_args()
-    if wishes.only_matches:
-        match_with_pycolmap(wishes.images, wishes.out, threads=wishes.threads)
+    parsed = parser.parse_args()
+    if parsed.only_matches:
+        match_with_pycolmap(parsed.images, parsed.out, threads=parsed.threads)
         return
     reconstruct_with_pycolmap(
-        wishes.images,
-        wishes.out,
-        refine_principal_point=wishes.refine_principal_point,
-        threads=wishes.threads,
+        parsed.images,
+        parsed.out,
+        refine_principal_point=parsed.refine_principal_point,
+        threads=parsed.threads,
     )
 
 

@@ -27,14 +27,14 @@ Answer = tuple[Any, Any, FundamentalFit | None]
 OURS, THESIS = "ours", "ours (thesis)"
 LINEAR, MINIMAL = "ours (eight points)", "ours (seven points)"
 CONFIDENCE, ITERATIONS = 0.9999, 20000
-"""What OpenCV is given beyond its defaults (0.99 and 1000)."""
+"""Settings of OpenCV instead of its defaults (0.99 and 1000)."""
 MIN_ITERATIONS = 10000
-"""What COLMAP and PoseLib are given beyond their defaults (1000; both end at 0.9999 or 100000 anyway)."""
+"""Setting of COLMAP and PoseLib instead of 1000; both stop at 0.9999 or 100000."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """``F`` (3, 3), None where the method gave none, ``inliers`` (N,) as the method tells them; of ours the
+    """``F`` (3, 3), None if the method gave none, ``inliers`` (N,) as the method reports them; of ours the
     whole ``fit``."""
 
     F: F64 | None
@@ -62,13 +62,13 @@ def _thesis(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
 
 
 def _eight_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
-    """Of the matches that the front door takes for right: it knows no wrong ones."""
+    """Estimate from the inliers of the library function, as the method has no outlier test."""
     _, right, fit = _ours(xy1, xy2, threshold_px, seed)
     return (None, None, None) if fit is None else (estimate_eight_point(xy1[right], xy2[right]), right, None)
 
 
 def _seven_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
-    """The first of up to three matrices through seven of the matches that the front door takes for right."""
+    """Return the first of up to three matrices through seven inliers of the library function."""
     _, right, fit = _ours(xy1, xy2, threshold_px, seed)
     if fit is None:
         return None, None, None
@@ -80,8 +80,8 @@ def _seven_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
 def _opencv(method: str, confidence: float = 0.99, iterations: int = 1000) -> Solver:
     def solve(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
         kind = getattr(cv2, method)
-        F, told = cv2.findFundamentalMat(xy1, xy2, kind, threshold_px, confidence, iterations)
-        return F, told, None
+        F, mask = cv2.findFundamentalMat(xy1, xy2, kind, threshold_px, confidence, iterations)
+        return F, mask, None
 
     return solve
 
@@ -110,8 +110,8 @@ def _colmap(**options: int) -> Solver:
 def _poselib(**options: int) -> Solver:
     def solve(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
         settings = {"max_epipolar_error": threshold_px, "seed": seed, **options}
-        F, told = poselib.estimate_fundamental(xy1, xy2, settings, {})
-        return F, told["inliers"], None
+        F, mask = poselib.estimate_fundamental(xy1, xy2, settings, {})
+        return F, mask["inliers"], None
 
     return solve
 
@@ -145,11 +145,11 @@ def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed:
     """
     order = np.random.default_rng(seed).permutation(len(xy1))
     some1, some2 = np.ascontiguousarray(xy1[order]), np.ascontiguousarray(xy2[order])
-    F, told, fit = SOLVERS[method](some1, some2, threshold_px, seed)
+    F, mask, fit = SOLVERS[method](some1, some2, threshold_px, seed)
     inliers = np.zeros(len(xy1), dtype=bool)
     F = None if F is None else np.asarray(F, dtype=np.float64)
-    # OpenCV answers with nothing, zeros or three stacked matrices where it failed.
+    # OpenCV returns nothing, zeros or three stacked matrices on failure.
     if F is None or F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
         return Estimate(None, inliers)
-    inliers[order] = np.asarray(told).ravel() > 0
+    inliers[order] = np.asarray(mask).ravel() > 0
     return Estimate(F, inliers, None if fit is None else replace(fit, inliers=inliers))

@@ -1,7 +1,7 @@
-"""The reference libraries, each imported where it is first asked for something, by its adapters alone.
+"""Lazy import of the reference libraries for their adapters.
 
-A library that is missing, does not load, or no longer answers as its adapters expect raises
-:class:`NoReference` there, in a sentence, and nowhere else: what needs another library runs on.
+A library that is missing, does not load, or fails its check raises :class:`NoReference` on use; other
+libraries keep working.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ PACKAGES = {
     "poselib": "poselib",
     "open3d": "open3d",
 }
-"""Reference libraries: what Python calls them, and what pip does."""
+"""Reference libraries: module names and pip names."""
 NAMES = {"cv2": "OpenCV", "pycolmap": "pycolmap", "poselib": "PoseLib", "open3d": "Open3D"}
 
 _refused: dict[str, str] = {}
 
 
 class NoReference(ImportError):
-    """A reference library that cannot be asked; the text says which, why, and what to do."""
+    """A reference library is unavailable; the message names it, the cause and the remedy."""
 
 
 class Library:
@@ -60,13 +60,13 @@ def load(module: str) -> ModuleType:
 
 
 def refuse(libraries: Mapping[str, str]) -> None:
-    """From now on these libraries raise :class:`NoReference` with these sentences, and no others do."""
+    """Make these libraries raise :class:`NoReference` with these messages from now on."""
     _refused.clear()
     _refused.update(libraries)
 
 
 def one_thread() -> None:
-    """Let OpenCV, which takes all cores by itself, use one."""
+    """Limit OpenCV, which uses all cores by default, to one thread."""
     cv2.setNumThreads(1)
 
 

@@ -1,4 +1,4 @@
-"""Clouds in Open3D: ICP after a similarity, and pictures without a screen."""
+"""Clouds in Open3D: ICP after a similarity, and images without a screen."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def render_difference(path: Path, mine: F64, other: F64, reach: float) -> None:
         scene.add_geometry("mine", cloud(mine, colors), material)
         low, high = np.quantile(mine, [0.05, 0.95], axis=0)
         middle, extent = 0.5 * (low + high), float(np.linalg.norm(high - low))
-        # Cameras of ours and of the truths look along z with y down.
+        # Our cameras look along z with y down.
         eye = middle + extent * np.array([0.25, -0.3, -0.75])
         renderer.setup_camera(50.0, middle, eye, [0.0, -1.0, 0.0])
         o3d.io.write_image(path, renderer.render_to_image())

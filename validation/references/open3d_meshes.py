@@ -1,4 +1,4 @@
-"""Meshes in Open3D: distances to them, pictures of them, files."""
+"""Meshes in Open3D: distances to them, images of them, files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from validation.references.open3d_cameras import camera_of
 
 
 class Nearest:
-    """A surface, ready to be asked how far points are from it."""
+    """A surface prepared for distance queries."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)

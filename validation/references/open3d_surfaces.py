@@ -31,7 +31,7 @@ class OpenTsdf:
     least_views: int = 1
 
     def fuse(self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView]) -> TexturedMesh:
-        """The surface with colours of its vertices, means over the photographs ``views`` of the maps."""
+        """The surface with colours of its vertices, means over the images ``views`` of the maps."""
         kinds = (o3d.core.float32,) * 3
         grid = o3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight", "color"),
@@ -51,7 +51,7 @@ class OpenTsdf:
 
     def _integrate(self, grid: Any, depth_map: DepthMap, view: PinholeView) -> None:
         if depth_map.depth.shape != view.rgb.shape[:2]:
-            raise ValueError("each depth map needs its photograph at its own size")
+            raise ValueError("each depth map needs its image at its own size")
         K, world = camera_of(depth_map.P, shift=0.5)
         depth = o3d.t.geometry.Image(o3d.core.Tensor(np.nan_to_num(depth_map.depth).astype(np.float32)))
         color = o3d.t.geometry.Image(o3d.core.Tensor(view.rgb.astype(np.float32)))
@@ -87,6 +87,6 @@ def poisson_mesh(
     mesh.remove_vertices_by_mask(values < np.quantile(values, least_density))
     return TexturedMesh(
         np.asarray(mesh.vertices).copy(),
-        # What was solved faces the cameras as the normals do: outwards is anticlockwise there as here.
+        # Faces are oriented like the normals, towards the cameras: anticlockwise outside, as ours.
         np.asarray(mesh.triangles).astype(np.int64),
     )

@@ -1,4 +1,4 @@
-"""Pictures resampled by OpenCV, whose pixels are ours: the centre of the top-left one is (0, 0)."""
+"""Images resampled by OpenCV, whose pixels are ours: the centre of the top-left one is (0, 0)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ Size = tuple[int, int]
 
 
 def warp_affine(rgb: U8, A: F64, size: Size) -> U8:
-    """The picture (H, W, 3) whose pixel x goes to A x, A (2, 3), by Lanczos' filter; ``size`` is (W, H)."""
+    """The image (H, W, 3) whose pixel x goes to A x, A (2, 3), by Lanczos' filter; ``size`` is (W, H)."""
     return np.asarray(cv2.warpAffine(rgb, A, size, flags=cv2.INTER_LANCZOS4), np.uint8)
 
 
 def warp_perspective(picture: NDArray[Any], H: F64, size: Size) -> NDArray[Any]:
-    """The picture (H, W, C) whose pixel x goes to H x, H (3, 3), by cubic interpolation."""
+    """The image (H, W, C) whose pixel x goes to H x, H (3, 3), by cubic interpolation."""
     return np.asarray(cv2.warpPerspective(picture, H, size, flags=cv2.INTER_CUBIC))
 
 
 def shrink(rgb: U8, size: Size) -> U8:
-    """The picture at the smaller ``size`` (W, H), each pixel the mean over its area."""
+    """The image at the smaller ``size`` (W, H), each pixel the mean over its area."""
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)

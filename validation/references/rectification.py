@@ -1,4 +1,4 @@
-"""Rectification by OpenCV as ours is called: homographies of both photographs and a common frame."""
+"""Rectification by OpenCV as ours is called: homographies of both images and a common frame."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ Size = tuple[int, int]
 
 
 def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectification | None:
-    """``cv2.stereoRectifyUncalibrated`` (Hartley), the frame as large as the photograph as it is used there;
-    None where it refuses."""
+    """``cv2.stereoRectifyUncalibrated`` (Hartley), the frame as large as the image as it is used there;
+    None if it refuses."""
     done, H1, H2 = cv2.stereoRectifyUncalibrated(xy1.copy(), xy2.copy(), F, size)
     if not done:
         return None
@@ -23,7 +23,7 @@ def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectifi
 
 def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
     """``cv2.stereoRectify`` of two metric cameras without distortion, its defaults, the frame of the
-    photograph's size."""
+    image's size."""
     (K1, R1, t1), (K2, R2, t2) = decompose_camera(P1), decompose_camera(P2)
     R = R2 @ R1.T
     none = np.zeros(5)
@@ -35,6 +35,6 @@ def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
 
 
 def _positive(H: F64, size: Size) -> F64:
-    """H scaled such that the third coordinate is positive at the photograph's centre."""
+    """H scaled such that the third coordinate is positive at the image's centre."""
     third = float(H[2] @ [0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0), 1.0])
     return np.asarray(H * np.sign(third), dtype=np.float64)

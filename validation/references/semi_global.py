@@ -1,4 +1,4 @@
-"""OpenCV's semi-global block matching behind our front door."""
+"""OpenCV's semi-global block matching with our interface."""
 
 from __future__ import annotations
 

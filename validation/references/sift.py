@@ -18,7 +18,7 @@ ROWS = 512
 
 @dataclass(frozen=True)
 class SiftKeypoints:
-    """All keypoints of one photograph: ``xy`` (N, 2) px, ``size`` and ``response`` (N,), ``descriptors``
+    """All keypoints of one image: ``xy`` (N, 2) px, ``size`` and ``response`` (N,), ``descriptors``
     (N, 128)."""
 
     xy: F64
@@ -28,7 +28,7 @@ class SiftKeypoints:
 
 
 def detect_sift(grey: U8) -> SiftKeypoints:
-    """What :func:`compute_sift` finds; the keypoints of the last photographs are kept."""
+    """Return :func:`compute_sift`; the last images are cached."""
     return _detect(grey.tobytes(), grey.shape)
 
 
@@ -38,8 +38,8 @@ def _detect(pixels: bytes, shape: tuple[int, ...]) -> SiftKeypoints:
 
 
 def compute_sift(grey: U8) -> SiftKeypoints:
-    """SIFT of a grey photograph (H, W) with OpenCV's defaults."""
-    # Without this its places are a quarter of a pixel right of and below those of the photograph.
+    """SIFT of a grey image (H, W) with OpenCV's defaults."""
+    # Without this, positions are shifted by a quarter of a pixel.
     sift = cv2.SIFT.create(enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey, None)
     return SiftKeypoints(
@@ -51,7 +51,7 @@ def compute_sift(grey: U8) -> SiftKeypoints:
 
 
 def nearest_two(first: F32, second: F32) -> tuple[I64, F32]:
-    """Of each descriptor (N, D) the nearest two of (M, D) by brute force, and their distances; (N, 2)."""
+    """For each descriptor (N, D) the nearest two of (M, D) by brute force, and their distances; (N, 2)."""
     found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
     index = np.array([[m.trainIdx for m in pair] for pair in found], dtype=np.int64)
     return index, np.array([[m.distance for m in pair] for pair in found], dtype=np.float32)
@@ -78,7 +78,7 @@ def match_sift(first: SiftKeypoints, second: SiftKeypoints, *, ratio: float, mut
         closer = np.flatnonzero(squared.min(axis=0) < best)
         back[closer] = start + squared[:, closer].argmin(axis=0)
         best[closer] = squared[back[closer] - start, closer]
-        # One feature of the second image may be the nearest of many in the first: so is plain ratio matching.
+        # Plain ratio matching allows one feature of image 2 as the nearest of many in image 1.
         nearest[rows] = squared.argmin(axis=1)
         at = np.arange(len(block)), nearest[rows]
         least = squared[at]

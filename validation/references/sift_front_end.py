@@ -1,6 +1,6 @@
-"""OpenCV's SIFT as a front end that the pipeline can run in place of ours.
+"""OpenCV's SIFT as a front end of the pipeline.
 
-Its matches go through the same estimator of F and the same verification as ours.
+Its matches use our estimator of F and our verification.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def opencv_polynomial(P: F64, xy: F64) -> F64:
 def colmap_points(P: F64, xy: F64) -> F64:
     """``pycolmap.triangulate_point`` of two views, ``triangulate_multi_view_point`` of more, point by point.
 
-    COLMAP wants normalised image points: pixels and cameras are moved alike to where they are small. Points
+    COLMAP needs normalised image points, so pixels and cameras are normalised together. Points
     that it refuses come out as zeros.
     """
     scale, middle = 1e-3, xy.mean(axis=1)

@@ -1,1 +1,1 @@
-"""Cross-checks of thesisrecon against reference tools and truth."""
+"""Synthetic and real test scenes with ground truth."""

@@ -1,4 +1,4 @@
-"""True cameras of interpolated views, and pictures turned onto each other."""
+"""True cameras of interpolated views, and homographies between images."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from validation.scenes.fixtures import Pose
 
 
 def camera_between(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
-    """The camera (3, 4) that the view at s is of, given those of the photographs.
+    """The camera (3, 4) that the view at s is of, given those of the images.
 
     In the rectified frame both have their rows and depths in common up to a scale, so that the interpolated
     place of every point is its image in (1 - s) P_0 + s P_1 (Seitz and Dyer).
     """
     first, second = (H @ camera for H, camera in zip(pair.H, P, strict=True))
-    # What is common is so but for the errors of F.
+    # Equal up to the errors of F.
     scale = float(np.sum(first[1:] * second[1:]) / np.sum(second[1:] ** 2))
     return np.asarray(pair.frame.original_from_rectified(s) @ ((1.0 - s) * first + s * scale * second))
 
@@ -62,7 +62,7 @@ def best_homography(xy1: F64, xy2: F64) -> F64:
 
 
 def turned(picture: U8, H: F64) -> tuple[U8, B8]:
-    """The picture through H (3, 3), black outside, and where it has pixels."""
+    """The image through H (3, 3), black outside, and where it has pixels."""
     height, width = picture.shape[:2]
     y, x = np.indices((height, width), dtype=np.float64)
     back: F64 = np.asarray(np.linalg.inv(H), dtype=np.float64)

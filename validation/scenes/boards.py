@@ -1,7 +1,7 @@
-"""Photographs of a chequered board by cameras that are known, made in three ways.
+"""Chessboard images with known cameras, rendered in three ways.
 
-The ray caster that made the courtyard, the library's renderer of models, and the library's own camera with
-radial distortion: what an independent calibration finds in them says whether the truth is true.
+By the ray caster of the courtyard, the library's renderer, and the library's camera with radial distortion.
+An independent calibration of them checks the ground truth.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SQUARE_M = 0.03
 MARGIN = 2
 """Squares of white around the board."""
 TEXELS = 12
-"""Of a side of a square."""
+"""Side of a square (m)."""
 DARK, LIGHT = 0.05, 0.62
 PER_PIXEL = 2
 SENSOR = Sensor(vignetting=0.0)
@@ -81,7 +81,7 @@ def make_board(way: str, views: int) -> Board:
 
 
 def photographs(way: str, board: Board) -> list[U8]:
-    """(480, 640, 3) pictures, each of a camera of the board; the noise is that of the courtyard's sensor."""
+    """(480, 640, 3) images, each of a camera of the board; the noise is that of the courtyard's sensor."""
     light = {RAYCAST: _raycast, RENDERED: _rendered, LENS: _through_a_lens}[way](board)
     rng = np.random.default_rng(7)
     return [expose(one, SENSOR, gains=(1.0, 1.0, 1.0), rng=rng) for one in light]
@@ -101,7 +101,7 @@ TEXEL_M = SQUARE_M / TEXELS
 
 
 def _raycast(board: Board) -> list[NDArray[np.float32]]:
-    """By the tracer of the courtyard; its light falls straight on the board."""
+    """Render with the tracer of the courtyard, lit frontally."""
     world = _world()
     found = []
     for R, t in zip(board.R, board.t, strict=True):
@@ -122,7 +122,7 @@ def _world() -> World:
 
 
 def _rendered(board: Board) -> list[NDArray[np.float32]]:
-    """By the library's renderer: two triangles with a texture."""
+    """Render two textured triangles with the library's renderer."""
     pattern = _pattern()
     height, width = pattern.shape
     u, v = np.array([0.0, width - 1.0, width - 1.0, 0.0]), np.array([0.0, 0.0, height - 1.0, height - 1.0])
@@ -139,7 +139,7 @@ def _rendered(board: Board) -> list[NDArray[np.float32]]:
 
 
 def _through_a_lens(board: Board) -> list[NDArray[np.float32]]:
-    """By the library's camera: the ray of each sample, distortion taken off, meets the board."""
+    """Intersect the undistorted ray of each sample with the board."""
     y, x = (np.indices((SIZE[1] * PER_PIXEL, SIZE[0] * PER_PIXEL)) + 0.5) / PER_PIXEL - 0.5
     bent = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     rays = np.column_stack([undistort(bent, board.distortion), np.ones(len(bent))])

@@ -237,7 +237,7 @@ def _lid(x: float, y: float, z: float, radius: float, material: int) -> Surface:
 
 
 def build_objects() -> list[list[Surface]]:
-    """Where everything stands; small things first, so that they cut short the search along the walls."""
+    """Place all objects; small ones first, to shorten the search along the walls."""
     x, y, z = np.eye(3)
     walls = [
         Surface(np.array([-6.2, 0.0, 0.0]), x, z, (12.4, WALL_HEIGHT), BACK),

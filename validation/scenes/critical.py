@@ -1,8 +1,8 @@
-"""Sequences whose motion leaves self-calibration something open, and general ones that do not.
+"""Image sequences with critical motions for self-calibration, and general ones.
 
-Every motion comes exact and as a photographer makes it who wants it so: the hand turns the camera by
-``HAND_TURN_DEG`` about each axis and moves it by ``HAND_SHIFT`` of the distance along each, a wall has relief
-of ``WALL_RELIEF`` of its width. Scenes, focals, distances, numbers of cameras and noise are random.
+Every motion comes exact and hand-held: ``HAND_TURN_DEG`` is the rotation about each axis, ``HAND_SHIFT`` the
+shift in units of the distance, ``WALL_RELIEF`` the relief of a wall in units of its width. Scenes, focal
+lengths, distances, numbers of cameras and noise are random.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Motion(Enum):
-    """What the cameras do, or what they see."""
+    """Camera motions and scene types."""
 
     GENERAL = "general"
     TRANSLATION = "pure translation"
@@ -59,7 +59,7 @@ class Sequence:
 
 
 @dataclass(frozen=True)
-class _Wishes:
+class _Path:
     """``distance`` in units of the scene's radius; ``spread`` of the path in units of the distance."""
 
     views: int
@@ -67,7 +67,7 @@ class _Wishes:
     spread: float
 
 
-def _general(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+def _general(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     """Cameras on a cap of 40 to 80 degrees across, held at any roll up to 30 degrees, not quite aimed."""
     half = np.radians(rng.uniform(20.0, 40.0))
     azimuth, height = rng.uniform(-half, half, (2, w.views))
@@ -80,14 +80,14 @@ def _general(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
     return np.array(R), C
 
 
-def _translation(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+def _translation(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     start = np.array([w.distance, 0.0, 0.0])
     C = start + w.spread * w.distance * rng.uniform(-0.5, 0.5, (w.views, 3))
     R = look_at(start, 0.1 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
     return np.tile(R, (w.views, 1, 1)), C
 
 
-def _rotation(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+def _rotation(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     """A panorama from one point, turned up to 15 degrees about any axis."""
     start = np.array([w.distance, 0.0, 0.0])
     R = look_at(start, np.zeros(3), rng.uniform(-0.3, 0.3))
@@ -95,7 +95,7 @@ def _rotation(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
     return Rotation.from_rotvec(turns).as_matrix() @ R, np.tile(start, (w.views, 1))
 
 
-def _turntable(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+def _turntable(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     """One camera at any height and roll that circles about an axis, by 40 to 360 degrees in all."""
     height = np.radians(rng.uniform(-10.0, 45.0))
     start = w.distance * np.array([np.cos(height), 0.0, np.sin(height)])
@@ -105,7 +105,7 @@ def _turntable(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
     return R @ turn.swapaxes(1, 2), turn @ start
 
 
-def _planar(w: _Wishes, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64, F64]:
+def _planar(w: _Path, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64, F64]:
     """A tripod rolled over the floor: headings of its own at every place, the tilt as it was."""
     azimuth = rng.uniform(-0.6, 0.6, w.views)
     C = w.distance * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
@@ -119,19 +119,19 @@ def _planar(w: _Wishes, rng: np.random.Generator, axial: float = 0.0) -> tuple[F
     return start @ turn.swapaxes(1, 2), C
 
 
-def _parallel_axes(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+def _parallel_axes(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     """The same with a lift."""
     return _planar(w, rng, axial=rng.uniform(0.2, 0.6))
 
 
-def _optical_axis(w: _Wishes, rng: np.random.Generator) -> tuple[F64, F64]:
+def _optical_axis(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     """Forward and sideways, rolled by any angle, the optical axis never turned."""
     R, C = _translation(w, rng)
     roll = rng.uniform(-np.pi, np.pi, w.views)
     return Rotation.from_rotvec(roll[:, None] * UP).as_matrix() @ R, C
 
 
-_MOTIONS: dict[Motion, Callable[[_Wishes, np.random.Generator], tuple[F64, F64]]] = {
+_MOTIONS: dict[Motion, Callable[[_Path, np.random.Generator], tuple[F64, F64]]] = {
     Motion.GENERAL: _general,
     Motion.TRANSLATION: _translation,
     Motion.ROTATION: _rotation,
@@ -149,14 +149,14 @@ def make_sequence(
     """5 to 15 cameras and 150 to 400 points in a box, 0.5 to 1 px noise, a focal of 0.7 to 2 long sides.
 
     ``by_hand`` adds what a photographer cannot avoid; ``zoom``: focals vary by factors e^+-zoom. The
-    principal point is off by 0.5 % of the long side (rms), and a tenth of what is in the picture is not
+    principal point is off by 0.5 % of the long side (rms), and a tenth of what is in the image is not
     matched.
     """
-    wishes = _Wishes(int(rng.integers(5, 16)), rng.uniform(3.0, 6.0), rng.uniform(0.4, 0.8))
-    R, C = _MOTIONS[motion](wishes, rng)
+    path = _Path(int(rng.integers(5, 16)), rng.uniform(3.0, 6.0), rng.uniform(0.4, 0.8))
+    R, C = _MOTIONS[motion](path, rng)
     if by_hand:
         R = Rotation.from_rotvec(np.radians(rng.normal(0.0, HAND_TURN_DEG, (len(R), 3)))).as_matrix() @ R
-        C = C + wishes.distance * rng.normal(0.0, HAND_SHIFT, C.shape)
+        C = C + path.distance * rng.normal(0.0, HAND_SHIFT, C.shape)
     X = rng.uniform(-1.0, 1.0, (int(rng.integers(150, 401)), 3)) * rng.uniform(0.5, 1.0, 3)
     if motion is Motion.PLANE:
         X[:, 0] = (WALL_RELIEF * rng.uniform(-1.0, 1.0, len(X)) if by_hand else 0.0) * np.ones(len(X))
@@ -170,7 +170,7 @@ def make_sequence(
 
 
 def _focal(R: F64, C: F64, X: F64, rng: np.random.Generator) -> float:
-    """A focal (px) that fills the picture with the scene, give or take, within 0.6 and 2.5 long sides."""
+    """A focal (px) that fills the image with the scene, give or take, within 0.6 and 2.5 long sides."""
     Y = np.einsum("vab,vnb->vna", R, X[None] - C[:, None])
     reach = np.quantile(np.abs(Y[..., 0] / np.maximum(Y[..., 2], 1e-3)), 0.9)
     return float(np.clip(0.5 / reach * rng.uniform(0.7, 1.1), 0.6, 2.5) * SIZE.max())

@@ -1,4 +1,4 @@
-"""Many photographs from few: zoomed parts, whose overlap is known where they share a source."""
+"""Many images from few: zoomed crops with known overlap."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from thesisrecon.records import Image
 
 @dataclass(frozen=True)
 class Crop:
-    """A part of a photograph as a photograph of its own.
+    """A part of an image as an image of its own.
 
-    ``source`` counts the photographs it may come from, ``scene`` the sets these belong to; ``box`` (4,)
+    ``source`` counts the images it may come from, ``scene`` the sets these belong to; ``box`` (4,)
     is the part (left, top, right, bottom) as shares of the width and the height of the source.
     """
 
@@ -35,9 +35,9 @@ def make_crops(
     rng: np.random.Generator,
     least_share: float = 0.5,
 ) -> list[Crop]:
-    """``count`` parts of the photographs of some scenes, at random places and zooms.
+    """``count`` parts of the images of some scenes, at random places and zooms.
 
-    The sources take turns in an order drawn from ``rng``, so that ``count`` photographs come from as many
+    The sources take turns in an order drawn from ``rng``, so that ``count`` images come from as many
     sources as there are. The side of a part is ``least_share`` to 1 of that of its source, all logarithms
     equally likely; it is resized to ``long_side`` px, never enlarged by more than its source allows.
     """
@@ -66,15 +66,15 @@ def make_separate_crops(
     rng: np.random.Generator,
     per_scene: int = 10,
 ) -> list[Crop]:
-    """As :func:`make_crops`, but every ``per_scene`` photographs have a scene of their own.
+    """As :func:`make_crops`, but every ``per_scene`` images have a scene of their own.
 
-    So a photograph overlaps with as many others however many there are. Where the sets do not suffice they
+    So an image overlaps with as many others however many there are. Where the sets do not suffice they
     come again as negatives, mirrored, and as mirrored negatives, which show nothing that the first ones show.
     Raises ``ValueError`` where these do not suffice either.
     """
     most = 4 * len(scenes) * per_scene
     if count > most:
-        raise ValueError(f"{len(scenes)} sets make at most {most} photographs; got {count}")
+        raise ValueError(f"{len(scenes)} sets make at most {most} images; got {count}")
     crops: list[Crop] = []
     for k in range(-(-count // per_scene)):
         change, scene = divmod(k, len(scenes))
@@ -83,7 +83,7 @@ def make_separate_crops(
             rgb = 255 - crop.image.rgb if change % 2 else crop.image.rgb
             rgb = np.ascontiguousarray(rgb[:, ::-1]) if change >= 2 else rgb
             image = replace(crop.image, name=f"{len(crops):04d}.png", rgb=rgb)
-            # Photographs of other scenes have other numbers.
+            # Images of other scenes have other numbers.
             crops.append(replace(crop, image=image, scene=k, source=1000 * k + crop.source))
     return crops
 

@@ -1,4 +1,4 @@
-"""The dinosaur on its turntable (Oxford Visual Geometry Group): tracks without photographs, published
+"""The dinosaur on its turntable (Oxford Visual Geometry Group): tracks without images, published
 cameras, and pairs of views made from the tracks."""
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Dinosaur:
 
 
 def load_dinosaur() -> Dinosaur | None:
-    """The set, or None where it is not on this machine."""
+    """The set, or None if it is not on this machine."""
     root = data_root()
     if root is None or not (root / "dinosaur").is_dir():
         return None
@@ -46,7 +46,7 @@ def load_dinosaur() -> Dinosaur | None:
 def pairs_from_tracks(tracks: Tracks, *, seed: int = 0) -> list[TwoView]:
     """The pairs of views with ``MIN_COMMON`` points in common, their F estimated and verified as matches are.
 
-    The certainty of F is not judged.
+    Degeneracy of F is not tested.
     """
     table = np.full((tracks.n_views, tracks.n_points), -1)
     table[tracks.view_index, tracks.point_index] = np.arange(len(tracks.xy))

@@ -25,11 +25,7 @@ RELIEF_LEVELS = (0.0, 0.0, 0.0, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Facade:
-    """Matches xy1, xy2 (N, 2) px with noise, ``right`` (N,), the true F, and exact matches to judge an F by.
-
-    ``exact1, exact2`` (M, 2) px are the noise-free places of the right matches; ``off_plane`` counts the
-    right matches more than 3 ``sigma_px`` from where the plane's homography takes them.
-    """
+    """Parameters of a facade scene."""
 
     xy1: F64
     xy2: F64
@@ -43,7 +39,7 @@ class Facade:
 
 @dataclass(frozen=True)
 class FacadeMaker:
-    """What a facade is made of.
+    """Parameters of a random facade.
 
     Parameters
     ----------
@@ -64,7 +60,7 @@ class FacadeMaker:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> FacadeMaker:
-        """One of the whole range: relief of 0 to 3 % and 0 to 10 % off the plane, 10 to 50 % wrong."""
+        """Draw random parameters: relief of 0 to 3 % and 0 to 10 % off the plane, 10 to 50 % wrong."""
         return cls(
             matches=int(rng.integers(100, 1000)),
             relief=float(rng.choice([0.0, rng.uniform(0.0, 0.03)])),
@@ -106,7 +102,7 @@ class FacadeMaker:
         )
 
     def _points(self, period: F64, rng: np.random.Generator) -> F64:
-        """Corners of windows, a few kinds of place within each, and what stands off the wall."""
+        """Return window corners, in a few positions each, and points off the wall."""
         kinds = rng.random((12, 2))
         depth = self.relief * DISTANCE * rng.choice(RELIEF_LEVELS, 12)
         kind = rng.integers(0, 12, self.matches)

@@ -54,7 +54,7 @@ STANDPOINTS = (
 @dataclass(frozen=True)
 class Pose:
     """A true camera: ``K``, ``R`` (world-to-camera) (3, 3), ``C`` (3,) metres, and the ``exposure`` of its
-    photograph."""
+    image."""
 
     K: F64
     R: F64
@@ -101,7 +101,7 @@ def encode_depth(depth: U16) -> bytes:
 
 
 def versions() -> dict[str, str]:
-    """What decides the bytes besides this code."""
+    """Return the versions that affect the bytes."""
     jpeg = features.version("libjpeg_turbo") or features.version("jpg") or "unknown"
     return {"pillow": PIL.__version__, "libjpeg": jpeg, "numpy": np.__version__, "numba": numba.__version__}
 

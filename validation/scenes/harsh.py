@@ -1,8 +1,7 @@
-"""Sets of photographs as people bring them who know nothing of self-calibration: too few, hardly turned,
-cropped, zoomed while one camera is told, with lenses and pixels that the model does not have.
+"""Difficult image sets for self-calibration: few images, small rotations, crops, zooms under a shared-camera
+assumption, and lenses and pixels outside the camera model.
 
-Every kind is a random scene with the exact truth of each camera. What is told of the cameras goes with it,
-right or wrong.
+Every kind is a random scene with exact true cameras, and the camera assumption, right or wrong.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ SEEN = 0.85
 
 @dataclass(frozen=True)
 class HarshSet:
-    """True cameras ``K, R`` (V, 3, 3), ``C`` (V, 3), points ``X`` (N, 3); ``lens`` (k1, k2); what is done to
-    the observations (``sigma_px``, share of ``wrong`` matches, share of points that move with an object); and
-    what is ``told`` of the cameras."""
+    """True cameras ``K, R`` (V, 3, 3), ``C`` (V, 3), points ``X`` (N, 3); ``lens`` (k1, k2); observation
+    errors (``sigma_px``, share of ``wrong`` matches, share of points ``moving`` with an object); and the
+    camera assumption ``cameras``."""
 
     K: F64
     R: F64
@@ -37,7 +36,7 @@ class HarshSet:
     lens: tuple[float, float] = (0.0, 0.0)
     wrong: float = 0.0
     moving: float = 0.0
-    told: Literal["shared", "per-image"] = "shared"
+    cameras: Literal["shared", "per-image"] = "shared"
 
     @property
     def sizes(self) -> I64:
@@ -50,7 +49,7 @@ class HarshSet:
         return np.asarray(np.sqrt(self.K[:, 0, 0] * self.K[:, 1, 1]))
 
     def observe(self, rng: np.random.Generator) -> Tracks:
-        """Tracks of what lies in the pictures, with everything that is wrong with them."""
+        """Return tracks of the visible points with all observation errors."""
         X = np.repeat(self.X[None], len(self.K), axis=0)
         object_ = rng.random(len(self.X)) < self.moving
         step = 0.15 * rng.normal(size=(len(self.K), 1, 3))
@@ -60,7 +59,7 @@ class HarshSet:
             x = Y[..., :2] / Y[..., 2:]
         r2 = np.sum(x**2, axis=-1, keepdims=True)
         x = x * (1.0 + self.lens[0] * r2 + self.lens[1] * r2**2)
-        # Beyond where it folds back the polynomial is no lens.
+        # Beyond its turning point the polynomial is not invertible.
         whole = 1.0 + 3.0 * self.lens[0] * r2[..., 0] + 5.0 * self.lens[1] * r2[..., 0] ** 2 > 0.1
         xy = np.einsum("vab,vnb->vna", self.K[:, :2, :2], x) + self.K[:, None, :2, 2]
         seen = (Y[..., 2] > 0.1) & whole & ((xy >= 0) & (xy <= SIZE - 1)).all(axis=2)
@@ -104,7 +103,7 @@ def _orbit(rng: np.random.Generator, views: int) -> tuple[F64, F64]:
 
 
 def _set(poses: tuple[F64, F64], X: F64, rng: np.random.Generator) -> HarshSet:
-    """One focal that fills the picture with the scene, the principal point off by half a hundredth."""
+    """One focal that fills the image with the scene, the principal point off by half a hundredth."""
     R, C = poses
     Y = np.einsum("vab,vnb->vna", R, X[None] - C[:, None])
     reach = np.quantile(np.abs(Y[..., 0] / np.maximum(Y[..., 2], 1e-3)), 0.9)
@@ -122,10 +121,10 @@ def _general(rng: np.random.Generator, views: int | None = None) -> HarshSet:
     return _set(_cap(rng, views or _several(rng)), _points(rng), rng)
 
 
-def _zooming(scene: HarshSet, factors: F64, told: Literal["shared", "per-image"]) -> HarshSet:
+def _zooming(scene: HarshSet, factors: F64, cameras: Literal["shared", "per-image"]) -> HarshSet:
     K = scene.K.copy()
     K[:, :2, :2] *= factors[:, None, None]
-    return replace(scene, K=K, told=told)
+    return replace(scene, K=K, cameras=cameras)
 
 
 def _cropped(scene: HarshSet, shift: F64) -> HarshSet:
@@ -196,8 +195,8 @@ def _zoomed_path(rng: np.random.Generator) -> HarshSet:
 
 
 KINDS: Mapping[str, Callable[[np.random.Generator], HarshSet]] = {
-    "three photographs": lambda rng: _general(rng, 3),
-    "four photographs, each its zoom": lambda rng: _own_zooms(_general(rng, 4), rng),
+    "three images": lambda rng: _general(rng, 3),
+    "four images, each its zoom": lambda rng: _own_zooms(_general(rng, 4), rng),
     "a small arc of 5 to 10 degrees": lambda rng: _set(
         _cap(rng, _several(rng), rng.uniform(2.5, 5.0)), _points(rng), rng
     ),
@@ -212,14 +211,14 @@ KINDS: Mapping[str, Callable[[np.random.Generator], HarshSet]] = {
     "turntable, each its zoom": lambda rng: _own_zooms(
         _set(_orbit(rng, _several(rng)), _points(rng), rng), rng
     ),
-    "two zooms by turns, one camera told": lambda rng: _two_zooms(rng, 1.1, 2.0),
-    "two near zooms by turns, one camera told": lambda rng: _two_zooms(rng, 1.02, 1.1),
-    "one photograph of another focal, one camera told": _one_other,
+    "two zooms by turns, shared camera assumed": lambda rng: _two_zooms(rng, 1.1, 2.0),
+    "two near zooms by turns, shared camera assumed": lambda rng: _two_zooms(rng, 1.02, 1.1),
+    "one image of another focal, shared camera assumed": _one_other,
     "cropped alike": lambda rng: _cropped(_general(rng), rng.uniform(-0.12, 0.12, 2)),
     "each cropped for itself": lambda rng: _own_zooms(
         _cropped(scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))), rng
     ),
-    "each cropped for itself, one camera told": lambda rng: _cropped(
+    "each cropped for itself, shared camera assumed": lambda rng: _cropped(
         scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))
     ),
     "pixels not square": _aspect,
@@ -231,5 +230,5 @@ KINDS: Mapping[str, Callable[[np.random.Generator], HarshSet]] = {
     "noise of 2 to 3 px": lambda rng: replace(_general(rng), sigma_px=float(rng.uniform(2.0, 3.0))),
     "a fifth of the matches wrong": lambda rng: replace(_general(rng), wrong=0.2),
     "an object moves with 30 % of the points": lambda rng: replace(_general(rng), moving=0.3),
-    "five photographs of few points, each its zoom": _few_points,
+    "five images of few points, each its zoom": _few_points,
 }

@@ -140,7 +140,7 @@ def _cross(s: F64, kind: int, ray: F64, bracket: tuple[float, float, float, floa
 
 @compiled
 def _leap(s: F64, ray: F64, t: float, speeds: tuple[float, float, float], pool: Pool) -> float:
-    """How far a ray over a plane can go above the highest point of its block; 0 where it may meet the
+    """Return the step of a ray above the highest point of its block; 0 if it may meet the
     relief."""
     u, v, h = _chart(s, 0, ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5])
     x, y = (u + s[20]) / s[19], (v + s[21]) / s[19]

@@ -1,7 +1,7 @@
-"""As many photographs of the courtyard as one likes, from as many places: what sets that grow are made of.
+"""Arbitrarily many rendered images of the courtyard.
 
-They are rendered, not cut from others: photographs that share a centre would make pairs without parallax, and
-another cost than that of a walk. The first n of a longer set are the set of n, spread over the same arc.
+They are rendered, not cropped: images with a common centre would have no parallax and another cost. The first
+n of a longer set are the set of n, spread over the same arc.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HALF_ARC_DEG = 55.0
 
 
 def walk(count: int, size: tuple[int, int], *, seed: int = 0) -> list[Pose]:
-    """``count`` true cameras about the yard, of one calibration, for photographs of ``size`` (width, height).
+    """``count`` true cameras about the yard, of one calibration, for images of ``size`` (width, height).
 
     The angles are those of van der Corput's sequence, so that the first n of any walk are spread evenly;
     heights, distances, rolls and what is looked at are drawn.
@@ -58,7 +58,7 @@ def _van_der_corput(k: int) -> float:
 
 
 def render(world: World, pose: Pose, size: tuple[int, int], *, seed: int) -> U8:
-    """The photograph (H, W, 3) of one camera."""
+    """The image (H, W, 3) of one camera."""
     rows = (0, 2 * size[1])
     light = trace(world, Rays(pose.K, pose.R, pose.C), size, per_pixel=2, rows=rows)[0]
     sensor, gain = Sensor(), 0.82 * pose.exposure
@@ -67,7 +67,7 @@ def render(world: World, pose: Pose, size: tuple[int, int], *, seed: int) -> U8:
 
 
 def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360), threads: int = 2) -> None:
-    """Photographs ``0000.png`` and so on of :func:`walk` in ``folder``; those that are there stay."""
+    """Images ``0000.png`` and so on of :func:`walk` in ``folder``; those that are there stay."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [k for k in range(count) if not (folder / f"{k:04d}.png").is_file()]
     if not missing:

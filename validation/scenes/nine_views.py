@@ -1,4 +1,4 @@
-"""Nine equally spaced rectified photographs: views between two of them are there to compare with."""
+"""Nine equally spaced rectified images, with real views between the inputs."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class NineViews:
     disparities: tuple[F32, F32]
 
     def share(self, view: int) -> float:
-        """Where a view is on the way from the first end, 0, to the second, 1."""
+        """Return the position of a view between the ends, 0 to 1."""
         return (view - ENDS[0]) / (ENDS[1] - ENDS[0])
 
 
 def load_cones() -> NineViews | None:
-    """The Cones of Scharstein and Szeliski (CVPR 2003); None where they are not on this machine."""
+    """The Cones of Scharstein and Szeliski (CVPR 2003); None if they are not on this machine."""
     root = data_root()
     folder = None if root is None else root / "stereo" / "Cones9"
     if folder is None or not folder.is_dir():
@@ -55,18 +55,18 @@ def read_rgb(path: Path) -> U8:
 
 
 def mirrored(image: U8) -> U8:
-    """The picture from right to left: the right one of a pair becomes a left one."""
+    """The image from right to left: the right one of a pair becomes a left one."""
     return np.ascontiguousarray(image[:, ::-1])
 
 
 def both_ways(match: Callable[[U8, U8], F32], left: U8, right: U8) -> tuple[F32, F32]:
-    """Disparities of either photograph by a method that knows those of the left one only."""
+    """Return disparities of both images by a method for the left one."""
     back = match(mirrored(right), mirrored(left))
     return match(left, right), np.ascontiguousarray(back[:, ::-1])
 
 
 def our_disparities(left: U8, right: U8) -> tuple[DisparityMap, DisparityMap]:
-    """The maps of both photographs by the library's default matcher, with its confidences."""
+    """The maps of both images by the library's default matcher, with its confidences."""
     match = partial(SemiGlobalMatching().match, disparity_range=(0, DISPARITIES - 1))
     return match_both_sides(match, left, right)
 
@@ -87,12 +87,12 @@ def synthesis_of_disparities(
 
 
 def dissolved(first: U8, second: U8, share: float) -> U8:
-    """Both photographs mixed where they are: what a view between must be better than."""
+    """Both images mixed where they are: what a view between must be better than."""
     mixed = (1.0 - share) * first.astype(np.float64) + share * second
     return np.asarray(np.rint(mixed), dtype=np.uint8)
 
 
 def _quarters(path: Path) -> F32:
     with Image.open(path) as image:
-        told = np.asarray(image, dtype=np.float32)
-    return np.where(told > 0.0, 0.25 * told, np.nan).astype(np.float32)
+        values = np.asarray(image, dtype=np.float32)
+    return np.where(values > 0.0, 0.25 * values, np.nan).astype(np.float32)

@@ -1,5 +1,4 @@
-"""From linear light to a photograph: lens blur, vignetting, exposure, photon and read noise, tone curve,
-JPEG."""
+"""From linear light to an image: lens blur, vignetting, exposure, noise, tone curve, JPEG."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ def integrate_pixels(samples: F32, per_pixel: int, blur_px: float) -> F32:
 
 
 def expose(light: F32, sensor: Sensor, *, gains: tuple[float, float, float], rng: np.random.Generator) -> U8:
-    """8-bit photograph of linear light (H, W, 3); ``gains`` = exposure times white balance per channel."""
+    """8-bit image of linear light (H, W, 3); ``gains`` = exposure times white balance per channel."""
     height, width = light.shape[:2]
     y = (np.arange(height) - 0.5 * (height - 1))[:, None] / (0.5 * width)
     x = (np.arange(width) - 0.5 * (width - 1))[None, :] / (0.5 * width)

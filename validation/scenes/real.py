@@ -1,4 +1,4 @@
-"""Photographs with their truth, found by name: the fixtures of this project and the public sets beside it."""
+"""Images with ground truth by name: the fixtures and the public data sets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 @dataclass(frozen=True)
 class Scene:
-    """A set of photographs, sorted by name, and its truth where there is one.
+    """A set of images, sorted by name, and its truth where there is one.
 
     ``K``, ``R`` (world-to-camera) (V, 3, 3) and ``C`` (V, 3) camera centres in metres, all None without
     truth.
@@ -40,12 +40,12 @@ class Scene:
 
     @property
     def has_truth(self) -> bool:
-        """Whether the cameras are known."""
+        """Return whether the cameras are known."""
         return self.C is not None
 
 
 def data_root() -> Path | None:
-    """The folder of real photographs: THESISRECON_DATA, else ../shared/data beside the repository, None when
+    """The folder of real images: THESISRECON_DATA, else ../shared/data beside the repository, None when
     absent."""
     named = os.environ.get("THESISRECON_DATA")
     folder = Path(named) if named else ROOT.parent / "shared" / "data"
@@ -61,34 +61,34 @@ def read_scene(folder: Path, name: str) -> Scene:
     found = sorted(images.iterdir(), key=lambda p: p.name) if images.is_dir() else []
     paths = tuple(p for p in found if p.suffix.lower() in SUFFIXES)
     if not paths:
-        raise ValueError(f"a scene needs photographs in images/; {folder} has none")
+        raise ValueError(f"a scene needs images in images/; {folder} has none")
     truth = folder / "cameras.json"
     if not truth.is_file():
         return Scene(name, paths)
-    told = read_json(truth)
-    cameras = told.get("cameras") if isinstance(told, dict) else None
+    record = read_json(truth)
+    cameras = record.get("cameras") if isinstance(record, dict) else None
     if not isinstance(cameras, dict):
-        raise ValueError(f"{truth} must hold cameras, a table of photographs by their names")
+        raise ValueError(f"{truth} must hold cameras, a table of images by their names")
     missing = [p.name for p in paths if p.name not in cameras]
     if missing:
-        raise ValueError(f"cameras.json must name every photograph; it lacks {missing} of {folder}")
+        raise ValueError(f"cameras.json must name every image; it lacks {missing} of {folder}")
     return Scene(name, paths, *(_numbers(truth, cameras, paths, key) for key in ("K", "R", "C")))
 
 
 def _numbers(truth: Path, cameras: dict[str, Any], paths: Sequence[Path], key: str) -> F64:
-    """K, R (V, 3, 3) or C (V, 3) of the photographs."""
+    """K, R (V, 3, 3) or C (V, 3) of the images."""
     shape = (len(paths), 3) if key == "C" else (len(paths), 3, 3)
     try:
         numbers = np.array([cameras[path.name][key] for path in paths], dtype=np.float64)
     except (TypeError, KeyError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.shape != shape or not np.isfinite(numbers).all():
-        raise ValueError(f"{truth} must give every photograph a finite {key} {shape[1:]}")
+        raise ValueError(f"{truth} must give every image a finite {key} {shape[1:]}")
     return numbers
 
 
 def real_folder(name: str) -> Path | None:
-    """Where one of ``REAL_SCENES`` is, None where its photographs are not on this machine.
+    """Return the folder of one of ``REAL_SCENES``, or None if missing.
 
     Raises ``ValueError`` for a name that is none of them.
     """
@@ -119,10 +119,10 @@ def load_fixture_depth(view: int, name: str = "courtyard") -> tuple[F64, int]:
     from PIL import Image as PillowImage
 
     folder = ROOT / "fixtures" / name
-    told = json.loads((folder / "cameras.json").read_text(encoding="utf-8"))["depth"]
+    record = json.loads((folder / "cameras.json").read_text(encoding="utf-8"))["depth"]
     with PillowImage.open(folder / "depth" / f"{view:04d}.png") as image:
         steps = np.asarray(image, dtype=np.float64)
-    depth = np.where(steps == told["none"], np.nan, steps * told["unit_m"])
+    depth = np.where(steps == record["none"], np.nan, steps * record["unit_m"])
     # Every caller gets the same array.
     depth.flags.writeable = False
-    return depth, int(told["stride"])
+    return depth, int(record["stride"])

@@ -1,6 +1,6 @@
-"""Pairs of real photographs with matches and their truth: what estimates of F are held against.
+"""Pairs of real images with matches and ground truth.
 
-SIFT matches are OpenCV's and kept in a folder, so that they are found once.
+SIFT matches are OpenCV's and cached in a folder.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8
 CONSISTENT_PX = 1.5
 """Sampson distance to the true F within which a match of a scene with cameras counts as right."""
 FARTHEST = 3.0
-"""Depth in medians beyond which such a match is a wrong one that happens to lie on its line."""
+"""Depth in medians beyond which such a match counts as wrong."""
 ADELAIDE = ("biscuit", "book")
 SCENES_WITH_CAMERAS = ("fountain-P11", "Herz-Jesus-P8")
 
@@ -76,7 +76,7 @@ def kusvod2_pairs(
 ) -> Iterator[RealPair]:
     """The pairs of Lebeda, Matas and Chum (BMVC 2012) with their hand-made correspondences as ``truth``.
 
-    Nothing where the photographs are not on this machine; ``names`` picks some; with ``mutual`` the matches
+    Nothing where the images are not on this machine; ``names`` picks some; with ``mutual`` the matches
     must be each other's nearest.
     """
     root = data_root()
@@ -91,7 +91,7 @@ def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2
     """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise.
 
     Its points are the matches that agree with the cameras, moved to where they agree exactly, so they lie
-    where the scene has texture. Nothing where the photographs are not on this machine.
+    where the scene has texture. Nothing where the images are not on this machine.
     """
     if scene is None or scene.K is None or scene.R is None or scene.C is None:
         return

@@ -39,8 +39,7 @@ class Rig:
         )
 
     def tied_off_planes(self, least: int) -> bool:
-        """Whether pairs of views tie all views together, a pair being two that see ``least`` common points
-        off the plane with the most of them (``plane`` numbers the planes)."""
+        """Return whether pairs connect all views, each with ``least`` common points off its largest plane."""
         seen = np.isfinite(self.pixels()[..., 0])
         planes = np.arange(len(self.X)) if self.plane is None else self.plane
         tied = np.zeros((len(self.K), len(self.K)), dtype=bool)
@@ -87,7 +86,7 @@ def noisy_tracks(rig: Rig, sigma_px: float, rng: np.random.Generator) -> Tracks:
 def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) -> Reconstruction:
     """The minimum of the projective bundle adjustment nearest to the truth, in a random projective frame.
 
-    What a projective stage without fault hands on; a study of self-calibration needs no other. Flat views are
+    The output of a perfect projective stage, as input of self-calibration studies. Flat views are
     left out, as the gate of the projective stage does.
     """
     n = len(rig.K)

@@ -1,4 +1,4 @@
-"""Right metric models made wrong in the ways that reconstructions go wrong, for the self-check to find."""
+"""Correct metric models with typical reconstruction errors, for tests of the self-check."""
 
 from __future__ import annotations
 
@@ -70,17 +70,17 @@ def move_cameras(
 
 
 def one_moved(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
-    """One camera stands and looks elsewhere."""
+    """Move and rotate one camera."""
     return move_cameras(model, rng, rng.choice(np.flatnonzero(model.registered), 1), 20.0)
 
 
 def all_moved(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
-    """Every camera does: what adjusts from there ends in some local minimum."""
+    """Move and rotate all cameras, so that adjustment ends in a local minimum."""
     return move_cameras(model, rng, np.flatnonzero(model.registered), 8.0)
 
 
 def two_swapped(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
-    """Two cameras change places."""
+    """Swap two cameras."""
     i, j = rng.choice(np.flatnonzero(model.registered), 2, replace=False)
     R, C = model.cameras.R.copy(), centres(model)
     R[[i, j]], C[[i, j]] = R[[j, i]], C[[j, i]]
@@ -94,7 +94,7 @@ def mirrored(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     o = np.median(model.X[model.valid], axis=0)
     M = np.eye(3) - 2.0 * np.outer(z, z)
     R = np.diag([1.0, 1.0, -1.0]) @ model.cameras.R @ M
-    # Mirrored with the scene the cameras would look away from it: they come back to their side.
+    # Mirrored cameras look away from the scene; move them back to their side.
     C = o + (centres(model) - o) @ M
     return _placed(model, R, C - 2.0 * ((C - o) @ z)[:, None] * z)
 
@@ -130,7 +130,7 @@ def wrong_focal(model: MetricEstimate, rng: np.random.Generator) -> MetricEstima
 
 @dataclass(frozen=True)
 class Spoiling:
-    """A way to go wrong: its ``name``, and what it makes of a model."""
+    """A reconstruction error: its ``name`` and its effect on a model."""
 
     name: str
     spoil: Callable[[MetricEstimate, np.random.Generator], MetricEstimate]

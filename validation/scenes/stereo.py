@@ -30,7 +30,7 @@ class StereoPair:
 
 
 def stereo_folder(name: str) -> Path | None:
-    """Where one of ``STEREO_PAIRS`` is, None where its files are not on this machine.
+    """Return the folder of one of ``STEREO_PAIRS``, or None if missing.
 
     The motorcycle comes with scikit-image, whose files are read without importing it.
     """
@@ -44,7 +44,7 @@ def stereo_folder(name: str) -> Path | None:
 
 
 def load_stereo_pair(name: str) -> StereoPair | None:
-    """One of ``STEREO_PAIRS``, None where its files are not on this machine."""
+    """One of ``STEREO_PAIRS``, None if its files are not on this machine."""
     folder = stereo_folder(name)
     if folder is None:
         return None

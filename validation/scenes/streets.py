@@ -1,6 +1,6 @@
 """Synthetic walks along a street or around a block, as large as wanted, for bundle adjustment alone.
 
-One camera photographs a facade every half metre; points are seen by 3 to 10 neighbouring photographs, so the
+One camera observes a facade every half metre; points are seen by 3 to 10 neighbouring images, so the
 pattern of which views share points is that of a street, or of a ring where the walk closes.
 """
 
@@ -24,7 +24,7 @@ INTRINSICS = (1000.0, 1.0, 0.0, 500.0, 375.0, 0.02)
 
 @dataclass(frozen=True)
 class Walk:
-    """True cameras and points, and what the photographs show of them."""
+    """True cameras, points and observations."""
 
     cameras: MetricCameras
     X: F64
@@ -41,7 +41,7 @@ class Walk:
 
 
 def make_walk(n: int, kind: Kind, rng: np.random.Generator, *, sigma_px: float = 0.5) -> Walk:
-    """n photographs with noise ``sigma_px`` in each coordinate, some 60 points for each."""
+    """n images with noise ``sigma_px`` in each coordinate, some 60 points for each."""
     R, t = _poses(n, kind, rng)
     X = _facade(n, kind, 200 * n // 3, rng)
     view, point = _tracks(R, t, X, rng)

@@ -1,5 +1,4 @@
-"""Photographs taken anew from photographs: zoomed and cropped ones, their central parts, and photographs of
-which only a part is left. The truth of each is exact: the pixels are moved, and K with them."""
+"""Zoomed, cropped and masked images derived from images, with exact ground truth."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ FEATHER_PX = 24.0
 
 @dataclass(frozen=True)
 class Frame:
-    """The part of a photograph that becomes one of its own: ``size`` (width, height) px, its corner at
-    ``(left, top)`` of the photograph enlarged ``zoom`` times."""
+    """The part of an image that becomes one of its own: ``size`` (width, height) px, its corner at
+    ``(left, top)`` of the image enlarged ``zoom`` times."""
 
     zoom: float
     left: float
@@ -29,12 +28,12 @@ class Frame:
     size: tuple[int, int]
 
     def calibration(self, K: F64) -> F64:
-        """K (3, 3) of the new photograph, from that of the old one."""
+        """K (3, 3) of the new image, from that of the old one."""
         move = 0.5 * self.zoom - 0.5 - np.array([self.left, self.top])
         return np.array([[self.zoom, 0, move[0]], [0, self.zoom, move[1]], [0, 0, 1]]) @ K
 
     def cut(self, rgb: U8) -> U8:
-        """The new photograph (H, W, 3), resampled once."""
+        """The new image (H, W, 3), resampled once."""
         box = np.array([self.left, self.top, self.left + self.size[0], self.top + self.size[1]]) / self.zoom
         low, high = np.zeros(4), np.tile(rgb.shape[1::-1], 2)
         left, top, right, bottom = (float(v) for v in np.clip(box, low, high))
@@ -45,17 +44,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class Rezoom:
-    """Every photograph zoomed and cropped for itself.
+    """Every image zoomed and cropped for itself.
 
     ``zoom``: the logarithm of the factor lies within +- this; ``shift``: the principal point moves from the
-    middle by up to this share of the new width and height. A frame is never larger than the photograph was.
+    middle by up to this share of the new width and height. A frame is never larger than the image was.
     """
 
     zoom: float = 0.4
     shift: float = 0.1
 
     def frame(self, K: F64, size: tuple[int, int], rng: np.random.Generator) -> Frame:
-        """A frame of a photograph of this ``size`` (width, height) with the calibration K (3, 3)."""
+        """A frame of an image of this ``size`` (width, height) with the calibration K (3, 3)."""
         factor = float(np.exp(rng.uniform(-self.zoom, self.zoom)))
         off = rng.uniform(-self.shift, self.shift, 2)
         centre, whole = factor * (K[:2, 2] + 0.5), factor * np.array(size)
@@ -66,14 +65,14 @@ class Rezoom:
 
 
 def rezoom_scene(scene: Scene, folder: Path, *, seed: int, how: Rezoom | None = None) -> Scene:
-    """The scene with every photograph in a :class:`Rezoom` frame of its own, written to ``folder``."""
+    """The scene with every image in a :class:`Rezoom` frame of its own, written to ``folder``."""
     how, rng = how or Rezoom(), np.random.default_rng(seed)
     return _framed(scene, folder, lambda K, size: how.frame(K, size, rng), f"zoom-{seed}")
 
 
 def central_scene(scene: Scene, folder: Path, *, share: float = 0.5, zoom: float = 1.0) -> Scene:
     """The scene seen through a longer lens: ``share`` of the width and height around the middle of every
-    photograph, enlarged ``zoom`` times."""
+    image, enlarged ``zoom`` times."""
 
     def frame(_: F64, size: tuple[int, int]) -> Frame:
         width, height = (round(zoom * share * side) for side in size)
@@ -84,7 +83,7 @@ def central_scene(scene: Scene, folder: Path, *, share: float = 0.5, zoom: float
 
 
 def windowed_scene(scene: Scene, folder: Path, boxes: dict[int, F64]) -> Scene:
-    """The scene with only a part left of some photographs: ``boxes`` maps the number of a photograph to the
+    """The scene with only a part left of some images: ``boxes`` maps the number of an image to the
     part (left, top, right, bottom) as shares of width and height. The rest is grey, with a soft edge that
     gives no corners; the camera stays what it was."""
     paths = []
@@ -108,7 +107,7 @@ def _ramp(length: int, low: float, high: float) -> F64:
 
 def _framed(scene: Scene, folder: Path, frame: Callable[[F64, tuple[int, int]], Frame], name: str) -> Scene:
     if scene.K is None:
-        raise ValueError(f"new photographs need the calibration of the old ones; {scene.name} has none")
+        raise ValueError(f"new images need the calibration of the old ones; {scene.name} has none")
     paths, K = [], []
     for path, calibration in zip(scene.image_paths, scene.K, strict=True):
         rgb = _read(path)

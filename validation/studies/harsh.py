@@ -60,7 +60,7 @@ def run_trial(kind: str, number: int) -> Trial:
     pairs = pairs_from_tracks(observed, seed=number)
     tracks = verified_tracks(observed, pairs)
     config = PipelineConfig()
-    config = replace(config, intrinsics=replace(config.intrinsics, cameras=scene.told))
+    config = replace(config, intrinsics=replace(config.intrinsics, cameras=scene.cameras))
     matched = Matched(kind, tracks, pairs, scene.sizes, scene.focal_px)
     result, failures, _ = solve(matched, config, seed=number, first=0)
     return judge(number, result, failures, matched)

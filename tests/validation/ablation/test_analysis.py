@@ -8,7 +8,7 @@ import pytest
 
 from tests.validation.ablation.toy import Darts
 from validation.ablation import Measure, Study, analyse
-from validation.ablation.analysis import as_told
+from validation.ablation.analysis import as_reported
 from validation.ablation.plan import Plan, plan_study
 from validation.ablation.run import Row, Rows
 from validation.ablation.tables import write_tables
@@ -82,7 +82,7 @@ def test_quotients_where_all_values_allow_them():
     rows = rows_of(ratio, lambda p: (1.0 + p.seed) * (2.0 if p.variant == "aim = 1" else 1.0))
     found = compared(rows, "aim = 1")
     assert found.ratio
-    assert as_told(found) == pytest.approx((2.0, 2.0, 2.0))
+    assert as_reported(found) == pytest.approx((2.0, 2.0, 2.0))
     with_zero = rows_of(ratio, lambda p: float(p.seed) + (p.variant == "aim = 1"))
     assert not compared(with_zero, "aim = 1").ratio
     assert compared(with_zero, "aim = 1").interval.mean == 1.0

@@ -88,7 +88,7 @@ def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
 def test_an_unreported_metric_is_named(tmp_path):
     knowledge = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
     rows = ablate(knowledge, tmp_path, executor="local")
-    assert {r.failure for r in rows} == {"the task tells no wieght"}
+    assert {r.failure for r in rows} == {"the task returned no wieght"}
     assert rows[1].metrics["size"] == 800.0
     assert "no row tells wieght" in analyse(rows).warnings
 
@@ -213,10 +213,12 @@ def test_an_executor_of_the_caller_stays_open():
 
 
 def test_progress_reports_every_row(tmp_path):
-    heard = []
-    ablate(study(tmp_path / "log"), tmp_path / "out", executor="local", heard=lambda s: heard.append(s.done))
-    assert heard[0] == 0
-    assert heard[-1] == 12
+    seen = []
+    ablate(
+        study(tmp_path / "log"), tmp_path / "out", executor="local", on_progress=lambda s: seen.append(s.done)
+    )
+    assert seen[0] == 0
+    assert seen[-1] == 12
 
 
 def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path):

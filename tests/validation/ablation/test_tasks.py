@@ -70,8 +70,8 @@ def test_exact_views_are_calibrated_exactly():
         (CalibrationOverNoise(), "clod", "did you mean cloud"),
         (PairsOfPhotographs(), "fountain-P11", "unknown pair"),
         (RectifiedPairs(), "Tedy", "did you mean Teddy"),
-        (Reconstruction(), "courtyrd", "a folder of photographs is one too"),
-        (Reconstruction(), str(ROOT / "docs"), "there are no photographs in"),
+        (Reconstruction(), "courtyrd", "a folder of images is one too"),
+        (Reconstruction(), str(ROOT / "scripts"), "there are no images in"),
     ],
 )
 def test_a_missing_scene_is_reported(task, scene, words):
@@ -123,7 +123,7 @@ def test_metrics_a_scene_cannot_give_are_rejected_only_on_request(yard, tmp_path
     study = Study({"epipolar": ["thesis-ransac"]}, [str(bare)], seeds=1)
     assert {m.name for m in plan_study(study).measures} >= {"points", "verified", "trusted"}
     assert "focal_error_pct" not in [m.name for m in plan_study(study).measures]
-    with pytest.raises(UsageError, match="no scene of this study can tell focal_error_pct"):
+    with pytest.raises(UsageError, match="no scene of this study has the metric focal_error_pct"):
         plan_study(replace(study, metrics=["points", "focal_error_pct"]))
     early = replace(study, task=Reconstruction(until="matches"), scenes=[str(yard)])
     assert [m.name for m in plan_study(early).measures] == ["verified", "sigma_px"]

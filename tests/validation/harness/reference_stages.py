@@ -21,16 +21,16 @@ class ReferenceStage:
     title = "References"
     definition = "Whether each answers."
 
-    def takes(self, scene, wishes):
+    def takes(self, scene, options):
         return True
 
-    def methods(self, scene, wishes):
+    def methods(self, scene, options):
         return tuple(scene.split("-"))
 
     def needs(self, method):
         return ()
 
-    def run(self, task, wishes):
+    def run(self, task, options):
         rng = np.random.default_rng(0)
         P = np.stack([np.eye(3, 4), np.eye(3, 4)])
         P[1, 0, 3] = -1.0
@@ -45,7 +45,7 @@ class ReferenceStage:
         if task.method == "open3d":
             Nearest(TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))).distances(X)
 
-    def judge(self, scene, outcomes, wishes):
+    def judge(self, scene, outcomes, options):
         values = {name: 1.0 if o.ok else None for name, o in outcomes.items()}
         return Judgement([Metric(scene, "answers", "", values, next(iter(values)))])
 

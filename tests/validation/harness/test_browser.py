@@ -7,7 +7,7 @@ from tests.report.synthetic import Witness
 from tests.validation.harness.toy_stages import STAGES, WAYS
 from validation.harness.gates import Gate
 from validation.harness.page import write_pages
-from validation.harness.records import Judgement, Outcome, Plot, Wishes
+from validation.harness.records import Judgement, Outcome, Plot, ReportOptions
 from validation.harness.results import collect
 from validation.metrics.record import Metric
 
@@ -20,7 +20,7 @@ EVIL = "<img src=x onerror=alert(1)>"
 def pages(tmp_path_factory):
     """A report of two numbers, one of which breaks its gate, with a flat and a solid plot."""
     out = tmp_path_factory.mktemp("pages")
-    wishes = Wishes(out, ("yard",), ("toy",))
+    options = ReportOptions(out, ("yard",), ("toy",))
     values = dict.fromkeys(WAYS, 1.5)
     metrics = [
         Metric("yard", "wheels, lost", "px", values, "ours", definition=EVIL),
@@ -39,7 +39,7 @@ def pages(tmp_path_factory):
     failed = Outcome(out, EVIL)
     judged = {("toy", "yard"): (judgement, {"ours": Outcome(out), "crashing": failed})}
     gates = {"toy/yard/wheels-lost": Gate("toy/yard/wheels-lost", 1.0, True, EVIL)}
-    write_pages(wishes, STAGES, judged, collect(wishes, judged, gates), None)
+    write_pages(options, STAGES, judged, collect(options, judged, gates), None)
     return out
 
 

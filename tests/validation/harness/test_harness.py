@@ -12,7 +12,7 @@ from tests.validation.harness.toy_stages import STAGES, WAYS
 from validation.command import main
 from validation.harness.gates import Gate, read_gates
 from validation.harness.page import write_pages
-from validation.harness.records import Task, Wishes, slug
+from validation.harness.records import ReportOptions, Task, slug
 from validation.harness.results import Results, collect, compare, read_results, write_results
 from validation.harness.scenes import QUICK
 from validation.harness.schedule import run_tasks, tasks_behind, tasks_of
@@ -26,8 +26,8 @@ GATES = {
 }
 
 
-def toy_wishes(out, *, quick):
-    return Wishes(
+def toy_options(out, *, quick):
+    return ReportOptions(
         out,
         ("yard", "elsewhere"),
         ("toy",),
@@ -39,8 +39,8 @@ def toy_wishes(out, *, quick):
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
-    wishes, reported = toy_wishes(tmp_path_factory.mktemp("harness"), quick=False), list[str]()
-    return wishes, run_tasks(wishes, STAGES, reported.append), reported
+    options, reported = toy_options(tmp_path_factory.mktemp("harness"), quick=False), list[str]()
+    return options, run_tasks(options, STAGES, reported.append), reported
 
 
 def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
@@ -52,7 +52,7 @@ def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
     assert outcomes["missing"].failure == "No module named 'no_such_library'"
     assert outcomes["failing"].failure == "the toy is broken; it has 1 wheel; buy another."
     assert outcomes["crashing"].failure == "crashed with signal 11"
-    assert outcomes["hanging"].failure == "ended after the 8 s that a task may take"
+    assert outcomes["hanging"].failure == "exceeded the time limit of 8 s"
     assert outcomes["hanging"].wall_s < 3 * LIMIT_S
     values = judgement.metrics[0].values
     assert (values["ours"], values["good"], values["after"]) == (0.5, 2.0, 8.0)
@@ -61,8 +61,8 @@ def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
 
 
 def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran):
-    wishes, judged, _ = ran
-    results = collect(wishes, judged, GATES)
+    options, judged, _ = ran
+    results = collect(options, judged, GATES)
     row = results.rows[0]
     assert (row.key, row.value, row.limit, row.direction, row.verdict) == (
         "toy/yard/wheels-lost",
@@ -75,18 +75,18 @@ def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran):
     assert results.missing == ["toy/yard/never-reported"]
     assert set(results.failures) == {f"toy/yard/{n}" for n in ("missing", "failing", "crashing", "hanging")}
     strict = {row.key: dataclasses.replace(GATES[row.key], limit=0.4)}
-    assert collect(wishes, judged, strict).broken[0].key == row.key
+    assert collect(options, judged, strict).broken[0].key == row.key
 
 
 def test_tasks_that_many_wait_for_come_first():
-    tasks = tasks_of(toy_wishes(Path("nowhere"), quick=False), STAGES)
+    tasks = tasks_of(toy_options(Path("nowhere"), quick=False), STAGES)
     behind = tasks_behind(tasks, STAGES)
     assert [behind[Task("toy", "yard", method)] for method in ("good", "after", "ours", "")] == [2, 1, 1, 0]
 
 
 @pytest.mark.parametrize("name", REPORTED)
 def test_a_quick_report_includes_all_gated_numbers(name, tmp_path):
-    quick = Wishes(tmp_path, ("courtyard",), (name,), quick=True)
+    quick = ReportOptions(tmp_path, ("courtyard",), (name,), quick=True)
     asked = dataclasses.replace(quick, gates_only=True)
     stage = REPORTED[name]
     scenes = [s for s in QUICK if stage.takes(s, quick)]
@@ -106,8 +106,8 @@ def test_a_gate_holds_up_to_its_limit(value, held):
 
 
 def test_results_are_written_read_and_compared(ran, tmp_path):
-    wishes, judged, _ = ran
-    results = collect(wishes, judged, GATES)
+    options, judged, _ = ran
+    results = collect(options, judged, GATES)
     write_results(tmp_path, results)
     again = read_results(tmp_path)
     assert compare(results, again) == []
@@ -127,18 +127,18 @@ def test_results_are_written_read_and_compared(ran, tmp_path):
 
 
 def test_two_runs_report_the_same_numbers_but_for_times(ran, tmp_path):
-    wishes, judged, _ = ran
-    quick = toy_wishes(tmp_path, quick=True)
+    options, judged, _ = ran
+    quick = toy_options(tmp_path, quick=True)
     first, second = (collect(quick, run_tasks(quick, STAGES, lambda _: None), GATES) for _ in range(2))
     assert [c.key for c in compare(first, second) if not c.is_time] == []
-    assert first.rows[0].value == collect(wishes, judged, GATES).rows[0].value
+    assert first.rows[0].value == collect(options, judged, GATES).rows[0].value
 
 
 def test_the_pages_escape_their_input(ran):
-    wishes, judged, _ = ran
-    results = collect(wishes, judged, GATES)
-    index = write_pages(wishes, STAGES, judged, results, compare(results, results))
-    whole, scene = (wishes.out / n for n in ("index.html", "scene-yard.html"))
+    options, judged, _ = ran
+    results = collect(options, judged, GATES)
+    index = write_pages(options, STAGES, judged, results, compare(results, results))
+    whole, scene = (options.out / n for n in ("index.html", "scene-yard.html"))
     assert index == whole
     text = whole.read_text(encoding="utf-8")
     assert "A &lt;b&gt;toy&lt;/b&gt;" in text
@@ -181,18 +181,20 @@ def test_wrong_options_are_named(arguments, words, tmp_path, capsys):
 
 def test_names_for_files():
     assert slug("COLMAP, pp refined") == "COLMAP-pp-refined"
-    assert json.loads(json.dumps(Wishes(Path("a"), (), ()).to_json()))["out"] == "a"
-    assert Wishes.from_json(Wishes(Path("a"), ("s",), ()).to_json()) == Wishes(Path("a"), ("s",), ())
+    assert json.loads(json.dumps(ReportOptions(Path("a"), (), ()).to_json()))["out"] == "a"
+    assert ReportOptions.from_json(ReportOptions(Path("a"), ("s",), ()).to_json()) == ReportOptions(
+        Path("a"), ("s",), ()
+    )
     assert Results([], [], {}, {}, {}).broken == []
 
 
 def test_a_run_starts_from_the_references_of_a_like_one(tmp_path):
-    first = toy_wishes(tmp_path / "first", quick=True)
+    first = toy_options(tmp_path / "first", quick=True)
     run_tasks(first, STAGES, lambda _: None)
     # Of ours nothing is taken but the folders of a run; a reference stands as it is.
     (first.place("toy", "yard", "good") / "value.json").write_text("7.0", encoding="utf-8")
     reported = []
-    second = dataclasses.replace(toy_wishes(tmp_path / "second", quick=True), resume=str(first.out))
+    second = dataclasses.replace(toy_options(tmp_path / "second", quick=True), resume=str(first.out))
     judgement, outcomes = run_tasks(second, STAGES, reported.append)["toy", "yard"]
     assert judgement.metrics[0].values == {"ours": 0.5, "good": 7.0}
     assert [line for line in reported if "good" in line] == []
@@ -201,10 +203,10 @@ def test_a_run_starts_from_the_references_of_a_like_one(tmp_path):
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"quick": True}, None])
 def test_a_run_starts_from_no_unlike_one(change, tmp_path):
-    wishes = dataclasses.replace(toy_wishes(tmp_path / "now", quick=False), resume=str(tmp_path / "before"))
+    options = dataclasses.replace(toy_options(tmp_path / "now", quick=False), resume=str(tmp_path / "before"))
     if change is not None:
-        before = dataclasses.replace(wishes, **change)
+        before = dataclasses.replace(options, **change)
         (tmp_path / "before").mkdir()
-        (tmp_path / "before" / "wishes.json").write_text(json.dumps(before.to_json()), encoding="utf-8")
-    with pytest.raises(ValueError, match="start from a like one" if change else "holds no run"):
-        run_tasks(wishes, STAGES, lambda _: None)
+        (tmp_path / "before" / "options.json").write_text(json.dumps(before.to_json()), encoding="utf-8")
+    with pytest.raises(ValueError, match="use a run with the same options" if change else "holds no run"):
+        run_tasks(options, STAGES, lambda _: None)

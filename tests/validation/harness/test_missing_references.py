@@ -15,7 +15,7 @@ from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
 from validation.harness.process import own_cores
-from validation.harness.records import Wishes
+from validation.harness.records import ReportOptions
 from validation.harness.results import collect
 from validation.harness.schedule import run_tasks
 from validation.references.libraries import NAMES, PACKAGES, NoReference, load, refuse
@@ -44,8 +44,8 @@ def stub(tmp_path, monkeypatch):
     return folder
 
 
-def wishes_for(out, scene, limit_s=60.0):
-    return Wishes(
+def options_for(out, scene, limit_s=60.0):
+    return ReportOptions(
         out,
         (scene,),
         ("references",),
@@ -59,8 +59,8 @@ def wishes_for(out, scene, limit_s=60.0):
 def test_one_that_is_missing_leaves_the_others(library, stub, tmp_path):
     (stub / f"{library}.py").write_text(MISSING.format(library))
     other = "cv2" if library == "poselib" else "poselib"
-    wishes = wishes_for(tmp_path / "out", f"{library}-{other}")
-    (judged,) = run_tasks(wishes, STAGES, lambda _: None).values()
+    options = options_for(tmp_path / "out", f"{library}-{other}")
+    (judged,) = run_tasks(options, STAGES, lambda _: None).values()
     assert judged[1][library].failure == not_installed(library)
     assert judged[0].metrics[0].values == {library: None, other: 1.0}
 
@@ -70,24 +70,24 @@ def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(s
     for library, text in stubs.items():
         (stub / f"{library}.py").write_text(text)
     limit_s = 12.0  # others are to answer within it, on a machine with other work too
-    refused = ask_canaries(wishes_for(tmp_path, "-".join(METHODS), limit_s))
+    refused = ask_canaries(options_for(tmp_path, "-".join(METHODS), limit_s))
     version = refused["poselib"].split()[1]
     assert refused == {
         "cv2": "OpenCV crashed with signal 6 when asked a small question",
-        "pycolmap": "pycolmap gives no answer to a small question within 12 s",
+        "pycolmap": "pycolmap did not answer a small question within 12 s",
         "poselib": f"PoseLib {version} gives F of matches with y2 = 2 y1 as [[ 0. 0. 0.] [ 0. 0. 2.] "
         "[ 0. -1. 0.]]; this harness expects [[ 0. 0. 0.] [ 0. 0. -1.] [ 0. 2. 0.]]",
         "open3d": not_installed("open3d"),
     }
-    wishes = wishes_for(tmp_path, "-".join(METHODS))
-    judged = run_tasks(wishes, STAGES, lambda _: None)
+    options = options_for(tmp_path, "-".join(METHODS))
+    judged = run_tasks(options, STAGES, lambda _: None)
     ((_, outcomes),) = judged.values()
     # Nobody waits for one that is known to hang.
     assert {name: o.failure for name, o in outcomes.items()} == refused
-    results = collect(wishes, judged, {})
-    page = write_pages(wishes, STAGES, judged, results, None).read_text(encoding="utf-8")
-    assert page.count("pycolmap gives no answer to a small question within 12 s") == 2
-    assert "Not asked: OpenCV crashed" in results.environment[PACKAGES["cv2"]]
+    results = collect(options, judged, {})
+    page = write_pages(options, STAGES, judged, results, None).read_text(encoding="utf-8")
+    assert page.count("pycolmap did not answer a small question within 12 s") == 2
+    assert "Not used: OpenCV crashed" in results.environment[PACKAGES["cv2"]]
 
 
 def test_report_and_check_run_without_any(stub, tmp_path):

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from tests.runtime.test_signals import is_alive
-from tests.validation.harness.test_harness import toy_wishes
+from tests.validation.harness.test_harness import toy_options
 from tests.validation.harness.toy_stages import ToyStage
 from validation.harness.schedule import run_tasks
 from validation.scenes.real import ROOT
@@ -19,20 +19,20 @@ from validation.studies.robustness import stopped
 PROGRAM = """
 import sys
 from pathlib import Path
-from tests.validation.harness.test_harness import toy_wishes
+from tests.validation.harness.test_harness import toy_options
 from tests.validation.harness.test_stops import hanging_stages
 from thesisrecon.runtime.signals import with_resume_advice, install_signal_handlers
 from validation.harness.schedule import run_tasks
 install_signal_handlers("toy")
 with with_resume_advice("begin again"):
-    run_tasks(toy_wishes(Path(sys.argv[1]), quick=False), hanging_stages(), print)
+    run_tasks(toy_options(Path(sys.argv[1]), quick=False), hanging_stages(), print)
 """
 
 
 class HangingStage(ToyStage):
     """All its methods hang."""
 
-    def methods(self, scene, wishes):  # noqa: ARG002
+    def methods(self, scene, options):  # noqa: ARG002
         return ("hanging",)
 
 
@@ -65,7 +65,7 @@ def test_a_report_that_is_ended_takes_its_tasks_along(asked, tmp_path):
 
 
 def test_an_interrupt_in_a_program_ends_the_tasks(tmp_path):
-    wishes = replace(toy_wishes(tmp_path, quick=False), limit_s=120.0)
+    options = replace(toy_options(tmp_path, quick=False), limit_s=120.0)
 
     def interrupt():
         while not process_of(tmp_path):
@@ -77,7 +77,7 @@ def test_an_interrupt_in_a_program_ends_the_tasks(tmp_path):
     try:
         threading.Thread(target=interrupt, daemon=True).start()
         with pytest.raises(KeyboardInterrupt):
-            run_tasks(wishes, hanging_stages(), print)
+            run_tasks(options, hanging_stages(), print)
     finally:
         signal.signal(signal.SIGINT, before)
     assert is_gone(process_of(tmp_path))

@@ -23,17 +23,17 @@ class ToyStage:
     title = "A <b>toy</b>"
     definition = "Numbers that were saved."
 
-    def takes(self, scene, wishes):
+    def takes(self, scene, options):
         return scene == "yard"
 
-    def methods(self, scene, wishes):
-        return ("ours", "good") if wishes.quick else ("after", *WAYS)
+    def methods(self, scene, options):
+        return ("ours", "good") if options.quick else ("after", *WAYS)
 
     def needs(self, method):
         return (("toy", "good"),) if method == "after" else ()
 
-    def run(self, task, wishes):
-        place = wishes.place(task.stage, task.scene, task.method)
+    def run(self, task, options):
+        place = options.place(task.stage, task.scene, task.method)
         if task.method == "missing":
             import no_such_library  # noqa: F401
         if task.method == "failing":
@@ -46,15 +46,15 @@ class ToyStage:
             time.sleep(600)
         value = VALUES[task.method]
         if task.method == "after":
-            value *= json.loads((wishes.place("toy", task.scene, "good") / "value.json").read_text())
+            value *= json.loads((options.place("toy", task.scene, "good") / "value.json").read_text())
         (place / "value.json").write_text(json.dumps(value))
 
-    def judge(self, scene, outcomes, wishes):
+    def judge(self, scene, outcomes, options):
         values = {
             name: json.loads((o.place / "value.json").read_text()) if o.ok else None
             for name, o in outcomes.items()
         }
-        place = wishes.place(self.name, scene)
+        place = options.place(self.name, scene)
         PIL.Image.new("RGB", (40, 30), (200, 10, 10)).save(place / "red.png")
         metrics = [
             Metric(scene, "wheels, lost", "px", values, "ours", definition='"less" is <better>'),

@@ -38,7 +38,7 @@ def test_a_missing_function_is_reported(library, monkeypatch, capsys):
     gone = replace(QUESTIONS[library][0], ask=lambda: getattr(load(library), "no_such_function"))  # noqa: B009
     monkeypatch.setitem(canary.QUESTIONS, library, (gone,))
     assert main([library]) == 3
-    assert f"does not tell {gone.words}, which this harness needs" in capsys.readouterr().err
+    assert f"does not compute {gone.words}, which this harness needs" in capsys.readouterr().err
 
 
 def test_quaternions_in_another_order_would_be_reported(monkeypatch):

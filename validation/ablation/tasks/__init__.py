@@ -1,4 +1,4 @@
-"""What a row of a study can run."""
+"""Tasks of study rows."""
 
 from __future__ import annotations
 

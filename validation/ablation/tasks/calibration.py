@@ -83,5 +83,5 @@ class CalibrationOverNoise:
 
 @lru_cache(maxsize=4)
 def _drawn(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
-    """The rows of one draw stand together, so that a process rarely makes it twice."""
+    """Cache draws; the rows of one draw are consecutive."""
     return draw_cell(cell, seed)

@@ -12,13 +12,13 @@ from validation.ablation.study import Measure, Place, TaskFunction
 
 @dataclass(frozen=True)
 class FunctionTask:
-    """``function(config, scene, seed)`` tells its numbers by name; every scene is its own affair."""
+    """A task of a plain ``function(config, scene, seed)`` that returns numbers by name."""
 
     function: TaskFunction
     measures: ClassVar[Sequence[Measure]] = ()
 
     def check(self, scene: str) -> None:
-        """A function knows itself what its scenes are."""
+        """Accept every scene; the function checks its scenes."""
 
     def scene_key(self, scene: str) -> str:
         return scene

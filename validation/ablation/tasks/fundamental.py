@@ -60,7 +60,7 @@ class FundamentalOfCube:
     def scene_key(self, scene: str) -> str:
         return scene
 
-    def untold(self, scene: str) -> set[str]:  # noqa: ARG002 (there is one)
+    def unavailable(self, scene: str) -> set[str]:  # noqa: ARG002 (there is one)
         """Without noise there is no bound."""
         return set() if self.noise_px > 0.0 else {"over_bound"}
 

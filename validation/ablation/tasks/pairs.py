@@ -1,4 +1,4 @@
-"""Pairs of photographs with known cameras as a task: what a front end verifies, and how good its F is."""
+"""Image pairs with known cameras as a task: verified matches and the error of F."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 
 @dataclass(frozen=True)
 class PairsOfPhotographs:
-    """Photographs ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side 1536: corners,
+    """Images ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side 1536: corners,
     matches, F and verification of the configuration, judged by correspondences of the true cameras."""
 
     gap: int = 2
@@ -48,9 +48,9 @@ class PairsOfPhotographs:
             raise UsageError(unknown_word("pair", scene, known))
         found = load_real_scene(name)
         if found is None:
-            raise UsageError(f"the photographs of {name} are not on this machine (THESISRECON_DATA)")
+            raise UsageError(f"the images of {name} are not on this machine (THESISRECON_DATA)")
         if int(first) + self.gap >= len(found.image_paths):
-            raise UsageError(f"{name} has {len(found.image_paths)} photographs: there is no pair {scene}")
+            raise UsageError(f"{name} has {len(found.image_paths)} images: there is no pair {scene}")
 
     def scene_key(self, scene: str) -> str:
         return scene
@@ -72,7 +72,7 @@ class PairsOfPhotographs:
 def numbers_of_pair(
     config: PipelineConfig, views: Sequence[Any], pair: tuple[int, int], seed: int, truth: F64
 ) -> dict[str, float]:
-    """What is told of two prepared views, against true correspondences (M, 4) px."""
+    """Measure two prepared views against true correspondences (M, 4) px."""
     view = match_views(config, views[0], views[1], pair, seed)
     if not view.F.any():
         raise StageFailure("the pair has no F", view.reason)

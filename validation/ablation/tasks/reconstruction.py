@@ -1,4 +1,4 @@
-"""Photographs to cameras, or as far as asked, judged by the true cameras."""
+"""Reconstruction of images, or its first steps, evaluated with the true cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thesisrecon.runtime.run import Until
 from thesisrecon.runtime.run_folder import code_key, key_of
 from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
-from validation.harness.records import Wishes
+from validation.harness.records import ReportOptions
 from validation.harness.scenes import PHOTOGRAPHS, load_photographs, truth_of
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
 from validation.scenes.real import Scene
@@ -33,7 +33,7 @@ SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
 }
 """The settings that each step adds to those before it."""
 NEED_TRUTH = ("focal_error_pct", "centre_error_mm", "rotation_error_deg")
-TOLD_FROM: Mapping[str, tuple[str, ...]] = {
+AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
     "matches": ("verified", "sigma_px"),
     "projective": ("registered_pct", "points"),
     "metric": ("reprojection_px", "trusted", *NEED_TRUTH),
@@ -45,7 +45,7 @@ TOLD_FROM: Mapping[str, tuple[str, ...]] = {
 class Reconstruction:
     """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread.
 
-    A scene is one with a name, or a folder of photographs, with ``cameras.json`` or ``sparse/0`` as its truth
+    A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth
     if there is one; without truth the errors of cameras are missing.
     """
 
@@ -55,7 +55,7 @@ class Reconstruction:
         Measure("focal_error_pct", "%", "less", True, "median |f / f_true - 1| of the registered cameras"),
         Measure("centre_error_mm", "mm", "less", True, "mean distance of the centres after a similarity"),
         Measure("rotation_error_deg", "deg", "less", True, "median angle after the common rotation"),
-        Measure("registered_pct", "%", "more", False, "share of the photographs that have a camera"),
+        Measure("registered_pct", "%", "more", False, "share of the images that have a camera"),
         Measure("points", "", "more", True, "points of the model"),
         Measure("reprojection_px", "px", "less", True, "median distance of observations from their points"),
         Measure("verified", "", "more", True, "verified matches of all accepted pairs"),
@@ -76,11 +76,13 @@ class Reconstruction:
             content.update(path.name.encode() + path.read_bytes())
         return content.hexdigest()[:32]
 
-    def untold(self, scene: str) -> set[str]:
-        """What needs true cameras, where there are none, and what needs a later step."""
+    def unavailable(self, scene: str) -> set[str]:
+        """Return the measures that need missing true cameras or a later step."""
         steps = list(SETTINGS_OF)
         reached = steps.index(self.until)
-        found = {name for step, names in TOLD_FROM.items() if reached < steps.index(step) for name in names}
+        found = {
+            name for step, names in AVAILABLE_FROM.items() if reached < steps.index(step) for name in names
+        }
         return found if _load(scene).has_truth else found | set(NEED_TRUTH)
 
     def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
@@ -117,13 +119,13 @@ class Reconstruction:
 
 
 def _load(scene: str) -> Scene:
-    """The photographs of a scene by its name or its folder; :class:`UsageError` where there are none."""
+    """The images of a scene by its name or its folder; :class:`UsageError` where there are none."""
     folder = Path(scene)
     named = {} if scene in PHOTOGRAPHS or not folder.is_dir() else {scene: str(folder)}
     if scene not in PHOTOGRAPHS and not named:
-        raise UsageError(f"{unknown_word('scene', scene, PHOTOGRAPHS)}; a folder of photographs is one too")
+        raise UsageError(f"{unknown_word('scene', scene, PHOTOGRAPHS)}; a folder of images is one too")
     try:
-        return load_photographs(scene, Wishes(Path(), (), (), named))
+        return load_photographs(scene, ReportOptions(Path(), (), (), named))
     except ValueError as error:
         raise UsageError(str(error)) from None
 
@@ -154,7 +156,7 @@ def _measured(result: RunResult, scene: Scene) -> dict[str, float]:
 
 
 def _truth_at_working_size(result: RunResult, scene: Scene) -> TrueCameras | None:
-    """The true cameras of the photographs that were read, in their pixels."""
+    """The true cameras of the images that were read, in their pixels."""
     truth = truth_of(scene)
     if truth is None:
         return None

@@ -1,4 +1,4 @@
-"""Sections 1.2 and 1.3: views between two photographs, without a model, beside the real ones."""
+"""Sections 1.2 and 1.3: interpolated views beside the real images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.view_interpolation import prepare_rectified_pair
 from thesisrecon.views.virtual_camera import camera_at
-from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
@@ -37,43 +37,40 @@ THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 BY_TENSOR = " (tensor)"
 TENSOR = OURS + BY_TENSOR
 BORDER_PX = 50
-"""Columns of views beyond the ends that no photograph shows, or whose picture ends before."""
+"""Border columns of extrapolated views that no input image covers."""
 
 
-class BetweenStage:
-    """The same warp with our disparities, OpenCV's and the true ones, and the tensor with each of them."""
+class BetweenStage(Stage):
+    """The same warp with our disparities, OpenCV's and the true ones, and the tensor with each."""
 
     name = "between"
-    title = "Views between photographs"
+    title = "View interpolation"
     definition = (
-        "Photographs 3, 4 and 5 of nine, made from 2 and 6, beside the real ones: interpolation with our "
-        "disparities, with OpenCV's and with the true ones, the tensor with the same, and a mere mixture. "
-        "The tensor also makes 1 and 7, a quarter of the baseline beyond the ends."
+        "Images 3, 4 and 5 of nine, computed from 2 and 6, beside the real ones: interpolation with our "
+        "disparities, with OpenCV's and with the true ones, the tensor with the same, and a cross-dissolve. "
+        "The tensor also computes 1 and 7, a quarter of the baseline beyond the ends."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
         return scene == "Cones" and load_cones() is not None
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         sources = (OURS, THREE_WAY, HH, TRUE)
-        tensors = (OURS,) if wishes.gates_only else sources
+        tensors = (OURS,) if options.gates_only else sources
         return (*sources, DISSOLVE, *(source + BY_TENSOR for source in tensors))
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (nothing)
-        return ()
-
-    def run(self, task: Task, wishes: Wishes) -> None:
-        place = wishes.place(task.stage, task.scene, task.method)
+    def run(self, task: Task, options: ReportOptions) -> None:
+        place = options.place(task.stage, task.scene, task.method)
         for view, picture in _pictures(task.method, _cones()).items():
             PIL.Image.fromarray(picture).save(_file(place, view))
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         cones = _cones()
         made = {name: _read(outcome) for name, outcome in outcomes.items()}
         judged = Judged(cones, made)
         peak = judged.mean(psnr_db)
         sgbm = max((v for n in (THREE_WAY, HH) if (v := peak[n]) is not None), default=None)
-        words = "mean over photographs 3, 4 and 5"
+        words = "mean over images 3, 4 and 5"
         metrics = [
             Metric(scene, "PSNR", "dB", peak, OURS, at_most=False, definition=words),
             Metric(scene, "SSIM", "", judged.mean(ssim), OURS, at_most=False, definition=words),
@@ -86,19 +83,19 @@ class BetweenStage:
         ]
         return Judgement(
             metrics,
-            pictures=_beside(wishes.place(self.name, scene), cones, made),
+            pictures=_beside(options.place(self.name, scene), cones, made),
             notes=[f"{n}: {o.failure}." for n, o in outcomes.items() if not o.ok],
         )
 
 
 class Judged:
-    """Pictures of methods, by the number of the view, beside the photographs."""
+    """Computed views of each method and the real images."""
 
     def __init__(self, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> None:
         self.cones, self.made = cones, made
 
     def mean(self, measure: Measure) -> dict[str, float | None]:
-        """Of all views between, by method; None where one is missing."""
+        """Return the mean over the views between the inputs by method; None if one is missing."""
         return {
             name: float(np.mean([measure(pictures[k], self.cones.images[k]) for k in BETWEEN]))
             if pictures
@@ -107,7 +104,7 @@ class Judged:
         }
 
     def view(self, scene: str, k: int) -> Metric:
-        """The row of one view."""
+        """Return the row of one view."""
         beyond = k in BEYOND
         shown = slice(BORDER_PX, -BORDER_PX) if beyond else slice(None)
         wanted = self.cones.images[k][:, shown]
@@ -126,7 +123,7 @@ def _beside(place: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]])
     for k, picture in made[OURS].items():
         row = np.concatenate([cones.images[k], picture, _difference(picture, cones.images[k])], axis=1)
         PIL.Image.fromarray(row).save(_file(place, k))
-        words = "The photograph, ours, and four times the difference from middle grey."
+        words = "The image, ours, and four times the difference from middle grey."
         shown.append(Picture(_file(place, k).name, f"View {k}", words))
     return shown
 
@@ -157,7 +154,7 @@ def _pictures(method: str, cones: NineViews) -> dict[int, U8]:
         pair = prepare_rectified_pair(left, right, disparity=maps)
         return {k: pair.view(cones.share(k)) for k in BETWEEN}
     of_left, of_right = (m.disparity if isinstance(m, DisparityMap) else m for m in maps)
-    # The true disparities are known of hidden pixels, too, which need not agree.
+    # True disparities include hidden pixels, which need not agree.
     agree = {"agree_px": np.inf} if method.startswith(TRUE) else {}
     made = synthesis_of_disparities(left, right, of_left, of_right, **agree)
     return {

@@ -1,4 +1,4 @@
-"""The ground rule: what an independent calibration finds in photographs that this project makes itself."""
+"""Independent calibration of rendered images with known cameras."""
 
 from __future__ import annotations
 
@@ -10,81 +10,78 @@ import numpy as np
 import PIL.Image
 
 from thesisrecon.arrays import F64
-from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
 from validation.metrics.record import Metric
 from validation.references.chessboard import board_corners, calibrate_from_corners
 from validation.references.libraries import one_thread
 from validation.scenes.boards import CORNERS, SIZE, WAYS, Board, K, make_board, photographs
 
-OURS, OWN = "ours", "cv2, its own deviation"
+OURS, OWN = "ours", "cv2, stated standard deviation"
 BOARDS = "boards"
 VIEWS, QUICK_VIEWS = 16, 12
 SHOWN = 4
-"""Photographs of each kind on the page."""
+"""Images of each kind on the page."""
 
 
-class BoardsStage:
+class BoardsStage(Stage):
     """``cv2.calibrateCamera`` on rendered boards."""
 
     name = "boards"
     title = "Calibration of rendered boards"
     definition = (
-        "A chequered board photographed by cameras that are known: by the ray caster that makes the "
-        "courtyard, by the library's renderer, and through the library's camera with radial distortion; "
+        "A chessboard rendered with known cameras by the ray caster of the courtyard, by the library's "
+        "renderer, and through the library's camera with radial distortion; "
         "lens blur, noise and tone curve are the courtyard's. cv2.findChessboardCorners, cornerSubPix and "
-        "calibrateCamera know nothing of them. Differences are OpenCV's result minus the truth, beside the "
-        "standard deviation that OpenCV states for it."
+        "calibrateCamera are independent of them. Differences are OpenCV's result minus truth, beside the "
+        "standard deviation stated by OpenCV."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
         return scene == BOARDS
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         return WAYS
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (nothing)
-        return ()
-
-    def run(self, task: Task, wishes: Wishes) -> None:
+    def run(self, task: Task, options: ReportOptions) -> None:
         one_thread()
-        board = _board(task.method, wishes)
+        board = _board(task.method, options)
         pictures = photographs(task.method, board)
-        place = wishes.place(task.stage, task.scene, task.method)
+        place = options.place(task.stage, task.scene, task.method)
         for n, picture in enumerate(pictures):
             PIL.Image.fromarray(picture).save(place / f"{n:02d}.png")
         corners = [board_corners(picture, CORNERS) for picture in pictures]
         found = calibrate_from_corners(board.X, corners, SIZE)
         np.savez(place / "found.npz", corners=np.array(corners), K=found.K, k1=found.k1, std=found.std)
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         metrics: list[Metric] = []
         traces: list[dict[str, Any]] = []
         for way, outcome in outcomes.items():
-            board = _board(way, wishes)
+            board = _board(way, options)
             found = _read(outcome) if outcome.ok else None
             metrics += _metrics(scene, way, board, found)
             if found is not None:
                 off = (found["corners"] - board.projections()).reshape(-1, 2)
                 traces.append(_trace(way, off))
-        place, pictures = wishes.place(self.name, scene), list[Picture]()
+        place, pictures = options.place(self.name, scene), list[Picture]()
         for way, outcome in outcomes.items():
             if outcome.ok:
                 file = f"{way.replace(' ', '-')}.png"
                 PIL.Image.fromarray(_row(outcome.place)).save(place / file)
-                pictures.append(Picture(file, f"By the {way}", "Four of the photographs."))
+                pictures.append(Picture(file, f"By the {way}", "Four of the images."))
         axes = {
             "xaxis": {"title": {"text": "x (px)"}},
             "yaxis": {"title": {"text": "y (px)"}, "scaleanchor": "x"},
         }
         layout = {**axes, "margin": {"l": 60, "r": 10, "t": 10, "b": 50}}
-        words = "Each point is a corner: where OpenCV finds it, less where the true camera puts it."
-        plots = [Plot("Corners off", {"data": traces, "layout": layout}, words)] if traces else []
+        words = "Each point is a corner: OpenCV's position minus its true projection."
+        plots = [Plot("Corner errors", {"data": traces, "layout": layout}, words)] if traces else []
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         return Judgement(metrics, plots, pictures, notes)
 
 
-def _board(way: str, wishes: Wishes) -> Board:
-    return make_board(way, QUICK_VIEWS if wishes.quick else VIEWS)
+def _board(way: str, options: ReportOptions) -> Board:
+    return make_board(way, QUICK_VIEWS if options.quick else VIEWS)
 
 
 def _read(outcome: Outcome) -> dict[str, F64]:
@@ -93,7 +90,7 @@ def _read(outcome: Outcome) -> dict[str, F64]:
 
 
 def _metrics(scene: str, way: str, board: Board, found: Mapping[str, F64] | None) -> list[Metric]:
-    """Of one way to make photographs: corners, focal length, principal point, distortion."""
+    """Return the rows of one renderer: corners, focal length, principal point, distortion."""
 
     def row(name: str, unit: str, ours: float | None, own: float | None, words: str) -> Metric:
         values = {OURS: ours, OWN: own}

@@ -1,4 +1,4 @@
-"""Bundle adjustment of the same problem by ours and by COLMAP's Ceres: cost, parameters, covariances."""
+"""Bundle adjustment of the same problem by ours and COLMAP (Ceres): cost, parameters, covariances."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bund
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import Reconstruction
-from validation.harness.records import Judgement, Outcome, Task, Wishes
+from validation.harness.records import Judgement, Outcome, ReportOptions, Task
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS
 from validation.harness.stages.cameras import read_model
@@ -28,7 +28,7 @@ STREET = "street"
 
 
 class BundleStage:
-    """One problem, one start, one loss."""
+    """The same problem, start and loss for all methods."""
 
     name = "bundle"
     title = "Bundle adjustment"
@@ -40,23 +40,23 @@ class BundleStage:
         "squared loss, focal length, principal point and k1 free, two views fixed."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
-        return scene == STREET or is_photographs(scene, wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return scene == STREET or is_photographs(scene, options)
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         return (OURS, CERES)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the same for both)
         return (("cameras", OUR_CAMERAS),)
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        place = wishes.place(task.stage, task.scene, task.method)
-        exact, points, given, size = _optimum(task.scene, wishes)
+    def run(self, task: Task, options: ReportOptions) -> None:
+        place = options.place(task.stage, task.scene, task.method)
+        exact, points, given, size = _optimum(task.scene, options)
         poses, camera = _covariances(task.method, exact, points, given, size)
         np.savez(place / "covariances.npz", poses=poses, camera=camera)
         if task.scene == STREET:
             return
-        cameras, X, seen, size = _problem(task.scene, wishes)
+        cameras, X, seen, size = _problem(task.scene, options)
         adjusted, points, seconds = _adjust(task.method, cameras, X, seen, size)
         np.savez(
             place / "adjusted.npz",
@@ -67,11 +67,11 @@ class BundleStage:
             seconds=seconds,
         )
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         if scene == STREET:
             return Judgement(_covariance_metrics(scene, outcomes), notes=notes)
-        cameras, _, seen, _ = _problem(scene, wishes)
+        cameras, _, seen, _ = _problem(scene, options)
         kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
         costs = {n: None if k is None else _cost(k, cameras.group, seen) for n, k in kept.items()}
         focals = {n: None if k is None else float(k["intrinsics"][0, 0]) for n, k in kept.items()}
@@ -97,29 +97,29 @@ class BundleStage:
 Problem = tuple[MetricCameras, F64, Observations, tuple[int, int]]
 
 
-def _problem(scene: str, wishes: Wishes) -> Problem:
+def _problem(scene: str, options: ReportOptions) -> Problem:
     """The saved model, moved off its optimum."""
-    model = _saved(scene, wishes)
-    cameras, X, seen = perturbed_model(model, np.random.default_rng(wishes.seed))
+    model = _saved(scene, options)
+    cameras, X, seen = perturbed_model(model, np.random.default_rng(options.seed))
     return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
 
 
-def _optimum(scene: str, wishes: Wishes) -> Problem:
-    """Where covariances are asked for: the true street, or the saved model as it is."""
+def _optimum(scene: str, options: ReportOptions) -> Problem:
+    """Return the model of the covariances: the true street, or the saved model."""
     if scene == STREET:
         walk = make_walk(12, "street", np.random.default_rng(4))
         return walk.cameras, walk.X, walk.seen, SIZE
-    model = _saved(scene, wishes)
+    model = _saved(scene, options)
     cameras, X, seen = model_as_bundle(model)
     return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
 
 
-def _saved(scene: str, wishes: Wishes) -> Reconstruction:
-    photographs = load_photographs(scene, wishes)
-    outcome = Outcome(wishes.place("cameras", scene, OUR_CAMERAS))
+def _saved(scene: str, options: ReportOptions) -> Reconstruction:
+    photographs = load_photographs(scene, options)
+    outcome = Outcome(options.place("cameras", scene, OUR_CAMERAS))
     model = read_model(photographs, OUR_CAMERAS, outcome)
     if model is None:
-        raise ValueError(f"there is no model of ours of {scene} to adjust: run the stage cameras too")
+        raise ValueError(f"our model of {scene} is missing: run the stage cameras too")
     return _registered_only(model)
 
 
@@ -127,16 +127,16 @@ def _registered_only(model: Reconstruction) -> Reconstruction:
     """A model all of whose views have a camera."""
     if model.registered.all():
         return model
-    raise ValueError("a photograph has no camera, so this model is not adjusted")
+    raise ValueError("an image has no camera, so this model is not adjusted")
 
 
 def _adjust(
     method: str, cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int]
 ) -> tuple[MetricCameras, F64, float]:
-    """The second of two runs counts: the first compiles."""
+    """Run twice and return the second run; the first compiles."""
     if method == CERES:
-        told = refine_with_ceres(cameras, X, seen, size, CeresOptions("soft_l1", LOSS_PX))
-        return told.cameras, told.X, told.cpu_s
+        result = refine_with_ceres(cameras, X, seen, size, CeresOptions("soft_l1", LOSS_PX))
+        return result.cameras, result.X, result.cpu_s
     options = BundleOptions(loss="soft_l1", loss_px=LOSS_PX, max_iterations=200, threads=1)
     for _ in range(2):
         start = time.process_time()
@@ -151,7 +151,7 @@ def _read(outcome: Outcome) -> dict[str, F64]:
 
 
 def _cost(kept: Mapping[str, F64], group: np.ndarray, seen: Observations) -> float:
-    """1/2 sum rho(|r|^2), rho(s) = 2 c^2 (sqrt(1 + s / c^2) - 1): written out here, of nobody's library."""
+    """1/2 sum rho(|r|^2), rho(s) = 2 c^2 (sqrt(1 + s / c^2) - 1): no library involved."""
     f, aspect, skew, cx, cy, k1 = kept["intrinsics"][group[seen.view_index]].T
     X = kept["X"][seen.point_index]
     x = np.einsum("nab,nb->na", kept["R"][seen.view_index], X) + kept["t"][seen.view_index]
@@ -166,7 +166,7 @@ def _cost(kept: Mapping[str, F64], group: np.ndarray, seen: Observations) -> flo
 def _covariances(
     method: str, cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int]
 ) -> tuple[F64, F64]:
-    """Of poses (V, 6, 6) and of (f, cx, cy, k1) at one optimum, for noise of 1 px, two views fixed."""
+    """Return covariances of poses (V, 6, 6) and (f, cx, cy, k1) for 1 px noise, two views fixed."""
     if method == CERES:
         return ceres_covariances(cameras, X, seen, size, (0, 1))
     fixed = np.arange(len(cameras.R)) < 2
@@ -181,11 +181,11 @@ def _covariances(
 def _covariance_metrics(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     if not all(o.ok for o in outcomes.values()):
         return [Metric(scene, "largest difference of covariances", "std^2", {OURS: None}, OURS)]
-    told = {}
+    covariances = {}
     for name, outcome in outcomes.items():
         with np.load(Path(outcome.place) / "covariances.npz") as kept:
-            told[name] = (kept["poses"][2:], kept["camera"][None])
-    off = [_off(a, b) for a, b in zip(told[OURS], told[CERES], strict=True)]
+            covariances[name] = (kept["poses"][2:], kept["camera"][None])
+    off = [_off(a, b) for a, b in zip(covariances[OURS], covariances[CERES], strict=True)]
     what = "entry of the covariances in units of COLMAP's standard deviations, ours minus COLMAP's"
     return [
         Metric(scene, "covariance of poses", "std^2", {OURS: off[0]}, OURS, definition=f"largest {what}"),

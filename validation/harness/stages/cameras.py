@@ -1,4 +1,4 @@
-"""Chapters 4 to 7 whole: intrinsics and cameras of photographs, beside COLMAP's mappers and the truth."""
+"""Chapters 4 to 7: intrinsics and cameras of images beside COLMAP's mappers and the truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from thesisrecon.io.files import read_json
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime.run import FOLDERS
 from thesisrecon.runtime.run_folder import MANIFEST_FILE, RunDirectory
-from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Task
 from validation.harness.scenes import is_photographs, load_photographs, truth_of
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
@@ -44,28 +44,28 @@ CENTRE = "mean distance of the camera centres after the least-squares similarity
 PRINCIPAL_POINT = "median distance from the true one"
 REPROJECTION = "median distance of inlier observations from their projected points"
 ROTATION = "median angle after the rotation common to all cameras is taken off"
-SHARE_HELD = "share of focal lengths and principal points whose stated 95 % interval holds the truth"
+SHARE_HELD = "share of focal lengths and principal points whose stated 95 % interval contains the truth"
 
 
 class CamerasStage:
-    """The main job of ours beside COLMAP without priors, on the same photographs."""
+    """Reconstruction by ours and by COLMAP without priors on the same images."""
 
     name = "cameras"
     title = "Cameras and intrinsics"
     definition = (
-        "From photographs alone, nothing told of the camera: the default and the thesis' preset beside "
+        "From images without any camera prior: the default and the thesis' preset beside "
         "COLMAP (default, with the principal point refined, and its global mapper), one thread each. "
         "Every number is recomputed from the saved cameras and points."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
-        return is_photographs(scene, wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return is_photographs(scene, options)
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
-        if wishes.gates_only:
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
+        if options.gates_only:
             return (OURS, THESIS) if scene == FIXTURE else (OURS, PER_IMAGE)
         return (
-            (OURS, MATCHES, COLMAP, THESIS) if wishes.quick else (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
+            (OURS, MATCHES, COLMAP, THESIS) if options.quick else (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
         )
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
@@ -73,28 +73,28 @@ class CamerasStage:
             return ((self.name, OURS),)
         return ((self.name, MATCHES),) if method in MAPPERS else ()
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        scene = load_photographs(task.scene, wishes)
-        place = wishes.place(task.stage, task.scene, task.method)
+    def run(self, task: Task, options: ReportOptions) -> None:
+        scene = load_photographs(task.scene, options)
+        place = options.place(task.stage, task.scene, task.method)
         if task.method not in SETTINGS:
-            _run_colmap(task, scene, wishes, place)
+            _run_colmap(task, scene, options, place)
             return
         if task.method == PER_IMAGE:
             # The matches are the same.
-            matched = wishes.place(self.name, task.scene, OURS) / "run"
+            matched = options.place(self.name, task.scene, OURS) / "run"
             shutil.copytree(matched, place / "run", dirs_exist_ok=True)
         thesisrecon.reconstruct(
             list(scene.image_paths),
             place / "run",
             config=SETTINGS[task.method],
-            seed=wishes.seed,
+            seed=options.seed,
             threads=1,
             until="metric",
             overwrite=True,
         )
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        photographs = load_photographs(scene, wishes)
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        photographs = load_photographs(scene, options)
         models = {m: read_model(photographs, m, o) for m, o in outcomes.items() if m != MATCHES}
         shared = outcomes.get(MATCHES)
         metrics = [*_numbers(photographs, models), *_costs(scene, outcomes, shared)]
@@ -105,7 +105,7 @@ class CamerasStage:
 
 
 def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
-    """The saved model of a method in the order of the scene's photographs; None where there is none."""
+    """The saved model of a method in the order of the scene's images; None if there is none."""
     names = [path.name for path in scene.image_paths]
     try:
         if method in SETTINGS:
@@ -121,12 +121,12 @@ def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | 
         return None
 
 
-def _run_colmap(task: Task, scene: Scene, wishes: Wishes, place: Path) -> None:
+def _run_colmap(task: Task, scene: Scene, options: ReportOptions, place: Path) -> None:
     images = scene.image_paths[0].parent
     if task.method == MATCHES:
         match_with_pycolmap(images, place, threads=1)
         return
-    matched = wishes.place(task.stage, task.scene, MATCHES)
+    matched = options.place(task.stage, task.scene, MATCHES)
     start = Start(refine_principal_point=task.method == COLMAP_PP)
     mapper: Literal["incremental", "global"] = "global" if task.method == COLMAP_GLOBAL else "incremental"
     map_with_pycolmap(images, matched, place, start=start, threads=1, mapper=mapper)
@@ -134,13 +134,13 @@ def _run_colmap(task: Task, scene: Scene, wishes: Wishes, place: Path) -> None:
 
 def _numbers(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
     registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
-    words = "share of the photographs"
+    words = "share of the images"
     rows = [Metric(scene.name, "registered", "%", registered, OURS, at_most=False, definition=words)]
     return [*rows, *_errors(scene, models), *_fit(scene, models)]
 
 
 def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
-    """How far the cameras are from the true ones; nothing where nobody knows them."""
+    """Compare the cameras with the true ones, if known."""
     truth = truth_of(scene)
     if truth is None:
         return []
@@ -163,7 +163,7 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
 
 
 def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
-    """How well the cameras and points of a model fit what was seen, and how many there are."""
+    """Return reprojection errors and numbers of points."""
     residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
     points = {n: None if m is None else float(m.valid.sum()) for n, m in models.items()}
     median = {n: None if r is None else r.median_px for n, r in residuals.items()}
@@ -180,7 +180,7 @@ def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metr
 
 
 def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
-    """Chapters 6 and 7 by themselves, from the files of their stages: the metric stage makes much good."""
+    """Evaluate chapters 6 and 7 separately, before the metric stage corrects their errors."""
     if outcome is None or not outcome.ok:
         return []
     projective = _kept(outcome, "projective")
@@ -221,17 +221,17 @@ def _costs(scene: str, outcomes: Mapping[str, Outcome], shared: Outcome | None) 
     times = {n: seconds(n, o) for n, o in kept.items()}
     memory = {n: o.peak_mb if o.ok else None for n, o in kept.items()}
     return [
-        Metric(scene, "time", "s", times, OURS, definition="processor seconds from photographs to cameras"),
+        Metric(scene, "time", "s", times, OURS, definition="processor seconds from images to cameras"),
         Metric(scene, "peak memory", "MB", memory, OURS, definition="of the process"),
     ]
 
 
 def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
-    """Focal lengths where nothing is said of the photographs having one camera."""
+    """Return errors of focal lengths with independent cameras."""
     if scene.K is None or model is None or model.K is None or not model.registered.any():
         return []
     errors = focal_errors_pct(model.K[model.registered], scene.K[model.registered])
-    words = "of |f / f_true - 1| over the photographs, each with a camera of its own"
+    words = "|f / f_true - 1| over the images, with independent cameras"
     return [
         Metric(
             scene.name,
@@ -253,13 +253,13 @@ def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
 
 
 def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    """What ours says of itself: whether it trusts the result, and whether its intervals hold the truth."""
-    told: dict[str, dict[str, Any]] = {}
+    """Return self-check results and the coverage of the stated intervals."""
+    records: dict[str, dict[str, Any]] = {}
     for name in (n for n in SETTINGS if n in outcomes and outcomes[n].ok):
         text = (outcomes[name].place / "run" / "summary.json").read_text(encoding="utf-8")
-        told[name] = json.loads(text)
-    trusted: dict[str, float | None] = {n: float(bool(t["trusted"])) for n, t in told.items()}
-    silent = {n: float(sum(not r["reason"] for r in t["refused"])) for n, t in told.items()}
+        records[name] = json.loads(text)
+    trusted: dict[str, float | None] = {n: float(bool(t["trusted"])) for n, t in records.items()}
+    silent = {n: float(sum(not r["reason"] for r in t["refused"])) for n, t in records.items()}
     rows = [
         Metric(
             scene.name, "trusted", "", trusted, OURS, at_most=False, definition="1: passed its self-check"
@@ -267,10 +267,10 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
         Metric(scene.name, "refused without a reason", "", {**silent}, OURS, definition="photographs"),
     ]
     truth = truth_of(scene)
-    if truth is None or not told:
+    if truth is None or not records:
         return rows
     for name, where in ((OURS, ""), (PER_IMAGE, ", a camera each")):
-        cameras = told.get(name, {}).get("cameras", [])
+        cameras = records.get(name, {}).get("cameras", [])
         held: dict[str, float | None] = {OURS: _share_held(cameras, truth.K) if cameras else None}
         widest = {OURS: _widest(cameras)}
         words = "largest stated deviation of a focal length"
@@ -290,8 +290,8 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
 
 
 def _widest(cameras: list[dict[str, Any]]) -> float | None:
-    told = [c["focal_px"] for c in cameras if c.get("focal_px")]
-    return max((100.0 * f["std"] / f["value"] for f in told), default=None)
+    focals = [c["focal_px"] for c in cameras if c.get("focal_px")]
+    return max((100.0 * f["std"] / f["value"] for f in focals), default=None)
 
 
 def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float | None:
@@ -299,11 +299,11 @@ def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float
     held = []
     for camera, true_K in zip(cameras, K, strict=True):
         for name, place in places.items():
-            told = camera.get(name)
-            if told is None or not told["std"]:
+            interval = camera.get(name)
+            if interval is None or not interval["std"]:
                 continue
             truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if place is None else true_K[place]
-            held.append(abs(told["value"] - truth) <= 1.96 * told["std"])
+            held.append(abs(interval["value"] - truth) <= 1.96 * interval["std"])
     return 100.0 * float(np.mean(held)) if held else None
 
 
@@ -312,7 +312,7 @@ def _millimetres(errors: CameraErrors) -> float | None:
 
 
 def _plots(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Plot]:
-    """The focal length of every photograph, as each method has it, and the true one."""
+    """The focal length of every image, as each method has it, and the true one."""
     traces: list[dict[str, Any]] = []
     for name, model in models.items():
         if model is None:

@@ -1,4 +1,4 @@
-"""Points of ours and COLMAP after similarity alignment: distances both ways, ICP, pictures of differences."""
+"""Point clouds of ours and COLMAP after similarity alignment: distances both ways, ICP, renderings."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.similarity import Similarity, estimate_similarity
 from thesisrecon.records import Reconstruction
-from validation.harness.records import Judgement, Outcome, Picture, Plot, Task, Wishes, slug
+from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Task, slug
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import COLMAP, COLMAP_PP, OURS, read_model
 from validation.metrics.record import Metric
 from validation.references.open3d_clouds import refine_by_icp, render_difference
 from validation.scenes.real import Scene
 
-ICP, PICTURES = "Open3D, ICP", "Open3D, pictures"
+ICP, PICTURES = "Open3D, ICP", "Open3D, images"
 NEAR_PCT = 0.5
-"""A point has a partner where the other cloud has one within this share of its distance from the cameras."""
+"""A point has a partner if the other cloud has a point within this share of its depth (%)."""
 PLOTTED = 6000
 SAME_PX = 1.0
-"""Points of two models are one where they were seen this near each other."""
+"""Points of two models are the same if observed within this distance (px)."""
 
 
 class CloudsStage:
-    """Two clouds of one scene, brought together by their cameras."""
+    """Two clouds of one scene, aligned by their cameras."""
 
     name = "clouds"
     title = "Point clouds"
     definition = (
-        "The points of ours and of COLMAP, brought together by the least-squares similarity of their camera "
+        "The points of ours and of COLMAP, aligned by the least-squares similarity of their camera "
         "centres (both to the true ones where they are known). Distances are in per cent of the median "
         "distance of the points from the cameras. ICP refines rotation and translation, the scale is kept."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
-        return is_photographs(scene, wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return is_photographs(scene, options)
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
-        return () if wishes.gates_only else (ICP, PICTURES)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        return () if options.gates_only else (ICP, PICTURES)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the same for all)
         return (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        place = wishes.place(task.stage, task.scene, task.method)
-        photographs = load_photographs(task.scene, wishes)
-        for name, (mine, other, unit) in _pairs_of_clouds(photographs, _models(photographs, wishes)).items():
+    def run(self, task: Task, options: ReportOptions) -> None:
+        place = options.place(task.stage, task.scene, task.method)
+        photographs = load_photographs(task.scene, options)
+        for name, (mine, other, unit) in _pairs_of_clouds(photographs, _models(photographs, options)).items():
             if task.method == PICTURES:
                 render_difference(place / f"{slug(name)}.png", mine, other, NEAR_PCT / 100.0 * unit)
                 continue
             transform = refine_by_icp(mine, other, NEAR_PCT / 100.0 * unit)
             np.savez(place / f"{slug(name)}.npz", transform=transform)
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        photographs = load_photographs(scene, wishes)
-        models = _models(photographs, wishes)
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        photographs = load_photographs(scene, options)
+        models = _models(photographs, options)
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         ours = models[OURS]
         if ours is None or (models[COLMAP] is None and models[COLMAP_PP] is None):
@@ -79,17 +79,17 @@ class CloudsStage:
             metrics += _metrics(scene, name, mine, other, unit)
             metrics += _icp_metrics(scene, name, mine, other, unit, outcomes.get(ICP))
             plots.append(_plot(name, mine, other, unit))
-            pictures += _pictures(wishes.place(self.name, scene), name, outcomes.get(PICTURES))
+            pictures += _pictures(options.place(self.name, scene), name, outcomes.get(PICTURES))
         few = [name for name in (COLMAP, COLMAP_PP) if models[name] is not None and name not in clouds]
-        notes += [f"{name}: too few cameras in common to bring the clouds together." for name in few]
+        notes += [f"{name}: too few common cameras to align the clouds." for name in few]
         return Judgement(metrics, plots, pictures, notes)
 
 
-def _models(scene: Scene, wishes: Wishes) -> dict[str, Reconstruction | None]:
-    """The models that the cameras were judged by, None where a run left none."""
+def _models(scene: Scene, options: ReportOptions) -> dict[str, Reconstruction | None]:
+    """The models that the cameras were judged by, None if a run left none."""
     models = {}
     for name in (OURS, COLMAP, COLMAP_PP):
-        place = wishes.place("cameras", scene.name, name)
+        place = options.place("cameras", scene.name, name)
         models[name] = read_model(scene, name, Outcome(place)) if place.is_dir() else None
     return models
 
@@ -97,7 +97,7 @@ def _models(scene: Scene, wishes: Wishes) -> dict[str, Reconstruction | None]:
 def _pairs_of_clouds(
     scene: Scene, models: Mapping[str, Reconstruction | None]
 ) -> dict[str, tuple[F64, F64, float]]:
-    """What :func:`_common_frame` makes of ours and each of theirs that there is."""
+    """Return :func:`_common_frame` of ours and each reference cloud."""
     ours, found = models[OURS], {}
     for name in (COLMAP, COLMAP_PP):
         theirs = models[name]
@@ -127,13 +127,13 @@ def _common_frame(
 
 
 def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
-    """Pairs (M, 2) of valid points, as places among the valid ones, that stand for one point of the scene.
+    """Return pairs (M, 2) of indices of valid points that are the same scene point.
 
-    They were seen within ``SAME_PX`` of each other in more photographs than any other pair of either.
+    They were seen within ``SAME_PX`` of each other in more images than any other pair of either.
     """
     votes: Counter[tuple[int, int]] = Counter()
     for view in np.flatnonzero(ours.registered & theirs.registered):
-        (xy1, point1), (xy2, point2) = (_seen(model, int(view)) for model in (ours, theirs))
+        (xy1, point1), (xy2, point2) = (_is_supported(model, int(view)) for model in (ours, theirs))
         if not len(xy1) or not len(xy2):
             continue
         distance, nearest = cKDTree(xy2).query(xy1, distance_upper_bound=SAME_PX)
@@ -148,7 +148,7 @@ def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _seen(model: Reconstruction, view: int) -> tuple[F64, I64]:
+def _is_supported(model: Reconstruction, view: int) -> tuple[F64, I64]:
     """Inlier observations of a view: pixels, and the places of their points among the valid ones."""
     place = np.cumsum(model.valid) - 1
     tracks = model.tracks
@@ -164,7 +164,7 @@ def _same_points(
     if not len(pairs):
         return []
     apart = 100.0 * np.linalg.norm(mine[pairs[:, 0]] - other[pairs[:, 1]], axis=1) / unit
-    words = "distance of ours to theirs, of points that both saw within a pixel of each other"
+    words = "distance of ours to theirs, for points observed by both within a pixel"
     return [
         Metric(
             scene,
@@ -218,7 +218,7 @@ def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float) -> list[
 def _icp_metrics(
     scene: str, name: str, mine: F64, other: F64, unit: float, outcome: Outcome | None
 ) -> list[Metric]:
-    """How far Open3D's ICP moves our cloud, and how many of its points have a partner then."""
+    """Return the motion and the inlier share of Open3D's ICP."""
     if outcome is None or not outcome.ok:
         return []
     with np.load(outcome.place / f"{slug(name)}.npz") as kept:

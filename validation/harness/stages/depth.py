@@ -1,4 +1,4 @@
-"""Section 2.6: depth maps of all photographs of a scene, against true depth and against sparse points."""
+"""Section 2.6: depth maps of all images of a scene against true depth and sparse points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thesisrecon.io.images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.neighbours import pinhole_view
-from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Task
 from validation.harness.scenes import load_photographs
 from validation.harness.stages.cameras import OURS as OUR_CAMERAS
 from validation.harness.stages.cameras import read_model
@@ -44,51 +44,51 @@ SCENES = (COURTYARD, "fountain-P11", "Herz-Jesus-P8")
 SIDE_PX = 448
 """Long side of the depth maps: the library's own is 1024, for which a report has no time."""
 WORST = 0.02
-"""Relative error that is red in the pictures."""
+"""Relative error that is red in the figures."""
 
 
 class DepthStage:
-    """Depth maps of the default and of the thesis' way, from the cameras that our run found."""
+    """Depth maps of the default and the thesis preset, from our cameras."""
 
     name = "depth"
     title = "Depth maps"
     definition = (
-        f"Depth maps of every photograph from our own cameras, long side {SIDE_PX} px unless another is "
-        "asked for (the library's is 1024), the same for both ways: the default (matched pairs, robust "
+        f"Depth maps of every image from our own cameras, long side {SIDE_PX} px by "
+        "default (the library's is 1024), the same for both presets: the default (matched pairs, robust "
         "fusion, slanted windows, completion) and the thesis' (maximum likelihood scanlines, linked along "
-        "the sequence; on the courtyard alone, not in a quick report). The courtyard is held against its "
-        "true depth after the similarity of the cameras; other photographs, which have none, against the "
-        "sparse points that each observes."
+        "the sequence; on the courtyard alone, not in a quick report). The courtyard is compared "
+        "with its true depth after similarity alignment of the cameras; other images with their sparse "
+        "points."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
-        return scene in SCENES or scene in wishes.folders
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return scene in SCENES or scene in options.folders
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
-        # The thesis' way takes as long as the default, and only the truth tells what it is worth.
-        whole = scene == COURTYARD and not (wishes.quick or wishes.gates_only)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
+        # The thesis preset takes as long as the default and is evaluated only with true depth.
+        whole = scene == COURTYARD and not (options.quick or options.gates_only)
         return (OURS, THESIS) if whole else (OURS,)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the same for all)
         return (("cameras", OUR_CAMERAS),)
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        photographs = load_photographs(task.scene, wishes)
-        images, model = images_of(photographs), model_of(photographs, wishes)
-        stereo = stereo_of(task.method, wishes)
+    def run(self, task: Task, options: ReportOptions) -> None:
+        photographs = load_photographs(task.scene, options)
+        images, model = images_of(photographs), model_of(photographs, options)
+        stereo = stereo_of(task.method, options)
         start = time.process_time()
         maps = stereo.map_all(images, model, threads=1)
         seconds = time.process_time() - start
-        place = wishes.place(task.stage, task.scene, task.method)
+        place = options.place(task.stage, task.scene, task.method)
         for view, found in maps.items():
             np.savez(
                 place / f"{view:04d}.npz", P=found.P, depth=found.depth, std=found.std, views=found.views
             )
         write_text(place / "seconds.txt", f"{seconds / max(len(maps), 1)}\n")
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        photographs = load_photographs(scene, wishes)
-        model = model_of(photographs, wishes)
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        photographs = load_photographs(scene, options)
+        model = model_of(photographs, options)
         kept = {name: read_maps(o.place) if o.ok else {} for name, o in outcomes.items()}
         truths = _truths(photographs, kept)
         judged = {n: together(_judged(maps, photographs, model, truths)) for n, maps in kept.items() if maps}
@@ -101,41 +101,41 @@ class DepthStage:
             Metric(scene, "time a view", "s", seconds, OURS, definition="processor time, compiling included")
         )
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
-        return Judgement(metrics, pictures=_pictures(photographs, kept, model, self, wishes), notes=notes)
+        return Judgement(metrics, pictures=_pictures(photographs, kept, model, self, options), notes=notes)
 
 
-def side_of(wishes: Wishes) -> int:
+def side_of(options: ReportOptions) -> int:
     """Long side of depth maps, px."""
-    return wishes.side_px or SIDE_PX
+    return options.side_px or SIDE_PX
 
 
-def stereo_of(method: str, wishes: Wishes) -> MultiViewStereo:
+def stereo_of(method: str, options: ReportOptions) -> MultiViewStereo:
     """The way to depth maps of a preset, at the size of this report."""
     dense = preset(PRESETS[method]).dense
     assert isinstance(dense, MultiViewStereo)
-    return replace(dense, max_side=side_of(wishes))
+    return replace(dense, max_side=side_of(options))
 
 
 def images_of(photographs: Scene) -> list[Image]:
-    """The photographs as they are, in the order of the scene."""
+    """The images as they are, in the order of the scene."""
     read = read_images(list(photographs.image_paths), max_size_px=10_000)
     by_name = {image.name: image for image in read.images}
     return [by_name[path.name] for path in photographs.image_paths]
 
 
-def model_of(photographs: Scene, wishes: Wishes) -> Reconstruction:
+def model_of(photographs: Scene, options: ReportOptions) -> Reconstruction:
     """Our saved reconstruction of a scene; ``ValueError`` where there is none."""
-    outcome = Outcome(wishes.place("cameras", photographs.name, OUR_CAMERAS))
+    outcome = Outcome(options.place("cameras", photographs.name, OUR_CAMERAS))
     model = read_model(photographs, OUR_CAMERAS, outcome)
     if model is None:
-        raise ValueError(f"there is no model of ours of {photographs.name}: run the stage cameras too")
+        raise ValueError(f"our model of {photographs.name} is missing: run the stage cameras too")
     return model
 
 
-def views_of(photographs: Scene, model: Reconstruction, wishes: Wishes) -> dict[int, PinholeView]:
-    """The photographs without distortion, at the size of the depth maps, by view."""
+def views_of(photographs: Scene, model: Reconstruction, options: ReportOptions) -> dict[int, PinholeView]:
+    """The images without distortion, at the size of the depth maps, by view."""
     return {
-        i: pinhole_view(image, model, i, max_side=side_of(wishes))
+        i: pinhole_view(image, model, i, max_side=side_of(options))
         for i, image in enumerate(images_of(photographs))
         if model.registered[i]
     }
@@ -152,7 +152,7 @@ def read_maps(place: Path) -> dict[int, DepthMap]:
 
 
 def _truths(photographs: Scene, kept: Mapping[str, Mapping[int, DepthMap]]) -> dict[int, TrueDepth]:
-    """True depths of the views that have a map, where there are any."""
+    """Return the true depths of the views with a map, if known."""
     if photographs.name != COURTYARD:
         return {}
     return {
@@ -171,7 +171,7 @@ def _judged(
 
 def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric]:
     of, against = (
-        ("places that two photographs show", "true depth")
+        ("points visible in two images", "true depth")
         if scene == COURTYARD
         else ("sparse points of the view", "depth of the sparse points")
     )
@@ -225,19 +225,19 @@ def _pictures(
     kept: Mapping[str, Mapping[int, DepthMap]],
     model: Reconstruction,
     stage: DepthStage,
-    wishes: Wishes,
+    options: ReportOptions,
 ) -> list[Picture]:
-    """Of two views: photograph, the maps, and where there is truth the truth and the errors."""
+    """Draw two views: image, maps, and, if known, truth and errors."""
     views = sorted(set.intersection(*(set(maps) for maps in kept.values()))) if kept else []
     chosen = sorted({views[len(views) // 4], views[len(views) // 2]}) if views else []
-    images, place = images_of(photographs), wishes.place(stage.name, photographs.name)
+    images, place = images_of(photographs), options.place(stage.name, photographs.name)
     pictures = []
     for view in chosen:
-        photograph = pinhole_view(images[view], model, view, max_side=side_of(wishes)).rgb
+        photograph = pinhole_view(images[view], model, view, max_side=side_of(options)).rgb
         maps = {name: found[view] for name, found in kept.items()}
         limits = depth_range([found.depth for found in maps.values()])
         rows = [[photograph, *(depth_colours(found.depth, limits) for found in maps.values())]]
-        words = f"Photograph, {', then '.join(maps)}: near red, far blue, unknown black."
+        words = f"Image, {', then '.join(maps)}: near red, far blue, unknown black."
         if photographs.name == COURTYARD:
             scales = {name: true_from_maps(found, photographs).scale for name, found in kept.items()}
             true = _true_map(view, next(iter(maps.values())).depth.shape)
@@ -247,7 +247,7 @@ def _pictures(
             words += f" Below the truth, and errors from blue (none) to red ({100.0 * WORST:g} % or more)."
         file = f"view-{view:02d}.png"
         PIL.Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(place / file)
-        pictures.append(Picture(file, f"Depth of photograph {view + 1}", words))
+        pictures.append(Picture(file, f"Depth of image {view + 1}", words))
     return pictures
 
 

@@ -12,7 +12,7 @@ import PIL.Image
 from thesisrecon.arrays import F32
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, PairMatcher, SemiGlobalMatching
-from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
@@ -27,10 +27,14 @@ MATCHERS: dict[str, PairMatcher] = {
 }
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 BAD, KNOWN = "off by more than 1 px", "share before holes are filled"
-DEFINITION = "share of the pixels that both cameras see, holes filled along the row"
+DEFINITION = "share of the pixels visible in both images, holes filled along the row"
+OVER_BETTER = "off by more than 1 px, over the better mode of OpenCV"
+HIDDEN = "share of the pixels hidden in the other image that have a disparity"
+ON_SURFACES = "mean over the pixels visible in both images that are off by less than 1 px"
+OVER_HH = "processor time, a ratio of two runs on the same machine"
 
 
-class DisparityStage:
+class DisparityStage(Stage):
     """Dense matching with the same parameters for all pairs."""
 
     name = "disparity"
@@ -40,28 +44,25 @@ class DisparityStage:
         "semi-global matching has block 3, P1 = 216, P2 = 864, and widened images, to see every column."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
         return scene in STEREO_PAIRS
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         return (*MATCHERS, THREE_WAY, HH)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (nothing)
-        return ()
-
-    def run(self, task: Task, wishes: Wishes) -> None:
+    def run(self, task: Task, options: ReportOptions) -> None:
         pair = _pair(task.scene)
-        runs = 1 if wishes.quick else 3
+        runs = 1 if options.quick else 3
         _match(task.method, pair)  # compiles
         seconds = []
         for _ in range(runs):
             start = time.process_time()
             disparity = _match(task.method, pair)
             seconds.append(time.process_time() - start)
-        place = wishes.place(task.stage, task.scene, task.method)
+        place = options.place(task.stage, task.scene, task.method)
         np.savez(place / "disparity.npz", disparity=disparity, seconds=min(seconds))
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         pair = _pair(scene)
         kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
 
@@ -75,47 +76,31 @@ class DisparityStage:
         spent = {n: None if k is None else 1e3 * k[1] for n, k in kept.items()}
         wrong = bad(1.0)
         better = min((v for n in (THREE_WAY, HH) if (v := wrong[n]) is not None), default=None)
+        hidden = {n: None if k is None else _known_though_hidden(k[0], pair) for n, k in kept.items()}
+        error = {n: None if k is None else _surface_error(k[0], pair) for n, k in kept.items()}
+        over_better = {OURS: _ratio(wrong[OURS], better)}
         metrics = [
             Metric(scene, BAD, "%", wrong, OURS, definition=DEFINITION),
             Metric(scene, "off by more than 2 px", "%", bad(2.0), OURS, definition=DEFINITION),
             Metric(scene, "known", "%", known, OURS, at_most=False, definition=KNOWN),
-            Metric(scene, "time", "ms", spent, OURS, definition="processor time, the least of all runs"),
+            Metric(scene, "time", "ms", spent, OURS, definition="processor time, minimum of all runs"),
             Metric(
-                scene,
-                "bad pixels over the better reference",
-                "",
-                {OURS: _ratio(wrong[OURS], better)},
-                OURS,
-                definition="off by more than 1 px, over the better mode of OpenCV",
+                scene, "bad pixels over the better reference", "", over_better, OURS, definition=OVER_BETTER
             ),
             *_of_variants(scene, wrong, known),
-            Metric(
-                scene,
-                "told though hidden",
-                "%",
-                {n: None if k is None else _told_though_hidden(k[0], pair) for n, k in kept.items()},
-                OURS,
-                definition="share of the pixels hidden in the other image that have a disparity all the same",
-            ),
-            Metric(
-                scene,
-                "error on surfaces",
-                "px",
-                {n: None if k is None else _surface_error(k[0], pair) for n, k in kept.items()},
-                OURS,
-                definition="mean over the pixels that both cameras see and that are off by less than 1 px",
-            ),
+            Metric(scene, "told though hidden", "%", hidden, OURS, definition=HIDDEN),
+            Metric(scene, "error on surfaces", "px", error, OURS, definition=ON_SURFACES),
             Metric(
                 scene,
                 "time over SGBM HH",
                 "s / s",
                 {OURS: _ratio(spent[OURS], spent[HH])},
                 OURS,
-                definition="processor time, a ratio of two runs on the same machine",
+                definition=OVER_HH,
             ),
         ]
         maps = {n: k[0] for n, k in kept.items() if k is not None}
-        place = wishes.place(self.name, scene)
+        place = options.place(self.name, scene)
         shown = [name for name in (THESIS, OURS, THREE_WAY) if name in maps]
         PIL.Image.fromarray(picture(pair, maps, shown)).save(place / "maps.png")
         words = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
@@ -142,7 +127,7 @@ def _surface_error(disparity: F32, pair: StereoPair) -> float:
         return float(off[off < 1.0].mean())
 
 
-def _told_though_hidden(disparity: F32, pair: StereoPair) -> float:
+def _known_though_hidden(disparity: F32, pair: StereoPair) -> float:
     hidden = np.isfinite(pair.truth) & ~pair.judged
     return float(100.0 * np.isfinite(disparity)[hidden].mean())
 

@@ -16,7 +16,7 @@ from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Image
-from validation.harness.records import Judgement, Outcome, Task, Wishes
+from validation.harness.records import Judgement, Outcome, ReportOptions, Task
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.fundamental import MATCHES
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
@@ -31,56 +31,56 @@ OURS, THESIS, SIFT, HARRIS = "ours", "ours (thesis)", "SIFT", "cv2.cornerHarris"
 FRONT_ENDS = {OURS: "ours", THESIS: "thesis", SIFT: "SIFT"}
 CORNERS = 1000
 REPEATED_PX = 1.5
-VERIFIED = "mean over the pairs; none where F is wrong"
+VERIFIED = "mean over the pairs; none if F is wrong"
 NOISE = "median over the pairs of the noise of the verified matches"
 MAX_SIZE_PX = 1600
 WITH_DEPTH = ("courtyard",)
-"""Scenes whose depth is known, so that it is known where a corner must be in the next photograph."""
+"""Scenes with true depth, which gives the position of a corner in the next image."""
 
 
 class FeaturesStage:
-    """Corners by repeatability, front ends by the matches that a right F verifies."""
+    """Repeatability of corners, and verified matches of front ends."""
 
     name = "features"
     title = "Corners and matches"
     definition = (
-        "Verified matches: inliers of an F that is right (below 1 px on matches of the true cameras), "
+        "Verified matches: inliers of a correct F (error below 1 px on matches of the true cameras), "
         "all front ends through one estimator and one verification. Repeatability: of the 1000 strongest "
         "corners, those with a corner within 1.5 px of where the true depth takes them in the next one."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
-        return is_photographs(scene, wishes) and load_photographs(scene, wishes).has_truth
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return is_photographs(scene, options) and load_photographs(scene, options).has_truth
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:
-        if wishes.gates_only:
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
+        if options.gates_only:
             return (OURS, THESIS) if scene in WITH_DEPTH else (OURS,)
         return (*FRONT_ENDS, HARRIS) if scene in WITH_DEPTH else tuple(FRONT_ENDS)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        # The judgement scores F on correspondences made of these matches, moved onto the true lines.
+        # The judgement evaluates F on these matches, moved onto the true epipolar lines.
         return () if method else (("fundamental", MATCHES),)
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        scene = load_photographs(task.scene, wishes)
+    def run(self, task: Task, options: ReportOptions) -> None:
+        scene = load_photographs(task.scene, options)
         images = read_images(scene.image_paths, max_size_px=MAX_SIZE_PX).images
-        place = wishes.place(task.stage, task.scene, task.method)
+        place = options.place(task.stage, task.scene, task.method)
         if task.scene in WITH_DEPTH:
             corners: dict[str, Any] = {f"{i}": _corners(task.method, m) for i, m in enumerate(images)}
             np.savez(place / "corners.npz", **corners)
         if task.method != HARRIS:
-            np.savez(place / "matches.npz", **_matches(task.method, images, wishes))
+            np.savez(place / "matches.npz", **_matches(task.method, images, options))
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        photographs = load_photographs(scene, wishes)
-        gaps = _gaps(wishes)
-        cache = wishes.place("fundamental", scene, MATCHES)
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        photographs = load_photographs(scene, options)
+        gaps = _gaps(options)
+        cache = options.place("fundamental", scene, MATCHES)
         notes = [f"{n}: {o.failure}." for n, o in outcomes.items() if not o.ok]
         try:
             truths = {(p.name, g): p for g in gaps for p in camera_pairs(photographs, cache, (g,))}
         except NoReference as error:
             gaps, truths = (), {}
-            notes.append(f"Matches are not judged, for true correspondences are made of SIFT's: {error}.")
+            notes.append(f"Matches are not evaluated: true correspondences need SIFT: {error}.")
         metrics = []
         for gap in gaps:
             pairs = [pair for (_, g), pair in truths.items() if g == gap]
@@ -90,12 +90,12 @@ class FeaturesStage:
         return Judgement(metrics, notes=notes)
 
 
-def _gaps(wishes: Wishes) -> tuple[int, ...]:
-    return (1,) if wishes.quick else (1, 2)
+def _gaps(options: ReportOptions) -> tuple[int, ...]:
+    return (1,) if options.quick else (1, 2)
 
 
 def _corners(method: str, image: Image) -> F64:
-    """The strongest corners (N, 2) of a photograph."""
+    """The strongest corners (N, 2) of an image."""
     if method in (OURS, THESIS):
         config = HarrisCorners() if method == THESIS else preset("default").features
         found = config.detect(image)
@@ -104,16 +104,16 @@ def _corners(method: str, image: Image) -> F64:
     return sift_corners(image, CORNERS) if method == SIFT else harris_corners(image, CORNERS)
 
 
-def _matches(method: str, images: tuple[Image, ...], wishes: Wishes) -> dict[str, Any]:
+def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> dict[str, Any]:
     """F, number of inliers and sigma of every pair."""
     prepared = PreparedViews(front_ends()[FRONT_ENDS[method]], images)
-    told: dict[str, Any] = {}
-    for gap in _gaps(wishes):
-        views = [prepared.relate(i, i + gap, wishes.seed) for i in range(len(images) - gap)]
-        told[f"F{gap}"] = np.array([view.F for view in views])
-        told[f"inliers{gap}"] = np.array([view.inliers for view in views])
-        told[f"sigma{gap}"] = np.array([view.sigma_px for view in views])
-    return told
+    arrays: dict[str, Any] = {}
+    for gap in _gaps(options):
+        views = [prepared.relate(i, i + gap, options.seed) for i in range(len(images) - gap)]
+        arrays[f"F{gap}"] = np.array([view.F for view in views])
+        arrays[f"inliers{gap}"] = np.array([view.inliers for view in views])
+        arrays[f"sigma{gap}"] = np.array([view.sigma_px for view in views])
+    return arrays
 
 
 def _match_metrics(
@@ -160,14 +160,12 @@ def _repeatability(scene: Scene, outcomes: Mapping[str, Outcome]) -> Metric:
         with np.load(Path(outcome.place) / "corners.npz") as kept:
             corners = [kept[f"{i}"] for i in range(len(scene.image_paths))]
         values[name] = 100.0 * _share_repeated(scene, corners)
-    words = (
-        "of the 1000 strongest corners that the next photograph must show, those found again within 1.5 px"
-    )
+    words = "of the 1000 strongest corners that the next image must show, those found again within 1.5 px"
     return Metric(scene.name, "repeatability", "%", values, OURS, at_most=False, definition=words)
 
 
 def _share_repeated(scene: Scene, corners: list[F64]) -> float:
-    """Over all neighbouring photographs."""
+    """Over all neighbouring images."""
     again, asked = 0, 0
     transfer = _transfer(scene)
     for i in range(len(corners) - 1):
@@ -178,7 +176,7 @@ def _share_repeated(scene: Scene, corners: list[F64]) -> float:
 
 
 def _transfer(scene: Scene) -> Callable[[int, int, F64], F64]:
-    """Where points (N, 2) of view i are in view j: those with a depth whose place is seen there too."""
+    """Transfer points (N, 2) of view i to view j by true depth; only mutually visible ones."""
     assert scene.K is not None
     assert scene.R is not None
     assert scene.C is not None

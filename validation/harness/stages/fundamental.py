@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.two_view import epipoles
-from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Task
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
@@ -38,7 +38,7 @@ ERROR = "RMS distance of right correspondences to their epipolar lines, over bot
 
 @dataclass(frozen=True)
 class Answers:
-    """What a method said of all pairs, once a seed: ``F`` (pairs, seeds, 3, 3), NaN where it gave none,
+    """Answers of a method for all pairs and seeds: ``F`` (pairs, seeds, 3, 3), NaN where it gave none,
     ``inliers`` (pairs, seeds) how many it took, ``seconds`` (pairs, seeds) of one processor."""
 
     F: F64
@@ -52,25 +52,25 @@ class FundamentalStage:
     name = "fundamental"
     title = "Fundamental matrices"
     definition = (
-        "F of the same SIFT matches, threshold 1 px, several seeds, which draw the order of the matches too. "
-        "Errors are on correspondences of the true cameras (or hand-made ones) that no method has seen."
+        "F of the same SIFT matches, threshold 1 px, several seeds, which also order the matches. "
+        "Errors are on correspondences of the true cameras (or hand-made ones) that no method was given."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
+    def takes(self, scene: str, options: ReportOptions) -> bool:
         return scene == "kusvod2" or (
-            is_photographs(scene, wishes) and load_photographs(scene, wishes).has_truth
+            is_photographs(scene, options) and load_photographs(scene, options).has_truth
         )
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
-        if wishes.gates_only:
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        if options.gates_only:
             return (MATCHES, OURS, *VARIANTS, MINIMAL)
-        return (MATCHES, OURS, *VARIANTS, MINIMAL, *(QUICK if wishes.quick else REFERENCES))
+        return (MATCHES, OURS, *VARIANTS, MINIMAL, *(QUICK if options.quick else REFERENCES))
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return () if method in ("", MATCHES) else ((self.name, MATCHES),)
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        pairs = _pairs(task.scene, wishes)
+    def run(self, task: Task, options: ReportOptions) -> None:
+        pairs = _pairs(task.scene, options)
         if task.method == MATCHES:
             return
 
@@ -80,40 +80,40 @@ class FundamentalStage:
             return found.F, found.inliers, time.process_time() - start
 
         answer(pairs[0], 0)  # compiles
-        told = [[answer(pair, wishes.seed + seed) for seed in range(_seeds(wishes))] for pair in pairs]
+        answers = [[answer(pair, options.seed + seed) for seed in range(_seeds(options))] for pair in pairs]
         none = np.full((3, 3), np.nan)
         np.savez(
-            wishes.place(task.stage, task.scene, task.method) / "answers.npz",
-            F=[[none if F is None else F for F, _, _ in row] for row in told],
-            inliers=[[float(inliers.sum()) for _, inliers, _ in row] for row in told],
-            seconds=[[seconds for _, _, seconds in row] for row in told],
+            options.place(task.stage, task.scene, task.method) / "answers.npz",
+            F=[[none if F is None else F for F, _, _ in row] for row in answers],
+            inliers=[[float(inliers.sum()) for _, inliers, _ in row] for row in answers],
+            seconds=[[seconds for _, _, seconds in row] for row in answers],
         )
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        pairs = _pairs(scene, wishes)
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        pairs = _pairs(scene, options)
         answers = {m: _read(o) if o.ok else None for m, o in outcomes.items() if m != MATCHES}
         errors = {m: None if a is None else _errors(a, pairs) for m, a in answers.items()}
         metrics = _metrics(scene, pairs, answers, errors)
-        notes = [f"{len(pairs)} pairs, {_seeds(wishes)} seeds each."]
+        notes = [f"{len(pairs)} pairs, {_seeds(options)} seeds each."]
         notes += [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         return Judgement(metrics, plots=[_plot(errors)], notes=notes)
 
 
-def _seeds(wishes: Wishes) -> int:
-    return 2 if wishes.quick else 5
+def _seeds(options: ReportOptions) -> int:
+    return 2 if options.quick else 5
 
 
-def _pairs(scene: str, wishes: Wishes) -> list[RealPair]:
+def _pairs(scene: str, options: ReportOptions) -> list[RealPair]:
     """The pairs of a scene; their matches are kept where the task of the matches leaves them.
 
-    Raises :class:`NoReference` where nobody can make them.
+    Raises :class:`NoReference` where nothing can make them.
     """
-    cache = wishes.place("fundamental", scene, MATCHES)
+    cache = options.place("fundamental", scene, MATCHES)
     try:
         if scene == "kusvod2":
             return list(kusvod2_pairs(cache))
-        gaps = (1,) if wishes.quick else (1, 2)
-        return list(camera_pairs(load_photographs(scene, wishes), cache, gaps))
+        gaps = (1,) if options.quick else (1, 2)
+        return list(camera_pairs(load_photographs(scene, options), cache, gaps))
     except NoReference as error:
         raise NoReference(f"there are no SIFT matches: {error}") from error
 
@@ -161,7 +161,7 @@ def _metrics(
             "inliers",
             "%",
             of_answers(lambda a: 100.0 * np.mean(a.inliers / counts)),
-            "mean share of the matches a method takes for right",
+            "mean share of the matches accepted as inliers",
         ),
         row(
             "time",
@@ -210,7 +210,7 @@ def _direction(F: F64, middle: F64, spread: float) -> F64:
 
 
 def _plot(errors: Mapping[str, F64 | None]) -> Plot:
-    """All errors of every method, sorted: a curve to the left and above is better."""
+    """Plot the sorted errors of every method."""
     traces = []
     for name, found in errors.items():
         if found is None:

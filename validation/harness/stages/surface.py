@@ -1,4 +1,4 @@
-"""Section 2.6: surfaces of the same depth maps by ours and by Open3D, both ways against the true one."""
+"""Section 2.6: surfaces of the same depth maps by ours and Open3D against the true surface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
-from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Task
 from validation.harness.scenes import load_photographs
 from validation.harness.stages.depth import (
     COURTYARD,
@@ -37,7 +37,7 @@ TSDF, POISSON = "Open3D TSDF", "Open3D Poisson"
 SHOWN = (OURS, TSDF, POISSON)
 WITHIN = (0.2, 0.5, 1.0)
 RED_PCT = 1.0
-"""Distance that is red in the pictures, percent of the scene's depth."""
+"""Distance that is red in the figures, in percent of the scene depth."""
 QUICK_SAMPLES = 50_000
 
 
@@ -49,30 +49,30 @@ class SurfaceStage:
     definition = (
         "Surfaces of the depth maps of the stage above: our default, and Open3D's grid of truncated signed "
         "distances (voxels of 1.5 pixels, as ours) and its Poisson surface (octree of depth 9) of the same "
-        "maps; the thesis' preset of its own maps. Cameras are laid over the true ones by a similarity; "
+        "maps; the thesis' preset of its own maps. Cameras are aligned to the true ones by a similarity; "
         "distances are Open3D's, in per cent of the scene's depth, at most 5 % in the means. Accuracy: from "
-        "points spread evenly over the surface, where two photographs could show them, to the true surface. "
-        "Completeness: from what two photographs show to the surface."
+        "points spread evenly over the surface, where two images could show them, to the true surface. "
+        "Completeness: from what two images show to the surface."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
         return scene == COURTYARD
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
-        return (OURS, TSDF) if wishes.quick or wishes.gates_only else (OURS, THESIS, TSDF, POISSON)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+        return (OURS, TSDF) if options.quick or options.gates_only else (OURS, THESIS, TSDF, POISSON)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return (("depth", THESIS if method == THESIS else OURS),)
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        mesh = _surface(task.method, task.scene, wishes)
-        place = wishes.place(task.stage, task.scene, task.method)
+    def run(self, task: Task, options: ReportOptions) -> None:
+        mesh = _surface(task.method, task.scene, options)
+        place = options.place(task.stage, task.scene, task.method)
         np.savez(place / "mesh.npz", vertices=mesh.vertices, faces=mesh.faces.astype(np.int32))
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         truth = load_truth()
-        samples = QUICK_SAMPLES if wishes.quick else SAMPLES
-        meshes = {n: _true_mesh(n, o, scene, wishes) if o.ok else None for n, o in outcomes.items()}
+        samples = QUICK_SAMPLES if options.quick else SAMPLES
+        meshes = {n: _true_mesh(n, o, scene, options) if o.ok else None for n, o in outcomes.items()}
         judged = {n: None if m is None else judge_surface(m, truth, samples) for n, m in meshes.items()}
         faces = {n: None if m is None else float(len(m.faces)) for n, m in meshes.items()}
         metrics = [
@@ -81,8 +81,8 @@ class SurfaceStage:
         ]
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         notes.append(f"The scene is {truth.depth_m:.2f} m deep, the median over all true depth maps.")
-        place, pictures = wishes.place(self.name, scene), list[Picture]()
-        camera = _camera(scene, wishes)
+        place, pictures = options.place(self.name, scene), list[Picture]()
+        camera = _camera(scene, options)
         for name in SHOWN:
             mesh = meshes.get(name)
             if mesh is None:
@@ -90,15 +90,13 @@ class SurfaceStage:
             file = f"{name.replace(' ', '-')}.png"
             off_pct = 100.0 * truth.surface.distances(mesh.vertices) / truth.depth_m
             PIL.Image.fromarray(_drawn(mesh, off_pct, camera)).save(place / file)
-            words = (
-                f"Seen from a middle photograph; blue is true, red {RED_PCT:g} % of the depth off or more."
-            )
+            words = f"View of a middle image; blue: no error, red: {RED_PCT:g} % of the depth or more."
             pictures.append(Picture(file, f"Surface: {name}", words))
         return Judgement(metrics, pictures=pictures, notes=notes)
 
 
-def _surface(method: str, scene: str, wishes: Wishes) -> TexturedMesh:
-    maps = read_maps(wishes.place("depth", scene, THESIS if method == THESIS else OURS))
+def _surface(method: str, scene: str, options: ReportOptions) -> TexturedMesh:
+    maps = read_maps(options.place("depth", scene, THESIS if method == THESIS else OURS))
     if not maps:
         raise ValueError(f"there are no depth maps of {scene}: run the stage depth too")
     ordered = [maps[view] for view in sorted(maps)]
@@ -108,21 +106,21 @@ def _surface(method: str, scene: str, wishes: Wishes) -> TexturedMesh:
         return model.surface_of(ordered)
     if method == POISSON:
         return poisson_mesh(ordered)
-    photographs = load_photographs(scene, wishes)
-    views = views_of(photographs, model_of(photographs, wishes), wishes)
+    photographs = load_photographs(scene, options)
+    views = views_of(photographs, model_of(photographs, options), options)
     return OpenTsdf().fuse(ordered, [views[m.view] for m in ordered])
 
 
-def _true_mesh(method: str, outcome: Outcome, scene: str, wishes: Wishes) -> TexturedMesh:
+def _true_mesh(method: str, outcome: Outcome, scene: str, options: ReportOptions) -> TexturedMesh:
     """The saved surface in the frame of the truth."""
-    align = _true_from_ours(scene, wishes, THESIS if method == THESIS else OURS)
+    align = _true_from_ours(scene, options, THESIS if method == THESIS else OURS)
     with np.load(Path(outcome.place) / "mesh.npz") as kept:
         faces = kept["faces"].astype(np.int64)
         return TexturedMesh(align.apply(kept["vertices"]), faces)
 
 
-def _true_from_ours(scene: str, wishes: Wishes, maps: str) -> Similarity:
-    return true_from_maps(read_maps(wishes.place("depth", scene, maps)), load_photographs(scene, wishes))
+def _true_from_ours(scene: str, options: ReportOptions, maps: str) -> Similarity:
+    return true_from_maps(read_maps(options.place("depth", scene, maps)), load_photographs(scene, options))
 
 
 def _metrics(scene: str, judged: Mapping[str, tuple[F64, F64] | None]) -> list[Metric]:
@@ -142,7 +140,7 @@ def _metrics(scene: str, judged: Mapping[str, tuple[F64, F64] | None]) -> list[M
         for bound in WITHIN:
             near = of(lambda d, bound=bound: 100.0 * float((d <= bound).mean()))  # type: ignore[misc]
             name = f"{what}, within {bound} %"
-            definition = f"share of the points {words[what]} that are no farther"
+            definition = f"share of the points {words[what]} within this distance"
             rows.append(Metric(scene, name, "%", near, OURS, at_most=False, definition=definition))
     for what, values in means.items():
         ours, theirs = values.get(OURS), values.get(TSDF)
@@ -156,9 +154,9 @@ def _row(scene: str, name: str, unit: str, values: Mapping[str, float | None], w
     return Metric(scene, name, unit, values, OURS, definition=words)
 
 
-def _camera(scene: str, wishes: Wishes) -> Camera:
+def _camera(scene: str, options: ReportOptions) -> Camera:
     """The true camera in the middle, at a size for a page."""
-    truth = load_photographs(scene, wishes)
+    truth = load_photographs(scene, options)
     assert truth.K is not None
     assert truth.R is not None
     assert truth.C is not None

@@ -1,4 +1,4 @@
-"""Section 6.2: points from two and more views by ours, OpenCV and COLMAP, against the truth."""
+"""Section 6.2: triangulation from two and more views by ours, OpenCV and COLMAP, against the truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_midpoint, triangulate_optimal
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
-from validation.harness.records import Judgement, Outcome, Plot, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
 from validation.metrics.record import Metric
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.rigs import Rig
@@ -28,7 +28,7 @@ LINEAR, MIDPOINT = "ours (linear)", "ours (mid-point)"
 ADJUSTED = "ours (cameras too)"
 """Projective adjustment, which chapter 6 has from the points on: cameras and points of five views."""
 MOVED = 1e-3
-"""Share by which every entry of a camera is moved before the adjustment: about a pixel."""
+"""Relative perturbation of camera entries before the adjustment, about a pixel."""
 OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV", "OpenCV, correctMatches", "COLMAP"
 NOISES_PX = (0.5, 1.0, 2.0)
 POINTS = 400
@@ -50,8 +50,8 @@ class Problem:
     frame: F64
 
 
-class TriangulationStage:
-    """The thesis' comparison, beside the references."""
+class TriangulationStage(Stage):
+    """The thesis' comparison of methods, beside the references."""
 
     name = "triangulation"
     title = "Triangulation"
@@ -60,22 +60,19 @@ class TriangulationStage:
         "frames of space. The optimum is that of the reprojection over all views."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:  # noqa: ARG002 (the same for all wishes)
+    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
         return scene == "cloud"
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         return (OURS, LINEAR, MIDPOINT, ADJUSTED, OPENCV, OPENCV_POLYNOMIAL, COLMAP)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (nothing)
-        return ()
-
-    def run(self, task: Task, wishes: Wishes) -> None:
+    def run(self, task: Task, options: ReportOptions) -> None:
         answers: dict[str, Any] = {}
         seconds = []
-        for n, problem in enumerate(_problems(wishes)):
+        for n, problem in enumerate(_problems(options)):
             if task.method == ADJUSTED:
                 if len(problem.P) == 5:
-                    answers[f"P{n}"], answers[f"{n}"] = _adjusted(problem, wishes.seed)
+                    answers[f"P{n}"], answers[f"{n}"] = _adjusted(problem, options.seed)
                 continue
             method = _solver(task.method, len(problem.P))
             if method is None:
@@ -85,11 +82,11 @@ class TriangulationStage:
             answers[f"{n}"] = method(problem.P, problem.xy)
             if len(problem.P) == 2:
                 seconds.append((time.process_time() - start) / problem.xy.shape[1])
-        place = wishes.place(task.stage, task.scene, task.method)
+        place = options.place(task.stage, task.scene, task.method)
         np.savez(place / "points.npz", seconds=np.array(seconds), **answers)
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        problems = list(_problems(wishes))
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        problems = list(_problems(options))
         kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
         metrics = [_adjustment(scene, problems, kept.pop(ADJUSTED, None))]
         for views in (2, 5):
@@ -107,7 +104,7 @@ class TriangulationStage:
 
 
 def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
-    """Cameras and points of least squares from cameras that are moved a little."""
+    """Adjust cameras and points, from slightly perturbed cameras."""
     rng, (views, points) = np.random.default_rng(seed), problem.xy.shape[:2]
     P = problem.P * (1.0 + MOVED * rng.normal(size=problem.P.shape))
     view, point = np.tile(np.arange(views), points), np.repeat(np.arange(points), views)
@@ -130,7 +127,7 @@ def _adjustment(scene: str, problems: list[Problem], kept: Mapping[str, F64] | N
 
 
 def _solver(method: str, views: int) -> Method | None:
-    """None where a method knows two views only, and there are more."""
+    """Return None if a method is limited to two views and there are more."""
     if method == OURS:
         return triangulate_polynomial if views == 2 else triangulate_optimal
     if method in (LINEAR, MIDPOINT):
@@ -142,13 +139,13 @@ def _solver(method: str, views: int) -> Method | None:
     return opencv_linear if method == OPENCV else opencv_polynomial
 
 
-def _problems(wishes: Wishes) -> Iterator[Problem]:
-    trials = 1 if wishes.quick else 4
+def _problems(options: ReportOptions) -> Iterator[Problem]:
+    trials = 1 if options.quick else 4
     for title, (make, views) in SCENES.items():
         for sigma in NOISES_PX:
             for projective in (False, True):
                 for trial in range(trials):
-                    rng = np.random.default_rng([wishes.seed, trial])
+                    rng = np.random.default_rng([options.seed, trial])
                     rig = make(rng, views, POINTS)
                     exact = rig.pixels()
                     seen = np.asarray(np.isfinite(exact).all(axis=(0, 2)))

@@ -1,4 +1,4 @@
-"""Section 2.6: the model seen from a photograph that it was not made of, beside that photograph."""
+"""Section 2.6: renderings of the model at a left-out image, beside that image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thesisrecon.surface.texture_atlas import TextureAtlas
 from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
-from validation.harness.records import Judgement, Outcome, Picture, Task, Wishes
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Task
 from validation.harness.scenes import load_photographs
 from validation.harness.stages.depth import COURTYARD, OURS, model_of, read_maps, views_of
 from validation.metrics.depth import coloured
@@ -25,19 +25,19 @@ from validation.metrics.record import Metric
 from validation.references.open3d_meshes import render_open3d
 from validation.references.open3d_surfaces import OpenTsdf
 
-SINGLE = "ours (one photograph each)"
+SINGLE = "ours (one image each)"
 TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF, 1 px, levelled"
-OWN_PICTURE = "Open3D TSDF, 1 px, its own picture"
+OWN_PICTURE = "Open3D TSDF, 1 px, its own image"
 VOXELS_PX = {TSDF: 1.5, FINE: 1.0, LEVELLED: 1.0}
 SCENES = (COURTYARD, "Herz-Jesus-P8")
 LEFT_OUT = 2
 RED_LEVELS = 64.0
-"""Difference in grey levels that is red in the pictures."""
+"""Difference in grey levels that is red in the figures."""
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """Of pictures to photographs, means over those that were left out: made equally bright (``psnr_db``,
+    """Mean scores over the left-out images: with equalised exposures (``psnr_db``,
     ``ssim``) and as they are, and the share of the frame that is ``covered``."""
 
     psnr_db: float
@@ -48,39 +48,39 @@ class Likeness:
 
 
 class ViewsStage:
-    """Photographs that are left out, one by one."""
+    """Images are left out one by one."""
 
     name = "views"
     title = "Views of the model"
     definition = (
-        f"{LEFT_OUT} photographs are left out, one by one: neither "
+        f"{LEFT_OUT} images are left out, one by one: neither "
         "their depth map nor their colours go into a model. (Other depth maps were matched with them, for "
         "all alike.) Ours is textured; Open3D's is its grid of truncated signed distances with coloured "
-        "vertices, from the same depth maps and photographs, once from photographs that our gains had made "
-        "equally bright. All are drawn by our renderer at the camera that was left out, Open3D's finer one "
-        "(but for a quick report) also by its own, and compared over the pixels that all cover whole. How "
-        "an unseen photograph was exposed nobody knows: each picture is first multiplied by one factor a "
-        "channel that fits best."
+        "vertices, from the same depth maps and images, once with exposures equalised by our gains. All "
+        "are drawn by our renderer at the left-out camera, Open3D's finer one "
+        "(but for a quick report) also by its own, and compared over the pixels that all cover whole. The "
+        "exposure of a left-out image is unknown: each rendering is first multiplied by the best factor of "
+        "each channel."
     )
 
-    def takes(self, scene: str, wishes: Wishes) -> bool:
-        return scene in SCENES or scene in wishes.folders
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return scene in SCENES or scene in options.folders
 
-    def methods(self, scene: str, wishes: Wishes) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         sternest = (OURS, FINE, LEVELLED)
-        return sternest if wishes.quick or wishes.gates_only else (OURS, SINGLE, TSDF, FINE, LEVELLED)
+        return sternest if options.quick or options.gates_only else (OURS, SINGLE, TSDF, FINE, LEVELLED)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return (("depth", OURS), *(((self.name, OURS),) if method in (SINGLE, LEVELLED) else ()))
 
-    def run(self, task: Task, wishes: Wishes) -> None:
-        photographs = load_photographs(task.scene, wishes)
-        maps = read_maps(wishes.place("depth", task.scene, OURS))
+    def run(self, task: Task, options: ReportOptions) -> None:
+        photographs = load_photographs(task.scene, options)
+        maps = read_maps(options.place("depth", task.scene, OURS))
         if not maps:
             raise ValueError(f"there are no depth maps of {task.scene}: run the stage depth too")
-        views = views_of(photographs, model_of(photographs, wishes), wishes)
-        place = wishes.place(task.stage, task.scene, task.method)
-        shared = wishes.place(task.stage, task.scene, OURS)
+        views = views_of(photographs, model_of(photographs, options), options)
+        place = options.place(task.stage, task.scene, task.method)
+        shared = options.place(task.stage, task.scene, OURS)
         for k in _left_out(sorted(maps)):
             others = [i for i in sorted(maps) if i != k]
             seen = [views[i] for i in others]
@@ -89,14 +89,14 @@ class ViewsStage:
             drawn = render(mesh, camera)
             _save(place / f"{k:04d}.png", drawn.color)
             _save(place / f"{k:04d}-covered.png", np.where(drawn.valid, 255, 0).astype(np.uint8))
-            if task.method == FINE and not wishes.quick:
+            if task.method == FINE and not options.quick:
                 _draw_by_open3d(place / f"{k:04d}-own.png", mesh, camera)
 
-    def judge(self, scene: str, outcomes: Mapping[str, Outcome], wishes: Wishes) -> Judgement:
-        photographs = load_photographs(scene, wishes)
-        views = views_of(photographs, model_of(photographs, wishes), wishes)
-        left_out = _left_out(sorted(read_maps(wishes.place("depth", scene, OURS))))
-        place, pictures = wishes.place(self.name, scene), list[Picture]()
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        photographs = load_photographs(scene, options)
+        views = views_of(photographs, model_of(photographs, options), options)
+        left_out = _left_out(sorted(read_maps(options.place("depth", scene, OURS))))
+        place, pictures = options.place(self.name, scene), list[Picture]()
         found: dict[str, list[Likeness]] = {}
         for k in left_out:
             drawn = _drawn(outcomes, k)
@@ -107,19 +107,19 @@ class ViewsStage:
             file = f"left-out-{k:02d}.png"
             _save(place / file, _beside(views[k].rgb, shown, compared))
             words = (
-                f"The photograph, then {', '.join(shown)}; below the differences, blue (none) to red "
+                f"The image, then {', '.join(shown)}; below the differences, blue (none) to red "
                 f"({RED_LEVELS:g} grey levels or more), black where not compared."
             )
-            pictures.append(Picture(file, f"Photograph {k + 1}, left out", words))
+            pictures.append(Picture(file, f"Image {k + 1}, left out", words))
         names = [*outcomes, *([OWN_PICTURE] if OWN_PICTURE in found else [])]
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         numbers = ", ".join(str(k + 1) for k in left_out)
-        notes.append(f"Left out: photograph{'s' * (len(left_out) > 1)} {numbers}.")
+        notes.append(f"Left out: image{'s' * (len(left_out) > 1)} {numbers}.")
         return Judgement(_metrics(scene, {n: _mean(found.get(n)) for n in names}), (), pictures, notes)
 
 
 def _left_out(views: Sequence[int]) -> list[int]:
-    """Some of the views, evenly, without the first and the last where there are others."""
+    """Return evenly spaced views, without the first and the last if possible."""
     places = np.linspace(0, len(views) - 1, LEFT_OUT + 2)[1:-1]
     return sorted({views[round(float(place))] for place in places})
 
@@ -145,7 +145,7 @@ def _read_surface(path: Path) -> TexturedMesh:
 
 
 def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list[PinholeView]:
-    """The photographs with one exposure, by the gains that our texture finds."""
+    """The images with one exposure, by the gains that our texture finds."""
     gains = BlendedTexture().prepare(surface, views).gains
     return [
         replace(view, rgb=np.clip(np.rint(view.rgb * gain), 0, 255).astype(np.uint8))
@@ -154,7 +154,7 @@ def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list
 
 
 def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: Camera) -> None:
-    """Open3D's own picture, where the machine has graphics that it can use."""
+    """Open3D's own image, where the machine has graphics that it can use."""
     try:
         _save(path, render_open3d(mesh, camera))
     except RuntimeError as error:
@@ -162,7 +162,7 @@ def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: Camera) -> None:
 
 
 def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[str, Likeness], B8]:
-    """Pictures of one camera beside its photograph, and the pixels (H, W) compared: those that all of them
+    """Images of one camera beside its image, and the pixels (H, W) compared: those that all of them
     cover whole."""
     whole = {name: covered_pixels(picture) & view.seen for name, picture in drawn.items()}
     compared = np.logical_and.reduce([view.seen, *whole.values()])
@@ -174,7 +174,7 @@ def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[
 
 
 def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView]:
-    """The saved pictures of a camera, without their depths."""
+    """The saved images of a camera, without their depths."""
     drawn = {}
     for name, outcome in outcomes.items():
         place = Path(outcome.place)
@@ -210,9 +210,9 @@ def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
         values = {n: None if one is None else float(getattr(one, what)) for n, one in found.items()}
         return Metric(scene, name, unit, values, OURS, at_most=False, definition=words)
 
-    peak = row("PSNR", "dB", "psnr_db", "made equally bright first; mean over the photographs left out")
-    like = row("SSIM", "", "ssim", "made equally bright first; mean over the photographs left out")
-    as_is = "exposures as they are; mean over the photographs left out"
+    peak = row("PSNR", "dB", "psnr_db", "exposures equalised first; mean over the left-out images")
+    like = row("SSIM", "", "ssim", "exposures equalised first; mean over the left-out images")
+    as_is = "original exposures; mean over the left-out images"
     return [
         peak,
         like,
@@ -225,7 +225,7 @@ def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
 
 
 def _over(scene: str, metric: Metric, unit: str) -> Metric:
-    """Ours above the best of Open3D's."""
+    """Return ours minus the best of Open3D's."""
     theirs = [v for n, v in metric.values.items() if n.startswith("Open3D") and v is not None]
     ours = metric.values.get(OURS)
     over = ours - max(theirs) if ours is not None and theirs else None
@@ -235,7 +235,7 @@ def _over(scene: str, metric: Metric, unit: str) -> Metric:
 
 
 def _beside(photograph: U8, shown: Mapping[str, U8], compared: B8) -> U8:
-    """Photograph and pictures in a row, differences of those made equally bright below."""
+    """Image and images in a row, differences of those made equally bright below."""
     empty = np.zeros_like(photograph)
     above, below = [photograph], [empty]
     for color in shown.values():
