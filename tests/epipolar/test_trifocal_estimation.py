@@ -167,7 +167,7 @@ def test_the_covariance_reflects_points_near_a_plane():
         points = np.stack([project(camera, X) for camera in P])
         fit = estimate_trifocal(points + rng.normal(0.0, 0.2, points.shape))
         spreads.append(np.sqrt(np.trace(fit.covariance)))
-        weaknesses.append(fit.weakness)
+        weaknesses.append(fit.relative_std)
     assert spreads[1] > 10.0 * spreads[0]
     assert weaknesses[0] < 0.01 < weaknesses[1] < 0.4
 

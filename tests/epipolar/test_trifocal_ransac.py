@@ -312,7 +312,7 @@ def test_any_input_gives_numbers_or_a_named_failure(seed, kind, n, m):
             continue
         for array in (fit.T, fit.P, fit.X, fit.lines, fit.covariance, fit.point_residuals_px):
             assert np.isfinite(array).all()
-        assert np.isfinite([fit.sigma_px, fit.weakness]).all()
+        assert np.isfinite([fit.sigma_px, fit.relative_std]).all()
 
 
 @pytest.mark.parametrize("kind", ["plane", "rotation", "parallel"])

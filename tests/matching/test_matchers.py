@@ -13,7 +13,7 @@ from thesisrecon.records import Image
 VARIANTS = [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())]
 SWITCHED = [
     SeedsAndGrowth(orientation="upright"),
-    SeedsAndGrowth(orientation="turned"),
+    SeedsAndGrowth(orientation="rotated"),
     SeedsAndGrowth(support="always"),
     SeedsAndGrowth(support="never"),
     SeedsAndGrowth(growth=False),
@@ -110,7 +110,7 @@ def test_seeds_find_a_photograph_that_was_turned(quarter_turns):
     seeds = [MultiScaleCorners().detect(photograph(g)).seeds for g in (gray, np.rot90(gray, quarter_turns))]
     assert seeds[0] is not None
     assert seeds[1] is not None
-    found = match_seeds(seeds[0], seeds[1], turned=True, ratio=0.8)
+    found = match_seeds(seeds[0], seeds[1], rotated=True, ratio=0.8)
     x, y = found.xy1.T
     w, h = 420, 300
     truth = {1: (y, w - 1 - x), 2: (w - 1 - x, h - 1 - y), 3: (h - 1 - y, x)}[quarter_turns]

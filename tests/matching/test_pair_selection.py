@@ -191,23 +191,23 @@ def test_features_without_seeds_are_refused_with_the_way_out():
 
 def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
     image = photograph(texture(SIDE, SIDE, 5))
-    turned = photograph(np.rot90(texture(SIDE, SIDE, 5)).copy())
+    rotated = photograph(np.rot90(texture(SIDE, SIDE, 5)).copy())
     detector = MultiScaleCorners()
-    one, other = (detector.detect(view).seeds for view in (image, turned))
+    one, other = (detector.detect(view).seeds for view in (image, rotated))
     assert one is not None
     assert other is not None
     strange = [f.seeds for f in windows.features]
     for kind, least in ((True, 20.0), (False, -10.0)):
-        test, sketch = OverlapTest(), subset_seeds(one, turned=kind, per_scale=200)
-        assert test.score(sketch, subset_seeds(other, turned=kind, per_scale=200)) > least
+        test, sketch = OverlapTest(), subset_seeds(one, rotated=kind, per_scale=200)
+        assert test.score(sketch, subset_seeds(other, rotated=kind, per_scale=200)) > least
         assert test.score(sketch, sketch) > 20.0
         # The number of false alarms bounds how often chance reaches an evidence.
-        chance = [test.score(sketch, subset_seeds(s, turned=kind, per_scale=200)) for s in strange if s]
+        chance = [test.score(sketch, subset_seeds(s, rotated=kind, per_scale=200)) for s in strange if s]
         assert max(chance) < 2.0
 
 
 def test_photographs_of_one_wall_use_the_same_words(windows):
-    sketches = [subset_seeds(f.seeds, turned=False, per_scale=200) for f in windows.features if f.seeds]
+    sketches = [subset_seeds(f.seeds, rotated=False, per_scale=200) for f in windows.features if f.seeds]
     alike = bow_similarity(
         [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
     )

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from thesisrecon.stereo.plane_kernels import HELD, HIDDEN, SAME_PLANE, TEXTURE, UNKNOWN
+from thesisrecon.stereo.plane_kernels import MIN_WINDOW_COVERAGE, MAX_EXCESS_COST, SAME_PLANE, TEXTURE, UNKNOWN
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED
 
 
@@ -51,7 +51,7 @@ class Setting:
             other = (a + fx * (b - a)) * (1.0 - fy) + (c + fx * (d - c)) * fy
             inside = (place >= 0.0).all(axis=1) & (place < np.array(four.shape[1::-1]) - 1).all(axis=1)
             held = np.where(inside & (a > 0.0), weight, 0.0)
-            if held.sum() >= HELD * weight.sum():
+            if held.sum() >= MIN_WINDOW_COVERAGE * weight.sum():
                 share = held / held.sum()
                 one, two = level - share @ level, other - share @ other
                 spread = (share @ one**2 + TEXTURE) * (share @ two**2 + TEXTURE)
@@ -62,7 +62,7 @@ class Setting:
         """That of the two best neighbours, the second at most ``HIDDEN`` above the first."""
         found = np.sort(self.costs(u, v, plane)) if plane[0] > 0.0 else np.full(1, np.nan)
         found = np.append(found[np.isfinite(found)], [UNKNOWN, UNKNOWN])
-        return found[0] + 0.5 * min(found[1] - found[0], HIDDEN) if found[0] < UNKNOWN else UNKNOWN
+        return found[0] + 0.5 * min(found[1] - found[0], MAX_EXCESS_COST) if found[0] < UNKNOWN else UNKNOWN
 
     def motions(self, u, v, rho):
         """Pixels (K,) that places move per unit of inverse depth."""

@@ -24,8 +24,8 @@ from thesisrecon.views.interpolation_kernels import (
     blending_weights,
     disparity_from_rectified,
     fill_empty_rows,
-    filter_guesses_by_colour,
-    filter_guesses_by_median,
+    filter_extrapolated_by_colour,
+    filter_extrapolated_by_median,
     intermediate_positions,
     mark_crossings,
 )
@@ -368,8 +368,8 @@ def test_guesses_become_medians_of_pixels_of_their_colour():
     levels = np.where(np.arange(31) < 18, 60.0, 200.0)[None, :, None] + rng.uniform(0, 40, (*shape, 3))
     levels = levels.astype(np.float32)
     out = np.empty_like(d)
-    filter_guesses_by_colour(levels, d, sure, (0, 9), (30.0, 0.5), out)
-    filter_guesses_by_colour(levels, d, sure, (9, 20), (30.0, 0.5), out)
+    filter_extrapolated_by_colour(levels, d, sure, (0, 9), (30.0, 0.5), out)
+    filter_extrapolated_by_colour(levels, d, sure, (9, 20), (30.0, 0.5), out)
     for y, x in np.ndindex(shape):
         if sure[y, x] > 0.0 or np.isnan(d[y, x]):
             np.testing.assert_array_equal(out[y, x], d[y, x])
@@ -400,7 +400,7 @@ def test_a_guess_alone_goes_with_those_around():
     sure = rng.choice([0.0, 0.0, 1.0], d.shape).astype(np.float32)
     out = np.empty_like(d)
     for rows in ((0, 5), (5, 14)):
-        filter_guesses_by_median(d, sure, rows, out)
+        filter_extrapolated_by_median(d, sure, rows, out)
     for y, x in np.ndindex(d.shape):
         around = d[max(y - NEAR, 0) : y + NEAR + 1, max(x - NEAR, 0) : x + NEAR + 1].ravel()
         around = np.sort(around[np.isfinite(around)])

@@ -8,7 +8,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.views.trilinear import seed_of_first, seed_of_two
-from thesisrecon.views.trilinear_synthesis import complete_correspondence, guess_rows, prepare_synthesis
+from thesisrecon.views.trilinear_synthesis import complete_correspondence, extrapolate_inverse_depth, prepare_synthesis
 from thesisrecon.views.virtual_camera import CalibratedPair, VirtualCamera, camera_at, cameras_along
 from thesisrecon.views.warping import DIRECTIONS, distances_to_known
 
@@ -226,7 +226,7 @@ def test_the_kernel_is_its_plain_twin():
     distance = np.empty((len(DIRECTIONS), *own.shape), dtype=np.int16)
     distances_to_known(own, DIRECTIONS, distance)
     found = np.empty_like(own)
-    guess_rows((own, other), P2, DIRECTIONS, distance, 0.05, found)
+    extrapolate_inverse_depth((own, other), P2, DIRECTIONS, distance, 0.05, found)
     for y, x in np.ndindex(own.shape):
         candidates = []
         for (dy, dx), n in zip(DIRECTIONS, distance[:, y, x], strict=True):

@@ -256,12 +256,12 @@ def classify_configuration(
     sigma = _scale(f, points[inliers])
     agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
     chance = chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
-    case = _Case(f, points, agree, multiplicity_weights(xy1, xy2), sigma, chance)
+    case = _InlierData(f, points, agree, multiplicity_weights(xy1, xy2), sigma, chance)
     return _classify(case, frame.scale, seed)
 
 
 @dataclass(frozen=True)
-class _Case:
+class _InlierData:
     """Matches (N, 4), F and noise in one frame, inliers, weights, and the probability to agree by chance."""
 
     f: F64
@@ -284,7 +284,7 @@ def _scale(f: F64, points: F64) -> float:
     return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
 
 
-def _classify(case: _Case, scale: float, seed: int) -> ConfigurationReport:
+def _classify(case: _InlierData, scale: float, seed: int) -> ConfigurationReport:
     sigma = case.sigma
     errors, off, chance, rotation_errors, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
     plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
@@ -328,7 +328,7 @@ def _plane_noise(squared: F64) -> float:
     return float(np.sqrt(max(variance, 1e-24)))
 
 
-def _excess_errors(case: _Case, near: B8, rss_plane: float) -> float:
+def _excess_errors(case: _InlierData, near: B8, rss_plane: float) -> float:
     """Standard errors by which the squared parallax of the matches near the plane exceeds the noise.
 
     A homography has 8 parameters for 2 K residuals and F takes 7 of the K across the epipolar lines: K - 1
@@ -374,7 +374,7 @@ def _rotation_limit(n: int) -> float:
     return float(scipy.special.stdtrit(n - 7, 1.0 - ROTATION_RISK))
 
 
-def _translation_ratio(case: _Case) -> float:
+def _translation_ratio(case: _InlierData) -> float:
     """(RSS of [e]x - RSS of F) relative to its limit, an F-test with 5 and n - 7 degrees of freedom."""
     inliers = case.points[case.agree]
     f = _fit_translation(inliers, case.sigma)

@@ -137,10 +137,10 @@ def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
     ndarray (N,)
         Weights in (0, 1].
     """
-    return 1.0 / np.maximum(_crowd(xy1), _crowd(xy2))
+    return 1.0 / np.maximum(_matches_per_cell(xy1), _matches_per_cell(xy2))
 
 
-def _crowd(xy: F64) -> F64:
+def _matches_per_cell(xy: F64) -> F64:
     cell = np.floor(xy / SAME_PX).astype(np.int64)
     _, place, count = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True, return_counts=True)
     return np.asarray(count[place], dtype=np.float64)
@@ -303,7 +303,7 @@ def _competing_model(
 
 
 @dataclass(frozen=True)
-class _Support:
+class _OffPlaneWeights:
     """Weights of matches off the plane: inliers of F, all, and contradicted inliers."""
 
     agreeing: float
@@ -395,7 +395,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     )
 
 
-def _least_gain(support: _Support, chance: float) -> float:
+def _least_gain(support: _OffPlaneWeights, chance: float) -> float:
     """Weight of matches that a competing model must gain: more than wrong matches agree by chance."""
     expected = 2.0 * chance * (support.tried - support.agreeing)
     return float(max(LEAST_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
@@ -412,7 +412,7 @@ def _differs(competing_model: _CompetingModel, relevant: float) -> bool:
     )
 
 
-def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near: float) -> _Support:
+def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near: float) -> _OffPlaneWeights:
     own = inliers & plane.off
     chosen = np.flatnonzero(own[inliers])
     chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
@@ -420,7 +420,7 @@ def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near:
     some = weights[inliers][chosen]
     agreeing = float(weights[own].sum())
     part = float(some[ratios > CONTRADICTED].sum() / max(some.sum(), 1e-300))
-    return _Support(agreeing, float(weights[plane.off].sum()), part * agreeing)
+    return _OffPlaneWeights(agreeing, float(weights[plane.off].sum()), part * agreeing)
 
 
 def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
@@ -432,7 +432,7 @@ def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
 
 
 def _reasons(
-    support: _Support,
+    support: _OffPlaneWeights,
     chance: float,
     competing_model: _CompetingModel | None,
     error_px: float,

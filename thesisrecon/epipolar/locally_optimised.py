@@ -78,8 +78,8 @@ class LocallyOptimisedRansac:
     max_starts : int
         Maximum number of searches.
     min_samples : int
-        Samples of six searches whatever the inlier ratio, since a wrong F of a dominant plane has many
-        inliers.
+        Minimum total of samples over six searches, for any inlier ratio: a wrong F of a dominant plane has
+        many inliers.
     max_samples : int
         Maximum number of samples of all searches.
     gates : tuple of float

@@ -169,7 +169,7 @@ class SevenPointProblem:
 
 @dataclass(frozen=True)
 class ThesisRansac:
-    """RANSAC as in section 5.4 of the thesis, with its slips corrected.
+    """RANSAC as in section 5.4 of the thesis, with its errors corrected.
 
     Draw samples of seven, keep the F with the most inliers, estimate sigma from the median distance, discard
     outliers, then refine and discard again ``rounds`` times. sigma = 1.4826 (1 + 5 / (n - 7)) median |d|; the

@@ -16,7 +16,7 @@ from thesisrecon.numerics.ransac import draw_sample, required_samples
 
 SUBSET = 300
 STRIDE = 16
-DOUBT = np.log(1e3)
+LOG_REJECTION_RATIO = np.log(1e3)
 """The sequential test calls at most one right matrix in a thousand wrong."""
 LARGEST = 1 << 40
 
@@ -121,7 +121,7 @@ def truncated_score(
         total += part
         inliers += inside
         doubt = inliers * evidence[0] + (end - inliers) * evidence[1]
-        if total > min(give_up * n, give_up * end + spread * np.sqrt(end)) or doubt > DOUBT:
+        if total > min(give_up * n, give_up * end + spread * np.sqrt(end)) or doubt > LOG_REJECTION_RATIO:
             return 1.0, int(inliers), end
     return total / n, int(inliers), n
 

@@ -285,7 +285,7 @@ class TrifocalFit:
     line_residuals_px: F64
     sigma_px: float
     covariance: F64
-    weakness: float
+    relative_std: float
     iterations: int
 
 
@@ -404,11 +404,11 @@ def require_determined(fit: TrifocalFit, equations: TensorEquations, xy: F64, *,
     family = int(np.sum(equations.noise_levels_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
-    if not (family < FAMILY and fit.weakness <= weak and narrowest > 3.0 * fit.sigma_px):
+    if not (family < FAMILY and fit.relative_std <= weak and narrowest > 3.0 * fit.sigma_px):
         raise StageFailure(
             "the matches do not determine the trifocal tensor",
             f"noise {fit.sigma_px:.2g} px explains {family} independent tensors (at most {FAMILY - 1}); "
-            f"narrowest spread of the matches {narrowest:.3g} px; weakness {fit.weakness:.2g} (at most "
+            f"narrowest spread of the matches {narrowest:.3g} px; weakness {fit.relative_std:.2g} (at most "
             f"{weak:.2g})",
             "use matches off one plane from three different positions, and check for wrong matches",
         )

@@ -134,12 +134,12 @@ class TrifocalRansac:
             )
         frame = _Frame.of(points)
         cameras, samples = self._search(frame, points, rng)
-        fit, inliers = self._settle(frame, cameras, points)
+        fit, inliers = self._iterate_inliers(frame, cameras, points)
         line_inliers = np.zeros(segments.shape[1], dtype=bool)
         if segments.shape[1]:
             fit, inliers, line_inliers = self._with_lines(frame, fit, points, segments)
         p, s = points[:, inliers], segments[:, line_inliers]
-        self._refuse_a_plane(p, fit.sigma_px)
+        self._require_off_plane_tracks(p, fit.sigma_px)
         xy = np.concatenate([p, s.reshape(3, -1, 2)], axis=1)
         require_determined(fit, tensor_equations(p, s), xy, weak=WEAK)
         return RobustTrifocal(fit, inliers, line_inliers, samples)
@@ -209,7 +209,7 @@ class TrifocalRansac:
         squared = (_distances(P, track) / threshold) ** 2
         return float(sum(np.sum(np.maximum(0.0, 1.0 - squared * w)) for w in WIDTHS) / len(WIDTHS))
 
-    def _settle(self, frame: _Frame, P: F64, points: F64) -> tuple[TrifocalFit, B8]:
+    def _iterate_inliers(self, frame: _Frame, P: F64, points: F64) -> tuple[TrifocalFit, B8]:
         """Fit the tracks within the estimated noise until they stay the same."""
         track = frame.tracks(points)
         T, inliers = frame.tensor_in_pixels(P), np.zeros(len(track), dtype=bool)
@@ -243,7 +243,7 @@ class TrifocalRansac:
             raise self._no_consensus(len(track), found)
         return right, sigma
 
-    def _refuse_a_plane(self, points: F64, sigma_px: float) -> None:
+    def _require_off_plane_tracks(self, points: F64, sigma_px: float) -> None:
         """Raise ``StageFailure`` if fewer than 4 tracks are off a plane: any two would determine the rest."""
         off = np.zeros(points.shape[1], dtype=bool)
         for _ in range(PLANE_ROUNDS):

@@ -1,4 +1,4 @@
-"""Section 6.4: a camera from space points and their images.
+"""Section 6.4: camera resection, linear (DLT) and from three points (P3P).
 
 Linear (DLT) in any projective frame, and from three points for a calibrated camera (Grunert's quartic in the
 form of Haralick et al., IJCV 13(3), 1994).

@@ -1,4 +1,4 @@
-"""Section 3.6: two views: F, epipoles and epipolar lines, residuals, homographies, canonical cameras.
+"""Section 3.6: two views: F, epipoles and epipolar lines, Sampson distances, homographies, canonical cameras.
 
 x2' F x1 = 0; the epipolar line in image 2 is F x1, in image 1 F' x2; F e1 = 0, F' e2 = 0.
 """

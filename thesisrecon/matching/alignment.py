@@ -134,12 +134,12 @@ def _read_template(
                 gradient[5, at] = gradient[1, at] * row / HALF
                 at += 1
     for g in range(len(gradient)):
-        _clear(gradient[g], template, norm)
+        _project_out_gain_and_bias(gradient[g], template, norm)
     return True
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _clear(gradient: F32, template: F32, norm: float) -> None:
+def _project_out_gain_and_bias(gradient: F32, template: F32, norm: float) -> None:
     """Scale a gradient like the template and remove its components along a constant and the template."""
     total = np.float32(0.0)
     for n in range(len(gradient)):

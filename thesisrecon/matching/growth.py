@@ -283,7 +283,7 @@ class SeedsAndGrowth:
         Number of matches that define a local affine map.
     affine_std : float
         Prior standard deviation of an affine coefficient in the alignment.
-    orientation : {"auto", "upright", "turned"}
+    orientation : {"auto", "upright", "rotated"}
         Seeds by upright patches, by patches rotated to their gradient, or the latter too if the upright ones
         do not relate the pair well.
     support : {"auto", "always", "never"}
@@ -309,7 +309,7 @@ class SeedsAndGrowth:
     grown_ratio: float = 0.8
     neighbours: int = 10
     affine_std: float = 0.02
-    orientation: Literal["auto", "upright", "turned"] = "auto"
+    orientation: Literal["auto", "upright", "rotated"] = "auto"
     support: Literal["auto", "always", "never"] = "auto"
     growth: bool = True
     coarse_first: bool = True
@@ -409,8 +409,8 @@ class SeedsAndGrowth:
         assert seeds1 is not None
         assert seeds2 is not None
         best: tuple[SeedMatches, F64] | None = None
-        for turned in {"auto": (False, True), "upright": (False,), "turned": (True,)}[self.orientation]:
-            seeds = match_seeds(seeds1, seeds2, turned=turned, ratio=self.ratio)
+        for rotated in {"auto": (False, True), "upright": (False,), "rotated": (True,)}[self.orientation]:
+            seeds = match_seeds(seeds1, seeds2, rotated=rotated, ratio=self.ratio)
             for trial in self._trials(seeds):
                 try:
                     fit = estimate(trial.xy1, trial.xy2, rng)

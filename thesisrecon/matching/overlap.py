@@ -108,14 +108,14 @@ class FeatureSubset:
     size: F64
 
 
-def subset_seeds(seeds: Seeds, *, turned: bool, per_scale: int) -> FeatureSubset:
+def subset_seeds(seeds: Seeds, *, rotated: bool, per_scale: int) -> FeatureSubset:
     """Select the strongest seeds of each scale.
 
     Parameters
     ----------
     seeds : Seeds
         Seeds of one image.
-    turned : bool
+    rotated : bool
         Use the patches rotated to their dominant gradient, else the upright ones.
     per_scale : int
         Number of seeds per scale.
@@ -125,7 +125,7 @@ def subset_seeds(seeds: Seeds, *, turned: bool, per_scale: int) -> FeatureSubset
     FeatureSubset
         The selected seeds.
     """
-    use = np.flatnonzero((seeds.angle != 0.0) == turned)
+    use = np.flatnonzero((seeds.angle != 0.0) == rotated)
     parts = [use[seeds.scale[use] == scale][:per_scale] for scale in np.unique(seeds.scale[use])]
     kept = np.concatenate([np.empty(0, np.int64), *parts])
     extent = np.ptp(seeds.xy, axis=0) + 1.0 if len(seeds.xy) else np.ones(2)

@@ -124,12 +124,12 @@ class ListedPairs:
             If a name is unknown or no pair remains.
         """
         known = {*names, *left_out}
-        strange = sorted({name for pair in self.listed for name in pair} - known)
-        if strange:
-            more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
+        unknown = sorted({name for pair in self.listed for name in pair} - known)
+        if unknown:
+            more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
             some = ", ".join(repr(name) for name in sorted(known)[:3])
             raise UsageError(
-                f"the pair list names {strange[0]!r}{more}, which is not among the {len(known)} images "
+                f"the pair list names {unknown[0]!r}{more}, which is not among the {len(known)} images "
                 f"({some}{', ...' if len(known) > 3 else ''})"
             )
         if not any(set(pair) <= set(names) for pair in self.listed):
@@ -272,10 +272,11 @@ class OverlapEstimate:
                 f"the overlap of more than {self.all_up_to} images is estimated from seeds, which these "
                 "features do not have; set features.kind=multi-scale-corners, or pairs.kind=all-pairs"
             )
-        upright, turned = (
-            subset_seeds(features.seeds, turned=turned, per_scale=self.per_scale) for turned in (False, True)
+        upright, rotated = (
+            subset_seeds(features.seeds, rotated=rotated, per_scale=self.per_scale)
+            for rotated in (False, True)
         )
-        return upright, turned
+        return upright, rotated
 
     def _evidence(
         self, a: tuple[FeatureSubset, FeatureSubset], b: tuple[FeatureSubset, FeatureSubset]

@@ -125,7 +125,7 @@ class SeedMatches:
         return SeedMatches(self.xy1[chosen], self.xy2[chosen], self.affine[chosen], self.score[chosen])
 
 
-def match_seeds(seeds1: Seeds, seeds2: Seeds, *, turned: bool, ratio: float) -> SeedMatches:
+def match_seeds(seeds1: Seeds, seeds2: Seeds, *, rotated: bool, ratio: float) -> SeedMatches:
     """Match seeds that are mutually nearest and pass the ratio test.
 
     The distance of unit patches is sqrt(2 - 2 correlation). Other seeds count as elsewhere beyond a quarter
@@ -135,7 +135,7 @@ def match_seeds(seeds1: Seeds, seeds2: Seeds, *, turned: bool, ratio: float) -> 
     ----------
     seeds1, seeds2 : Seeds
         Seeds of both images.
-    turned : bool
+    rotated : bool
         Use the patches rotated to their dominant gradient, else the upright ones.
     ratio : float
         Maximum ratio of the distances to the best and to the second best seed.
@@ -145,7 +145,7 @@ def match_seeds(seeds1: Seeds, seeds2: Seeds, *, turned: bool, ratio: float) -> 
     SeedMatches
         The matches.
     """
-    use1, use2 = (np.flatnonzero((s.angle != 0.0) == turned) for s in (seeds1, seeds2))
+    use1, use2 = (np.flatnonzero((s.angle != 0.0) == rotated) for s in (seeds1, seeds2))
     if not (len(use1) and len(use2)):
         none = np.empty((0, 2))
         return SeedMatches(none, none, np.empty((0, 2, 2)), np.empty(0, np.float32))

@@ -297,7 +297,7 @@ def _own_focal_sigmas(views: PerViewChecks) -> F64:
 
 
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> list[str]:
-    """A sentence for the views that fail a check; each view is reported once, for the gravest failure."""
+    """A sentence for the views that fail a check; each view is reported once, for its most severe failure."""
     ratio, own = _noise_ratio(views), _own_focal_sigmas(views)
     left = model.registered.copy()
 

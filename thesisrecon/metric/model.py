@@ -164,8 +164,8 @@ def retriangulate_tracks(model: MetricEstimate, *, sigmas: float, min_angle: flo
     loss = model.sigma_px / scale
     X = _triangulate(poses, normalized, view, point, t.n_points, loss)
     model = select_inliers(replace(model, X=X), sigmas=sigmas, min_angle=min_angle)
-    spoiled = np.bincount(point[~model.inlier[near]], minlength=t.n_points) > 0
-    again = model.inlier[near] & spoiled[point]
+    has_outlier = np.bincount(point[~model.inlier[near]], minlength=t.n_points) > 0
+    again = model.inlier[near] & has_outlier[point]
     if again.any():
         Y = _triangulate(poses, normalized[again], view[again], point[again], t.n_points, loss)
         better = np.bincount(point[again], minlength=t.n_points) >= 2

@@ -181,7 +181,7 @@ class MetricRefinement:
         self, model: MetricEstimate, adjustment: BundleAdjustment
     ) -> tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]:
         """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
-        model = self._settle(model, adjustment)
+        model = self._iterate_inliers(model, adjustment)
         scatter = adjustment.scatter(model)
         own = per_camera_estimates(model, adjustment, scatter, self.model_floor_rel)
         assert model.cameras.shared is not None
@@ -192,10 +192,10 @@ class MetricRefinement:
         model, adjustment = apply_hierarchical_prior(
             model, replace(adjustment, inflation=inflation), hierarchical
         )
-        model = self._settle(model, adjustment)
+        model = self._iterate_inliers(model, adjustment)
         return model, adjustment, own, adjustment.scatter(model)
 
-    def _settle(self, model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:
+    def _iterate_inliers(self, model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:
         """Adjust and triangulate until the inliers stay the same, then adjust to convergence."""
         late, angle = self.outlier_sigmas[1], np.radians(self.min_angle_deg)
         for _ in range(self.rounds):

@@ -120,14 +120,14 @@ class SharedCameraTest:
 
 
 @dataclass(frozen=True)
-class _Set:
+class _SharedGroup:
     """Registered views (``places`` in their list) that share a value, or whose value is ``known``."""
 
     places: I64
     known: bool = False
 
     @property
-    def freedoms(self) -> int:
+    def degrees_of_freedom(self) -> int:
         return len(self.places) - (0 if self.known else 1)
 
 
@@ -173,29 +173,31 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
     return SharedCameraTest(tuple(failed_checks), tuple(warnings), focal_std)
 
 
-def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, column: int) -> list[_Set]:
+def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, column: int) -> list[_SharedGroup]:
     """Views that share a column; those whose principal point is known."""
     assert model.cameras.shared is not None
     rows = model.cameras.group[views]
     known = adjustment.row_prior(model).std[rows, column] == 0.0
     number = model.cameras.shared[rows, column]
-    sets = [_Set(np.flatnonzero((number == k) & ~known)) for k in np.unique(number)]
+    sets = [_SharedGroup(np.flatnonzero((number == k) & ~known)) for k in np.unique(number)]
     if column != FOCAL:
-        sets.append(_Set(np.flatnonzero(known), known=True))
+        sets.append(_SharedGroup(np.flatnonzero(known), known=True))
     return [s for s in sets if len(s.places) >= 3]
 
 
 def _contradicted(
-    before: MetricBundleResult, after: MetricBundleResult, sets: list[_Set], values: int
-) -> list[_Set]:
+    before: MetricBundleResult, after: MetricBundleResult, sets: list[_SharedGroup], values: int
+) -> list[_SharedGroup]:
     """All sets if own values reduce the cost by more than chance, else none."""
     saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
     return (
-        sets if saved > scipy.special.chdtri(values * sum(s.freedoms for s in sets), FALSE_ALARM_RATE) else []
+        sets
+        if saved > scipy.special.chdtri(values * sum(s.degrees_of_freedom for s in sets), FALSE_ALARM_RATE)
+        else []
     )
 
 
-def _focal_std(alone: MetricBundleResult, s: _Set) -> F64:
+def _focal_std(alone: MetricBundleResult, s: _SharedGroup) -> F64:
     """Inflated relative standard deviations of own focals; inf where undetermined."""
     variance = alone.intrinsics_covariance[s.places, FOCAL, FOCAL]
     focal = alone.cameras.intrinsics[s.places, FOCAL]
@@ -203,12 +205,12 @@ def _focal_std(alone: MetricBundleResult, s: _Set) -> F64:
     return np.where(np.isfinite(std) & (variance > 0.0), std, np.inf)
 
 
-def _focals_apart(alone: MetricBundleResult, s: _Set) -> bool:
+def _focals_apart(alone: MetricBundleResult, s: _SharedGroup) -> bool:
     log = np.log(alone.cameras.intrinsics[s.places, FOCAL])
     return bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE)
 
 
-def _std_of_a_kind(model: MetricEstimate, fit: _PerViewFit, s: _Set) -> float:
+def _std_of_a_kind(model: MetricEstimate, fit: _PerViewFit, s: _SharedGroup) -> float:
     """Relative standard deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
     # Standard deviations are inflated afterwards, the assumed scatter must not be.
     scattered = fit.adjusted((FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
@@ -218,7 +220,7 @@ def _std_of_a_kind(model: MetricEstimate, fit: _PerViewFit, s: _Set) -> float:
 
 
 def _centres_off(
-    model: MetricEstimate, adjustment: BundleAdjustment, views: I64, both: MetricBundleResult, s: _Set
+    model: MetricEstimate, adjustment: BundleAdjustment, views: I64, both: MetricBundleResult, s: _SharedGroup
 ) -> F64:
     """(n, 2) offsets, in long sides, of own principal points from the known one or the median."""
     rows = model.cameras.group[views[s.places]]
@@ -227,7 +229,7 @@ def _centres_off(
     return np.asarray(off if s.known else off - np.median(off, axis=0))
 
 
-def _focals_differ(views: I64, alone: MetricBundleResult, s: _Set) -> str:
+def _focals_differ(views: I64, alone: MetricBundleResult, s: _SharedGroup) -> str:
     focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s)
     low, high = int(focal.argmin()), int(focal.argmax())
     return (
@@ -238,7 +240,7 @@ def _focals_differ(views: I64, alone: MetricBundleResult, s: _Set) -> str:
     )
 
 
-def _centres_differ(s: _Set, off: F64) -> str:
+def _centres_differ(s: _SharedGroup, off: F64) -> str:
     if s.known:
         return (
             "The images contradict the given principal point: those of "

@@ -176,10 +176,10 @@ def retriangulate_points(model: ProjectiveModel, sigmas: float, *, points: B8 | 
         near = near & points[t.point_index]
     _triangulate(model, near)
     update_inliers(model, sigmas)
-    spoiled = np.bincount(t.point_index[near & ~model.inlier], minlength=t.n_points) > 0
-    spoiled &= np.bincount(t.point_index[near], minlength=t.n_points) >= 3
-    if spoiled.any():
-        again = near & spoiled[t.point_index]
+    has_outlier = np.bincount(t.point_index[near & ~model.inlier], minlength=t.n_points) > 0
+    has_outlier &= np.bincount(t.point_index[near], minlength=t.n_points) >= 3
+    if has_outlier.any():
+        again = near & has_outlier[t.point_index]
         _triangulate(model, again & consistent_observations(model, again, sigmas * model.sigma_px))
         update_inliers(model, sigmas)
 

@@ -106,13 +106,15 @@ def upright_rotation(rotations: F64) -> F64:
     x_axes, y_axes, z_axes = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     _, vectors = np.linalg.eigh(x_axes.T @ x_axes + 0.1 * z_axes.T @ z_axes)
     up = vectors[:, 0] if vectors[:, 0] @ y_axes.sum(axis=0) <= 0 else -vectors[:, 0]
-    gaze = z_axes.sum(axis=0)
-    gaze = gaze - (gaze @ up) * up
-    if np.linalg.norm(gaze) < 0.1 * len(z_axes):  # cameras all around the object: use the first one
-        gaze = z_axes[0] - (z_axes[0] @ up) * up
-    if np.linalg.norm(gaze) < 1e-6:  # it looks straight down: use its upward image direction
-        gaze = -y_axes[0] + (y_axes[0] @ up) * up
-    ahead = gaze / np.linalg.norm(gaze)
+    viewing_direction = z_axes.sum(axis=0)
+    viewing_direction = viewing_direction - (viewing_direction @ up) * up
+    if np.linalg.norm(viewing_direction) < 0.1 * len(
+        z_axes
+    ):  # cameras all around the object: use the first one
+        viewing_direction = z_axes[0] - (z_axes[0] @ up) * up
+    if np.linalg.norm(viewing_direction) < 1e-6:  # it looks straight down: use its upward image direction
+        viewing_direction = -y_axes[0] + (y_axes[0] @ up) * up
+    ahead = viewing_direction / np.linalg.norm(viewing_direction)
     return np.stack([np.cross(ahead, up), ahead, up])
 
 

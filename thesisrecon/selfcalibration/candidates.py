@@ -306,7 +306,7 @@ def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction,
         focal = frame.prior.mean[given, 0]
         values = f"{focal.min():.0f}" if np.ptp(focal) < 0.5 else f"{focal.min():.0f} to {focal.max():.0f}"
         return StageFailure(
-            "self-calibration failed near the focal length that was given",
+            "self-calibration found no solution near the given focal length",
             f"{values} px (+- {frame.prior.std[given, 0].max():.1%}) at working size was given; {evidence}",
             "the images contradict it: omit it, or set a larger focal_std_rel",
         )

@@ -483,8 +483,8 @@ class FocalsFromFundamental:
         start, spread = posterior.log_f[frame.group], posterior.std[frame.group]
         log_f, std = _refine_focals(pairs, unknown, start, principal_std=self.min_principal_point_std)
         # Whitened residuals also vanish at focal lengths near 0: keep the posterior mean there.
-        departed = np.abs(log_f - start) > _MAX_DEPARTURE_SIGMAS * np.maximum(spread, 0.1)
-        return np.where(departed, start, log_f), np.where(departed, np.maximum(spread, self.max_std), std)
+        diverged = np.abs(log_f - start) > _MAX_DEPARTURE_SIGMAS * np.maximum(spread, 0.1)
+        return np.where(diverged, start, log_f), np.where(diverged, np.maximum(spread, self.max_std), std)
 
     def _with_focal_std(self, found: SelfCalibration, frame: ReferenceFrame, std: F64) -> SelfCalibration:
         K_std = focal_only_std(frame, found.K, std)

@@ -492,7 +492,7 @@ def _complete(pencil: EpipolarPencil, xy1: F64, xy2: F64, P: F64 | None) -> Epip
             "the fundamental matrix or the matches are wrong; estimate them again",
         )
     P_z = _quasi_euclidean(pencil, xy1, xy2) if P_z is None else P_z
-    pencil = replace(pencil, flipped=not _farther_is_along(pencil, P_z, seen1, seen2))
+    pencil = replace(pencil, flipped=not _depth_increases_along_half_lines(pencil, P_z, seen1, seen2))
     arc = _common_arc(pencil, xy1)
     regions = (_region(pencil, 0, arc), _region(pencil, 1, arc))
     return EpipolarPair(pencil, xy1, xy2, arc, regions, P)
@@ -542,7 +542,7 @@ def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
     return best
 
 
-def _farther_is_along(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
+def _depth_increases_along_half_lines(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
     """Whether points that recede along their rays of view 1 move along the half-lines of view 2."""
     z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
     X = triangulate_linear(P, z)

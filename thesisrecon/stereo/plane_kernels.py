@@ -11,11 +11,11 @@ from thesisrecon.arrays import F32, F64, I64, U8, U32
 
 UNKNOWN = 4.0
 """Cost of a pixel without a plane; the largest cost of a plane is 2."""
-HIDDEN = 0.5
+MAX_EXCESS_COST = 0.5
 """Upper limit of the second neighbour's excess cost: the pixel may be occluded there."""
 TEXTURE = 4.0
 """Variance of the noise in squared grey levels: windows of less variance are uninformative."""
-HELD = 0.7
+MIN_WINDOW_COVERAGE = 0.7
 """Share of the window's weight that must lie in a neighbour's image."""
 SAME_PLANE = 0.1
 """Planes closer than this, in search steps over the window, are not tried again."""
@@ -247,7 +247,7 @@ def _cost_at_border(
         held += w
         sa, sb = sa + w * a, sb + w * b
         saa, sbb, sab = saa + w * a * a, sbb + w * b * b, sab + w * a * b
-    if held < HELD:
+    if held < MIN_WINDOW_COVERAGE:
         return -1.0
     sa, sb = sa / held, sb / held
     return _cost_of(saa / held - sa * sa, sbb / held - sb * sb, sab / held - sa * sb)
@@ -299,7 +299,7 @@ def _plane_cost(
             elif cost < second:
                 second = cost
     # The cap limits the influence of neighbours in which the pixel is occluded.
-    return least + 0.5 * min(second - least, HIDDEN) if least < UNKNOWN else UNKNOWN
+    return least + 0.5 * min(second - least, MAX_EXCESS_COST) if least < UNKNOWN else UNKNOWN
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

@@ -53,7 +53,7 @@ class PlaneRefinement:
         Grey level difference to the centre at which the weight of a sample is 1/e.
     max_cost : float
         Largest accepted cost.
-    max_doubtful_cost : float
+    max_continuation_cost : float
         Largest cost of pixels that are accepted if they continue a surface.
     converged_cost : float
         Planes up to this cost are not changed.
@@ -69,7 +69,7 @@ class PlaneRefinement:
     spacing: int = 2
     intensity_scale: float = 15.0
     max_cost: float = 0.4
-    max_doubtful_cost: float = 0.6
+    max_continuation_cost: float = 0.6
     converged_cost: float = 0.1
     gate: float = 3.0
     sigma_px: float = 0.4
@@ -134,7 +134,7 @@ class PlaneRefinement:
         self._sweep(setting, planes, cost, sweeps)
         planes[~wanted] = np.nan
         least, support, slope = setting.rate(planes, self.max_cost)
-        seen = self._seen(least, support)
+        seen = self._is_supported(least, support)
         with np.errstate(divide="ignore"):
             std = (self.sigma_px / slope).astype(np.float32)
         unknown = np.float32(np.nan)
@@ -151,15 +151,15 @@ class PlaneRefinement:
             step = self.first_step_px * 0.5**k
             sweep_planes(setting.views, setting.window, step, self.converged_cost, k % 2 == 1, planes, cost)
 
-    def _seen(self, least: F32, support: U8) -> B8:
+    def _is_supported(self, least: F32, support: U8) -> B8:
         """(H, W) planes that two neighbours support, or one clearly."""
         return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.max_cost)))
 
     def _kept(self, found: InverseDepth, setting: _Setting, planes: F32) -> InverseDepth:
         rho = planes[..., 0]
         least, support, slope = setting.rate(planes, self.max_cost)
-        seen = self._seen(least, support)
-        joining, std = self._joining(setting, planes, seen, least)
+        seen = self._is_supported(least, support)
+        joining, std = self._continuing_surfaces(setting, planes, seen, least)
         with np.errstate(divide="ignore", invalid="ignore"):
             std = np.where(joining, std, self.sigma_px / slope).astype(np.float32)
             near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
@@ -176,11 +176,11 @@ class PlaneRefinement:
             value, std, np.where(np.isfinite(value), views, 0).astype(np.uint8), found.conflicts
         )
 
-    def _joining(self, setting: _Setting, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
+    def _continuing_surfaces(self, setting: _Setting, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
         """(H, W) doubtful planes that continue the surface of accepted ones; standard deviations."""
-        doubtful = ~seen & (least <= self.max_doubtful_cost)
+        doubtful = ~seen & (least <= self.max_continuation_cost)
         slope = setting.rate(
-            np.where(doubtful[..., None], planes, np.float32(np.nan)), self.max_doubtful_cost
+            np.where(doubtful[..., None], planes, np.float32(np.nan)), self.max_continuation_cost
         )[2]
         with np.errstate(divide="ignore"):
             std = (self.sigma_px / slope).astype(np.float32)

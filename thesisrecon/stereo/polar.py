@@ -203,7 +203,7 @@ class PolarRectifier:
         chords = [_chord(pencil, side, phi) for side in (0, 1)]
         angles = _rows_of(pencil, phi, chords, self.limits.max_shrink)[::sign]
         bare = PolarRectification(pencil, angles, np.ones(2), np.zeros(2), np.zeros(2), (1, len(angles)))
-        alike = self._made_alike(bare, pair)
+        alike = self._align_disparities(bare, pair)
         ends = []
         for side, (lines, enter, leave) in enumerate(chords):
             met = leave >= enter
@@ -214,7 +214,7 @@ class PolarRectifier:
         extent = np.array([(high - low)[:, 0].max() + 1.0, len(angles)])
         return replace(alike, origins=low[:, 0].copy(), size=self.limits.require(extent, pair))
 
-    def _made_alike(self, bare: PolarRectification, pair: EpipolarPair) -> PolarRectification:
+    def _align_disparities(self, bare: PolarRectification, pair: EpipolarPair) -> PolarRectification:
         left, right = _matches_in(bare, pair)
         if len(left) < MIN_MATCHES:
             return bare

@@ -1,4 +1,4 @@
-"""Fusion of depth maps to one surface (thesis, section 2.6): volumetric, or as a union of sheets.
+"""Fusion of depth maps to one surface (thesis, section 2.6): TSDF, or as a union of sheets.
 
 :class:`VolumetricFusion` averages signed distances in a sparse voxel grid (Curless and Levoy 1996), measured
 across the surface instead of along the rays, and extracts the zero level as a surface net (Gibson 1998): one
@@ -134,10 +134,10 @@ class VolumetricFusion:
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
             truncation = self.truncation_voxels * voxel
-            sure = [m.sure(truncation) for m in measured]
-            grid = _grid(sure, voxel, truncation)
+            without_uncertain_depths = [m.without_uncertain_depths(truncation) for m in measured]
+            grid = _grid(without_uncertain_depths, voxel, truncation)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
-                return grid, truncation, sure
+                return grid, truncation, without_uncertain_depths
             voxel *= VOXEL_GROWTH
 
 
@@ -149,7 +149,7 @@ class _FusionMap:
     focal: float
     samples: MapSamples
 
-    def sure(self, truncation: float) -> _FusionMap:
+    def without_uncertain_depths(self, truncation: float) -> _FusionMap:
         """Without depths whose standard deviation across the surface exceeds the truncation."""
         with np.errstate(invalid="ignore"):
             certain = self.samples.std * self.samples.cosine <= truncation
@@ -167,7 +167,7 @@ def _measured(depth_map: DepthMap, grazing_deg: float) -> _FusionMap:
     K = decompose_camera(depth_map.P)[0]
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
     slope = max_depth_slope(depth_map.P, grazing_deg)
-    facing = _facing(depth_map, slope)
+    facing = _remove_grazing(depth_map, slope)
     return _FusionMap(
         facing.P, focal, MapSamples(facing.depth, facing.std, incidence_cosines(facing.depth, K), slope)
     )
@@ -212,7 +212,8 @@ def incidence_cosines(depth: F32, K: F64) -> F32:
     known = np.isfinite(inverse)
     share = np.maximum(scipy.ndimage.uniform_filter(known.astype(np.float32), 3), np.float32(1e-6))
     a, b = (
-        scipy.ndimage.uniform_filter(np.nan_to_num(_gentler(inverse, axis)), 3) / share for axis in (1, 0)
+        scipy.ndimage.uniform_filter(np.nan_to_num(_smaller_difference(inverse, axis)), 3) / share
+        for axis in (1, 0)
     )
     y, x = np.indices(inverse.shape, dtype=np.float32)
     # The plane with inverse depth (a, b, c) . (x, y, 1) has the normal K' (a, b, c).
@@ -222,7 +223,7 @@ def incidence_cosines(depth: F32, K: F64) -> F32:
     return np.where(known, np.maximum(cosine, np.float32(MIN_COSINE)), np.float32(1.0))
 
 
-def _gentler(values: F32, axis: int) -> F32:
+def _smaller_difference(values: F32, axis: int) -> F32:
     """(H, W) the smaller of the differences to the previous and the next neighbour, NaN without either."""
     step = np.diff(values, axis=axis)
     before = np.insert(step, 0, np.nan, axis=axis)
@@ -231,7 +232,7 @@ def _gentler(values: F32, axis: int) -> F32:
         return np.where((np.abs(after) < np.abs(before)) | np.isnan(before), after, before)
 
 
-def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
+def _remove_grazing(depth_map: DepthMap, slope: float) -> DepthMap:
     """Remove pixels at grazing incidence, whose depths blend into the background.
 
     The smaller of the differences to both neighbours counts, which preserves occluding borders.
@@ -239,7 +240,7 @@ def _facing(depth_map: DepthMap, slope: float) -> DepthMap:
     depth = depth_map.depth
     steepest = np.zeros_like(depth)
     for axis in (0, 1):
-        steepest = np.hypot(steepest, np.nan_to_num(_gentler(depth, axis)))
+        steepest = np.hypot(steepest, np.nan_to_num(_smaller_difference(depth, axis)))
     with np.errstate(invalid="ignore"):
         flat = steepest > np.maximum(slope * depth, 3.0 * depth_map.std)
     return replace(depth_map, depth=np.where(flat, np.float32(np.nan), depth))
@@ -347,7 +348,7 @@ class DepthSheets:
             shown = np.zeros(len(sheet.vertices), dtype=bool)
             for earlier in shows:
                 shown |= earlier(sheet.vertices)
-            shows.append(self._shown_by(depth_map))
+            shows.append(self._coverage_test(depth_map))
             sheets.append(select_faces(sheet, np.asarray(~shown[sheet.faces].all(axis=1))))
         if not sum(len(sheet.faces) for sheet in sheets):
             raise _nothing_to_fuse()
@@ -356,7 +357,7 @@ class DepthSheets:
         vertices = np.concatenate([sheet.vertices for sheet in sheets])
         return TexturedMesh(vertices, np.concatenate(faces))
 
-    def _shown_by(self, depth_map: DepthMap) -> Callable[[F64], B8]:
+    def _coverage_test(self, depth_map: DepthMap) -> Callable[[F64], B8]:
         """Function that tests whether points (N, 3) lie on the sheet of a map."""
         depth = depth_map.depth[:: self.step, :: self.step].astype(np.float64)
         std = depth_map.std[:: self.step, :: self.step].astype(np.float64)

@@ -19,8 +19,8 @@ from thesisrecon.views.interpolation_kernels import (
     blending_weights,
     disparity_from_rectified,
     fill_empty_rows,
-    filter_guesses_by_colour,
-    filter_guesses_by_median,
+    filter_extrapolated_by_colour,
+    filter_extrapolated_by_median,
     intermediate_positions,
     mark_crossings,
 )
@@ -93,10 +93,10 @@ class IntermediateFrame:
         middle = 0.5 * np.array([width - 1.0, height - 1.0])
         reach = np.maximum(middle, 0.5) * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         third = self.H[:, 2]
-        least = LEAST_DEPTH * (third @ np.append(middle, 1.0))
-        if not (least > 0.0).all():
+        min_known_weight = LEAST_DEPTH * (third @ np.append(middle, 1.0))
+        if not (min_known_weight > 0.0).all():
             raise ValueError("the image centre lies beyond the line at infinity of the rectification")
-        while not (homogenize(middle + reach) @ third.T >= least).all():
+        while not (homogenize(middle + reach) @ third.T >= min_known_weight).all():
             reach *= SHRINK
         corners: F64 = middle + reach
         return corners
@@ -196,26 +196,26 @@ class Blending:
 
     Parameters
     ----------
-    alike_px : float
+    same_surface_px : float
         Largest difference of disparity between pixels of one surface.
     colour : float
         Difference of colour (sum over channels) at which weights of guessed disparities fall to 1 / e.
-    guess_weight : float
+    extrapolated_weight : float
         Weight of guessed disparities relative to known ones.
-    least : float
+    min_known_weight : float
         Minimum weight of pixels with known disparity; otherwise the weight is the confidence.
-    guessed : float
+    unknown_pixel_weight : float
         Weight of pixels with guessed disparity.
-    rim : float
+    edge_factor : float
         Factor of the weight beside a depth discontinuity.
     """
 
-    alike_px: float = 1.5
+    same_surface_px: float = 1.5
     colour: float = 30.0
-    guess_weight: float = 0.5
-    least: float = 0.2
-    guessed: float = 0.01
-    rim: float = 0.2
+    extrapolated_weight: float = 0.5
+    min_known_weight: float = 0.2
+    unknown_pixel_weight: float = 0.01
+    edge_factor: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -243,8 +243,8 @@ class InterpolatedPair:
 
     Each pixel of either image moves along its row by a share of its disparity and out of the rectified frame
     in one step, so that colours are sampled once. Nearer pixels occlude farther ones, which also handles
-    violations of monotonicity. A pixel seen in one image only is taken from it, with the disparity of the adjacent
-    background; a pixel seen in neither is filled from behind.
+    violations of monotonicity. A pixel seen in one image only is taken from it, with the disparity of the
+    adjacent background; a pixel seen in neither is filled from behind.
 
     Parameters
     ----------
@@ -300,7 +300,9 @@ class InterpolatedPair:
     @cached_property
     def known(self) -> float:
         """Share of the pixels of both images with known correspondence."""
-        return float(np.mean([side.weight > 1.5 * self.blending.guessed for side in self._sides]))
+        return float(
+            np.mean([side.weight > 1.5 * self.blending.unknown_pixel_weight for side in self._sides])
+        )
 
     @cached_property
     def gain(self) -> F32:
@@ -314,7 +316,7 @@ class InterpolatedPair:
         with np.errstate(divide="ignore", invalid="ignore"):
             source = np.where(at[..., 2:] > 0.0, at[..., :2] / at[..., 2:], np.nan).astype(np.float32)
         levels = first.levels[grid], sample(self._sides[1].levels, source)
-        known = first.weight[grid] > self.blending.guessed
+        known = first.weight[grid] > self.blending.unknown_pixel_weight
         with np.errstate(invalid="ignore"):
             for level in levels:
                 known &= ((level > DARK) & (level < BRIGHT)).all(axis=2)
@@ -380,7 +382,7 @@ class InterpolatedPair:
                 (warped[0].near[part], warped[1].near[part]),
                 (warped[0].source[part], warped[1].source[part]),
                 (sides[0].weight, sides[1].weight),
-                (blending.alike_px, 1.5 * blending.guessed, s),
+                (blending.same_surface_px, 1.5 * blending.unknown_pixel_weight, s),
                 (out[0][part], out[1][part]),
             )
 
@@ -410,7 +412,7 @@ class InterpolatedPair:
         target = np.empty_like(this.places)
         G = self.frame.original_from_rectified(s)
         if turn is not None:
-            # Of any sign and scale: what is in the middle of the view stays in front.
+            # The sign that keeps the view centre in front of the camera.
             middle = np.array([0.5 * (self.size[0] - 1.0), 0.5 * (self.size[1] - 1.0), 1.0])
             G = np.ascontiguousarray(np.sign(turn[2] @ middle) * (turn @ G))
         share = s - side
@@ -430,21 +432,28 @@ class InterpolatedPair:
 def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
     whole = np.ascontiguousarray(found.filled())
     fill_empty_rows(whole)
-    # A pair of which nothing is known dissolves.
+    # Without any known disparity the views are cross-dissolved.
     maps = np.nan_to_num(whole), np.ascontiguousarray(found.confidence)
     shape = image.shape[:2]
     places = np.empty((*shape, 2))
     disparity, sure, weight = (np.empty(shape, dtype=np.float32) for _ in range(3))
     disparity_from_rectified(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
     levels, filtered = image.astype(np.float32), np.empty_like(disparity)
-    weighting = (blending.colour, blending.guess_weight)
+    weighting = (blending.colour, blending.extrapolated_weight)
     run_in_strips(
-        lambda rows: filter_guesses_by_colour(levels, disparity, sure, rows, weighting, filtered),
+        lambda rows: filter_extrapolated_by_colour(levels, disparity, sure, rows, weighting, filtered),
         shape[0],
         PREPARING,
     )
-    run_in_strips(lambda rows: filter_guesses_by_median(filtered, sure, rows, disparity), shape[0], PREPARING)
-    blending_weights(disparity, sure, (blending.guessed, blending.least, blending.rim), weight)
+    run_in_strips(
+        lambda rows: filter_extrapolated_by_median(filtered, sure, rows, disparity), shape[0], PREPARING
+    )
+    blending_weights(
+        disparity,
+        sure,
+        (blending.unknown_pixel_weight, blending.min_known_weight, blending.edge_factor),
+        weight,
+    )
     return _Side(levels, places, disparity, weight)
 
 

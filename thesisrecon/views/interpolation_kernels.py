@@ -118,7 +118,7 @@ def disparity_from_rectified(
 
 
 @njit(cache=True, nogil=True)
-def filter_guesses_by_colour(
+def filter_extrapolated_by_colour(
     levels: F32, disparity: F32, sure: F32, rows: tuple[int, int], limits: tuple[float, float], out: F32
 ) -> None:
     """Replace guessed disparities by a colour-weighted median of their surroundings.
@@ -166,7 +166,7 @@ def filter_guesses_by_colour(
 
 
 @njit(cache=True, nogil=True)
-def filter_guesses_by_median(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
+def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
     """Replace guessed disparities by the median of their neighbours, which removes isolated pixels.
 
     Parameters

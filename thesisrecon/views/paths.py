@@ -14,13 +14,13 @@ from thesisrecon.records import TexturedMesh
 ROUND_GAP = np.radians(120.0)
 """Cameras without a wider gap in azimuth surround the scene; the orbit is then a full circle."""
 
-LEAST_SWING = np.radians(30.0)
+MIN_ARC = np.radians(30.0)
 """Minimum arc of an orbit that is not a full circle."""
 
 TILT_WEIGHT = 0.02
 """Squared ratio of typical roll to typical tilt of hand-held cameras (about 3 and 20 degrees)."""
 
-STEEPEST = 0.1
+MIN_HORIZONTAL_DISTANCE = 0.1
 """Minimum horizontal distance of an orbit relative to its distance: near the vertical axis "up" is
 undefined."""
 
@@ -258,7 +258,7 @@ def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
     """Radius and height of the orbit from camera offsets (V, 3) and the ``spread`` of the scene."""
     height = float(np.median(offset @ up))
     radius = float(np.median(np.linalg.norm(offset - np.outer(offset @ up, up), axis=1)))
-    least = STEEPEST * max(np.hypot(radius, height), spread)
+    least = MIN_HORIZONTAL_DISTANCE * max(np.hypot(radius, height), spread)
     if not least > 0.0:
         raise ValueError("an orbit needs a distance; all points and cameras are in one place")
     return max(radius, least), height
@@ -281,7 +281,7 @@ def _azimuths(of_cameras: F64, frames: int) -> F64:
         return np.asarray(of_cameras[0] + phase)
     arc = 2.0 * np.pi - gaps[widest]
     start = ordered[(widest + 1) % len(ordered)]
-    return np.asarray(start + 0.5 * arc + 0.5 * max(arc, LEAST_SWING) * np.sin(phase))
+    return np.asarray(start + 0.5 * arc + 0.5 * max(arc, MIN_ARC) * np.sin(phase))
 
 
 def _looking_at(K: F64, centre: F64, target: F64, up: F64, size: tuple[int, int]) -> Camera:

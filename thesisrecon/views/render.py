@@ -303,7 +303,7 @@ def render(
     surface = _prepared(mesh, lit=shading is not None)
 
     def paint(rows: tuple[int, int]) -> None:
-        # A few rows at a time: what lies between is soon used, and little.
+        # A few rows at a time keep intermediate arrays in cache.
         for first in range(rows[0], rows[1], STRIP):
             last = min(first + STRIP, rows[1])
             part = fine.rows(samples * first, samples * last)

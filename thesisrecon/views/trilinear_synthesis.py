@@ -73,7 +73,7 @@ def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_dep
 
 
 @njit(cache=True, nogil=True)
-def guess_rows(
+def extrapolate_inverse_depth(
     inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
 ) -> None:
     """Complete the inverse depth of the pixels of an image from the pixels around them.
@@ -256,7 +256,9 @@ def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32]
     distance = np.empty((len(DIRECTIONS), *own.shape), dtype=np.int16)
     distances_to_known(own, DIRECTIONS, distance)
     guessed = np.empty_like(own)
-    guess_rows(inverse_depth, np.ascontiguousarray(pair.P2), DIRECTIONS, distance, step, guessed)
+    extrapolate_inverse_depth(
+        inverse_depth, np.ascontiguousarray(pair.P2), DIRECTIONS, distance, step, guessed
+    )
     y, x = np.nonzero(np.isnan(own))
     X = np.stack([x, y, np.ones_like(x), guessed[y, x]], axis=1).astype(np.float64)
     complete = places.copy()
@@ -395,7 +397,7 @@ def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: fl
     alike = seen1 & seen2 & (sure1 == sure2)
     weight[alike & (near2 > near1 + step)] = np.clip(4.0 * share - 1.0, 0.0, 1.0)
     weight[alike & (near1 > near2 + step)] = np.clip(4.0 * share - 2.0, 0.0, 1.0)
-    # What is known is right, before what is guessed or behind it, but where a guess moves next to nothing.
+    # Known correspondences win at any depth, except close to the image of the extrapolated pixel.
     weight[seen1 & seen2 & sure1 & ~sure2] = np.clip(4.0 * share - 3.0, 0.0, 1.0)
     weight[seen1 & seen2 & sure2 & ~sure1] = np.clip(4.0 * share, 0.0, 1.0)
     weight[seen1 & ~seen2] = 0.0

@@ -18,7 +18,7 @@ from thesisrecon.geometry.zbuffer import run_in_strips
 SLACK = 1e-7
 """Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
 
-BEHIND = 0.4
+BACKGROUND_FRACTION = 0.4
 """Pixels in this farther part of the range of inverse depth count as background; a single far pixel
 may be an outlier."""
 
@@ -135,7 +135,7 @@ def _draw_footprint(
 
 
 @njit(cache=True, nogil=True)
-def _beside(target: F64, a: tuple[int, int], reach: float, rows: tuple[int, int]) -> bool:
+def _outside_rows(target: F64, a: tuple[int, int], reach: float, rows: tuple[int, int]) -> bool:
     """Whether nothing that four pixels make can be seen in the rows: all lie farther from these on one side
     than a pixel and its neighbours of one surface reach."""
     least, most = np.inf, -np.inf
@@ -175,10 +175,10 @@ def draw_surface(
     for y in range(height):
         for x in range(width):
             a = (y, x)
-            # What is nowhere has a NaN among these.
+            # Skip pixels without position or depth (NaN).
             if np.isnan(inverse_depth[a] + target[y, x, 0] + target[y, x, 1]):
                 continue
-            if _beside(target, a, limits[1], rows):
+            if _outside_rows(target, a, limits[1], rows):
                 continue
             right = x + 1 < width and _joined(target, inverse_depth, a, (y, x + 1), limits)
             below = y + 1 < height and _joined(target, inverse_depth, a, (y + 1, x), limits)
@@ -327,7 +327,7 @@ def fill_from_behind(
                 if reach[k] <= limits[1]:
                     least = min(least, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
                     most = max(most, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
-            behind = least + max(limits[0], BEHIND * (most - least))
+            behind = least + max(limits[0], BACKGROUND_FRACTION * (most - least))
             for k in range(steps.shape[0]):
                 if not reach[k] <= limits[1]:
                     continue
