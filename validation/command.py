@@ -24,11 +24,11 @@ from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
 
 LEAST_SIDE_PX = 64
-"""Smallest long side of depth maps: smaller ones hold no matching window."""
+"""Smallest long side of depth maps, for the matching window."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command: 0 if all is well, 1 if a gate or a bound is missed, 2 for a wrong option."""
+    """Run the command; exit code 0: success, 1: a missed gate or bound, 2: a wrong option."""
     parsed = _parser().parse_args(arguments)
     if parsed.command == "ablate":
         return ablation.run_command(parsed)
@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--images", type=Path, help="folder of your own images")
         command.add_argument("--quick", action="store_true", help="few scenes and repetitions")
         command.add_argument("--seed", type=int, default=0)
-        command.add_argument("--threads", type=int, default=len(own_cores()), help="tasks that run at a time")
+        command.add_argument("--threads", type=int, default=len(own_cores()), help="number of parallel tasks")
         command.add_argument(
             "--resume", type=Path, help="folder of an earlier run whose references are reused"
         )

@@ -85,7 +85,7 @@ def _facts(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def _findings(analysis: Analysis) -> list[str]:
-    """One sentence for each measure: what is better and worse than the baseline."""
+    """Summarise each measure: variants better and worse than the baseline."""
     count = len(analysis.plan.conditions)
     found = []
     for measure in analysis.plan.measures:
@@ -278,7 +278,7 @@ def _forest(
 
 
 def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] | None:
-    """Accuracy over processor time; what nothing beats in both is joined."""
+    """Plot accuracy over processor time with the Pareto front."""
     names = list(dict.fromkeys(c.variant for c in cells))
     conditions = list(dict.fromkeys(c.condition for c in cells))
     if len(names) < 2 or len(conditions) > 1:

@@ -43,7 +43,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class PlannedRow:
-    """One row to be: ``key`` names the setting, scene, seed and versions."""
+    """A planned row; ``key`` identifies the setting, scene, seed and versions."""
 
     key: str
     variant: str
@@ -252,7 +252,7 @@ def _variants(study: Study) -> tuple[Variant, ...]:
 
 
 def _laid(parts: Sequence[Variant], name: str) -> Variant:
-    """The changes of a ladder, in the order of its steps: a later one of a path counts last."""
+    """Return the changes of a ladder in step order; later changes of a path win."""
     changes: dict[str, Any] = {}
     for part in parts:
         for path, value in part.changes.items():
@@ -266,7 +266,7 @@ def _laid(parts: Sequence[Variant], name: str) -> Variant:
 def _different(
     variants: Sequence[Variant], conditions: Sequence[Variant], settings: Mapping[tuple[str, str], Setting]
 ) -> tuple[Variant, ...]:
-    """The variants without those that equal an earlier one; one name for two settings is refused."""
+    """Remove repeated variants; reject one name for two settings."""
     kept: dict[str, Variant] = {}
     seen: list[list[Any]] = []
     for variant in variants:
@@ -279,11 +279,11 @@ def _different(
     return tuple(kept.values())
 
 
-# ---------------------------------------------------------------- what makes two rows the same
+# ---------------------------------------------------------------- row identity
 
 
 def identity(setting: Setting) -> list[Any]:
-    """Plain values that name a setting: equal ones find the same."""
+    """Return plain values that identify a setting."""
     return [_config_identity(setting.config), _task_identity(setting.task)]
 
 

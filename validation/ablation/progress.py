@@ -14,7 +14,7 @@ from validation.ablation.run import ProgressCallback, State
 
 @contextmanager
 def progress_view() -> Iterator[ProgressCallback]:
-    """Rows done and failed, and an estimate of the time left."""
+    """Show finished and failed rows and the estimated remaining time."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return

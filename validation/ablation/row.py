@@ -34,7 +34,7 @@ class Job:
 
 
 def pack(setting: Setting) -> tuple[bytes, tuple[Source, ...]]:
-    """A setting as it travels; :class:`UsageError` for what cannot."""
+    """Serialise a setting; :class:`UsageError` if impossible."""
     try:
         content: bytes = _pickler().dumps(setting)
     except Exception as error:
@@ -43,7 +43,7 @@ def pack(setting: Setting) -> tuple[bytes, tuple[Source, ...]]:
 
 
 def _pickler() -> Any:
-    """Where cloudpickle is installed (Dask brings it) classes of a script travel to any worker."""
+    """Prefer cloudpickle (installed with Dask), which also sends classes of a script."""
     try:
         import cloudpickle
     except ImportError:

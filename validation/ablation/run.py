@@ -67,8 +67,8 @@ class Rows(Sequence[Row]):
 
 @dataclass
 class State:
-    """How far a study is: rows in all, ended before this run, ended now and failed of these; wall seconds of
-    those of this run by variant; seconds since the start; how many run at a time."""
+    """Progress of a study: all rows, rows of earlier runs and of this run, failures; seconds by variant;
+    seconds since the start; number of parallel rows."""
 
     total: int
     kept: int = 0
@@ -83,7 +83,7 @@ class State:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds that the rest should take: for each variant the mean of its rows so far, else of all; None
+        """Estimate the remaining seconds from the mean of each variant, else of all rows; None
         before the first row."""
         every = [s for spent in self.spent.values() for s in spent]
         if not every:
@@ -136,7 +136,7 @@ def ablate(
 
 
 def read_rows(study: Study, out: str | Path) -> Rows:
-    """The rows of a study that are in ``out``; nothing is computed."""
+    """Return the rows of a study that are in ``out``, without computing."""
     return _rows(plan_study(study), Store(Path(out)), {})
 
 
@@ -167,7 +167,7 @@ def _rows(plan: Plan, store: Store, lost: Mapping[str, Outcome]) -> Rows:
     return Rows(plan, tuple(rows))
 
 
-# ---------------------------------------------------------------- what rows share
+# ---------------------------------------------------------------- shared steps
 
 
 @dataclass(frozen=True)
@@ -185,10 +185,9 @@ class _Part:
 
 
 def parts_of(rows: Sequence[PlannedRow]) -> list[_Part]:
-    """The rows, and before them those steps that several of them begin with.
+    """Return the rows, preceded by their shared first steps.
 
-    A step is a part of its own where its rows part after it: where all go on alike, the next step does for
-    both.
+    A step is a part only if its rows differ in the next step.
     """
     chains = {row.key: _chain(row) for row in rows}
     users = Counter(key for chain in chains.values() for _, key in chain)
@@ -206,7 +205,7 @@ def parts_of(rows: Sequence[PlannedRow]) -> list[_Part]:
 
 
 def _chain(row: PlannedRow) -> Sequence[tuple[str, str]]:
-    """The steps of a row with their keys; nothing for a task that has none. The last one is the row itself
+    """Return the steps of a row with keys, empty for a task without. The last one is the row itself
     where its measures are all that is left."""
     steps = getattr(row.setting.task, "steps", None)
     return [] if steps is None else list(steps(row.setting.config, row.scene, row.seed))
@@ -305,7 +304,7 @@ class _Session:
     def _gone(self) -> WorkersLost:
         cluster = self.crew.cluster
         lost = WorkersLost("the workers are gone") if cluster is None else cluster.lost()
-        return WorkersLost(f"{lost}; the rows that ended are kept, and the same command goes on from there")
+        return WorkersLost(f"{lost}; the rows that ended are kept, and the same command continues from there")
 
     def _again(self, part: _Part) -> bool:
         """Return whether a part whose process died is tried once more."""

@@ -47,7 +47,7 @@ class Interval:
 
 
 def paired_interval(groups: Sequence[F64], *, level: float = 0.95) -> Interval:
-    """The interval of the mean of paired differences, grouped by scene.
+    """Return the interval of the mean of paired differences, grouped by scene.
 
     All scenes have equal weight, however many differences they have. Where there are at least ``SCENES_FROM``
     scenes, or three whose differences do not depend on the seed, the scenes' means are the sample and the
@@ -118,7 +118,7 @@ def resampled_t(strata: Sequence[F64], *, resamples: int = RESAMPLES) -> F64:
 
 def holm(p: Sequence[float]) -> list[float]:
     """Adjust p-values for multiple comparisons (Holm 1979): all below alpha are jointly correct with a
-    probability of 1 - alpha. NaN stays and does not count."""
+    probability of 1 - alpha. NaN is ignored."""
     values = np.asarray(p, dtype=np.float64)
     adjusted = np.full(len(values), np.nan)
     known = np.flatnonzero(np.isfinite(values))
@@ -138,7 +138,7 @@ def mean_ranks(blocks: F64) -> F64:
 
 
 def on_front(cost: F64, loss: F64) -> NDArray[np.bool_]:
-    """(V,) whether nothing is better in one of both and no worse in the other; NaN is never."""
+    """Return the Pareto-optimal entries (V,); never NaN."""
     known = np.isfinite(cost) & np.isfinite(loss)
     front = known.copy()
     for k in np.flatnonzero(known):

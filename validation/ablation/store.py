@@ -41,7 +41,7 @@ class Store:
     path: Path
 
     def prepare(self) -> None:
-        """Make the folder; :class:`OutputError` where it cannot be written."""
+        """Create the folder; :class:`OutputError` if it cannot be written."""
         try:
             for name in (ROWS, STEPS, SHARED, WORK):
                 (self.path / name).mkdir(parents=True, exist_ok=True)
@@ -49,7 +49,7 @@ class Store:
             raise OutputError(f"the output folder {self.path}", error) from None
 
     def load(self, key: str, kind: str = ROWS) -> Outcome | None:
-        """The outcome kept under this key, None if it is absent or damaged."""
+        """Return the outcome of this key, or None if absent or damaged."""
         record = read_json(self.path / kind / f"{key}.json")
         try:
             numbers = {str(name): float(value) for name, value in record["metrics"].items()}

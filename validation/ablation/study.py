@@ -13,7 +13,7 @@ Mode = Literal["one-at-a-time", "grid", "ladder"]
 Changes = Mapping[str, Any]
 """Dotted path -> value: ``epipolar.threshold_px`` -> 0.5, ``features`` -> a variant."""
 Axis = Sequence[Any] | Mapping[str, Changes]
-"""The values of the dotted path that is its name, or named levels that change several paths each."""
+"""Values of the dotted path in its name, or named levels that change several paths."""
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def _no_nan(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-# ---------------------------------------------------------------- for people
+# ---------------------------------------------------------------- Markdown
 
 
 def text_of(analysis: Analysis) -> str:
@@ -155,8 +155,8 @@ def one_condition(analysis: Analysis, measure: Measure) -> str:
 
 
 def over_conditions(analysis: Analysis, measure: Measure) -> str:
-    """Means, a row for each variant and a column for each condition: bold where shown to be better than the
-    baseline, italic where shown to be worse."""
+    """Means, a row for each variant and a column for each condition: bold if significantly better than the
+    baseline, italic if significantly worse."""
     plan = analysis.plan
     cells = {(c.variant, c.condition): c for c in analysis.cells if c.measure == measure}
     found = {(c.variant, c.condition): c.verdict for c in analysis.comparisons if c.measure == measure}
@@ -186,7 +186,7 @@ def mean_text(cell: Cell) -> str:
 
 
 def comparison_text(found: Comparison | None) -> str:
-    """The difference or quotient with its interval; bold where it is shown to be one."""
+    """Return the difference or quotient with its interval; bold if significant."""
     if found is None or not math.isfinite(found.interval.mean):
         return ""
     mean, low, high = as_reported(found)

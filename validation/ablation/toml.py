@@ -71,7 +71,7 @@ def _config(table: Mapping[str, Any]) -> PipelineConfig:
 
 
 def _task(value: Any, folder: Path) -> Any:
-    """A task by its kind, or of a file of the user; a table holds its parameters too."""
+    """Return a task by kind or user file; a table also gives parameters."""
     table = {"kind": value} if isinstance(value, str) else value
     if not isinstance(table, Mapping) or not isinstance(table.get("kind"), str):
         raise UsageError(f"task takes a kind, or a table with its kind and parameters; got {value!r}")
@@ -89,7 +89,7 @@ def _task(value: Any, folder: Path) -> Any:
 
 
 def _metrics(names: Any) -> list[str | Measure]:
-    """Names of the task's measures, or tables that describe one."""
+    """Return names of measures, or measures described by tables."""
     if not isinstance(names, list):
         raise UsageError(f"metrics take a list; got {names!r}")
     return [_metric(item) for item in names]

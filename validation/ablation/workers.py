@@ -37,7 +37,7 @@ class Crew:
 
 
 class _Here(Executor):
-    """Carries a row out where and when it is submitted."""
+    """Run each row at once in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()

@@ -60,10 +60,9 @@ class Template:
         self._child.wait()
 
     def run(self, arguments: Sequence[str], *, log: Path, limit_s: float) -> Process:
-        """``main`` of these arguments in a fork, which is killed with all it started after ``limit_s``; its
-        output goes to the file ``log``.
+        """Run ``main`` in a fork, killed with its children after ``limit_s``; output goes to ``log``.
 
-        Raises ``RuntimeError`` where the template itself has ended.
+        Raises ``RuntimeError`` if the template has ended.
         """
         log.parent.mkdir(parents=True, exist_ok=True)
         assert self._child.stdin is not None
@@ -74,7 +73,7 @@ class Template:
         except BrokenPipeError:
             line = ""
         if not line:
-            raise RuntimeError(f"the process that tasks are forks of ended with {self._child.wait()}")
+            raise RuntimeError(f"the template process of the tasks ended with {self._child.wait()}")
         code, peak_mb, cpu_s, timed_out = json.loads(line)
         return Process(code, time.perf_counter() - start, peak_mb, cpu_s, timed_out)
 
@@ -85,8 +84,7 @@ class Template:
 
 
 def serve(main: Callable[[list[str]], int], orders: IO[str], answers: IO[str]) -> None:
-    """Carry out one order after another, until there are no more: [log, seconds, *arguments], in JSON. Where
-    the other end of ``orders`` is closed, or dies, the task that runs is killed."""
+    """Run JSON orders [log, seconds, *arguments] one by one; kill the running task if ``orders`` closes."""
     for order in orders:
         log, limit_s, *arguments = json.loads(order)
         child = os.fork()
@@ -100,8 +98,7 @@ def serve(main: Callable[[list[str]], int], orders: IO[str], answers: IO[str]) -
 
 
 def _wait(child: int, limit_s: float, orders: IO[str]) -> tuple[int, float, float, bool] | None:
-    """Exit code, peak memory in MB, processor seconds, and whether its time was up; None if nothing wants
-    to know any more."""
+    """Return exit code, peak memory (MB), processor seconds and time-out; None if ``orders`` is closed."""
     ended = os.pidfd_open(child)
     either = select.poll()
     either.register(ended, select.POLLIN)
@@ -121,7 +118,7 @@ def _wait(child: int, limit_s: float, orders: IO[str]) -> tuple[int, float, floa
 
 
 def _become(main: Callable[[list[str]], int], arguments: list[str], log: str) -> None:
-    """This fork is the task from here on, and ends with it."""
+    """Run the task in this fork and exit."""
     code = 1
     try:
         os.setsid()

@@ -39,7 +39,7 @@ def write_pages(
     results: Results,
     changes: Sequence[Change] | None,
 ) -> Path:
-    """Write all pages; the path of the first to open."""
+    """Write all pages and return the path of the first."""
     scenes = [s for s in options.scenes if any(scene == s for _, scene in judged)]
     links = [("All scenes", "index.html"), *((s, f"scene-{slug(s)}.html") for s in scenes)]
     names = {
@@ -178,7 +178,7 @@ def _plot(stage: str, number: int, plot: Plot) -> dict[str, Any]:
 
 
 def _picture(place: Path, picture: Picture) -> dict[str, Any]:
-    """The image as a data address, no wider than a page needs."""
+    """Return the image as a data URL at page width."""
     with PIL.Image.open(place / picture.file) as opened:
         rgb = opened.convert("RGB")
     rgb.thumbnail((WIDEST_PX, WIDEST_PX))
@@ -195,7 +195,7 @@ def _picture(place: Path, picture: Picture) -> dict[str, Any]:
 
 
 def short(value: float | None) -> str:
-    """Three significant digits, whole numbers in full."""
+    """Format three significant digits, whole numbers in full."""
     if value is None:
         return "–"
     if float(value).is_integer() and abs(value) < 1e9:

@@ -47,10 +47,9 @@ class CopiedTree:
 
     @contextmanager
     def planted(self, file: str, text: str, number: int) -> Iterator[Path]:
-        """The tree where ``file`` is this faulty ``text``, and the folder of compiled kernels for it.
+        """Yield the kernel folder of the tree with the faulty ``text`` in ``file``.
 
-        Of the fault and all that import it nothing is taken that was compiled without it, by Python (their
-        files count as newer) or by numba; what is compiled with it goes with it.
+        Bytecode and kernels of the module and its importers are recompiled, and removed with the fault.
         """
         path = self.tree / file
         sound, kernels = path.read_text(encoding="utf-8"), self.out / f"kernels-{number:02d}"
@@ -79,10 +78,9 @@ def importers(root: Path, file: str) -> list[Path]:
 
 
 def compiled_from(root: Path, file: str) -> list[Path]:
-    """The modules whose compiled kernels may hold code or constants of this one.
+    """Return the modules whose compiled kernels may contain code or constants of this one.
 
-    A kernel takes them from modules that its own imports, and from these on only through kernels: what plain
-    Python imports is not compiled into it.
+    Kernels inline code of directly imported modules, and of further ones only through kernels.
     """
     found = _reached(root, file, lambda path: has_kernels(path) or path.name == "__init__.py")
     return [path for path in found if has_kernels(path)]
@@ -94,7 +92,7 @@ def has_kernels(path: Path) -> bool:
 
 
 def _reached(root: Path, file: str, passes: Callable[[Path], bool]) -> list[Path]:
-    """The module and those that import it, through modules that pass."""
+    """Return the module and its importers through modules that pass."""
     modules = {
         ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
         for path in sorted((root / file.split("/")[0]).rglob("*.py"))

@@ -35,7 +35,7 @@ class Process:
 
 
 def own_cores() -> list[int]:
-    """The cores this process may use."""
+    """Return the cores this process may use."""
     return sorted(os.sched_getaffinity(0))
 
 
@@ -50,13 +50,13 @@ def run_process(
 ) -> Process:
     """Run ``command`` in the folder ``cwd`` on these cores and wait; its output goes to the file ``log``.
 
-    Where ``limit_s`` passes, the child and all it started are killed.
+    After ``limit_s`` the child and its children are killed.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     start, timed_out = time.perf_counter(), False
     with log.open("wb") as sink:
         child = subprocess.Popen(
-            # The child takes its cores itself, so that every thread it starts inherits them.
+            # The child sets its own affinity, so that its threads inherit it.
             [sys.executable, "-c", _PIN, ",".join(map(str, cores)), *command],
             stdout=sink,
             stderr=subprocess.STDOUT,
@@ -94,7 +94,7 @@ def last_words(log: Path) -> str:
 
 
 def failure_of(process: Process, words: str, limit_s: float) -> str:
-    """Why a process did not end well, in a clause; empty if it did. ``words`` are its last."""
+    """Return the failure of a process, or an empty string. ``words`` is its last line."""
     if process.timed_out:
         return f"exceeded the time limit of {limit_s:.0f} s"
     if process.code < 0:

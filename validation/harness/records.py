@@ -38,7 +38,7 @@ class ReportOptions:
     stages_from: str = "validation.harness.stages"
 
     def place(self, stage: str, scene: str, method: str = "") -> Path:
-        """The folder of a task, or of all tasks of a stage on a scene."""
+        """Return the folder of a task, or of all tasks of a stage on a scene."""
         place = self.out / "data" / stage / scene
         return place / slug(method) if method else place
 
@@ -86,7 +86,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Plot:
-    """An interactive plot on the page of a scene: ``figure`` as plotly.js takes it (data, layout)."""
+    """An interactive plot on the page of a scene: ``figure`` for plotly.js (data, layout)."""
 
     title: str
     figure: Mapping[str, Any]

@@ -1,4 +1,4 @@
-"""``results.json`` and the tables as CSV: every number with its limit and references; two runs compared."""
+"""``results.json`` and the tables as CSV: numbers with limits and references; comparison of runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from validation.references.libraries import PACKAGES
 
 OWN_PACKAGES = ("thesisrecon", "numpy", "scipy", "numba")
 TIME_UNITS = ("s", "s processor", "s / s", "us", "ms", "MB")
-"""Units of numbers that are never the same twice."""
+"""Units of numbers that vary between runs."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Results:
 
 
 def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
-    """The row of a metric that carries the limit of its gate."""
+    """Return the row of a metric with the limit of its gate."""
     others = {name: _finite(v) for name, v in metric.values.items() if name != metric.judged}
     at_most = metric.at_most if gate is None else gate.at_most
     value = _finite(metric.values.get(metric.judged))
@@ -122,7 +122,7 @@ def _version(package: str) -> str:
 
 
 def write_results(out: Path, results: Results) -> None:
-    """``results.json``, and ``tables/STAGE.csv``."""
+    """Write ``results.json`` and ``tables/STAGE.csv``."""
     record = {
         "rows": [vars(row) | {"reference": dict(row.reference)} for row in results.rows],
         "missing": list(results.missing),
@@ -138,9 +138,9 @@ def write_results(out: Path, results: Results) -> None:
 
 
 def read_results(out: Path) -> Results:
-    """The run in this folder.
+    """Read the run in this folder.
 
-    Raises ``ValueError`` where there is none.
+    Raises ``ValueError`` if there is none.
     """
     try:
         record = json.loads(read_bytes(out / "results.json").decode("utf-8"))
@@ -157,7 +157,7 @@ def read_results(out: Path) -> Results:
 
 @dataclass(frozen=True)
 class Change:
-    """A number that differs between two runs; None if one has it not."""
+    """A number that differs between two runs; None if missing in one."""
 
     key: str
     unit: str

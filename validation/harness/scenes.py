@@ -30,7 +30,7 @@ cameras; a walk of cameras."""
 
 
 def available_scenes(*, quick: bool) -> tuple[str, ...]:
-    """The scenes whose files are on this machine."""
+    """Return the scenes whose files are on this machine."""
     root = data_root()
     found = [name for name in PHOTOGRAPHS if name == "courtyard" or real_folder(name) is not None]
     found += [name for name in STEREO_PAIRS if stereo_folder(name) is not None]
@@ -46,10 +46,10 @@ def is_photographs(name: str, options: ReportOptions) -> bool:
 
 
 def load_photographs(name: str, options: ReportOptions) -> Scene:
-    """The images of a scene with their truth, where there is one.
+    """Return the images of a scene with their truth, if known.
 
     A folder of the user holds images, or images/ with them; its truth is ``cameras.json`` (as in
-    fixtures) or a COLMAP model in ``sparse/0``. Raises ``ValueError`` where a scene has no images.
+    fixtures) or a COLMAP model in ``sparse/0``. Raises ``ValueError`` if a scene has no images.
     """
     if name in options.folders:
         return _own_scene(Path(options.folders[name]), name)

@@ -27,11 +27,11 @@ from validation.metrics.record import Metric
 Reporter = Callable[[str], None]
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
 JUDGE = ""
-"""The method of the task that judges all others of its stage and scene."""
+"""Method name of the judgement task."""
 
 
 def tasks_of(options: ReportOptions, stages: Mapping[str, Stage]) -> list[Task]:
-    """Every method of every stage on every scene, and the judgement after them."""
+    """Return every method of every stage on every scene, then its judgement."""
     found = []
     for scene in options.scenes:
         for name in options.stages:
@@ -45,7 +45,7 @@ def tasks_of(options: ReportOptions, stages: Mapping[str, Stage]) -> list[Task]:
 def run_tasks(
     options: ReportOptions, stages: Mapping[str, Stage], report: Reporter
 ) -> dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]:
-    """The judgement and outcomes of each (stage, scene); nothing that fails stops the others."""
+    """Return the judgement and outcomes of each (stage, scene); failures do not stop other tasks."""
     shutil.rmtree(options.out / "data", ignore_errors=True)
     options.out.mkdir(parents=True, exist_ok=True)
     write_text(options.out / "options.json", json.dumps(options.to_json()))
@@ -98,7 +98,7 @@ def tasks_behind(tasks: list[Task], stages: Mapping[str, Stage]) -> dict[Task, i
 
 
 class _Templates:
-    """Processes that no task is running in: one a core."""
+    """Idle processes, one per core."""
 
     def __init__(self, cores: list[int], options: ReportOptions, stack: ExitStack) -> None:
         self._modules = ("validation.harness.worker", options.stages_from)
@@ -114,7 +114,7 @@ class _Templates:
         return self._stack.enter_context(Template(self._modules, core, ENVIRONMENT))
 
     def run(self, arguments: list[str], log: Path, limit_s: float) -> Process:
-        """One task, on the core that has been free for longest."""
+        """Run one task on the core that has been idle longest."""
         with self._lock:
             core, template = self._free.pop(0)
         try:
@@ -168,7 +168,7 @@ def _carry_out(
         write_text(place / OUTCOMES, json.dumps(record))
     else:
         arguments.append(task.method)
-    # Beside the place of the task, which may empty it.
+    # Outside the task folder, which the task may empty.
     log = place.with_name(f"{place.name}.log")
     process = free.run(arguments, log, options.limit_s)
     failure = failure_of(process, last_words(log), options.limit_s)
@@ -186,7 +186,7 @@ def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
 
 def _judgement(outcome: Outcome) -> Judgement:
     if not outcome.ok:
-        return Judgement((), notes=(f"This comparison could not be judged: {outcome.failure}.",))
+        return Judgement((), notes=(f"This comparison could not be evaluated: {outcome.failure}.",))
     record: dict[str, Any] = json.loads((outcome.place / JUDGEMENT).read_text(encoding="utf-8"))
     return Judgement(
         [Metric(**metric) for metric in record["metrics"]],

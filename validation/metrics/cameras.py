@@ -84,7 +84,7 @@ def rotation_errors_deg(R: F64, R_true: F64) -> F64:
 def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
     """Project every point into every registered view that sees it as an inlier, and measure the distances.
 
-    Raises ``ValueError`` where there is no such observation.
+    Raises ``ValueError`` if there is no such observation.
     """
     assert reconstruction.K is not None
     tracks = reconstruction.tracks

@@ -15,7 +15,7 @@ from validation.scenes.real import Scene, load_fixture_depth
 SAME = 0.01
 """Maximum relative depth error of a correct depth, and between views of the same point."""
 NORMAL_MEDIAN = 0.6745
-"""Median absolute value of a normal variable of deviation 1."""
+"""Median absolute value of a standard normal variable."""
 NEAR_TO_FAR = np.array(
     [[48, 18, 59], [70, 107, 227], [40, 187, 236], [50, 242, 152], [238, 207, 58], [208, 48, 5]]
 )
@@ -36,7 +36,7 @@ class Judged:
 class JudgedMaps:
     """Mean scores of all maps: ``median`` relative error, the shares ``right`` and ``known`` of what
     can be known (means over the maps, and the ``worst`` map's share right), the share ``right_of_known``, and
-    the median error in stated ``deviations``, 1 for those that are true."""
+    the median error in stated ``deviations``, ideally 1."""
 
     median: float
     right: float
@@ -47,7 +47,7 @@ class JudgedMaps:
 
 
 def together(judged: Sequence[Judged]) -> JudgedMaps:
-    """One judgement of the maps of a scene; ``ValueError`` where there is none."""
+    """Combine the scores of the maps of a scene; ``ValueError`` without maps."""
     if not judged:
         raise ValueError("there is no depth map to judge")
     error = np.concatenate([one.error for one in judged])
@@ -92,7 +92,7 @@ def true_depth(scene: Scene, view: int) -> TrueDepth:
 
 
 def true_from_maps(maps: Mapping[int, DepthMap], scene: Scene) -> Similarity:
-    """The similarity that lays the cameras of depth maps over the true ones."""
+    """Return the similarity that aligns the cameras of depth maps with the true ones."""
     assert scene.C is not None
     views = sorted(maps)
     centres = [-np.linalg.solve(maps[i].P[:, :3], maps[i].P[:, 3]) for i in views]
@@ -112,7 +112,7 @@ def at_true_places(found: DepthMap, shape: tuple[int, int], stride: int, width_p
 
 
 def judge_against_truth(found: DepthMap, truth: TrueDepth, scale: float) -> Judged:
-    """One map, ``scale`` true lengths over its own; what can be known is what two views see."""
+    """Evaluate one map, ``scale`` true lengths over its own, at pixels visible in two views."""
     depth, stride, seen = truth
     own, std = at_true_places(found, depth.shape, stride, stride * depth.shape[1])
     ours, std = scale * own, scale * std
@@ -122,7 +122,7 @@ def judge_against_truth(found: DepthMap, truth: TrueDepth, scale: float) -> Judg
 
 
 def judge_against_points(found: DepthMap, model: Reconstruction) -> Judged:
-    """One map at the valid points of which its view has an inlying observation."""
+    """Evaluate one map at the valid points with inlier observations in its view."""
     tracks = model.tracks
     mine = (tracks.view_index == found.view) & model.inlier & model.valid[tracks.point_index]
     Xh = model.X[np.unique(tracks.point_index[mine])]

@@ -59,5 +59,5 @@ def _derivatives(rig: Rig, v: int, X: F64) -> tuple[F64, F64]:
 
     steps = _STEP * np.eye(12)
     J = np.stack([(pixels(s) - pixels(-s)) / (2.0 * _STEP) for s in steps], axis=-1)
-    # Moving all points by d is moving the centre by d: the derivative by the centre is that by each point.
+    # Moving the centre by d is equivalent to moving all points by -d.
     return J[:, :, :9], -J[:, :, 9:]

@@ -16,11 +16,11 @@ from validation.references.open3d_meshes import Nearest
 from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene
 
 SAMPLES = 200_000
-"""Points on a surface that distances are taken from."""
+"""Number of points sampled on a surface."""
 BEHIND = 0.05
 """Relative depth tolerance of visibility."""
 CAPPED = 5.0
-"""Percent of the scene's depth beyond which the mean counts no more."""
+"""Maximum distance in the mean, in percent of the scene depth."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Truth:
 
 
 def load_truth() -> Truth:
-    """The courtyard as its true depth maps have it, one sheet of triangles for each view."""
+    """Return the courtyard from its true depth maps, one triangle sheet per view."""
     scene = load_fixture_scene("courtyard")
     assert scene.K is not None
     assert scene.R is not None
@@ -64,7 +64,7 @@ def _together(meshes: Sequence[TexturedMesh]) -> TexturedMesh:
 
 
 def points_on(mesh: TexturedMesh, count: int = SAMPLES) -> F64:
-    """(count, 3) points spread over a surface, as many on equal areas; the same ones each time."""
+    """Sample points (count, 3) uniformly over a surface, deterministically."""
     rng = np.random.default_rng(0)
     area = np.cumsum(face_areas(mesh.vertices, mesh.faces))
     face = np.searchsorted(area, (np.arange(count) + rng.random(count)) * (area[-1] / count))
@@ -76,7 +76,7 @@ def points_on(mesh: TexturedMesh, count: int = SAMPLES) -> F64:
 
 
 def asked_for(points: F64, scene: Scene) -> I64:
-    """(N,) in how many images points are in the frame and not hidden by what is truly there."""
+    """Return the number of images (N,) that truly show each point."""
     assert scene.K is not None
     assert scene.R is not None
     assert scene.C is not None

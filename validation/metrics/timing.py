@@ -10,8 +10,8 @@ from validation.metrics.record import Metric
 
 
 def time_of_a_frame(scene: str, draw: Callable[[], Any], *, repeats: int, target_s: float) -> Metric:
-    """Least wall and processor seconds of ``repeats`` calls that draw on two threads, after one that compiles
-    and prepares; the processor's are judged, which other work on the machine disturbs less."""
+    """Return minimum wall and processor seconds of ``repeats`` calls on two threads, after a warm-up call;
+    processor time is less disturbed by other work."""
     wall, processor = [], []
     for _ in range(repeats + 1):
         start = time.perf_counter(), time.process_time()

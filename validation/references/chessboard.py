@@ -28,7 +28,7 @@ class BoardCalibration:
 
 def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
     """(N, 2) inner corners, ``size`` along and across, row by row from the corner that comes first on the
-    image's diagonal; :class:`StageFailure` where OpenCV does not find them."""
+    image's diagonal; :class:`StageFailure` if OpenCV does not find them."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     found, corners = cv2.findChessboardCorners(grey, size)
     if not found:

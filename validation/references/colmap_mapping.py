@@ -36,7 +36,7 @@ class ReferenceRun:
 @dataclass(frozen=True)
 class Start:
     """Start of COLMAP: a focal length of ``focal_rel`` long sides, and optionally the principal
-    point; or ``K`` (3, 3) by the name of the image, pixels as ours, taken for
+    point; or ``K`` (3, 3) by the name of the image, pixels as ours, assumed
     exact (the cameras of the images must be their own then)."""
 
     refine_principal_point: bool = False
@@ -53,10 +53,10 @@ def map_with_pycolmap(
     threads: int = 2,
     mapper: Literal["incremental", "global"] = "incremental",
 ) -> ReferenceRun:
-    """Mapping of what :func:`match_with_pycolmap` left in ``matched``, as ``start`` has it.
+    """Map the matches of :func:`match_with_pycolmap` in ``matched`` from ``start``.
 
     ``out`` is another folder, emptied first; the global mapper (GLOMAP) refines what it refines by default.
-    Raises :class:`StageFailure` where COLMAP makes no model.
+    Raises :class:`StageFailure` if COLMAP makes no model.
     """
     start = start or Start()
     pycolmap.set_random_seed(0)
@@ -129,7 +129,7 @@ def _map_globally(images: Path, out: Path, threads: int) -> ReferenceRun:
 
 
 def give_calibration(database: Path, K: Mapping[str, F64]) -> None:
-    """Put the true calibration in the place of every camera."""
+    """Set the true calibration of every camera."""
     store = pycolmap.Database.open(database)
     for image in store.read_all_images():
         camera, known = store.read_camera(image.camera_id), K[image.name]

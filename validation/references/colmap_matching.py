@@ -46,7 +46,7 @@ def match_with_pycolmap(
 
 
 def forget_focal_priors(database: Path, focal_rel: float = DEFAULT_FOCAL_REL) -> None:
-    """Put a guess in the place of every focal length, also of those that came from EXIF."""
+    """Replace every focal length, including EXIF ones, by a guess."""
     store = pycolmap.Database.open(database)
     for camera in store.read_all_cameras():
         guess = focal_rel * max(camera.width, camera.height)

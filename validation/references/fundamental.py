@@ -141,7 +141,7 @@ and PoseLib as they come, or with ``MIN_ITERATIONS`` ("long")."""
 def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed: int) -> Estimate:
     """F and inliers of matches (N, 2) px by one of ``SOLVERS``; never raises for hard data.
 
-    The inliers are in the order of the matches, whatever order the method saw.
+    The inliers are in the order of the matches, independent of the shuffled order.
     """
     order = np.random.default_rng(seed).permutation(len(xy1))
     some1, some2 = np.ascontiguousarray(xy1[order]), np.ascontiguousarray(xy2[order])

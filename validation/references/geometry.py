@@ -1,4 +1,4 @@
-"""Small functions of OpenCV, COLMAP and PoseLib as ours are called: maps, similarities, poses."""
+"""Small functions of OpenCV, COLMAP and PoseLib with our signatures: maps, similarities, poses."""
 
 from __future__ import annotations
 

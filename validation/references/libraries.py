@@ -32,7 +32,7 @@ class NoReference(ImportError):
 class Library:
     """The library ``module``, imported when something of it is first used.
 
-    Every use raises :class:`NoReference` where it cannot be had.
+    Every use raises :class:`NoReference` if it cannot be had.
     """
 
     def __init__(self, module: str) -> None:
@@ -45,7 +45,7 @@ class Library:
 def load(module: str) -> ModuleType:
     """The reference library ``module``, one of :data:`PACKAGES`.
 
-    Raises :class:`NoReference` where it is refused, missing, or does not load.
+    Raises :class:`NoReference` if it is refused, missing, or does not load.
     """
     if module in _refused:
         raise NoReference(_refused[module])

@@ -1,4 +1,4 @@
-"""Our cameras and depth maps in Open3D's words."""
+"""Our cameras and depth maps in Open3D's types."""
 
 from __future__ import annotations
 

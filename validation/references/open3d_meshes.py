@@ -31,7 +31,7 @@ class Nearest:
 def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
     """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
 
-    Raises ``RuntimeError`` where the machine has no graphics that it can use.
+    Raises ``RuntimeError`` if the machine has no graphics that it can use.
     """
     width, height = camera.size
     renderer = o3d.visualization.rendering.OffscreenRenderer(width, height)

@@ -1,4 +1,4 @@
-"""Open3D's surfaces of depth maps as our stage is called: truncated distances and Poisson.
+"""Open3D's surfaces of depth maps with the interface of our stage: truncated distances and Poisson.
 
 Its voxel grids take the pixel that the truncated coordinates name, so the centre of the top-left pixel is
 (0.5, 0.5) there; its points of a depth image have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0

@@ -1,4 +1,4 @@
-"""Rectification by OpenCV as ours is called: homographies of both images and a common frame."""
+"""Rectification by OpenCV with our signature: homographies of both images and a common frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Triangulation by OpenCV and COLMAP as ours is called: P (V, 3, 4), xy (V, N, 2) px -> X (N, 4)."""
+"""Triangulation by OpenCV and COLMAP with our signature: P (V, 3, 4), xy (V, N, 2) px -> X (N, 4)."""
 
 from __future__ import annotations
 

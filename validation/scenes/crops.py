@@ -70,7 +70,7 @@ def make_separate_crops(
 
     So an image overlaps with as many others however many there are. Where the sets do not suffice they
     come again as negatives, mirrored, and as mirrored negatives, which show nothing that the first ones show.
-    Raises ``ValueError`` where these do not suffice either.
+    Raises ``ValueError`` if these do not suffice either.
     """
     most = 4 * len(scenes) * per_scene
     if count > most:

@@ -74,7 +74,7 @@ def our_disparities(left: U8, right: U8) -> tuple[DisparityMap, DisparityMap]:
 def synthesis_of_disparities(
     left: U8, right: U8, of_left: F32, of_right: F32, *, agree_px: float = AGREE_PX
 ) -> TensorSynthesis:
-    """A rectified pair of parallel cameras as a pair for the tensor, unknown pixels taken for background."""
+    """A rectified pair of parallel cameras as a pair for the tensor, unknown pixels treated as background."""
     height, width = of_left.shape
     places = []
     for d, sign in ((of_left, -1.0), (of_right, 1.0)):
@@ -87,7 +87,7 @@ def synthesis_of_disparities(
 
 
 def dissolved(first: U8, second: U8, share: float) -> U8:
-    """Both images mixed where they are: what a view between must be better than."""
+    """Cross-dissolve of both images, the baseline of interpolation."""
     mixed = (1.0 - share) * first.astype(np.float64) + share * second
     return np.asarray(np.rint(mixed), dtype=np.uint8)
 

@@ -84,7 +84,7 @@ def fractal(
     """Multi-octave noise (H, W), zero mean, about 0.5 RMS, between two wavelengths; ``wrap`` closes it along
     x.
 
-    Raises ``ValueError`` where the shortest wavelength is under two texels (the map would be aliased).
+    Raises ``ValueError`` if the shortest wavelength is under two texels (the map would be aliased).
     """
     if wavelengths_m[1] < 2.0 * texel_m:
         raise ValueError(

@@ -55,7 +55,7 @@ def data_root() -> Path | None:
 def read_scene(folder: Path, name: str) -> Scene:
     """A folder with images/ and perhaps cameras.json.
 
-    Raises ``ValueError`` where there are no images, or cameras.json lacks one of them or is damaged.
+    Raises ``ValueError`` if there are no images, or cameras.json lacks one of them or is damaged.
     """
     images = folder / "images"
     found = sorted(images.iterdir(), key=lambda p: p.name) if images.is_dir() else []

@@ -76,7 +76,7 @@ def kusvod2_pairs(
 ) -> Iterator[RealPair]:
     """The pairs of Lebeda, Matas and Chum (BMVC 2012) with their hand-made correspondences as ``truth``.
 
-    Nothing where the images are not on this machine; ``names`` picks some; with ``mutual`` the matches
+    Empty if the images are not on this machine; ``names`` picks some; with ``mutual`` the matches
     must be each other's nearest.
     """
     root = data_root()
@@ -91,7 +91,7 @@ def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2
     """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise.
 
     Its points are the matches that agree with the cameras, moved to where they agree exactly, so they lie
-    where the scene has texture. Nothing where the images are not on this machine.
+    where the scene has texture. Empty if the images are not on this machine.
     """
     if scene is None or scene.K is None or scene.R is None or scene.C is None:
         return

@@ -73,7 +73,7 @@ def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(s
     refused = ask_canaries(options_for(tmp_path, "-".join(METHODS), limit_s))
     version = refused["poselib"].split()[1]
     assert refused == {
-        "cv2": "OpenCV crashed with signal 6 when asked a small question",
+        "cv2": "OpenCV crashed with signal 6 on a small question",
         "pycolmap": "pycolmap did not answer a small question within 12 s",
         "poselib": f"PoseLib {version} gives F of matches with y2 = 2 y1 as [[ 0. 0. 0.] [ 0. 0. 2.] "
         "[ 0. -1. 0.]]; this harness expects [[ 0. 0. 0.] [ 0. 0. -1.] [ 0. 2. 0.]]",

@@ -119,7 +119,7 @@ class Reconstruction:
 
 
 def _load(scene: str) -> Scene:
-    """The images of a scene by its name or its folder; :class:`UsageError` where there are none."""
+    """The images of a scene by its name or its folder; :class:`UsageError` if there are none."""
     folder = Path(scene)
     named = {} if scene in PHOTOGRAPHS or not folder.is_dir() else {scene: str(folder)}
     if scene not in PHOTOGRAPHS and not named:

@@ -109,8 +109,8 @@ def _metrics(scene: str, way: str, board: Board, found: Mapping[str, F64] | None
             "px",
             float(np.linalg.norm(off.mean(axis=0))),
             scatter,
-            "length of the mean of (corner as OpenCV finds it minus its projection by the true camera); "
-            "beside it the deviation of that mean",
+            "length of the mean of (OpenCV corner - true projection); "
+            "beside it the standard deviation of that mean",
         ),
         row(
             "focal length",

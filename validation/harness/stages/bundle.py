@@ -98,7 +98,7 @@ Problem = tuple[MetricCameras, F64, Observations, tuple[int, int]]
 
 
 def _problem(scene: str, options: ReportOptions) -> Problem:
-    """The saved model, moved off its optimum."""
+    """Return the saved model, perturbed."""
     model = _saved(scene, options)
     cameras, X, seen = perturbed_model(model, np.random.default_rng(options.seed))
     return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
@@ -124,7 +124,7 @@ def _saved(scene: str, options: ReportOptions) -> Reconstruction:
 
 
 def _registered_only(model: Reconstruction) -> Reconstruction:
-    """A model all of whose views have a camera."""
+    """Return the model if all views have a camera."""
     if model.registered.all():
         return model
     raise ValueError("an image has no camera, so this model is not adjusted")

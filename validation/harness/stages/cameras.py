@@ -32,7 +32,7 @@ OURS, THESIS, PER_IMAGE = "ours", "ours (thesis)", "ours (a camera each)"
 COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, global"
 MATCHES = "COLMAP, matches"
 FIXTURE = "courtyard"
-"""The scene that is always there: the gates of the thesis' preset are set on it."""
+"""Scene of the gates of the thesis preset, always available."""
 SETTINGS: dict[str, PipelineConfig] = {
     OURS: preset("default"),
     THESIS: preset("thesis"),
@@ -105,7 +105,7 @@ class CamerasStage:
 
 
 def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
-    """The saved model of a method in the order of the scene's images; None if there is none."""
+    """Return the saved model of a method in image order, or None."""
     names = [path.name for path in scene.image_paths]
     try:
         if method in SETTINGS:
@@ -203,14 +203,14 @@ def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
 
 
 def _kept(outcome: Outcome, stage: str) -> Any:
-    """The last record that a stage of the run kept."""
+    """Return the last record of a stage of the run."""
     folder = RunDirectory(outcome.place / "run").stage(FOLDERS[stage])
     *_, (item, key) = read_json(folder.path / MANIFEST_FILE)["keys"].items()
     return folder.load(item, key)
 
 
 def _costs(scene: str, outcomes: Mapping[str, Outcome], shared: Outcome | None) -> list[Metric]:
-    """Processor seconds and memory; COLMAP's mappers carry the matching they all started from."""
+    """Return processor seconds and memory; COLMAP's mappers include the shared matching."""
 
     def seconds(name: str, outcome: Outcome) -> float | None:
         if not outcome.ok:
@@ -273,7 +273,7 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
         cameras = records.get(name, {}).get("cameras", [])
         held: dict[str, float | None] = {OURS: _share_held(cameras, truth.K) if cameras else None}
         widest = {OURS: _widest(cameras)}
-        words = "largest stated deviation of a focal length"
+        words = "largest stated standard deviation of a focal length"
         rows += [
             Metric(
                 scene.name,
@@ -312,7 +312,7 @@ def _millimetres(errors: CameraErrors) -> float | None:
 
 
 def _plots(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Plot]:
-    """The focal length of every image, as each method has it, and the true one."""
+    """Plot the focal length of every image by each method, and the true one."""
     traces: list[dict[str, Any]] = []
     for name, model in models.items():
         if model is None:

@@ -68,7 +68,7 @@ class CloudsStage:
         ours = models[OURS]
         if ours is None or (models[COLMAP] is None and models[COLMAP_PP] is None):
             names = ", ".join(name for name, model in models.items() if model is None)
-            return Judgement((), notes=[f"There is no model of {names}, hence nothing to compare.", *notes])
+            return Judgement((), notes=[f"There is no model of {names} to compare.", *notes])
         metrics: list[Metric] = []
         plots, pictures = list[Plot](), list[Picture]()
         clouds = _pairs_of_clouds(photographs, models)
@@ -86,7 +86,7 @@ class CloudsStage:
 
 
 def _models(scene: Scene, options: ReportOptions) -> dict[str, Reconstruction | None]:
-    """The models that the cameras were judged by, None if a run left none."""
+    """Return the models of the stage cameras, None if missing."""
     models = {}
     for name in (OURS, COLMAP, COLMAP_PP):
         place = options.place("cameras", scene.name, name)
@@ -110,8 +110,8 @@ def _pairs_of_clouds(
 def _common_frame(
     scene: Scene, ours: Reconstruction, theirs: Reconstruction
 ) -> tuple[F64, F64, float] | None:
-    """Both clouds (N, 3), (M, 3) in the frame of the truth, or of theirs where there is none, and the median
-    distance of the points from the cameras there."""
+    """Return both clouds (N, 3), (M, 3) in the true frame, or theirs without truth, and the median
+    distance of the points from the cameras."""
     both = ours.registered & theirs.registered
     if both.sum() < 3:
         return None
@@ -149,7 +149,7 @@ def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
 
 
 def _is_supported(model: Reconstruction, view: int) -> tuple[F64, I64]:
-    """Inlier observations of a view: pixels, and the places of their points among the valid ones."""
+    """Return inlier observations of a view: pixels and indices among the valid points."""
     place = np.cumsum(model.valid) - 1
     tracks = model.tracks
     here = (tracks.view_index == view) & model.inlier & model.valid[tracks.point_index]
@@ -231,7 +231,7 @@ def _icp_metrics(
     near = "share of our points with a partner after ICP"
     return [
         Metric(scene, f"ICP to {name}: turn", "deg", {OURS: turn}, OURS, definition=turned),
-        _row(scene, f"ICP to {name}: shift", 100.0 * shift / unit, "how far it moves the cloud's middle"),
+        _row(scene, f"ICP to {name}: shift", 100.0 * shift / unit, "shift of the cloud centre"),
         Metric(scene, f"ICP to {name}: inliers", "%", {OURS: share}, OURS, at_most=False, definition=near),
     ]
 
@@ -241,7 +241,7 @@ def _row(scene: str, name: str, value: float, words: str) -> Metric:
 
 
 def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
-    """Both clouds in space: ours coloured by the distance to theirs, theirs grey."""
+    """Plot both clouds: ours coloured by the distance to theirs, theirs grey."""
     distance = 100.0 * cKDTree(other).query(mine)[0] / unit
     ours, theirs = _thinned(mine), _thinned(other)
     low, high = np.quantile(mine, [0.02, 0.98], axis=0)
@@ -279,7 +279,7 @@ def _thinned(X: F64) -> np.ndarray[Any, Any]:
 
 
 def _pictures(place: Path, name: str, outcome: Outcome | None) -> list[Picture]:
-    """The difference of the clouds as Open3D rendered it, copied beside the judgement."""
+    """Copy Open3D's rendering of the difference next to the judgement."""
     if outcome is None or not outcome.ok:
         return []
     file = f"{slug(name)}.png"

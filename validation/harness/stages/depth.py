@@ -42,7 +42,7 @@ PRESETS = {OURS: "default", THESIS: "thesis"}
 COURTYARD = "courtyard"
 SCENES = (COURTYARD, "fountain-P11", "Herz-Jesus-P8")
 SIDE_PX = 448
-"""Long side of the depth maps: the library's own is 1024, for which a report has no time."""
+"""Long side of the depth maps; the library default of 1024 takes too long for a report."""
 WORST = 0.02
 """Relative error that is red in the figures."""
 
@@ -105,26 +105,26 @@ class DepthStage:
 
 
 def side_of(options: ReportOptions) -> int:
-    """Long side of depth maps, px."""
+    """Return the long side of depth maps (px)."""
     return options.side_px or SIDE_PX
 
 
 def stereo_of(method: str, options: ReportOptions) -> MultiViewStereo:
-    """The way to depth maps of a preset, at the size of this report."""
+    """Return the stereo method of a preset, at the size of this report."""
     dense = preset(PRESETS[method]).dense
     assert isinstance(dense, MultiViewStereo)
     return replace(dense, max_side=side_of(options))
 
 
 def images_of(photographs: Scene) -> list[Image]:
-    """The images as they are, in the order of the scene."""
+    """Read the original images in scene order."""
     read = read_images(list(photographs.image_paths), max_size_px=10_000)
     by_name = {image.name: image for image in read.images}
     return [by_name[path.name] for path in photographs.image_paths]
 
 
 def model_of(photographs: Scene, options: ReportOptions) -> Reconstruction:
-    """Our saved reconstruction of a scene; ``ValueError`` where there is none."""
+    """Return our saved reconstruction of a scene; ``ValueError`` if missing."""
     outcome = Outcome(options.place("cameras", photographs.name, OUR_CAMERAS))
     model = read_model(photographs, OUR_CAMERAS, outcome)
     if model is None:
@@ -133,7 +133,7 @@ def model_of(photographs: Scene, options: ReportOptions) -> Reconstruction:
 
 
 def views_of(photographs: Scene, model: Reconstruction, options: ReportOptions) -> dict[int, PinholeView]:
-    """The images without distortion, at the size of the depth maps, by view."""
+    """Return undistorted images at depth-map size, by view."""
     return {
         i: pinhole_view(image, model, i, max_side=side_of(options))
         for i, image in enumerate(images_of(photographs))
@@ -215,7 +215,7 @@ def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric
             "error in deviations",
             "",
             lambda j: j.deviations,
-            "median error over the deviation that the map states, over 0.6745: 1 where the stated is true",
+            "median error over the stated standard deviation, over 0.6745: 1 is ideal",
         ),
     ]
 
@@ -252,7 +252,7 @@ def _pictures(
 
 
 def _true_map(view: int, shape: Sequence[int]) -> F32:
-    """The true depth at the nearest samples to the pixels of a map of this shape."""
+    """Return the true depth at the samples nearest to the pixels of a map of this shape."""
     true, _ = load_fixture_depth(view)
     y, x = (
         np.clip(np.rint((np.arange(n) + 0.5) * m / n - 0.5), 0, m - 1).astype(np.int64)

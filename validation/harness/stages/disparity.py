@@ -111,7 +111,7 @@ class DisparityStage(Stage):
 def _of_variants(
     scene: str, wrong: Mapping[str, float | None], known: Mapping[str, float | None]
 ) -> list[Metric]:
-    """The numbers that gates of our other variants are set for."""
+    """Return the gate numbers of our other variants."""
     rows = []
     for name in (THESIS, SEMI_GLOBAL):
         rows += [

@@ -95,7 +95,7 @@ def _gaps(options: ReportOptions) -> tuple[int, ...]:
 
 
 def _corners(method: str, image: Image) -> F64:
-    """The strongest corners (N, 2) of an image."""
+    """Return the strongest corners (N, 2) of an image."""
     if method in (OURS, THESIS):
         config = HarrisCorners() if method == THESIS else preset("default").features
         found = config.detect(image)
@@ -105,7 +105,7 @@ def _corners(method: str, image: Image) -> F64:
 
 
 def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> dict[str, Any]:
-    """F, number of inliers and sigma of every pair."""
+    """Return F, number of inliers and sigma of every pair."""
     prepared = PreparedViews(front_ends()[FRONT_ENDS[method]], images)
     arrays: dict[str, Any] = {}
     for gap in _gaps(options):
@@ -160,12 +160,14 @@ def _repeatability(scene: Scene, outcomes: Mapping[str, Outcome]) -> Metric:
         with np.load(Path(outcome.place) / "corners.npz") as kept:
             corners = [kept[f"{i}"] for i in range(len(scene.image_paths))]
         values[name] = 100.0 * _share_repeated(scene, corners)
-    words = "of the 1000 strongest corners that the next image must show, those found again within 1.5 px"
+    words = (
+        "share of the 1000 strongest corners visible in the next image that are detected there within 1.5 px"
+    )
     return Metric(scene.name, "repeatability", "%", values, OURS, at_most=False, definition=words)
 
 
 def _share_repeated(scene: Scene, corners: list[F64]) -> float:
-    """Over all neighbouring images."""
+    """Return the mean over all neighbouring images."""
     again, asked = 0, 0
     transfer = _transfer(scene)
     for i in range(len(corners) - 1):

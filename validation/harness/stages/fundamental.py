@@ -38,8 +38,8 @@ ERROR = "RMS distance of right correspondences to their epipolar lines, over bot
 
 @dataclass(frozen=True)
 class Answers:
-    """Answers of a method for all pairs and seeds: ``F`` (pairs, seeds, 3, 3), NaN where it gave none,
-    ``inliers`` (pairs, seeds) how many it took, ``seconds`` (pairs, seeds) of one processor."""
+    """Answers of a method for all pairs and seeds: ``F`` (pairs, seeds, 3, 3), NaN if missing,
+    ``inliers`` (pairs, seeds) their number, ``seconds`` (pairs, seeds) of one processor."""
 
     F: F64
     inliers: F64
@@ -104,9 +104,9 @@ def _seeds(options: ReportOptions) -> int:
 
 
 def _pairs(scene: str, options: ReportOptions) -> list[RealPair]:
-    """The pairs of a scene; their matches are kept where the task of the matches leaves them.
+    """Return the pairs of a scene, with the matches of the matching task.
 
-    Raises :class:`NoReference` where nothing can make them.
+    Raises :class:`NoReference` if SIFT is unavailable.
     """
     cache = options.place("fundamental", scene, MATCHES)
     try:
@@ -187,8 +187,8 @@ def _third_singular_value(answers: Answers) -> float:
 
 
 def _epipole_angles(answers: Answers, pairs: list[RealPair]) -> F64:
-    """Angles in degrees between the epipoles of image 1 and the true ones, as directions from the middle of
-    the matches at the distance of their spread; 90 where a method gave no F."""
+    """Return the angles (deg) between estimated and true epipoles of image 1, as directions from the centre
+    of the matches at the distance of their spread; 90 without F."""
     angles = []
     for pair, row in zip(pairs, answers.F, strict=True):
         assert pair.F is not None

@@ -112,7 +112,7 @@ def _surface(method: str, scene: str, options: ReportOptions) -> TexturedMesh:
 
 
 def _true_mesh(method: str, outcome: Outcome, scene: str, options: ReportOptions) -> TexturedMesh:
-    """The saved surface in the frame of the truth."""
+    """Return the saved surface in the true frame."""
     align = _true_from_ours(scene, options, THESIS if method == THESIS else OURS)
     with np.load(Path(outcome.place) / "mesh.npz") as kept:
         faces = kept["faces"].astype(np.int64)
@@ -155,7 +155,7 @@ def _row(scene: str, name: str, unit: str, values: Mapping[str, float | None], w
 
 
 def _camera(scene: str, options: ReportOptions) -> Camera:
-    """The true camera in the middle, at a size for a page."""
+    """Return the middle true camera at page size."""
     truth = load_photographs(scene, options)
     assert truth.K is not None
     assert truth.R is not None
@@ -168,6 +168,6 @@ def _camera(scene: str, options: ReportOptions) -> Camera:
 
 
 def _drawn(mesh: TexturedMesh, off_pct: F64, camera: Camera) -> NDArray[np.uint8]:
-    """The surface coloured by how far each vertex is off."""
+    """Render the surface coloured by the vertex errors."""
     colored = replace(mesh, colors=coloured(off_pct / RED_PCT))
     return render(colored, camera, background=(245, 247, 250)).color

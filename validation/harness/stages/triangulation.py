@@ -23,10 +23,10 @@ from validation.studies.triangulation import SCENES, cameras_of, frame_of, squar
 
 OURS = "ours (polynomial, optimal)"
 DESCENT = 40
-"""Steps to the least reprojection error."""
+"""Iterations to the minimum reprojection error."""
 LINEAR, MIDPOINT = "ours (linear)", "ours (mid-point)"
 ADJUSTED = "ours (cameras too)"
-"""Projective adjustment, which chapter 6 has from the points on: cameras and points of five views."""
+"""Projective bundle adjustment of cameras and points of five views (chapter 6)."""
 MOVED = 1e-3
 """Relative perturbation of camera entries before the adjustment, about a pixel."""
 OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV", "OpenCV, correctMatches", "COLMAP"
@@ -115,7 +115,7 @@ def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
 
 
 def _adjustment(scene: str, problems: list[Problem], kept: Mapping[str, F64] | None) -> Metric:
-    """The largest over the problems."""
+    """Return the maximum over the problems."""
     over = []
     for n, p in enumerate(problems if kept is not None else []):
         if kept is not None and f"P{n}" in kept:
@@ -213,21 +213,21 @@ def _metrics(
 
 
 def _median_space_error(problems: Mapping[int, Problem], answers: Mapping[int, F64]) -> float:
-    """Over all points of all problems, %."""
+    """Return the median over all points of all problems (%)."""
     return float(np.median(np.concatenate([_space_errors(problems[n], X) for n, X in answers.items()])))
 
 
 def _least_squared_distances(n: int, problem: Problem, kept: Mapping[str, Mapping[str, F64] | None]) -> F64:
-    """(N,) of the optimum: the least of all answers and of a descent from the truth, which may miss it."""
+    """Return the optimal residuals (N,): the minimum of all answers and of a descent from the truth."""
     answers = [a[f"{n}"] for a in kept.values() if a is not None and f"{n}" in a]
     found = [squared_distances(problem.P, X, problem.xy) for X in (*answers, _least_near_truth(problem))]
     return np.asarray(np.min(found, axis=0))
 
 
 def _least_near_truth(problem: Problem) -> F64:
-    """Points (N, 4) of least reprojection error, from the true ones on: by an iteration of its own.
+    """Return points (N, 4) of minimum reprojection error, iterated from the true ones.
 
-    Levenberg-Marquardt in the metric frame, every point with a damping of its own.
+    Levenberg-Marquardt in the metric frame, with a separate damping for every point.
     """
     P, X = problem.P @ problem.frame, problem.rig.X[problem.seen]
     cost, damping = np.full(len(X), np.inf), np.full(len(X), 1e-3)
@@ -249,7 +249,7 @@ def _least_near_truth(problem: Problem) -> F64:
 
 
 def _space_errors(problem: Problem, X: F64) -> F64:
-    """Per cent of the distance from the first camera."""
+    """Return the error in percent of the distance from the first camera."""
     back = dehomogenize(X @ np.linalg.inv(problem.frame).T)
     true = problem.rig.X[problem.seen]
     off = np.linalg.norm(back - true, axis=1) / np.linalg.norm(true - problem.rig.C[0], axis=1)
@@ -257,7 +257,7 @@ def _space_errors(problem: Problem, X: F64) -> F64:
 
 
 def _plot(problems: list[Problem], kept: Mapping[str, Mapping[str, F64] | None]) -> Plot:
-    """Error in space over noise: two views beside each other, metric frame."""
+    """Plot the error in space over noise: two views, metric frame."""
     traces = []
     for name, answers in kept.items():
         if answers is None:

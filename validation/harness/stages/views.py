@@ -127,7 +127,7 @@ def _left_out(views: Sequence[int]) -> list[int]:
 def _model(
     method: str, maps: Sequence[DepthMap], views: Sequence[PinholeView], surface: Path
 ) -> TexturedMesh:
-    """A model with colours; ours leaves its ``surface`` for the methods that start from it."""
+    """Build a coloured model; ours stores its ``surface`` for the other methods."""
     if method == OURS:
         surface_model = SurfaceModel().surface_of(maps)
         np.savez(surface, vertices=surface_model.vertices, faces=surface_model.faces)
@@ -145,7 +145,7 @@ def _read_surface(path: Path) -> TexturedMesh:
 
 
 def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list[PinholeView]:
-    """The images with one exposure, by the gains that our texture finds."""
+    """Return the images with equalised exposures, by our texture gains."""
     gains = BlendedTexture().prepare(surface, views).gains
     return [
         replace(view, rgb=np.clip(np.rint(view.rgb * gain), 0, 255).astype(np.uint8))
@@ -154,7 +154,7 @@ def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list
 
 
 def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: Camera) -> None:
-    """Open3D's own image, where the machine has graphics that it can use."""
+    """Return Open3D's own rendering, if the machine supports it."""
     try:
         _save(path, render_open3d(mesh, camera))
     except RuntimeError as error:
@@ -162,7 +162,7 @@ def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: Camera) -> None:
 
 
 def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[str, Likeness], B8]:
-    """Images of one camera beside its image, and the pixels (H, W) compared: those that all of them
+    """Renderings of one camera, its image, and the compared pixels (H, W): those that all of them
     cover whole."""
     whole = {name: covered_pixels(picture) & view.seen for name, picture in drawn.items()}
     compared = np.logical_and.reduce([view.seen, *whole.values()])
@@ -174,7 +174,7 @@ def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[
 
 
 def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView]:
-    """The saved images of a camera, without their depths."""
+    """Return the saved renderings of a camera, without depths."""
     drawn = {}
     for name, outcome in outcomes.items():
         place = Path(outcome.place)
@@ -229,13 +229,13 @@ def _over(scene: str, metric: Metric, unit: str) -> Metric:
     theirs = [v for n, v in metric.values.items() if n.startswith("Open3D") and v is not None]
     ours = metric.values.get(OURS)
     over = ours - max(theirs) if ours is not None and theirs else None
-    words = f"{metric.name} of ours less the best of Open3D's"
+    words = f"{metric.name} of ours minus the best of Open3D's"
     name = f"{metric.name} over Open3D"
     return Metric(scene, name, unit, {OURS: over}, OURS, at_most=False, definition=words)
 
 
 def _beside(photograph: U8, shown: Mapping[str, U8], compared: B8) -> U8:
-    """Image and images in a row, differences of those made equally bright below."""
+    """Draw the image and renderings in a row, exposure-compensated differences below."""
     empty = np.zeros_like(photograph)
     above, below = [photograph], [empty]
     for color in shown.values():
