@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import math
+import operator
 from dataclasses import dataclass
 
 import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, project_camera, undistort
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+
+_ORTHOGONAL = 1e-4
+"""Largest deviation of R'R from the identity; four printed digits leave less."""
+_TRIANGULAR = 1e-9
+"""Largest deviation of K from upper triangular with K33 = 1, by rounding."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """Metric camera x ~ K [R t] X with radial distortion (3.21).
 
@@ -31,7 +39,8 @@ class Camera:
     Raises
     ------
     ValueError
-        If a shape is wrong, a number is not finite or the size is below one pixel.
+        If a shape is wrong, a number is not finite, K is not upper triangular with positive focal lengths and
+        K33 = 1, R is not orthogonal, or the size is not whole numbers of at least 1.
 
     Examples
     --------
@@ -53,16 +62,24 @@ class Camera:
     distortion: F64 | None = None
 
     def __post_init__(self) -> None:
-        shapes = (np.shape(self.K), np.shape(self.R), np.shape(self.t))
-        if shapes != ((3, 3), (3, 3), (3,)):
-            raise ValueError(f"Camera needs K (3, 3), R (3, 3), t (3,); got {shapes}")
-        if min(self.size) < 1:
-            raise ValueError(f"Camera needs a size of at least 1 x 1; got {self.size}")
-        if self.distortion is not None and np.ndim(self.distortion) != 1:
-            raise ValueError(f"Camera needs distortion (C,); got shape {np.shape(self.distortion)}")
-        lens = () if self.distortion is None else (self.distortion,)
-        if not all(np.isfinite(a).all() for a in (self.K, self.R, self.t, *lens)):
-            raise ValueError("Camera needs finite K, R, t and distortion")
+        fields = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("K", "R", "t")}
+        K, R, t = fields.values()
+        require_shapes("Camera", K=(K, (3, 3)), R=(R, (3, 3)), t=(t, (3,)))
+        if self.distortion is not None:
+            fields["distortion"] = np.asarray(self.distortion, dtype=np.float64)
+            require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
+        require_finite("Camera", *fields.values())
+        low = np.append(K[[1, 2, 2], [0, 0, 1]], K[2, 2] - 1.0)
+        if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= _TRIANGULAR):
+            raise ValueError(
+                "Camera needs K upper triangular with positive focal lengths and K33 = 1; "
+                f"got {K.round(6).tolist()}"
+            )
+        apart = np.abs(R.T @ R - np.eye(3)).max()
+        if not apart <= _ORTHOGONAL:
+            raise ValueError(f"Camera needs a rotation R; R'R deviates from the identity by {apart:.2g}")
+        for name, value in {**fields, "size": _checked_size(self.size)}.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def from_matrix(cls, P: F64, size: tuple[int, int]) -> Camera:
@@ -83,8 +100,10 @@ class Camera:
         Raises
         ------
         ValueError
-            If the camera centre is at infinity.
+            If P is not (3, 4) or not finite, the camera centre is at infinity, or the size is invalid.
         """
+        P = np.asarray(P, dtype=np.float64)
+        require_shapes("Camera.from_matrix", P=(P, (3, 4)))
         return cls(*decompose_camera(P), size)
 
     @property
@@ -114,7 +133,14 @@ class Camera:
         -------
         ndarray (N, 2)
             Pixels xy.
+
+        Raises
+        ------
+        ValueError
+            If X is not (N, 3).
         """
+        X = np.asarray(X, dtype=np.float64)
+        require_shapes("Camera.project", X=(X, ("N", 3)))
         return project_camera(self.K, self.R, self.t, X, distortion=self._coefficients)
 
     def unproject(self, xy: F64, depth: F64 | None = None) -> F64:
@@ -131,8 +157,16 @@ class Camera:
         -------
         ndarray (N, 3)
             Points, or unit directions from the centre, in the world frame.
+
+        Raises
+        ------
+        ValueError
+            If xy is not (N, 2) or depth is not (N,).
         """
         xy = np.asarray(xy, dtype=np.float64)
+        require_shapes("Camera.unproject", xy=(xy, ("N", 2)))
+        if depth is not None:
+            require_shapes("Camera.unproject", xy=(xy, ("N", 2)), depth=(depth, ("N",)))
         xh = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(self.K).T
         rays = np.column_stack([undistort(xh[:, :2] / xh[:, 2:], self._coefficients), np.ones(len(xy))])
         if depth is None:
@@ -151,7 +185,14 @@ class Camera:
         -------
         Camera
             The camera of the resized image.
+
+        Raises
+        ------
+        ValueError
+            If the factor is not positive and finite.
         """
+        if not 0.0 < factor < math.inf:
+            raise ValueError(f"Camera.scaled needs a finite factor above 0; got {factor}")
         width, height = (max(1, round(side * factor)) for side in self.size)
         S = np.diag([width / self.size[0], height / self.size[1], 1.0])
         S[:2, 2] = (np.diag(S)[:2] - 1.0) / 2.0
@@ -160,3 +201,13 @@ class Camera:
     @property
     def _coefficients(self) -> F64:
         return np.zeros(1) if self.distortion is None else np.asarray(self.distortion, dtype=np.float64)
+
+
+def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
+    try:
+        width, height = (operator.index(side) for side in size)
+    except (TypeError, ValueError):
+        raise ValueError(f"Camera needs a size (width, height) of whole numbers; got {size}") from None
+    if min(width, height) < 1:
+        raise ValueError(f"Camera needs a size of at least 1 x 1; got {size}")
+    return width, height

@@ -79,6 +79,39 @@ MAX_DEPTH = 16
 
 EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
+# Stage -> word in text -> class. A new method is one line here.
+KINDS: Mapping[str, Mapping[str, type[Any]]] = {
+    "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
+    "pairs": {
+        "all-pairs": AllPairs,
+        "overlap-estimate": OverlapEstimate,
+        "sequence-window": SequenceWindow,
+        "listed-pairs": ListedPairs,
+    },
+    "matching": {"seeds-and-growth": SeedsAndGrowth, "strength-of-match": StrengthOfMatch},
+    "epipolar": {"locally-optimised-ransac": LocallyOptimisedRansac, "thesis-ransac": ThesisRansac},
+    "verification": {"pair-verification": PairVerification},
+    "tracks": {"aligned-tracks": AlignedTracks, "plain-tracks": PlainTracks},
+    "projective": {
+        "incremental-projective": IncrementalProjective,
+        "sequential-projective": SequentialProjective,
+        "factorization": Factorization,
+    },
+    "selfcalibration": {
+        "hypotheses-and-refinement": HypothesesAndRefinement,
+        "stratified": Stratified,
+        "linear-quadric": LinearQuadric,
+        "scanned-quadric": ScannedQuadric,
+        "nonlinear-quadric": NonlinearQuadric,
+        "kruppa-equations": KruppaEquations,
+        "focals-from-fundamental": FocalsFromFundamental,
+        "focal-scan": FocalScan,
+    },
+    "metric": {"metric-refinement": MetricRefinement},
+    "dense": {"multi-view-stereo": MultiViewStereo},
+    "model": {"surface-model": SurfaceModel},
+}
+
 
 class Detector(Protocol):
     """Detect the features of one image (4.2.1)."""
@@ -331,39 +364,6 @@ class PipelineConfig:
     dense: DepthEstimator = field(default_factory=MultiViewStereo)
     model: ModelBuilder = field(default_factory=SurfaceModel)
 
-
-# Stage -> word in text -> class. A new method is one line here.
-KINDS: Mapping[str, Mapping[str, type[Any]]] = {
-    "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
-    "pairs": {
-        "all-pairs": AllPairs,
-        "overlap-estimate": OverlapEstimate,
-        "sequence-window": SequenceWindow,
-        "listed-pairs": ListedPairs,
-    },
-    "matching": {"seeds-and-growth": SeedsAndGrowth, "strength-of-match": StrengthOfMatch},
-    "epipolar": {"locally-optimised-ransac": LocallyOptimisedRansac, "thesis-ransac": ThesisRansac},
-    "verification": {"pair-verification": PairVerification},
-    "tracks": {"aligned-tracks": AlignedTracks, "plain-tracks": PlainTracks},
-    "projective": {
-        "incremental-projective": IncrementalProjective,
-        "sequential-projective": SequentialProjective,
-        "factorization": Factorization,
-    },
-    "selfcalibration": {
-        "hypotheses-and-refinement": HypothesesAndRefinement,
-        "stratified": Stratified,
-        "linear-quadric": LinearQuadric,
-        "scanned-quadric": ScannedQuadric,
-        "nonlinear-quadric": NonlinearQuadric,
-        "kruppa-equations": KruppaEquations,
-        "focals-from-fundamental": FocalsFromFundamental,
-        "focal-scan": FocalScan,
-    },
-    "metric": {"metric-refinement": MetricRefinement},
-    "dense": {"multi-view-stereo": MultiViewStereo},
-    "model": {"surface-model": SurfaceModel},
-}
 
 PRESETS: Mapping[str, PipelineConfig] = {
     "default": PipelineConfig(),

@@ -43,6 +43,31 @@ FOCALS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 REFINED = 3
 CONSTRAINTS = 2
 ITERATIONS = 50
+MINIMUM = 12
+# Squared distances from a homography in sigma^2 are chi-square(2) with this median; below 11 their halves
+# across and along the epipolar lines have this mean.
+NEAR = 11.0
+NEAR_MEAN, CHI2_MEDIAN = 0.97743, 1.386294
+TRIMMINGS = 3
+# The F of a plane chooses the epipole with the smallest noise along its lines: 1.5 +- 1 standard errors.
+STANDARD_ERRORS = 4.0
+# Squared distance in sigma^2 beyond which a match is off the homography; noise exceeds it once in 3000.
+FAR = 16.0
+# Maximum log10 of the false alarms of the matches off the simpler model.
+LARGEST_CHANCE = -3.0
+BAND = 2.5
+# The F of a plane is also fitted to wrong matches, which therefore agree this much more often.
+FLEXIBLE = 2.0
+# Degrees of freedom of F beyond a homography and beyond [e]x.
+EPIPOLE, BEYOND_TRANSLATION = 2, 5
+# Probability to reject a pure translation for normal residuals, and the tolerance added if wrong matches are
+# expected in the band, which attract F.
+RISK, ALLOWANCE = 2e-3, 0.4
+# Probability to reject a rotation by its eigenvalues (either side) and by the camera test.
+ROTATION_RISK = 1e-3
+# Matches within this many sigma of a translation are compared with F.
+TRANSLATED = 3.3
+CORRECTIONS, EXACT = 10, 1e-12
 
 
 def rotation_homography(parameters: F64) -> F64:
@@ -114,33 +139,6 @@ def _start(H: F64, f: float) -> F64:
     U, _, Vt = np.linalg.svd(A)
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return np.array([np.log(f), 0.0, 0.0, *scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()])
-
-
-MINIMUM = 12
-# Squared distances from a homography in sigma^2 are chi-square(2) with this median; below 11 their halves
-# across and along the epipolar lines have this mean.
-NEAR = 11.0
-NEAR_MEAN, CHI2_MEDIAN = 0.97743, 1.386294
-TRIMMINGS = 3
-# The F of a plane chooses the epipole with the smallest noise along its lines: 1.5 +- 1 standard errors.
-STANDARD_ERRORS = 4.0
-# Squared distance in sigma^2 beyond which a match is off the homography; noise exceeds it once in 3000.
-FAR = 16.0
-# Maximum log10 of the false alarms of the matches off the simpler model.
-LARGEST_CHANCE = -3.0
-BAND = 2.5
-# The F of a plane is also fitted to wrong matches, which therefore agree this much more often.
-FLEXIBLE = 2.0
-# Degrees of freedom of F beyond a homography and beyond [e]x.
-EPIPOLE, BEYOND_TRANSLATION = 2, 5
-# Probability to reject a pure translation for normal residuals, and the tolerance added if wrong matches are
-# expected in the band, which attract F.
-RISK, ALLOWANCE = 2e-3, 0.4
-# Probability to reject a rotation by its eigenvalues (either side) and by the camera test.
-ROTATION_RISK = 1e-3
-# Matches within this many sigma of a translation are compared with F.
-TRANSLATED = 3.3
-CORRECTIONS, EXACT = 10, 1e-12
 
 
 class Configuration(Enum):

@@ -22,6 +22,12 @@ from thesisrecon.geometry.two_view import enforce_rank_two, unit_norm
 
 # Ratio of the eighth to the first singular value below which F is undetermined.
 UNDETERMINED_REL = 1e-12
+DIAGONAL = np.sqrt(0.5)
+LANES = 32
+# Rows of a solved batch: 0 and 9 the transforms to the bases (9 each), 18 the orientation of the first three
+# matches, 21 and 30 the last three points of either image (9 each), 39 and 45 the two members (6 each) of
+# the pencil basis, 51 the three coefficients of the monic cubic.
+TO_BASIS_1, TO_BASIS_2, FIRST, SECOND, ROWS = 0, 9, 39, 45, 54
 
 
 def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_two: bool = True) -> F64:
@@ -130,9 +136,6 @@ def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
     solutions = np.empty((3, 9))
     count = seven_point(frame.points(xy1, xy2), np.arange(7), solutions)
     return np.array([frame.matrix_in_pixels(f) for f in solutions[:count]]).reshape(count, 3, 3)
-
-
-DIAGONAL = np.sqrt(0.5)
 
 
 @njit(
@@ -319,13 +322,6 @@ Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
 Three = tuple[float, float, float]
-
-
-LANES = 32
-# Rows of a solved batch: 0 and 9 the transforms to the bases (9 each), 18 the orientation of the first three
-# matches, 21 and 30 the last three points of either image (9 each), 39 and 45 the two members (6 each) of
-# the pencil basis, 51 the three coefficients of the monic cubic.
-TO_BASIS_1, TO_BASIS_2, FIRST, SECOND, ROWS = 0, 9, 39, 45, 54
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")

@@ -23,6 +23,7 @@ from thesisrecon.records import FundamentalFit
 
 # Smallest curvature relative to the largest: the F of a plane stays uncertain but finite.
 FLATTEST_REL = 1e-14
+PARAMETERS = 7
 
 
 def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
@@ -61,9 +62,6 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
     moved -= np.outer(pixels, pixels @ moved) / norm**2
     covariance: F64 = sigma**2 * moved @ moved.T
     return covariance
-
-
-PARAMETERS = 7
 
 
 def _degrees_of_freedom(fit: FundamentalFit) -> float:

@@ -26,6 +26,8 @@ CHI2_1_95, CHI2_2_95 = 3.841458820694124, 5.991464547107979
 MINIMUM = 8
 # Residuals below this are rounding errors, not noise.
 EXACT_PX = 1e-6
+# Matches over which the last rounds take the median; over all matches it grows with the wrong ones.
+NEAR_SIGMAS = 2.5
 
 
 @dataclass(frozen=True)
@@ -272,10 +274,6 @@ class ThesisRansac:
         f = frame.matrix_in_frame(F)
         covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
         return FundamentalFit(F, inliers, sigma, covariance, found.samples)
-
-
-# Matches over which the last rounds take the median; over all matches it grows with the wrong ones.
-NEAR_SIGMAS = 2.5
 
 
 @dataclass(frozen=True)

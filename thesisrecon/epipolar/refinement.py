@@ -20,6 +20,8 @@ SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
 CORRECTIONS = 8
 BLOCK = 128
+# Stands for an infinite width of the loss; its square is still finite.
+UNBOUNDED = 1e150
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
@@ -346,10 +348,6 @@ def refine(
         if gain <= 1e-6 * cost:
             break
     return cost, steps
-
-
-# Stands for an infinite width of the loss; its square is still finite.
-UNBOUNDED = 1e150
 
 
 def refine_sampson(

@@ -37,6 +37,15 @@ from thesisrecon.numerics.levenberg_marquardt import (
 )
 from thesisrecon.numerics.losses import LOSSES
 
+# Maximum weakness of a fit. Planes, rotations and random matches give 0.5 to 1.5 at any noise; scenes with
+# depth and noise of a hundredth of the parallax below 0.1.
+WEAK = 0.4
+# A fit is refused if noise of 1.25 times its own explains six tensors of the linear equations. Points or
+# lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls at most 5, which the
+# constraints of the cameras resolve.
+SAME_NOISE, FAMILY = 1.25, 6
+NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
+
 
 @dataclass(frozen=True)
 class _State:
@@ -234,18 +243,6 @@ def _camera_columns(by_camera: F64) -> F64:
     for view in (1, 2):
         columns[:, view, :, view - 1] = by_camera[:, view].reshape(n, 2, 12)
     return columns.reshape(n, 3, 2, 24)
-
-
-# Maximum weakness of a fit. Planes, rotations and random matches give 0.5 to 1.5 at any noise; scenes with
-# depth and noise of a hundredth of the parallax below 0.1.
-WEAK = 0.4
-
-# A fit is refused if noise of 1.25 times its own explains six tensors of the linear equations. Points or
-# lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls at most 5, which the
-# constraints of the cameras resolve.
-SAME_NOISE, FAMILY = 1.25, 6
-
-NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 
 
 @dataclass(frozen=True)

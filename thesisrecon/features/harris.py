@@ -22,6 +22,8 @@ from thesisrecon.records import Features, Image
 
 # det / trace (grey levels squared) below which corners are quantisation and compression noise.
 NOISE_RESPONSE = 0.05
+# Maximum fraction of the pool that one part of the image may fill, relative to an even distribution.
+POOL_LIMIT = 1.5
 
 
 @dataclass(frozen=True)
@@ -174,10 +176,6 @@ def find_corners(channels: F32, measure: CornerMeasure) -> tuple[F64, F32]:
     xy, value = fit_maxima(measure.response(channels), measure.noise_response, measure.subpixel)
     order = np.argsort(-value, kind="stable")
     return xy[order], value[order]
-
-
-# Maximum fraction of the pool that one part of the image may fill, relative to an even distribution.
-POOL_LIMIT = 1.5
 
 
 @dataclass(frozen=True)

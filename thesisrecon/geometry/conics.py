@@ -16,6 +16,11 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import checked_inverse, checked_unit, require_finite
 
+ABSOLUTE_CONIC = np.eye(3)
+"""Omega on the plane at infinity of a metric frame (3.2)."""
+ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
+"""Its tangent planes in a metric frame (section 3.4.6, figure 3.7)."""
+
 
 def bilinear_form(C: F64, x: F64, y: F64) -> F64:
     """Return S(x, y) = x'C y (3.5).
@@ -282,13 +287,6 @@ def project_dual_quadric(P: F64, dual_quadric: F64) -> F64:
     [640000.0, 640000.0, 1.0]
     """
     return np.asarray(P @ dual_quadric @ np.swapaxes(P, -1, -2))
-
-
-ABSOLUTE_CONIC = np.eye(3)
-"""Omega on the plane at infinity of a metric frame (3.2)."""
-
-ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
-"""Its tangent planes in a metric frame (section 3.4.6, figure 3.7)."""
 
 
 def image_of_absolute_conic(K: F64) -> F64:

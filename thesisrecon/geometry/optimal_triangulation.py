@@ -31,6 +31,8 @@ Four = tuple[float, float, float, float]
 DEGREE = 6
 MONOTONE = 3.0
 """If the linear coefficient exceeds the derivative of the others by this factor, Newton's steps contract."""
+_RANK = 1e-13
+"""Singular values below this fraction of the largest are zero."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -301,10 +303,6 @@ def _intersect_rays(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: 
         norm = 1.0 / math.sqrt(norm)
         for m in range(4):
             X[k, m] *= norm
-
-
-_RANK = 1e-13
-"""Singular values below this fraction of the largest are zero."""
 
 
 @dataclass(frozen=True)

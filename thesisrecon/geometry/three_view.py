@@ -31,6 +31,11 @@ from thesisrecon.geometry.lines_and_planes import unit_normals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import unit_norm
 
+LARGEST_PX = 1e15
+"""Largest coordinate: beyond, fourth powers overflow and a double resolves no fraction of a pixel."""
+NEEDED_EQUATIONS = 26
+"""Seven points, thirteen lines, or a mixture (HZ 16.1)."""
+
 
 def unit_tensor(T: F64) -> F64:
     """Scale a tensor to unit norm.
@@ -344,13 +349,6 @@ def reorder_tensor(T: F64, order: tuple[int, int, int]) -> F64:
         return T if order[1] == 1 else np.swapaxes(T, 1, 2)
     P = cameras_from_tensor(T)
     return tensor_from_cameras(P[order[0]], P[order[1]], P[order[2]])
-
-
-LARGEST_PX = 1e15
-"""Largest coordinate: beyond, fourth powers overflow and a double resolves no fraction of a pixel."""
-
-NEEDED_EQUATIONS = 26
-"""Seven points, thirteen lines, or a mixture (HZ 16.1)."""
 
 
 @dataclass(frozen=True)

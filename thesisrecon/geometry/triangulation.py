@@ -32,6 +32,10 @@ from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
 PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
+_AT_REST = 1e-6
+"""Relative change of all depths at which the iterated linear method has converged."""
+_PARALLEL = 1e-14
+"""Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
 
 
 class _WeightedObservations(NamedTuple):
@@ -264,11 +268,6 @@ def _triangulate_each_midpoint(
 Method = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
 _SortedPixels = tuple[I64, I64, F64]
 """Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
-
-_AT_REST = 1e-6
-"""Relative change of all depths at which the iterated linear method has converged."""
-_PARALLEL = 1e-14
-"""Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
 
 
 def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:

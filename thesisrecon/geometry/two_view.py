@@ -20,6 +20,9 @@ from thesisrecon.geometry.homogeneous import (
     require_shapes,
 )
 
+PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
+"""Least displacement that no homography explains (90 % quantile), over the epipolar distances and in px."""
+
 
 def unit_norm(F: F64) -> F64:
     """Scale matrices to unit Frobenius norm.
@@ -391,10 +394,6 @@ def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -
     plane = quasi_euclidean_planes(F)[0] if plane is None else plane
     P2 = np.hstack([-cross_matrix(e2) @ F + np.outer(e2, plane), scale * e2[:, None]])
     return np.hstack([np.eye(3), np.zeros((3, 1))]), P2
-
-
-PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
-"""Least displacement that no homography explains (90 % quantile), over the epipolar distances and in px."""
 
 
 def require_parallax_of_matches(

@@ -18,6 +18,8 @@ from thesisrecon.camera import Camera
 
 SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
+NEAR = 1e-6
+"""Nearest depth that is drawn, relative to the depth of the farthest vertex."""
 
 
 @njit(cache=True, nogil=True)
@@ -196,10 +198,6 @@ def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
                 c, d = np.float32(texture[below, left, k]), np.float32(texture[below, right, k])
                 upper, lower = a + s * (b - a), c + s * (d - c)
                 out[y, x, k] = upper + t * (lower - upper)
-
-
-NEAR = 1e-6
-"""Nearest depth that is drawn, relative to the depth of the farthest vertex."""
 
 
 @dataclass(frozen=True)

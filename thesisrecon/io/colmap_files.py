@@ -34,6 +34,8 @@ _NEEDED = ("cameras", "images", "points3D")
 _Record = tuple[tuple[Any, ...], "NDArray[Any]"]
 """Values of the fields, and the list at the end of a record."""
 _NO_LIST = np.zeros(0)
+_POINT_2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+_TRACK_ENTRY = np.dtype([("image", "<u4"), ("row", "<u4")])
 
 
 class _Table(NamedTuple):
@@ -65,8 +67,6 @@ class _Table(NamedTuple):
         return self.packing.size + ("N" in self.fields) + _COUNT.size * self.counted
 
 
-_POINT_2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-_TRACK_ENTRY = np.dtype([("image", "<u4"), ("row", "<u4")])
 _TABLES = {
     "rigs": _Table(
         "IISI",

@@ -36,6 +36,13 @@ MIN_WINDOW_CORRELATION = 0.3
 LEAST_CONDITION = 1e-4
 # Squared step in pixels of the scale at which the iteration stops.
 SETTLED = 1e-6
+ITERATIONS = 12
+# A window of half the width must fit better and stay near the result of the wider one.
+FINE_CORRELATION = 0.85
+FINE_SHIFT = 1.0
+# Maximum standard deviation of the position in pixels of the scale. Removes smooth shading, which correlates
+# with anything and passes a correlation threshold.
+MAX_STD = 0.12
 
 
 @njit(cache=True, nogil=True)
@@ -237,15 +244,6 @@ def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
     dx, dy = size * delta[0], size * delta[1]
     xy[0] -= a[0, 0] * dx + a[0, 1] * dy
     xy[1] -= a[1, 0] * dx + a[1, 1] * dy
-
-
-ITERATIONS = 12
-# A window of half the width must fit better and stay near the result of the wider one.
-FINE_CORRELATION = 0.85
-FINE_SHIFT = 1.0
-# Maximum standard deviation of the position in pixels of the scale. Removes smooth shading, which correlates
-# with anything and passes a correlation threshold.
-MAX_STD = 0.12
 
 
 def align_corners(

@@ -21,6 +21,13 @@ from thesisrecon.records import Seeds
 
 MapAll = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
 """Apply a function to each item, possibly in several threads, and return the results in order."""
+# Minimum correlation of two patches of the same surface: half of the variance in common.
+MIN_CORRELATION = 0.5
+# Below this the tail of the binomial distribution underflows.
+MIN_LOG10 = -300.0
+SAMPLES_PER_WORD = 8
+ROUNDS = 4
+ROWS_AT_ONCE = 4096
 
 
 def pair_array(pairs: Iterable[Iterable[int]]) -> I64:
@@ -77,12 +84,6 @@ def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> 
                 count += 1
         most = max(most, count)
     return most
-
-
-# Minimum correlation of two patches of the same surface: half of the variance in common.
-MIN_CORRELATION = 0.5
-# Below this the tail of the binomial distribution underflows.
-MIN_LOG10 = -300.0
 
 
 @dataclass(frozen=True)
@@ -215,11 +216,6 @@ def _log10_false_alarms(k: int, matches: int, chance: float) -> float:
     """log10 of M times the probability that at least k of M - 1 other matches agree by chance."""
     tail = float(scipy.special.bdtrc(k - 1, matches - 1, chance)) if k > 0 else 1.0
     return float(np.log10(matches)) + max(float(np.log10(max(tail, 1e-320))), MIN_LOG10)
-
-
-SAMPLES_PER_WORD = 8
-ROUNDS = 4
-ROWS_AT_ONCE = 4096
 
 
 def bow_similarity(patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator) -> F64:

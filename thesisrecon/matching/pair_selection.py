@@ -23,6 +23,9 @@ from thesisrecon.records import Features, PairChoice
 
 # ruff: noqa: ARG002 (all selectors have the same arguments)
 
+# Evidence of the upright patches at which the rotated ones are not compared: one false alarm in a million.
+DECIDED = 6.0
+
 
 @dataclass(frozen=True)
 class AllPairs:
@@ -165,10 +168,6 @@ class ListedPairs:
         number = {name: i for i, name in enumerate(names)}
         there = (pair for pair in self.listed if pair[0] in number and pair[1] in number)
         return PairChoice(pair_array((number[one], number[two]) for one, two in there), "the listed pairs")
-
-
-# Evidence of the upright patches at which the rotated ones are not compared: one false alarm in a million.
-DECIDED = 6.0
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from thesisrecon.records import Features, FundamentalFit, Image, Matches
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 SIDE = 15
 SAMPLES = SIDE * SIDE
+PYRAMID_LEVELS = 4
 
 
 @njit(cache=True, nogil=True)
@@ -182,9 +183,6 @@ def affine_determinant(a: F64) -> float:
     """
     determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     return determinant if determinant > 0.04 and determinant < 25.0 else 0.0
-
-
-PYRAMID_LEVELS = 4
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ RAYLEIGH_90 = 2.1460
 """90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
 MIN_VIEWS_PER_LENS = 3
 """k2 and k3 are estimated only if this many views share them."""
+FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
 
 
 @dataclass(frozen=True)
@@ -262,6 +263,3 @@ def with_initial_gate(model: MetricEstimate) -> MetricEstimate:
         return model
     wider = max(1.0, noise_from_distances(norms) / model.sigma_px)
     return replace(model, tail=wider, loss_sigmas=2.0 * wider)
-
-
-FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))

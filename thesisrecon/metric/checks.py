@@ -26,6 +26,21 @@ MIN_BASELINE_RATIO = 2e-3
 """Baseline over distance to the scene; views nearer together have no usable parallax."""
 MIN_REDUNDANCY = 0.1
 """Coordinates with a smaller share of their variance left in the residual do not measure the noise."""
+_FOCAL_RANGE = (0.2, 20.0)
+_MAX_FOCAL_STD = 0.15
+_MIN_MODEL_INLIER_RATIO = 0.6
+_MAX_SIGMA_REL = 0.0015
+# Cropping a tenth of the image on two sides moves the principal point by 0.12 long sides.
+_MAX_PRINCIPAL_SHIFT = 0.15
+_MAX_FOCAL_CHANGE = 0.25
+MIN_INLIER_RATIO = 0.5
+"""Inlier ratio of a view, wrong matches included."""
+MIN_CONFIRMED_RATIO = 0.7
+"""The same for points that others determine: correct cameras reach 0.9, wrong ones stay below 0.5."""
+MAX_BEHIND = 0.05
+MAX_NOISE_RATIO = 3.0
+MAX_OWN_FOCAL = 0.03
+MAX_OWN_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
@@ -188,24 +203,6 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
         float(np.log(max(fit.intrinsics[1] / intrinsics[1], 1e-9))),
         float(std[1]),
     )
-
-
-_FOCAL_RANGE = (0.2, 20.0)
-_MAX_FOCAL_STD = 0.15
-_MIN_MODEL_INLIER_RATIO = 0.6
-_MAX_SIGMA_REL = 0.0015
-# Cropping a tenth of the image on two sides moves the principal point by 0.12 long sides.
-_MAX_PRINCIPAL_SHIFT = 0.15
-_MAX_FOCAL_CHANGE = 0.25
-
-MIN_INLIER_RATIO = 0.5
-"""Inlier ratio of a view, wrong matches included."""
-MIN_CONFIRMED_RATIO = 0.7
-"""The same for points that others determine: correct cameras reach 0.9, wrong ones stay below 0.5."""
-MAX_BEHIND = 0.05
-MAX_NOISE_RATIO = 3.0
-MAX_OWN_FOCAL = 0.03
-MAX_OWN_SIGMAS = 5.0
 
 
 def self_check(

@@ -22,6 +22,12 @@ from thesisrecon.numerics.partial_bundle import refine_pose
 
 ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 """Factors tried on the focal length of a camera that shares it with no registered view."""
+WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
+"""k1 is free from the start: without it gates would have to admit wrong points."""
+MAX_ROUNDS = 6
+MIN_GAIN = 0.003
+"""Increase of the inlier ratio below which the rounds end."""
+MIN_INLIER_RATIO = 0.5
 
 
 def resect_calibrated(
@@ -141,14 +147,6 @@ def _pose_and_focal(
         if pose is not None and (best is None or pose[2].sum() > best[3].sum()):
             best = pose[0], pose[1], table[row], pose[2]
     return best
-
-
-WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
-"""k1 is free from the start: without it gates would have to admit wrong points."""
-MAX_ROUNDS = 6
-MIN_GAIN = 0.003
-"""Increase of the inlier ratio below which the rounds end."""
-MIN_INLIER_RATIO = 0.5
 
 
 @dataclass(frozen=True)

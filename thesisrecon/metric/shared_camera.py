@@ -27,6 +27,21 @@ CENTRE_STD = 0.1
 MAX_OBSERVATIONS = 15000
 ITERATIONS = 30
 """A deformed model lies in a long valley of the cost: a dozen iterations do not suffice."""
+FALSE_ALARM_RATE = 1e-3
+STD_FLOOR = 2e-3
+"""Floor of the relative standard deviation of an own focal."""
+MIN_FOCAL_DIFFERENCE = 0.01
+"""Relative; smaller differences are harmless."""
+MIN_CENTRE_DIFFERENCE = 0.015
+"""In long sides; smaller differences are harmless."""
+MAX_OWN_FOCAL_STD = 0.03
+"""Relative; with less certain own focals the sharing cannot be tested."""
+ZOOM_STD = 0.03
+"""Assumed relative scatter of focals that cannot be tested."""
+MAX_SIGMAS = 3.0
+MAX_CENTRE_SIGMAS = 5.0
+MAX_OVERDISPERSION = 8.0
+"""Variance ratio of blocks over points: 1.5 to 5 for correct models of real images, 11 to 28 if deformed."""
 
 
 def _subsample_inliers(model: MetricEstimate) -> I64:
@@ -85,19 +100,6 @@ class _PerViewFit:
             prior=known,
             options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
         )
-
-
-FALSE_ALARM_RATE = 1e-3
-STD_FLOOR = 2e-3
-"""Floor of the relative standard deviation of an own focal."""
-MIN_FOCAL_DIFFERENCE = 0.01
-"""Relative; smaller differences are harmless."""
-MIN_CENTRE_DIFFERENCE = 0.015
-"""In long sides; smaller differences are harmless."""
-MAX_OWN_FOCAL_STD = 0.03
-"""Relative; with less certain own focals the sharing cannot be tested."""
-ZOOM_STD = 0.03
-"""Assumed relative scatter of focals that cannot be tested."""
 
 
 @dataclass(frozen=True)
@@ -260,12 +262,6 @@ def _untestable(std: float) -> str:
         f"The shared focal length cannot be verified: single images determine their own {alone}. The "
         f"interval allows for zoom differences of {ZOOM_STD:.0%}. Add images from more directions"
     )
-
-
-MAX_SIGMAS = 3.0
-MAX_CENTRE_SIGMAS = 5.0
-MAX_OVERDISPERSION = 8.0
-"""Variance ratio of blocks over points: 1.5 to 5 for correct models of real images, 11 to 28 if deformed."""
 
 
 def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustment) -> list[str]:

@@ -33,6 +33,22 @@ OVERDISPERSION_RANGE = (1.3, 1.8)
 """Pure noise stays below the first; at the second the model is certainly inexact."""
 TAIL_RANGE = (1.2, 1.6)
 """The same for the residuals' tail: normal noise has 1, matches of real images 2 to 3."""
+COLUMNS = (FOCAL, *CENTRE, K1)
+"""Intrinsics with a hierarchical prior."""
+MIN_MEMBERS = 3
+OUTLIER_SIGMAS = 4.0
+SAME_ZOOM = 0.01
+"""Cameras whose focals scatter by less (relative) share k2 and k3."""
+MIN_SPREAD = 1e-6
+MIN_SPREAD_SIGMAS = 0.3
+"""Lower bound of tau in units of the noise: a few values can agree by chance."""
+UNVERIFIED_SHARING = "shared focal length that the images cannot verify: small zoom differences allowed for"
+NORMAL_95 = 1.959964
+_COLUMNS = {
+    "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
+    "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1],
+    "k1": K1, "k2": K1 + 1, "k3": K1 + 2,
+}  # fmt: skip
 
 
 def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
@@ -63,17 +79,6 @@ def _std_floor(model: MetricEstimate, scatter: BlockScatter, floor_rel: float) -
     units = np.ones_like(model.cameras.intrinsics)
     units[:, (SKEW, *CENTRE)] = model.cameras.intrinsics[:, :1]
     return np.asarray(floor_rel * lack_of_fit(scatter, model.tail) * alone * units)
-
-
-COLUMNS = (FOCAL, *CENTRE, K1)
-"""Intrinsics with a hierarchical prior."""
-MIN_MEMBERS = 3
-OUTLIER_SIGMAS = 4.0
-SAME_ZOOM = 0.01
-"""Cameras whose focals scatter by less (relative) share k2 and k3."""
-MIN_SPREAD = 1e-6
-MIN_SPREAD_SIGMAS = 0.3
-"""Lower bound of tau in units of the noise: a few values can agree by chance."""
 
 
 @dataclass(frozen=True)
@@ -325,15 +330,6 @@ def focal_shrinkage(
         tau = np.where(active, tau, 1.0)
         weight = np.where(active, tau**2 / (tau**2 + std**2), 1.0)
     return FocalShrinkage(np.hypot(std, own.floor[:, FOCAL])[group], weight[group])
-
-
-UNVERIFIED_SHARING = "shared focal length that the images cannot verify: small zoom differences allowed for"
-NORMAL_95 = 1.959964
-_COLUMNS = {
-    "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
-    "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1],
-    "k1": K1, "k2": K1 + 1, "k3": K1 + 2,
-}  # fmt: skip
 
 
 def intrinsic_intervals(

@@ -16,6 +16,11 @@ from thesisrecon.numerics.losses import loss_curvature, loss_value, loss_weight
 from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
 from thesisrecon.numerics.small_solvers import away_from_zero
 
+POSE_DOF = 6
+# Columns of a table of intrinsics: with k1, or with k1, k2 and k3.
+INTRINSIC_DOFS = (6, 8)
+FOCAL = 0
+
 
 class MetricModel(NamedTuple):
     """Scene of the kernels: poses, points and the table of intrinsics.
@@ -208,12 +213,6 @@ def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
     m00, m01, m11 = d + 2.0 * slope * a * a, 2.0 * slope * a * b, d + 2.0 * slope * b * b
     D[0, 8], D[0, 9] = f * m00 + skew * m01, f * m01 + skew * m11
     D[1, 8], D[1, 9] = g * m01, g * m11
-
-
-POSE_DOF = 6
-# Columns of a table of intrinsics: with k1, or with k1, k2 and k3.
-INTRINSIC_DOFS = (6, 8)
-FOCAL = 0
 
 
 @dataclass(frozen=True)

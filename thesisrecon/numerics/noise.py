@@ -13,6 +13,16 @@ TAIL, SEPARATION = 4.0, 12.0
 """Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise."""
 CORE_COUNT, TAIL_COUNT, WRONG_COUNT = 1.0, 0.5, 1.0
 """Prior counts of each component."""
+MAD_FACTOR = 1.4826022185056018
+"""1 / Phi^-1(0.75): the thesis' text divides by Phi(0.75), which is not consistent."""
+MEDIAN_RATIO, MAX_WIDENINGS = 0.22, 6
+RAYLEIGH_MEDIAN = 1.1774
+TRIM, TRIMMED_VARIANCE, TRIM_ROUNDS = 2.5, 0.91125, 5
+"""Trimming point in standard deviations, variance of a standard normal variable trimmed there, and rounds."""
+EM_ROUNDS, QUANTILES = 6, 300
+"""EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more."""
+BISECTIONS = 20
+HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -67,18 +77,6 @@ def fit_noise_mixture(residuals: F64, parameters: float, spread: float, rounds: 
         mixture[3] = (n1 + TAIL_COUNT) / total
         mixture[4] = (n2 + WRONG_COUNT) / total
     return likelihood / n
-
-
-MAD_FACTOR = 1.4826022185056018
-"""1 / Phi^-1(0.75): the thesis' text divides by Phi(0.75), which is not consistent."""
-MEDIAN_RATIO, MAX_WIDENINGS = 0.22, 6
-RAYLEIGH_MEDIAN = 1.1774
-TRIM, TRIMMED_VARIANCE, TRIM_ROUNDS = 2.5, 0.91125, 5
-"""Trimming point in standard deviations, variance of a standard normal variable trimmed there, and rounds."""
-EM_ROUNDS, QUANTILES = 6, 300
-"""EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more."""
-BISECTIONS = 20
-HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 
 
 def noise_scale(residuals: F64, *, parameters: int = 7) -> float:

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 
+_MORTON_BITS = 31
+
 
 class Observations(NamedTuple):
     """Image observations of scene points, in any order; sorted by point is fastest.
@@ -131,9 +133,6 @@ class Weighting(NamedTuple):
     code: int
     delta: float
     min_curvature: float = 1.0
-
-
-_MORTON_BITS = 31
 
 
 def morton_pair_order(first: ArrayLike, second: ArrayLike) -> I64:

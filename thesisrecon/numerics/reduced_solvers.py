@@ -18,6 +18,11 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics.elimination import ReducedSums
 from thesisrecon.numerics.levenberg_marquardt import solve_positive
 
+# Cost of an operation relative to dense Cholesky: narrow bands compute slower, products read from memory.
+BAND_COST, PRODUCT_COST = 2.0, 8.0
+TYPICAL_PRODUCTS = 150
+SMALL = 600
+
 
 @njit(cache=True, nogil=True)
 def _fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
@@ -112,12 +117,6 @@ def invert_band(L: F64, Z: F64) -> None:
         for k in range(j + 1, last + 1):
             total += L[j, k - j] * Z[j, k - j]
         Z[j, 0] = pivot * (pivot - total)
-
-
-# Cost of an operation relative to dense Cholesky: narrow bands compute slower, products read from memory.
-BAND_COST, PRODUCT_COST = 2.0, 8.0
-TYPICAL_PRODUCTS = 150
-SMALL = 600
 
 
 @dataclass(frozen=True)

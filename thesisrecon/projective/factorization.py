@@ -35,6 +35,11 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 _BALANCING_ITERATIONS = 10
 # Relative gain of an iteration below which the factors have converged.
 _MIN_GAIN_REL = 1e-4
+_MIN_POINTS = 16
+"""Minimum number of complete tracks of a factorization."""
+_MAX_ROUNDS = 5
+_PLANE_SIGMAS = 3.0
+"""Whitened distances from a homography, in noise sigmas, of the points that it explains."""
 
 
 @dataclass(frozen=True)
@@ -207,12 +212,6 @@ def _factors(xy: F64, x: F64, T: F64, depths: F64, iterations: int) -> Factors:
 
 
 Edge = tuple[int, int]
-
-_MIN_POINTS = 16
-"""Minimum number of complete tracks of a factorization."""
-_MAX_ROUNDS = 5
-_PLANE_SIGMAS = 3.0
-"""Whitened distances from a homography, in noise sigmas, of the points that it explains."""
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,10 @@ from thesisrecon.projective.track_selection import (
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 _SAMPLE = 6
+# Required share of inliers among the points that a camera sees.
+_MIN_INLIER_RATIO = 0.3
+# Quantile over all points of the projection standard deviations that is tested.
+_STD_QUANTILE = 0.8
 
 
 def resect_ransac(
@@ -206,12 +210,6 @@ def find_inconsistent_view(
     share_of_view = np.where(total > 0, agreed / np.maximum(total, 1.0), 1.0)
     worst = int(np.argmin(share_of_view))
     return (worst, float(share_of_view[worst])) if share_of_view[worst] < min_ratio else None
-
-
-# Required share of inliers among the points that a camera sees.
-_MIN_INLIER_RATIO = 0.3
-# Quantile over all points of the projection standard deviations that is tested.
-_STD_QUANTILE = 0.8
 
 
 @dataclass(frozen=True)

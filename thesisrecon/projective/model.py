@@ -16,6 +16,12 @@ from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from thesisrecon.projective.track_selection import observation_cells
 from thesisrecon.records import Reconstruction, Tracks
 
+# Residual beyond which the loss of bundle adjustment is linear, in noise sigmas.
+LOSS_SIGMAS = 2.0
+# View pairs tried for a point with a wrong observation: all of them up to five observations.
+_HYPOTHESES = 10
+_POINT_ITERATIONS = 4
+
 
 @njit(cache=True, nogil=True)
 def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen: B8) -> tuple[F64, F64]:
@@ -55,13 +61,6 @@ def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen:
         if np.isfinite(u) and np.isfinite(v):
             distance[k] = np.sqrt(u * u + v * v)
     return depth, distance
-
-
-# Residual beyond which the loss of bundle adjustment is linear, in noise sigmas.
-LOSS_SIGMAS = 2.0
-# View pairs tried for a point with a wrong observation: all of them up to five observations.
-_HYPOTHESES = 10
-_POINT_ITERATIONS = 4
 
 
 @dataclass

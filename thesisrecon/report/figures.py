@@ -23,6 +23,12 @@ MAX_POINTS = 25_000
 _BINS = 28
 # Possible ends of the common histogram axis.
 _ROUND_LIMITS_PX = (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0)
+_INK, _ACCENT, _PANEL = "#1b2733", "#ff9f43", "#131a22"
+# Lightness falls evenly, so that the order is visible in grey and for colour-blind readers.
+_PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1f8089"], [1.0, "#0b4a5c"]]
+_REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
+MAX_MATRIX = 200
+_MAX_ANNOTATED = 14
 
 
 @dataclass(frozen=True)
@@ -152,13 +158,6 @@ def _box(corners: F64) -> tuple[F64, F64]:
     margin = 0.03 * float((high - low).max()) or 1.0
     return low - margin, high + margin
 
-
-_INK, _ACCENT, _PANEL = "#1b2733", "#ff9f43", "#131a22"
-# Lightness falls evenly, so that the order is visible in grey and for colour-blind readers.
-_PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1f8089"], [1.0, "#0b4a5c"]]
-_REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
-MAX_MATRIX = 200
-_MAX_ANNOTATED = 14
 
 Figure = dict[str, Any]
 

@@ -67,6 +67,23 @@ from thesisrecon.report.viewer import viewer_data
 if TYPE_CHECKING:
     import jinja2
 
+_FRAME_SIDE_PX, _FRAME_QUALITY = 960, 85
+"""Of the frames on a strip page; the files beside it have full size and quality."""
+_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT = 200.0, 44.0
+_MAX_LISTED_PAIRS = 120
+_AFFINE_POINTS = 5_000
+_INTRINSICS = {
+    "focal_px": "Focal length (px)",
+    "aspect": "Aspect (fy/fx)",
+    "skew_px": "Skew (px)",
+    "principal_x_px": "Principal x (px)",
+    "principal_y_px": "Principal y (px)",
+    "k1": "k1",
+    "k2": "k2",
+    "k3": "k3",
+}
+_ALWAYS_SHOWN = ("focal_px", "principal_x_px", "principal_y_px", "k1")
+
 
 def template_environment() -> jinja2.Environment:
     """Create a Jinja environment that escapes all text, with no undefined names and no NaN in JSON.
@@ -133,10 +150,6 @@ def script_hashes(scripts: Sequence[str]) -> str:
     return " ".join(found) or "'none'"
 
 
-_FRAME_SIDE_PX, _FRAME_QUALITY = 960, 85
-"""Of the frames on a strip page; the files beside it have full size and quality."""
-
-
 def strip_page(
     title: str, frames: Sequence[tuple[str, NDArray[np.uint8]]], *, notes: Sequence[str] = ()
 ) -> str:
@@ -180,23 +193,6 @@ def _embedded(rgb: NDArray[np.uint8]) -> str:
     picture = PillowImage.fromarray(rgb)
     picture.thumbnail((_FRAME_SIDE_PX, _FRAME_SIDE_PX), PillowImage.Resampling.LANCZOS)
     return embed_jpeg(picture, quality=_FRAME_QUALITY).uri
-
-
-_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT = 200.0, 44.0
-_MAX_LISTED_PAIRS = 120
-_AFFINE_POINTS = 5_000
-
-_INTRINSICS = {
-    "focal_px": "Focal length (px)",
-    "aspect": "Aspect (fy/fx)",
-    "skew_px": "Skew (px)",
-    "principal_x_px": "Principal x (px)",
-    "principal_y_px": "Principal y (px)",
-    "k1": "k1",
-    "k2": "k2",
-    "k3": "k3",
-}
-_ALWAYS_SHOWN = ("focal_px", "principal_x_px", "principal_y_px", "k1")
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,14 @@ from thesisrecon.runtime.dask_cluster import Cluster, connect_dask, is_dask_addr
 from thesisrecon.runtime.signals import CODES, starting_processes
 from thesisrecon.settings import unknown_word
 
+NAMES = ("local", "processes", "dask://HOST:PORT")
+AHEAD = 2
+"""Submitted tasks per worker: enough to keep it busy, few in memory."""
+SIGTERM_DELAY_S = 1.0
+"""Time a worker process waits for its parent to end after SIGTERM."""
+CHECK_S = 5.0
+"""Time without results after which the workers are checked."""
+
 
 @cache
 def package_key() -> str:
@@ -46,14 +54,6 @@ def package_key() -> str:
         content.update(path.read_bytes())
     return content.hexdigest()[:32]
 
-
-NAMES = ("local", "processes", "dask://HOST:PORT")
-AHEAD = 2
-"""Submitted tasks per worker: enough to keep it busy, few in memory."""
-SIGTERM_DELAY_S = 1.0
-"""Time a worker process waits for its parent to end after SIGTERM."""
-CHECK_S = 5.0
-"""Time without results after which the workers are checked."""
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -27,6 +27,7 @@ from thesisrecon.selfcalibration.unknowns import HOMOGRAPHY_NOISE, ConicConstrai
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ENTRY_WEIGHT = np.array([1.0 if a == b else np.sqrt(2.0) for a, b in _PAIRS])
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_DESCENTS = 3
 
 
 def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
@@ -279,9 +280,6 @@ def _focals(H: F64, w: F64) -> F64:
     dual = np.linalg.inv(_transferred_conics(usable, w))
     centred = dual[:, [0, 1], [0, 1]] / dual[:, 2, 2, None] - (dual[:, :2, 2] / dual[:, 2, 2, None]) ** 2
     return np.where(good, np.sqrt(np.abs(np.prod(centred, axis=1)) ** 0.5), 1.0)
-
-
-_DESCENTS = 3
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,9 @@ from thesisrecon.selfcalibration.frame import ReferenceFrame
 from thesisrecon.selfcalibration.refinement import minimize_batch
 from thesisrecon.selfcalibration.unknowns import ConicConstraints, square_pixel_constraints
 
+# Planes closer than this, relative to 1 + |p|, are the same.
+_SAME_PLANE = 1e-3
+
 
 @dataclass(frozen=True)
 class ProjectiveScene:
@@ -61,10 +64,6 @@ class PlaneCandidates:
     planes: F64
     scores: F64
     orthogonal: F64 = field(default_factory=lambda: np.zeros((0, 2, 3)))
-
-
-# Planes closer than this, relative to 1 + |p|, are the same.
-_SAME_PLANE = 1e-3
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,10 @@ from thesisrecon.selfcalibration.refinement import RotationCriterion, central_di
 from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns, weak_focal_prior
 
 _ROOT2 = np.sqrt(2.0)
+# A refined focal length further from the posterior mean, in its standard deviations, is not used.
+_MAX_DEPARTURE_SIGMAS = 4.0
+# Probability that F of a pair is wrong: no single pair can exclude a focal length.
+_WRONG_PAIR_PROBABILITY = 1e-2
 
 
 def bougnoux_focals(F: F64) -> F64:
@@ -232,13 +236,6 @@ def _inverse_root(C: F64, *, power: float) -> F64:
     large = (value > 1e-10 * np.maximum(value[:, 2:], 1e-300)) & np.array([False, True, True])
     root = np.where(large, np.where(large, value, 1.0) ** power, 0.0)
     return np.asarray((vector * root[:, None, :]) @ np.swapaxes(vector, 1, 2))
-
-
-# A refined focal length further from the posterior mean, in its standard deviations, is not used.
-_MAX_DEPARTURE_SIGMAS = 4.0
-
-# Probability that F of a pair is wrong: no single pair can exclude a focal length.
-_WRONG_PAIR_PROBABILITY = 1e-2
 
 
 @dataclass(frozen=True)

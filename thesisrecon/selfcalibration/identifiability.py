@@ -58,6 +58,64 @@ _MAX_ITERATIONS = 12
 _NEEDED_EQUATIONS = 8
 _FREE_STD = 1e3
 _FREE = np.array([True, True, False, True, True, False])
+_FOUND: Mapping[str, str] = {
+    PLANE: (
+        "the scene is planar: the points lie in one plane to {scene_planarity_ratio:.1%} of its width, which "
+        "hardly determines the cameras"
+    ),
+    ROTATION: (
+        "close to a pure rotation: the camera moved by only {centre_spread_over_distance:.1%} of the "
+        "distance "
+        "to the scene, which determines the focal length but hardly any depth"
+    ),
+    TRANSLATION: (
+        "close to a pure translation: the camera rotated by at most {largest_rotation_deg:.1f} degrees, "
+        "which "
+        "does not determine the focal length"
+    ),
+    OPTICAL_AXIS: (
+        "the camera rotated about its optical axis only and looked in one direction, which does not "
+        "determine "
+        "the focal length"
+    ),
+    TURNTABLE: (
+        "turntable motion: all views rotate about one axis (to within {rotation_axis_spread_deg:.1f} "
+        "degrees), "
+        "which does not determine the scale along the axis unless the aspect ratio of the pixels is known"
+    ),
+    PLANAR: (
+        "planar motion: the camera moved in a plane and rotated about one direction (to within "
+        "{rotation_axis_spread_deg:.1f} degrees), which does not determine the scale across the plane unless "
+        "the aspect ratio of the pixels is known"
+    ),
+    PARALLEL_AXES: (
+        "all rotation axes are parallel (to within {rotation_axis_spread_deg:.1f} degrees), which does not "
+        "determine the scale along the axes unless the aspect ratio of the pixels is known"
+    ),
+}
+_FOUND_PROJECTIVE: Mapping[str, str] = {
+    TRANSLATION: (
+        "the projective cameras fit a pure translation, which does not determine the focal length (points at "
+        "infinity move by {infinity_shift:.1%} of the image)"
+    ),
+    OPTICAL_AXIS: (
+        "the projective cameras fit a rotation about the optical axis, which does not determine the focal "
+        "length (points at infinity move by {infinity_shift_beyond_roll:.1%} of the image)"
+    ),
+}
+_ROTATE = "rotate the camera by at least 10 degrees between images, about the vertical and a horizontal axis"
+_HEIGHTS = "take some images from higher or lower positions, or with the camera rolled by 90 degrees"
+_ADVICE: Mapping[str, str] = {
+    PLANE: "include objects at different depths",
+    ROTATION: "walk around the scene between images",
+    TRANSLATION: _ROTATE,
+    OPTICAL_AXIS: "point the camera in different directions",
+    TURNTABLE: _HEIGHTS,
+    PLANAR: _HEIGHTS,
+    PARALLEL_AXES: "tilt the camera up and down too, or roll it by 90 degrees",
+}
+_RESOLVED_BY_FOCAL = (_ROTATE, _ADVICE[OPTICAL_AXIS])
+_RESOLVED_BY_ASPECT = (TURNTABLE, PLANAR, PARALLEL_AXES)
 
 
 def check_identifiability(
@@ -382,66 +440,6 @@ def rotation_significance(R: F64, covariance: F64 | None) -> float:
     tilt = (R @ (mean / max(float(np.linalg.norm(mean)), 1e-12)))[:, :2]
     variance = float(np.mean(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]))
     return float(np.sqrt(np.mean(tilt**2) / max(variance, 1e-300))) if np.isfinite(variance) else 0.0
-
-
-_FOUND: Mapping[str, str] = {
-    PLANE: (
-        "the scene is planar: the points lie in one plane to {scene_planarity_ratio:.1%} of its width, which "
-        "hardly determines the cameras"
-    ),
-    ROTATION: (
-        "close to a pure rotation: the camera moved by only {centre_spread_over_distance:.1%} of the "
-        "distance "
-        "to the scene, which determines the focal length but hardly any depth"
-    ),
-    TRANSLATION: (
-        "close to a pure translation: the camera rotated by at most {largest_rotation_deg:.1f} degrees, "
-        "which "
-        "does not determine the focal length"
-    ),
-    OPTICAL_AXIS: (
-        "the camera rotated about its optical axis only and looked in one direction, which does not "
-        "determine "
-        "the focal length"
-    ),
-    TURNTABLE: (
-        "turntable motion: all views rotate about one axis (to within {rotation_axis_spread_deg:.1f} "
-        "degrees), "
-        "which does not determine the scale along the axis unless the aspect ratio of the pixels is known"
-    ),
-    PLANAR: (
-        "planar motion: the camera moved in a plane and rotated about one direction (to within "
-        "{rotation_axis_spread_deg:.1f} degrees), which does not determine the scale across the plane unless "
-        "the aspect ratio of the pixels is known"
-    ),
-    PARALLEL_AXES: (
-        "all rotation axes are parallel (to within {rotation_axis_spread_deg:.1f} degrees), which does not "
-        "determine the scale along the axes unless the aspect ratio of the pixels is known"
-    ),
-}
-_FOUND_PROJECTIVE: Mapping[str, str] = {
-    TRANSLATION: (
-        "the projective cameras fit a pure translation, which does not determine the focal length (points at "
-        "infinity move by {infinity_shift:.1%} of the image)"
-    ),
-    OPTICAL_AXIS: (
-        "the projective cameras fit a rotation about the optical axis, which does not determine the focal "
-        "length (points at infinity move by {infinity_shift_beyond_roll:.1%} of the image)"
-    ),
-}
-_ROTATE = "rotate the camera by at least 10 degrees between images, about the vertical and a horizontal axis"
-_HEIGHTS = "take some images from higher or lower positions, or with the camera rolled by 90 degrees"
-_ADVICE: Mapping[str, str] = {
-    PLANE: "include objects at different depths",
-    ROTATION: "walk around the scene between images",
-    TRANSLATION: _ROTATE,
-    OPTICAL_AXIS: "point the camera in different directions",
-    TURNTABLE: _HEIGHTS,
-    PLANAR: _HEIGHTS,
-    PARALLEL_AXES: "tilt the camera up and down too, or roll it by 90 degrees",
-}
-_RESOLVED_BY_FOCAL = (_ROTATE, _ADVICE[OPTICAL_AXIS])
-_RESOLVED_BY_ASPECT = (TURNTABLE, PLANAR, PARALLEL_AXES)
 
 
 def _sentences(

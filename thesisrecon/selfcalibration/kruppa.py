@@ -40,6 +40,7 @@ from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 _MIN_CURVATURE_REL = 1e-12
 
 _MIN_SIGMA = 1e-12
+_ROOT2 = np.sqrt(2.0)
 
 
 @dataclass(frozen=True)
@@ -158,9 +159,6 @@ def _linearised(F: F64, x1: F64, x2: F64) -> tuple[F64, F64, F64]:
 def _rank_two(F: F64) -> F64:
     U, s, Vt = np.linalg.svd(F)
     return unit_norm((U[:, :2] * s[:2]) @ Vt[:2])
-
-
-_ROOT2 = np.sqrt(2.0)
 
 
 @dataclass(frozen=True)

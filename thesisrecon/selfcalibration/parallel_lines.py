@@ -30,6 +30,7 @@ _AMBIGUOUS = -2
 
 _FIRST_NOISE_PX, _LEAST_NOISE_PX = 0.5, 1e-3
 _MIN_SEGMENTS = 6
+_MIN_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -309,9 +310,6 @@ def _fit_plane(
     )  # fmt: skip
     points = moved(x)[0]
     return plane + x[0, :3], points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-_MIN_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)

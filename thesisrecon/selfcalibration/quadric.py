@@ -33,6 +33,9 @@ from thesisrecon.selfcalibration.refinement import RotationCriterion, central_di
 from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 
 _PAIRS = [(a, b) for a in range(4) for b in range(a, 4)]
+_MIN_NOISE = 1e-9
+# Maximum number of noise estimates.
+_NOISE_PASSES = 6
 
 
 def quadratic_rows(x: F64, y: F64) -> F64:
@@ -317,11 +320,6 @@ def _select(
         frame, np.concatenate([p, log_f], axis=1), criterion.cost(frame, p, log_f), "linear quadric"
     )
     return select_candidate(frame, reconstruction, criterion, candidates)
-
-
-_MIN_NOISE = 1e-9
-# Maximum number of noise estimates.
-_NOISE_PASSES = 6
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ from thesisrecon.selfcalibration.unknowns import SolverUnknowns, conic_constrain
 
 # Number of closed-form candidates to refine.
 _MAX_REFINED = 3
+_NEAR_INFINITY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -195,9 +196,6 @@ def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> 
     """
     frame = normalized_frame(reconstruction, prior)
     return ProjectiveScene(reconstruction, frame, conic_constraints(frame, prior))
-
-
-_NEAR_INFINITY = 1e-9
 
 
 def upgrade_to_affine(reconstruction: Reconstruction, plane: F64) -> Reconstruction:

@@ -18,6 +18,8 @@ HOMOGRAPHY_NOISE = 0.01
 
 # log focal, log of (aspect / prior aspect), skew, principal point (x, y) minus the prior one; unit-free.
 _N_INTRINSICS = 5
+# No skew, square pixels, principal point near the image centre.
+_SQUARE_PIXEL_STD = (0.0, HOMOGRAPHY_NOISE, HOMOGRAPHY_NOISE, 0.0)
 
 
 @dataclass(frozen=True)
@@ -272,10 +274,6 @@ def conic_constraints(frame: ReferenceFrame, prior: IntrinsicsPrior) -> ConicCon
     )
     first = (same_value.all(axis=2) & same_unit).argmax(axis=1).astype(np.int64)
     return ConicConstraints(std, first, frame.reference)
-
-
-# No skew, square pixels, principal point near the image centre.
-_SQUARE_PIXEL_STD = (0.0, HOMOGRAPHY_NOISE, HOMOGRAPHY_NOISE, 0.0)
 
 
 def square_pixel_constraints(frame: ReferenceFrame) -> ConicConstraints:

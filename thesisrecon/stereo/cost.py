@@ -29,6 +29,12 @@ from thesisrecon.stereo.cost_kernels import (
 
 MAX_DISPARITIES = 4096
 """Upper limit of the number of disparities searched."""
+STRIP_MARGIN = 24
+"""Additional rows above and below a strip: pixels farther away hardly change a path cost."""
+MIN_STRIP_ROWS = 32
+ROWS_FOR_NOISE = 24
+"""Number of evenly spaced rows used for the median."""
+CENSUS_BITS = 24
 
 
 def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
@@ -59,10 +65,6 @@ def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
 
 Result = TypeVar("Result")
 Strip = tuple[int, int, int, int]
-
-STRIP_MARGIN = 24
-"""Additional rows above and below a strip: pixels farther away hardly change a path cost."""
-MIN_STRIP_ROWS = 32
 
 
 def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[Strip]:
@@ -114,10 +116,6 @@ def run_strips(work: Callable[[Strip], Result], strips: Sequence[Strip], threads
         return [work(strip) for strip in strips]
     with ThreadPoolExecutor(min(threads, len(strips))) as pool:
         return list(pool.map(work, strips))
-
-
-ROWS_FOR_NOISE = 24
-"""Number of evenly spaced rows used for the median."""
 
 
 @dataclass(frozen=True)
@@ -209,9 +207,6 @@ def estimate_noise(image: StereoImage) -> float:
     below = np.cumsum(np.bincount(np.abs(response[:, inimage]).ravel()))
     median = int(np.searchsorted(below, 0.5 * below[-1]))
     return 1.4826 * median / 6.0 / LEVELS
-
-
-CENSUS_BITS = 24
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,11 @@ from thesisrecon.geometry.two_view import (
 FOCAL_PER_SIDE = 1.2
 """Unit of normalised coordinates relative to the longer image side: the focal length of a usual lens."""
 _J = np.array([[0.0, -1.0], [1.0, 0.0]])
+MIN_MATCHES = 8
+MIN_SAME_HALF = 0.8
+"""Share of matches that must lie on corresponding half-lines; wrong matches do by chance."""
+SAMPLES = 16
+"""Samples along each image side at which distortion is measured."""
 
 
 @dataclass(frozen=True)
@@ -316,12 +321,6 @@ def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> tuple[EpipolarPencil,
 
 
 Size = tuple[int, int]
-
-MIN_MATCHES = 8
-MIN_SAME_HALF = 0.8
-"""Share of matches that must lie on corresponding half-lines; wrong matches do by chance."""
-SAMPLES = 16
-"""Samples along each image side at which distortion is measured."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,18 @@ MIN_FACTOR = np.float32(0.05)
 """Factor of the confidence without texture."""
 MIN_TEXTURED = 20
 """One textured pixel is required for every so many pixels of a region."""
+STEP_PX = np.float32(1.0)
+"""Largest disparity difference of neighbours on one surface."""
+SUBSAMPLING = 5
+"""Row and column step of the pixels used for a median."""
+TEXTURE_RADIUS = 4
+"""Radius of the window in which texture is measured, equal to that of the costs."""
+TEXTURED = np.float32(1.7)
+"""Texture measure that noise does not reach."""
+LOCKING_PX = 0.17
+"""Standard deviation of the pixel-locking error of the sub-pixel fit, measured on known disparities."""
+MIN_NEIGHBOURS = 5
+"""Known neighbours required to fill a pinhole."""
 
 
 @njit(cache=True, nogil=True)
@@ -294,20 +306,8 @@ def _edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F3
             out[y, x] = total[x] / count[x] if count[x] > 0 else np.float32(np.nan)
 
 
-STEP_PX = np.float32(1.0)
-"""Largest disparity difference of neighbours on one surface."""
-SUBSAMPLING = 5
-"""Row and column step of the pixels used for a median."""
-TEXTURE_RADIUS = 4
-"""Radius of the window in which texture is measured, equal to that of the costs."""
 QUANTISATION = float(1.0 / np.sqrt(12.0))
 """Quantisation noise of integer grey levels."""
-TEXTURED = np.float32(1.7)
-"""Texture measure that noise does not reach."""
-LOCKING_PX = 0.17
-"""Standard deviation of the pixel-locking error of the sub-pixel fit, measured on known disparities."""
-MIN_NEIGHBOURS = 5
-"""Known neighbours required to fill a pinhole."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,8 @@ MOST_TAPS = 24
 """Limit of the filter width: reductions by more than 6 alias."""
 NOT_SHRUNK = 1.1
 """Reduction up to which the filter is not widened."""
+STRIP_ROWS = 64
+"""Rows whose positions are held in memory at a time."""
 
 
 @njit(cache=True, nogil=True)
@@ -113,10 +115,6 @@ def _sample_image(image: F32, xy: F64, out: F32) -> None:
                         total[c] += w * image[v, u, c]
             for c in range(channels):
                 out[i, j, c] = total[c] / weight
-
-
-STRIP_ROWS = 64
-"""Rows whose positions are held in memory at a time."""
 
 
 class Lookup(Protocol):

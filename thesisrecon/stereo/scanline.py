@@ -29,6 +29,14 @@ RADIX = 1 << 24
 fewer discontinuities.
 """
 MATCHED, LEFT_OCCLUDED, RIGHT_OCCLUDED = 0, 1, 2
+GREY_RANGE = 256.0
+"""Grey levels over which the value of an occluded pixel is uniformly distributed."""
+ROWS, WARM_UP = 96, 8
+"""Rows of a strip, and rows above it that are solved first to provide a previous row."""
+MATCH_NATS = 0.5
+"""Expected cost of a match per component: (z - z')^2 / (2 s^2) is chi-square distributed."""
+SIGNIFICANT = 30.0
+"""Nats above the minimum from which the probability is taken as 0."""
 
 
 @njit(cache=True, nogil=True)
@@ -272,16 +280,8 @@ def _solve_rows(
 
 Cohesion = Literal["none", "along", "along and across"]
 
-GREY_RANGE = 256.0
-"""Grey levels over which the value of an occluded pixel is uniformly distributed."""
 ROUNDING_PX = float(1.0 / np.sqrt(12.0))
 """Standard deviation of an integer disparity."""
-ROWS, WARM_UP = 96, 8
-"""Rows of a strip, and rows above it that are solved first to provide a previous row."""
-MATCH_NATS = 0.5
-"""Expected cost of a match per component: (z - z')^2 / (2 s^2) is chi-square distributed."""
-SIGNIFICANT = 30.0
-"""Nats above the minimum from which the probability is taken as 0."""
 
 
 @dataclass(frozen=True)

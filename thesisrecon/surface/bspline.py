@@ -25,6 +25,18 @@ _POLYNOMIALS = (
     / 6.0
 )
 """Row i: coefficients of 1, u, u^2, u^3 of the i-th non-zero B-spline, u in [0, 1]."""
+GRADIENT_WEIGHT = 1e-7
+"""Weight of the gradient energy relative to the bending energy; it determines undetermined slopes."""
+HUBER, TUKEY = 1.345, 4.685
+"""Thresholds of the weights in standard deviations; both have 95 % efficiency (Huber 1981)."""
+HUBER_ROUNDS, INITIAL_ROUNDS = 2, 5
+"""Rounds with convex weights, and rounds with the softest spline, which detect outliers."""
+MIN_ROOT_WEIGHT = 1e-3
+"""Root of the least weight, which keeps pieces of outliers determined."""
+MIN_STIFFNESS = 1e-3
+"""Initial stiffness, relative to the weight of a pixel with the median standard deviation."""
+FIRST_STEP, STEP_DECAY = 1e3, 0.65
+"""First factor of a change of stiffness, and the exponent from one factor to the next."""
 
 
 def basis(u: F64, derivative: int = 0) -> F64:
@@ -59,10 +71,6 @@ def _energies() -> tuple[F64, F64]:
     M0, M1, M2 = (np.einsum("n,ni,nj->ij", 0.5 * weights, v, v) for v in values)
     bending = np.kron(M2, M0) + 2.0 * np.kron(M1, M1) + np.kron(M0, M2)
     return bending, np.kron(M1, M0) + np.kron(M0, M1)
-
-
-GRADIENT_WEIGHT = 1e-7
-"""Weight of the gradient energy relative to the bending energy; it determines undetermined slopes."""
 
 
 @dataclass(frozen=True)
@@ -127,18 +135,6 @@ class _NormalEquations:
         value = np.empty(self.pieces.piece.shape)
         evaluate_pixels(self.pieces.piece, self.pieces.coefficient, c, self.pixel_basis, self.cell, value)
         return value
-
-
-HUBER, TUKEY = 1.345, 4.685
-"""Thresholds of the weights in standard deviations; both have 95 % efficiency (Huber 1981)."""
-HUBER_ROUNDS, INITIAL_ROUNDS = 2, 5
-"""Rounds with convex weights, and rounds with the softest spline, which detect outliers."""
-MIN_ROOT_WEIGHT = 1e-3
-"""Root of the least weight, which keeps pieces of outliers determined."""
-MIN_STIFFNESS = 1e-3
-"""Initial stiffness, relative to the weight of a pixel with the median standard deviation."""
-FIRST_STEP, STEP_DECAY = 1e3, 0.65
-"""First factor of a change of stiffness, and the exponent from one factor to the next."""
 
 
 @dataclass(frozen=True)

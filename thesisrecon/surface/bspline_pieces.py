@@ -19,6 +19,9 @@ from thesisrecon.numerics.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface.linear import max_depth_slope, same_surface
 
+STEP = 5.0
+"""Standard deviations of a significant depth step."""
+
 
 @njit(cache=True, nogil=True)
 def _root_of(parent: I64, k: int) -> int:
@@ -155,10 +158,6 @@ def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int,
                     for j in range(4):
                         total += basis[y % cell, i] * basis[x % cell, j] * c[coefficient[k, 4 * i + j]]
             value[y, x] = total
-
-
-STEP = 5.0
-"""Standard deviations of a significant depth step."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface.mesh import remove_unused_vertices
 
+RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
+"""Corners (0 1 above, 2 3 below) of the triangles of a square by its diagonal, the left one first."""
+
 
 def surface_from_depth(depth_map: DepthMap, *, step: int = 1, grazing_deg: float = 10.0) -> TexturedMesh:
     """Triangulate a depth map.
@@ -53,10 +56,6 @@ def surface_from_depth(depth_map: DepthMap, *, step: int = 1, grazing_deg: float
     order = np.concatenate(faces)
     order = order[np.lexsort(order.T[::-1])]
     return remove_unused_vertices(TexturedMesh(back_project(depth_map.P, depth, step), order))
-
-
-RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
-"""Corners (0 1 above, 2 3 below) of the triangles of a square by its diagonal, the left one first."""
 
 
 @dataclass(frozen=True)

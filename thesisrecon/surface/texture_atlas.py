@@ -32,6 +32,8 @@ CHART_MARGIN = 2
 
 SWATCH = 3
 """Texels per side of the patch of an unseen face."""
+MIN_SCALE = 0.05
+"""Smallest reduction of the images."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +43,6 @@ class _AtlasFaces:
     xy: F64
     label: I64
     chart: I64
-
-
-MIN_SCALE = 0.05
-"""Smallest reduction of the images."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ from thesisrecon.surface.texture_kernels import diffuse
 
 DEPTH_TOLERANCE_PX = 3.0
 """Depth tolerance of visible vertices in pixel sizes: the z-buffer holds one depth per pixel."""
+OWN_WEIGHT = 0.1
+"""Weight of a face's own share relative to those of its neighbours."""
 
 
 def view_camera(view: PinholeView) -> Camera:
@@ -145,10 +147,6 @@ def color_vertices(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads:
         weight += share
     mean = np.where(weight[:, None] > 0.0, total / np.maximum(weight, 1e-30)[:, None], 128.0)
     return replace(mesh, colors=np.rint(mean).astype(np.uint8), uv=None, texture=None)
-
-
-OWN_WEIGHT = 0.1
-"""Weight of a face's own share relative to those of its neighbours."""
 
 
 def choose_views(quality: F32, neighbours: I64, *, rounds: int = 40, min_chart_faces: int = 30) -> I64:

@@ -30,6 +30,14 @@ SHRINK = 0.8
 """Factor by which the quadrilateral is reduced until it lies in front of both cameras."""
 LEAST_DEPTH = 0.2
 """Minimum third coordinate of its corners, in units of that of its centre."""
+SLACK_PX = 0.5
+"""Correspondences may cross by this much: less is noise of the disparities."""
+SPARSE = 7
+"""Subsampling step for medians."""
+PREPARING = 2
+"""Threads that prepare an image."""
+DARK, BRIGHT = 8.0, 247.0
+"""Range of levels used for the ratio of exposures."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +128,6 @@ def _homography(source: F64, target: F64) -> F64:
     return np.asarray(H * np.sign(H[2] @ np.append(source[0], 1.0)))
 
 
-SLACK_PX = 0.5
-"""Correspondences may cross by this much: less is noise of the disparities."""
-
-
 @dataclass(frozen=True)
 class Monotonicity:
     """Result of the monotonicity test.
@@ -180,14 +184,6 @@ def check_monotonicity(disparity: F32, *, slack_px: float = SLACK_PX) -> Monoton
     known = np.isfinite(disparity)
     count = max(int(known.sum()), 1)
     return Monotonicity(violated, float(violated.sum() / count), float(known.mean()) if known.size else 0.0)
-
-
-SPARSE = 7
-"""Subsampling step for medians."""
-PREPARING = 2
-"""Threads that prepare an image."""
-DARK, BRIGHT = 8.0, 247.0
-"""Range of levels used for the ratio of exposures."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,11 @@ from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import Raster, rasterize, run_in_strips, sample_texture
 from thesisrecon.records import RenderedView, TexturedMesh
 
+STRIP = 16
+"""Rows that are coloured at a time, so that intermediate arrays stay in cache."""
+BARE = (200, 200, 200)
+"""Colour of a mesh without texture and vertex colours."""
+
 
 @njit(cache=True, nogil=True)
 def sum_face_normals(vertices: F64, faces: I64, total: F64) -> None:
@@ -223,13 +228,6 @@ def vertex_normals(mesh: TexturedMesh) -> F64:
     total = np.zeros_like(mesh.vertices)
     sum_face_normals(mesh.vertices, mesh.faces, total)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])
-
-
-STRIP = 16
-"""Rows that are coloured at a time, so that intermediate arrays stay in cache."""
-
-BARE = (200, 200, 200)
-"""Colour of a mesh without texture and vertex colours."""
 
 
 @dataclass(frozen=True)

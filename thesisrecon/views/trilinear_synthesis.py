@@ -22,6 +22,15 @@ from thesisrecon.views.trilinear import VirtualTensor, seed_of_first, seed_of_tw
 from thesisrecon.views.virtual_camera import CalibratedPair, VirtualCamera, cameras_along
 from thesisrecon.views.warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 
+SURFACE_PX = 1.0
+"""Largest difference of disparity between neighbouring pixels of one surface."""
+SPARSE = 16
+"""Subsampling step for medians."""
+AGREE_PX = 1.5
+"""Tolerance of the forward-backward check: half a pixel of rounding and a pixel of noise."""
+LEAST_SEEN = 0.05
+"""Minimum share of the image that must show the scene."""
+
 
 @njit(cache=True, nogil=True)
 def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_depth: F32) -> None:
@@ -132,11 +141,6 @@ def _occludes(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> b
 
 
 Both32 = tuple[F32, F32]
-
-SURFACE_PX = 1.0
-"""Largest difference of disparity between neighbouring pixels of one surface."""
-SPARSE = 16
-"""Subsampling step for medians."""
 
 
 def complete_correspondence(
@@ -264,12 +268,6 @@ def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32]
     complete = places.copy()
     complete[y, x] = dehomogenize(X @ pair.P2.T)
     return complete
-
-
-AGREE_PX = 1.5
-"""Tolerance of the forward-backward check: half a pixel of rounding and a pixel of noise."""
-LEAST_SEEN = 0.05
-"""Minimum share of the image that must show the scene."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ may be an outlier."""
 
 LEAST_AREA = 1e-9
 """Twice the area (px^2) of the smallest triangle that is drawn."""
+STRETCH = 3.0
+"""Neighbouring pixels of one surface come at most this far apart (px)."""
 
 
 @njit(cache=True, nogil=True)
@@ -342,9 +344,6 @@ def fill_from_behind(
             for c in range(colors.size):
                 out[y, x, c] = np.float32(colors[c] / total) if total > 0.0 else np.float32(np.nan)
 
-
-STRETCH = 3.0
-"""Neighbouring pixels of one surface come at most this far apart (px)."""
 
 DIRECTIONS = np.array(
     [(a, b) for a in range(-2, 3) for b in range(-2, 3) if np.gcd(a, b) == 1], dtype=np.int32
