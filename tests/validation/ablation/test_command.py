@@ -62,7 +62,7 @@ def test_an_interrupted_study_states_how_to_resume(tmp_path):
         signal.SIGINT,
         environment={**os.environ, "PYTHONPATH": str(ROOT)},
     )
-    kept = f"the same command goes on from the rows that ended, which are in {tmp_path / 'out'}"
+    kept = f"run the same command to continue from the finished rows in {tmp_path / 'out'}"
     assert (stop.code, stop.said, stop.left) == (130, f"validation: interrupted; {kept}\n", 0)
 
 
@@ -72,7 +72,9 @@ def test_an_interrupt_in_a_program_is_reported(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("validation.ablation.command.ablate", interrupt)
     assert main(["ablate", str(write_study(tmp_path)), "-o", str(tmp_path / "out")]) == 130
-    assert capsys.readouterr().err.startswith("ablate: interrupted; the same command goes on from the rows")
+    assert capsys.readouterr().err.startswith(
+        "ablate: interrupted; run the same command to continue from the finished rows"
+    )
 
 
 def test_failed_rows_and_wrong_options_have_their_exit_codes(tmp_path, capsys):

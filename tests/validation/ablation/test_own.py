@@ -76,12 +76,12 @@ def test_an_object_of_a_script_enters_a_study_in_python(tmp_path):
     [
         ("x = ", "mine.py:Mine", "mine.py does not run: SyntaxError"),
         ("import nothing_of_that_name", "mine.py:Mine", "does not run: ModuleNotFoundError"),
-        ("class Mine: pass", "mine.py:Mine", "a variant is a frozen dataclass, which mine.py:Mine is not"),
+        ("class Mine: pass", "mine.py:Mine", "mine.py:Mine is not a frozen dataclass, as a variant must be"),
         ("class Mine: pass", "mine.py:Min", "unknown name in mine.py 'Min'; did you mean Mine"),
         (
             "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Mine:\n    size: int = 1\n",
             "mine.py:Mine",
-            "a FundamentalEstimator has the method estimate, which Mine has not",
+            "a FundamentalEstimator must have the method estimate; Mine has none",
         ),
     ],
 )
