@@ -16,6 +16,7 @@ from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io.exports import _original_from_working
 from thesisrecon.records import Image, TexturedMesh, Tracks
 from thesisrecon.report.summary import point_colors
+from thesisrecon.runtime.run import stream
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 
@@ -79,8 +80,16 @@ def test_self_calibration_groups_views_by_size_and_takes_a_prior():
 
 def test_only_a_projective_reconstruction_is_calibrated():
     metric = replace(small_reconstruction(), stratum="metric")
-    with pytest.raises(ValueError, match="takes a projective reconstruction; got metric"):
-        thesisrecon.self_calibrate(metric)
+    for stage in (thesisrecon.self_calibrate, thesisrecon.upgrade_affine):
+        with pytest.raises(ValueError, match="takes a projective reconstruction; got metric"):
+            stage(metric)
+
+
+def test_a_seed_is_a_whole_number():
+    for seed in (np.random.default_rng(0), -1, 0.5, True):
+        with pytest.raises(ValueError, match="the seed must be a whole number of at least 0; got"):
+            stream(seed, "matches")
+    assert stream(np.int64(3), "matches").integers(1000) == stream(3, "matches").integers(1000)
 
 
 def test_triangulate_and_estimate_fundamental_are_front_doors():

@@ -56,3 +56,53 @@ def test_rendering_refuses_distortion(camera):
 def test_distortion_of_a_wrong_shape_is_refused(camera):
     with pytest.raises(ValueError, match="distortion"):
         replace(camera, distortion=np.zeros((2, 2)))
+
+
+def test_lists_are_converted():
+    camera = Camera(K.tolist(), np.eye(3).tolist(), [0, 0, 5], [640, np.int64(480)], [0.1])
+    assert camera.size == (640, 480)
+    assert all(isinstance(a, np.ndarray) and a.dtype == float for a in (camera.K, camera.R, camera.t))
+    X = [[0.1, 0.2, 3.0]]
+    np.testing.assert_allclose(camera.unproject(camera.project(X), [8.0]), X, atol=1e-9)
+    back = Camera.from_matrix((-2.0 * camera.P).tolist(), (640, 480))
+    np.testing.assert_allclose(back.K, K, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"K": K[:2]}, r"needs K \(3, 3\)"),
+        ({"t": np.zeros((3, 1))}, r"got .*\(3, 1\)"),
+        ({"R": np.full((3, 3), np.nan)}, "finite"),
+        ({"distortion": np.array([np.inf])}, "finite"),
+        ({"K": K.T}, "upper triangular"),
+        ({"K": -K}, "positive focal lengths"),
+        ({"K": 2.0 * K}, "K33 = 1"),
+        ({"R": 1.001 * np.eye(3)}, r"needs a rotation R; .* 0\.002"),
+        ({"R": np.zeros((3, 3))}, "needs a rotation R"),
+        ({"size": (640.0, 480.0)}, "whole numbers"),
+        ({"size": (640,)}, "whole numbers"),
+        ({"size": (640, 0)}, "at least 1 x 1"),
+    ],
+)
+def test_impossible_cameras_are_refused(camera, change, words):
+    with pytest.raises(ValueError, match=words):
+        replace(camera, **change)
+
+
+def test_a_rotation_of_four_digits_is_accepted(camera):
+    replace(camera, R=camera.R.round(4))
+
+
+def test_wrong_arguments_are_refused(camera):
+    for factor in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="factor above 0"):
+            camera.scaled(factor)
+    with pytest.raises(ValueError, match=r"needs P \(3, 4\); got \(3, 3\)"):
+        Camera.from_matrix(np.eye(3), (640, 480))
+    with pytest.raises(ValueError, match=r"needs X \(N, 3\); got \(3,\)"):
+        camera.project(np.zeros(3))
+    with pytest.raises(ValueError, match=r"needs xy \(N, 2\); got \(4, 3\)"):
+        camera.unproject(np.zeros((4, 3)))
+    with pytest.raises(ValueError, match=r"depth \(N\); got \(4, 2\), \(3,\)"):
+        camera.unproject(np.zeros((4, 2)), np.ones(3))

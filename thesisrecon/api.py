@@ -10,13 +10,23 @@ from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig, SelfCalibrator, with_images
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.features_to_tracks import ImageInput, match_pair
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import DisparityMap, Image, Reconstruction, SelfCalibration, Tracks
+from thesisrecon.records import (
+    DisparityMap,
+    FundamentalFit,
+    Image,
+    Reconstruction,
+    RunResult,
+    SelfCalibration,
+    TexturedMesh,
+    Tracks,
+    TwoView,
+)
 from thesisrecon.runtime.run import stream
 from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
 from thesisrecon.view_interpolation import interpolate_view
@@ -25,11 +35,18 @@ from thesisrecon.views.render import render
 
 __all__ = [
     "Camera",
+    "DisparityMap",
+    "FundamentalFit",
     "Image",
     "PipelineConfig",
     "Reconstruction",
+    "RunResult",
+    "SelfCalibration",
     "StageFailure",
+    "TexturedMesh",
     "Tracks",
+    "TwoView",
+    "UsageError",
     "estimate_fundamental",
     "interpolate_view",
     "match_pair",
@@ -123,7 +140,7 @@ def self_calibrate(
     Raises
     ------
     ValueError
-        If the reconstruction is not projective.
+        If the reconstruction is not projective or the seed is not a whole number of at least 0.
     StageFailure
         If the views do not determine a calibration.
 
@@ -194,6 +211,8 @@ def upgrade_affine(
 
     Raises
     ------
+    ValueError
+        If the reconstruction is not projective, the plane is zero or not finite, or the seed is invalid.
     StageFailure
         If the plane at infinity cannot be located.
 
@@ -210,6 +229,8 @@ def upgrade_affine(
     >>> affine.stratum, bool((affine.X[:, 3] == 1).all())
     ('affine', True)
     """
+    if reconstruction.stratum != "projective":
+        raise ValueError(f"upgrade_affine takes a projective reconstruction; got {reconstruction.stratum}")
     if plane is None:
         config = config or PipelineConfig()
         method = _method(config, images)

@@ -125,6 +125,7 @@ def synthesize_view(
     *,
     K: ArrayLike | None = None,
     config: PipelineConfig | None = None,
+    seed: int = 0,
 ) -> U8:
     """Compute the view of a virtual camera from two images by the trilinear tensor (section 1.3).
 
@@ -139,6 +140,8 @@ def synthesize_view(
         Intrinsics, as in :func:`prepare_trilinear_views`.
     config : PipelineConfig, optional
         The default configuration if None.
+    seed : int
+        Random seed of the matching.
 
     Returns
     -------
@@ -148,7 +151,7 @@ def synthesize_view(
     Raises
     ------
     ValueError
-        If the rotation, translation or K is invalid.
+        If the rotation, translation, K or seed is invalid.
     StageFailure
         If the images cannot be read, do not match or show no parallax, or the camera does not see the scene.
 
@@ -170,7 +173,9 @@ def synthesize_view(
     rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
     _given_intrinsics(K)
     VirtualCamera(rotation, translation, np.eye(3), (1, 1))
-    views = prepare_trilinear_views(match_images(image1, image2, config=config), K=K, config=config)
+    views = prepare_trilinear_views(
+        match_images(image1, image2, config=config, seed=seed), K=K, config=config
+    )
     return views.render(VirtualCamera(rotation, translation, views.pair.K2, views.sizes[1]))
 
 

@@ -321,7 +321,7 @@ def estimate_fundamental(
     xy2: NDArray[np.float64],
     *,
     threshold_px: float = 1.0,
-    seed: int = 0,
+    seed: int | Generator = 0,
     check_degeneracy: bool = False,
 ) -> FundamentalFit:
     """Estimate the fundamental matrix of matches with outliers.
@@ -334,8 +334,8 @@ def estimate_fundamental(
         Matched points, N >= 8, px.
     threshold_px : float
         Sampson distance of an inlier during the search.
-    seed : int
-        Random seed.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
     check_degeneracy : bool
         Also test whether the matches determine F
         (:func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`); many inliers alone do not show it.

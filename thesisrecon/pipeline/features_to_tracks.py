@@ -197,6 +197,8 @@ def match_pair(
     ------
     UsageError
         If a file does not exist.
+    ValueError
+        If the seed is not a whole number of at least 0.
     StageFailure
         If an image cannot be read or the images do not match.
 

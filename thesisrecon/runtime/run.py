@@ -40,7 +40,7 @@ Until = Literal["features", "matches", "projective", "metric", "dense", "model"]
 
 
 class RunOptions(TypedDict, total=False):
-    """Options of :func:`thesisrecon.reconstruct` that do not change its results.
+    """Options of :func:`thesisrecon.reconstruct`: ``until`` selects the last stage; none changes a result.
 
     Attributes
     ----------
@@ -83,13 +83,24 @@ def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
     -------
     numpy.random.Generator
 
+    Raises
+    ------
+    ValueError
+        If the seed is not a whole number of at least 0.
+
     Examples
     --------
     >>> from thesisrecon.runtime.run import stream
     >>> stream(0, "matches", 1, 2).integers(100) == stream(0, "matches", 1, 2).integers(100)
     np.True_
     """
-    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(stage.encode()), *ids]))
+    if not _is_seed(seed):
+        raise ValueError(f"the seed must be a whole number of at least 0; got {seed!r}")
+    return np.random.default_rng(np.random.SeedSequence([int(seed), zlib.crc32(stage.encode()), *ids]))
+
+
+def _is_seed(seed: Any) -> bool:
+    return isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0
 
 
 @dataclass
