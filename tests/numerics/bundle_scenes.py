@@ -1,4 +1,4 @@
-"""A small synthetic block of photographs for the tests of optimize."""
+"""A small synthetic block of images for the tests of numerics."""
 
 from dataclasses import dataclass
 

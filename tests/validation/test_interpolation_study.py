@@ -1,4 +1,4 @@
-"""The check of interpolated views: its cameras are right, and on real photographs its targets are reached."""
+"""The study of interpolated views: exact cameras, and targets reached on real images."""
 
 import numpy as np
 import pytest

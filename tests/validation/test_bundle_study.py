@@ -1,4 +1,4 @@
-"""The synthetic walks, the adapter to Ceres and the measurements that the check of bundle adjustment is."""
+"""The synthetic walks, the adapter to Ceres and the measurements of the study of bundle adjustment."""
 
 import itertools
 

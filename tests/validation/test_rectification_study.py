@@ -1,4 +1,4 @@
-"""The rectification check: OpenCV's homographies are rows too, and the table judges what it should."""
+"""The study of rectification: rows for OpenCV's homographies too, and a verdict where one belongs."""
 
 import numpy as np
 import pytest
