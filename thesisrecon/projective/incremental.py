@@ -418,8 +418,8 @@ class IncrementalProjective:
                 return None
             if counts[view] < self.min_points:
                 model.reasons[view] = (
-                    f"sees only {counted(counts[view], 'point')} of the model (at least {self.min_points} "
-                    f"needed)"
+                    f"sees only {counted(counts[view], 'point')} of the model (at "
+                    f"least {self.min_points} needed)"
                 )
             elif self._try_camera(model, int(view), rng):
                 return int(view)

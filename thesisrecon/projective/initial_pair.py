@@ -27,8 +27,7 @@ _NO_PARALLAX_REASONS = {
     "pure rotation": "the camera only rotated about its centre (pure rotation)",
     "plane": (
         "all matches lie on one plane (planar scene), the camera hardly moved, or it rotated about its "
-        "centre "
-        "while zooming (pure rotation)"
+        "centre while zooming (pure rotation)"
     ),
 }
 

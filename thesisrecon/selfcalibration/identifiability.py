@@ -65,23 +65,20 @@ _FOUND: Mapping[str, str] = {
     ),
     ROTATION: (
         "close to a pure rotation: the camera moved by only {centre_spread_over_distance:.1%} of the "
-        "distance "
-        "to the scene, which determines the focal length but hardly any depth"
+        "distance to the scene, which determines the focal length but hardly any depth"
     ),
     TRANSLATION: (
         "close to a pure translation: the camera rotated by at most {largest_rotation_deg:.1f} degrees, "
-        "which "
-        "does not determine the focal length"
+        "which does not determine the focal length"
     ),
     OPTICAL_AXIS: (
         "the camera rotated about its optical axis only and looked in one direction, which does not "
-        "determine "
-        "the focal length"
+        "determine the focal length"
     ),
     TURNTABLE: (
         "turntable motion: all views rotate about one axis (to within {rotation_axis_spread_deg:.1f} "
-        "degrees), "
-        "which does not determine the scale along the axis unless the aspect ratio of the pixels is known"
+        "degrees), which does not determine the scale along the axis unless the aspect ratio of the pixels "
+        "is known"
     ),
     PLANAR: (
         "planar motion: the camera moved in a plane and rotated about one direction (to within "
@@ -456,8 +453,7 @@ def _sentences(
     if evidence["excess_equations"] < 0:
         sentences.append(
             f"too few images for the unknown intrinsics: {-evidence['excess_equations']:.0f} equations are "
-            f"missing; "
-            "add images, or let them share one camera"
+            "missing; add images, or let them share one camera"
         )
     if is_critical:
         found = (_FOUND if calibrated else _FOUND_PROJECTIVE)[motion]
@@ -465,9 +461,8 @@ def _sentences(
     if _has_excess_noise(evidence):
         sentences.append(
             f"metric cameras with the given prior leave {evidence['noise_ratio_to_projective']:.1f} times "
-            f"the noise "
-            "of projective ones: images were zoomed or cropped individually, or come from different cameras; "
-            "estimate each camera separately (cameras = per-image)"
+            "the noise of projective ones: images were zoomed or cropped individually, or come from "
+            "different cameras; estimate each camera separately (cameras = per-image)"
         )
     if identifiable:
         return (*sentences, *_resolution(motion, evidence)) if is_critical else tuple(sentences)
@@ -479,21 +474,18 @@ def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
     std, free_std = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
     if motion in _RESOLVED_BY_ASPECT and free_std > 2.0 * std:
         return [
-            f"square pixels and a central principal point resolve it if the cameras are as assumed: the "
-            f"focal "
-            f"length is known to {_percent(std)} with them and to {_percent(free_std)} without; to depend "
-            f"less on "
-            f"them, {_ADVICE[motion]}"
+            "square pixels and a central principal point resolve it if the cameras are as assumed: the "
+            f"focal length is known to {_percent(std)} with them and to {_percent(free_std)} without; to "
+            f"depend less on them, {_ADVICE[motion]}"
         ]
     if motion in (PLANE, ROTATION):
         return [
             f"the focal length is known to {_percent(std)} if the cameras are as assumed; for reliable "
-            f"depths, "
-            f"{_ADVICE[motion]}"
+            f"depths, {_ADVICE[motion]}"
         ]
     return [
-        f"if the cameras are as assumed, the departure from this motion determines the focal length to "
-        f"{_percent(std)}"
+        "if the cameras are as assumed, the departure from this motion determines the focal "
+        f"length to {_percent(std)}"
     ]
 
 
@@ -511,8 +503,7 @@ def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, foca
     if evidence["infinity_shift_beyond_roll"] < MIN_INFINITY_SHIFT and std < MAX_FOCAL_STD:
         return [
             f"the rotations move points at infinity by only {evidence['infinity_shift_beyond_roll']:.2%} of "
-            f"the "
-            f"image, within the errors of a lens model, and do not determine the focal length; {advice}"
+            f"the image, within the errors of a lens model, and do not determine the focal length; {advice}"
         ]
     if std >= MAX_FOCAL_STD:
         return [f"the cameras determine the focal length only to {_percent(std)}; {advice}"]

@@ -407,7 +407,7 @@ class ParallelLines:
             return self._from_points(scene.frame, self.points)
         if len(self.images) != len(scene.reconstruction.P):
             raise ValueError(
-                f"ParallelLines needs vanishing points, or an image for each of the "
+                "ParallelLines needs vanishing points, or an image for each of the "
                 f"{len(scene.reconstruction.P)} views; got {len(self.images)} images"
             )
         return self._from_images(scene, rng)
@@ -528,8 +528,7 @@ def plane_through_points(X: F64) -> F64:
     if not s[2] > _MIN_SPREAD * s[0] or abs(plane[3]) < 1e-9:
         raise StageFailure(
             "the directions of the parallel lines lie in one plane, so their vanishing points do not "
-            "determine "
-            "the plane at infinity",
+            "determine the plane at infinity",
             f"the third singular value is {s[2] / s[0]:.1e} of the first",
             "give lines of a direction outside that plane",
         )
