@@ -23,8 +23,6 @@ NONE = "none"
 KIND = "kind"
 MAX_SHOWN = 120
 """Maximum length of a value in a message."""
-GIVEN = {"given": True}
-"""Metadata of a field that the pipeline fills with data: not a setting."""
 
 
 def table_from_dataclass(value: Any) -> Table:
@@ -49,6 +47,7 @@ def table_from_dataclass(value: Any) -> Table:
 
 
 def _settings_of(kind: type[Any]) -> list[str]:
+    """Names of the fields without those that the pipeline fills with data (metadata ``given``)."""
     return [f.name for f in dataclasses.fields(kind) if not f.metadata.get("given")]
 
 

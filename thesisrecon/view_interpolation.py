@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
@@ -17,6 +17,7 @@ from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.features_to_tracks import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
+from thesisrecon.stereo.semi_global import match_both_sides
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
     check_monotonicity,
@@ -173,16 +174,9 @@ def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
 
 
 def _matched_both_ways(left: U8, right: U8, config: PipelineConfig) -> tuple[DisparityMap, DisparityMap]:
-    """Match left to right and, as the mirrored pair, right to left."""
-    match = config.dense.match_rectified
     most = _largest_disparity(left, right, config)
-    mirrored = match(_mirrored(right), _mirrored(left), max_disparity_px=most)
-    back = DisparityMap(_mirrored(mirrored.disparity), _mirrored(mirrored.confidence), mirrored.sigma_px)
-    return match(left, right, max_disparity_px=most), back
-
-
-def _mirrored(image: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(image[:, ::-1])
+    match = partial(config.dense.match_rectified, max_disparity_px=most)
+    return match_both_sides(match, left, right)
 
 
 def _largest_disparity(left: U8, right: U8, config: PipelineConfig) -> float:

@@ -18,9 +18,9 @@ from thesisrecon.epipolar.six_point import (
     SAMPLE,
     _score,
     draw_samples,
-    reprojection_distances,
     search_trifocal,
     six_point,
+    three_view_distances,
 )
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
@@ -48,7 +48,7 @@ def tracks(points):
 
 def distances(P, track):
     out = np.empty(len(track))
-    reprojection_distances(P, track, out)
+    three_view_distances(P, track, out)
     return out
 
 

@@ -7,10 +7,15 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.synthetic import texture
-from thesisrecon.stereo.cost import CensusAndColour, estimate_noise, prepare_pair, row_strips
+from thesisrecon.stereo.cost import CensusAndColour, estimate_noise, prepare_stereo_images, row_strips
 from thesisrecon.stereo.postprocessing import DisparityPostprocessing
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import PUBLISHED, PathPenalties, SemiGlobalMatching, match_rectified
+from thesisrecon.stereo.semi_global import (
+    PUBLISHED,
+    PathPenalties,
+    SemiGlobalMatching,
+    match_rectified_arrays,
+)
 
 VARIANTS = [SemiGlobalMatching(), PUBLISHED, MaximumLikelihoodScanline()]
 HEIGHT, WIDTH = 120, 180
@@ -166,15 +171,15 @@ def test_wrong_calls_are_refused(variant):
 def test_the_front_door():
     left, right, truth, both = pair_with_truth()
     color = [np.repeat(np.clip(image, 0, 255)[..., None], 3, axis=2) for image in (left, right)]
-    found = match_rectified(*[image.astype(np.uint8) for image in color], max_disparity_px=23.2)
+    found = match_rectified_arrays(*[image.astype(np.uint8) for image in color], max_disparity_px=23.2)
     known = np.isfinite(found.disparity) & both
     assert known.mean() > 0.8
     assert np.mean(np.abs(found.disparity - truth)[known] > 1.0) < 0.02
-    thesis = match_rectified(left, right, max_disparity_px=24, matcher=MaximumLikelihoodScanline())
+    thesis = match_rectified_arrays(left, right, max_disparity_px=24, matcher=MaximumLikelihoodScanline())
     assert set(np.unique(thesis.disparity[np.isfinite(thesis.disparity)] % 1.0)) == {0.0}
     for wrong in (-1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="max_disparity_px"):
-            match_rectified(left, right, max_disparity_px=wrong)
+            match_rectified_arrays(left, right, max_disparity_px=wrong)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +224,7 @@ def test_the_noise_of_an_image_is_found_beside_its_texture():
     clean = texture(200, 300, 3)
     for sigma in (0.0, 2.0, 5.0):
         noisy = np.clip(clean + sigma * rng.normal(size=clean.shape), 0, 255)
-        side, _ = prepare_pair(noisy, noisy)
+        side, _ = prepare_stereo_images(noisy, noisy)
         assert estimate_noise(side) == pytest.approx(sigma, abs=1.2)
 
 

@@ -341,7 +341,7 @@ def _gauss_newton_step(H: F64, g: F64, X: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def reprojection_distances(P: F64, track: F64, distances: F64) -> None:
+def three_view_distances(P: F64, track: F64, distances: F64) -> None:
     """Compute the distance of each track to its reprojection in three views.
 
     Parameters

@@ -18,8 +18,8 @@ from thesisrecon.epipolar.six_point import (
     SAMPLE,
     WIDTHS,
     draw_samples,
-    reprojection_distances,
     search_trifocal,
+    three_view_distances,
 )
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_SEGMENTS,
@@ -325,7 +325,7 @@ class _Frame:
 
 def _distances(P: F64, track: F64) -> F64:
     out = np.empty(len(track))
-    reprojection_distances(P, track, out)
+    three_view_distances(P, track, out)
     return out
 
 

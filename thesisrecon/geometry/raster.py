@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import F32
+from thesisrecon.arrays import F32, F64, I64
 
 # Sums may be reordered; the flag "nnan" would remove the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -191,3 +191,26 @@ def cubic_weights(fraction: float, weights: NDArray[Any]) -> None:
     weights[1] = (1.5 * fraction - 2.5) * fraction * fraction + 1.0
     weights[2] = ((-1.5 * fraction + 2.0) * fraction + 0.5) * fraction
     weights[3] = (0.5 * fraction - 0.5) * fraction * fraction
+
+
+@njit(cache=True, nogil=True)
+def weighted_median(values: F32, weights: F64, order: I64, half: float) -> float:
+    """Return the smallest value up to which the weights sum to ``half``.
+
+    Parameters
+    ----------
+    values : ndarray (N,) of float32, values
+    weights : ndarray (N,), weights
+    order : ndarray (M,) of int, indices of the values in ascending order, M >= 1
+    half : float, half of the sum of the weights for the lower weighted median
+
+    Returns
+    -------
+    float, one of the values
+    """
+    total = 0.0
+    for k in order:
+        total += weights[k]
+        if total >= half:
+            return float(values[k])
+    return float(values[order[-1]])

@@ -1,7 +1,7 @@
 """Tests of shared intrinsics and given focal lengths against the images.
 
 Small zoom differences and crops deform a model quietly. The model is adjusted again with own values per view
-(:class:`PerViewFit`): twice the decrease in cost is chi-square under the hypothesis of one camera (likelihood
+(``_PerViewFit``): twice the decrease in cost is chi-square under the hypothesis of one camera (likelihood
 ratio). If own focal lengths stay undetermined, the test cannot decide and the interval is widened.
 """
 

@@ -116,7 +116,7 @@ def per_camera_estimates(
     scatter : BlockScatter
         Scatter of the adjustment.
     floor_rel : float
-        As for :func:`std_floor`.
+        Lower bound of standard deviations due to model error, relative to the focal length.
 
     Returns
     -------
@@ -353,7 +353,7 @@ def intrinsic_intervals(
     prior : IntrinsicsPrior
         Prior of each row of intrinsics.
     floor_rel : float
-        As for :func:`std_floor`.
+        Lower bound of standard deviations due to model error, relative to the focal length.
     shrinkage : FocalShrinkage
         Shrinkage of the focal lengths.
     noise_inflation : float

@@ -198,7 +198,7 @@ class PoseRefinement:
     ----------
     R : ndarray (3, 3), rotation world-to-camera
     t : ndarray (3,), translation
-    intrinsics : ndarray (6,) or (8,), row of intrinsics as in :class:`MetricCameras`
+    intrinsics : ndarray (6,) or (8,), row of ``MetricCameras.intrinsics``
     covariance : ndarray (6 + F, 6 + F)
         For noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x + d in the camera frame,
         then the F free intrinsics, the focal length as log f.
@@ -478,7 +478,7 @@ def refine_pose(
     ----------
     R : ndarray (3, 3), rotation world-to-camera
     t : ndarray (3,), translation
-    intrinsics : ndarray (6,) or (8,), row of intrinsics as in :class:`MetricCameras`
+    intrinsics : ndarray (6,) or (8,), row of ``MetricCameras.intrinsics``
     X : ndarray (M, 3), points
     xy : ndarray (M, 2), pixels
     free : ndarray (6,) or (8,) of bool, optional, intrinsics that move; none by default

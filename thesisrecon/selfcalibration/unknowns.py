@@ -188,7 +188,7 @@ def solver_unknowns(frame: ReferenceFrame, prior: IntrinsicsPrior) -> SolverUnkn
     Parameters
     ----------
     frame : ReferenceFrame
-        Frame of :func:`normalized_frame`.
+        Frame of :func:`~thesisrecon.selfcalibration.frame.normalized_frame`.
     prior : IntrinsicsPrior
         Prior of all views; std 0 makes a value known.
 
@@ -252,7 +252,7 @@ def conic_constraints(frame: ReferenceFrame, prior: IntrinsicsPrior) -> ConicCon
     Parameters
     ----------
     frame : ReferenceFrame
-        Frame of :func:`normalized_frame`.
+        Frame of :func:`~thesisrecon.selfcalibration.frame.normalized_frame`.
     prior : IntrinsicsPrior
         Prior of all views. Views that share or know all five intrinsics have one constant K.
 

@@ -137,7 +137,7 @@ class StereoImage:
     valid: U8
 
 
-def prepare_pair(left: ArrayLike, right: ArrayLike) -> tuple[StereoImage, StereoImage]:
+def prepare_stereo_images(left: ArrayLike, right: ArrayLike) -> tuple[StereoImage, StereoImage]:
     """Convert both images of a rectified pair to integer channels.
 
     Parameters

@@ -397,3 +397,21 @@ def cost_volume(
         _shares(counts, y, wide, share)
         for q in range(n):
             _mean_along_column(ring[q], y, wide, share, volume[y, q])
+
+
+@njit(cache=True, nogil=True)
+def add_squares(a: I16, b: I16, sign: int, out: I32) -> None:
+    """Add the squared differences of two rows.
+
+    Parameters
+    ----------
+    a, b : ndarray (W,) int16
+        Rows.
+    sign : int
+        1 to add, -1 to subtract.
+    out : ndarray (W,) int32
+        Sums, changed in place.
+    """
+    for x in range(len(out)):
+        apart = np.int32(b[x]) - np.int32(a[x])
+        out[x] = np.int32(out[x] + np.int32(sign) * apart * apart)

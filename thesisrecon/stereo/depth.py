@@ -31,7 +31,7 @@ from thesisrecon.stereo.neighbours import (
     sparse_points,
 )
 from thesisrecon.stereo.plane_refinement import ALIKE, PlaneRefinement
-from thesisrecon.stereo.semi_global import match_rectified
+from thesisrecon.stereo.semi_global import match_rectified_arrays
 
 Result = TypeVar("Result")
 SURE = 3.0
@@ -340,12 +340,14 @@ class MultiViewStereo:
         DisparityMap
             x_right = x_left - d, NaN = unknown or occluded.
         """
-        return match_rectified(left, right, max_disparity_px=max_disparity_px, matcher=self.pairs.matcher)
+        return match_rectified_arrays(
+            left, right, max_disparity_px=max_disparity_px, matcher=self.pairs.matcher
+        )
 
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
     ) -> RectifiedPair:
-        """Compute dense correspondence of two images, see :func:`.correspondence.match_two_views`.
+        """Compute dense correspondence of two images by :mod:`thesisrecon.stereo.correspondence`.
 
         Parameters
         ----------

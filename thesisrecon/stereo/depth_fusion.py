@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -59,22 +58,6 @@ class InverseDepth:
         value, std = (np.where(keep, part, np.float32(np.nan)) for part in (self.value, self.std))
         views, conflicts = (np.where(keep, part, np.uint8(0)) for part in (self.views, self.conflicts))
         return InverseDepth(value, std, views, conflicts)
-
-
-class Linker(Protocol):
-    """Method that fuses correspondences with other views into one inverse depth."""
-
-    def link(
-        self,
-        view: int,
-        views: Mapping[int, PinholeView],
-        neighbours: Sequence[int],
-        correspond: Correspond,
-    ) -> InverseDepth:
-        """Compute the inverse depths of the pixels of ``view``."""
-
-    def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
-        """Return the numbers of the other views that :meth:`link` requests."""
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from thesisrecon.arrays import B8, F32, I16, I32, U8, U16
+from thesisrecon.arrays import B8, F32, I16, U8, U16
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.cost import StereoImage
-from thesisrecon.stereo.cost_kernels import LEVELS
+from thesisrecon.stereo.cost_kernels import LEVELS, add_squares
 
 UNREACHED = np.uint16(65535)
 MIN_FACTOR = np.float32(0.05)
@@ -171,13 +171,6 @@ def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F
 
 
 @njit(cache=True, nogil=True)
-def _add_squares(before: I16, after: I16, sign: int, out: I32) -> None:
-    for x in range(len(out)):
-        apart = np.int32(after[x]) - np.int32(before[x])
-        out[x] = np.int32(out[x] + np.int32(sign) * apart * apart)
-
-
-@njit(cache=True, nogil=True)
 def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
     """Mean of (I(x + 1) - I(x - 1))^2 over channels and a square window, (H, W); zeros outside the image."""
     n, height, width = channels.shape
@@ -189,7 +182,7 @@ def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
             if 0 <= row < height and width > 2:
                 for k in range(n):
                     line = channels[k, row]
-                    _add_squares(line[: width - 2], line[2:], sign, columns[1 : width - 1])
+                    add_squares(line[: width - 2], line[2:], sign, columns[1 : width - 1])
         if y < 0:
             continue
         total = np.int64(0)

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo.cost import Strip, checked_range, estimate_noise, prepare_pair, run_strips
-from thesisrecon.stereo.cost_kernels import LEVELS
+from thesisrecon.stereo.cost import Strip, checked_range, estimate_noise, prepare_stereo_images, run_strips
+from thesisrecon.stereo.cost_kernels import LEVELS, add_squares
 from thesisrecon.stereo.postprocessing import final_confidence, texture_of
 
 OCCLUDED = -32768
@@ -40,13 +40,6 @@ SIGNIFICANT = 30.0
 
 
 @njit(cache=True, nogil=True)
-def _add_squares(a: I16, b: I16, out: I32) -> None:
-    for x in range(len(out)):
-        apart = np.int32(a[x]) - np.int32(b[x])
-        out[x] = np.int32(out[x] + apart * apart)
-
-
-@njit(cache=True, nogil=True)
 def _add_row(values: I32, out: I32) -> None:
     for x in range(len(out)):
         out[x] = np.int32(out[x] + values[x])
@@ -62,7 +55,7 @@ def _squared_differences(y: int, left: I16, right: I16, first: int, out: I32) ->
         out[q] = 0
         if hi > lo:
             for k in range(n):
-                _add_squares(left[k, y, lo:hi], right[k, y, lo - d : hi - d], out[q, lo:hi])
+                add_squares(right[k, y, lo - d : hi - d], left[k, y, lo:hi], 1, out[q, lo:hi])
 
 
 @njit(cache=True, nogil=True)
@@ -354,7 +347,7 @@ class MaximumLikelihoodScanline:
             If the image shapes are invalid or differ, or the range is empty.
         """
         first, last = checked_range(disparity_range)
-        sides = prepare_pair(left, right)
+        sides = prepare_stereo_images(left, right)
         noise = float(np.mean([estimate_noise(side) for side in sides]))
         variance = self.min_variance + noise**2
         components = len(sides[0].channels) * (2 * self.radius + 1) ** 2

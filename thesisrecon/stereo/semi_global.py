@@ -22,7 +22,7 @@ from thesisrecon.stereo.cost import (
     Strip,
     checked_range,
     estimate_noise,
-    prepare_pair,
+    prepare_stereo_images,
     row_strips,
     run_strips,
 )
@@ -151,7 +151,7 @@ class SemiGlobalMatching:
             If the image shapes are invalid or differ, or the range is empty.
         """
         first, last = checked_range(disparity_range)
-        images = prepare_pair(left, right)
+        images = prepare_stereo_images(left, right)
         measured = float(np.mean([estimate_noise(image) for image in images]))
         noise = float(np.hypot(MIN_NOISE, measured))
         height, width = images[0].valid.shape
@@ -211,14 +211,14 @@ PUBLISHED = SemiGlobalMatching(
 
 
 class PairMatcher(Protocol):
-    """A dense matcher: :class:`SemiGlobalMatching`, :class:`MaximumLikelihoodScanline`."""
+    """A dense matcher: :class:`SemiGlobalMatching` or that of :mod:`thesisrecon.stereo.scanline`."""
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
         """Compute the disparities of the left image within the range, both ends included."""
         ...
 
 
-def match_rectified(
+def match_rectified_arrays(
     left: ArrayLike, right: ArrayLike, *, max_disparity_px: float, matcher: PairMatcher | None = None
 ) -> DisparityMap:
     """Compute the disparities of a rectified pair of parallel cameras.
@@ -246,7 +246,7 @@ def match_rectified(
     --------
     >>> blocks = np.random.default_rng(0).uniform(0.0, 255.0, (10, 20))
     >>> right = np.kron(blocks, np.ones((4, 4)))
-    >>> found = match_rectified(np.roll(right, 5, axis=1), right, max_disparity_px=8)
+    >>> found = match_rectified_arrays(np.roll(right, 5, axis=1), right, max_disparity_px=8)
     >>> round(float(np.nanmedian(found.disparity)), 1)
     5.0
     """

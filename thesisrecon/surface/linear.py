@@ -55,7 +55,7 @@ def surface_from_depth(depth_map: DepthMap, *, step: int = 1, grazing_deg: float
             faces.append(corners[(triangles.rising == rising) & triangles.whole[..., k]][:, triple])
     order = np.concatenate(faces)
     order = order[np.lexsort(order.T[::-1])]
-    return remove_unused_vertices(TexturedMesh(back_project(depth_map.P, depth, step), order))
+    return remove_unused_vertices(TexturedMesh(points_of_depth_map(depth_map.P, depth, step), order))
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> 
     return np.asarray(np.abs(z1 - z2) <= limit)
 
 
-def back_project(P: F64, depth: F64, step: int = 1) -> F64:
+def points_of_depth_map(P: F64, depth: F64, step: int = 1) -> F64:
     """Back-project a depth map to points.
 
     Parameters

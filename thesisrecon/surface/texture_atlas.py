@@ -23,7 +23,7 @@ from thesisrecon.surface.texture_views import (
     choose_views,
     face_quality,
     label_charts,
-    project,
+    project_to_view,
     view_camera,
 )
 
@@ -139,7 +139,7 @@ def _corners(mesh: TexturedMesh, views: Sequence[PinholeView], label: I64) -> F6
     xy = np.zeros((len(mesh.faces), 3, 2))
     for v, view in enumerate(views):
         mine = label == v
-        xy[mine] = project(view_camera(view), mesh.vertices)[0][mesh.faces[mine]]
+        xy[mine] = project_to_view(view_camera(view), mesh.vertices)[0][mesh.faces[mine]]
     return xy
 
 

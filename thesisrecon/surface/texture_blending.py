@@ -23,7 +23,13 @@ from thesisrecon.surface.texture_kernels import (
     grow_colors,
     observe_points,
 )
-from thesisrecon.surface.texture_views import DEPTH_TOLERANCE_PX, Charts, project, sample_view, view_camera
+from thesisrecon.surface.texture_views import (
+    DEPTH_TOLERANCE_PX,
+    Charts,
+    project_to_view,
+    sample_view,
+    view_camera,
+)
 
 POINTS_PER_CHUNK = 1 << 17
 """Points processed at a time, which bounds the memory."""
@@ -366,7 +372,7 @@ def _colors(mesh: TexturedMesh, views: Sequence[PinholeView], view: I64, vertex:
         mine = view == v
         if mine.any():
             planes = [smooth(one.rgb[..., k].astype(np.float32), BLUR_PX) for k in range(3)]
-            xy = project(view_camera(one), mesh.vertices[vertex[mine]])[0]
+            xy = project_to_view(view_camera(one), mesh.vertices[vertex[mine]])[0]
             color[mine] = sample_view(one, xy, np.stack(planes, axis=-1))
     return color
 

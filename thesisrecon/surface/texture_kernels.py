@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F32, F64, I64, U8
+from thesisrecon.geometry.raster import weighted_median
 
 
 class ViewSurface(NamedTuple):
@@ -124,8 +125,8 @@ def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, co
 
 
 @njit(cache=True, nogil=True)
-def _weighted_median(values: F32, weights: F64, order: I64) -> float:
-    """Lower weighted median of values (V,) with weights (V,) that are not all 0; ``order`` is work space."""
+def _sort_weighted(values: F32, weights: F64, order: I64) -> tuple[int, float]:
+    """Sort the values (V,) of positive weight by index into ``order``; return their number and weight."""
     count, total = 0, 0.0
     for v in range(len(values)):
         if weights[v] > 0.0:
@@ -136,12 +137,7 @@ def _weighted_median(values: F32, weights: F64, order: I64) -> float:
             order[k] = v
             count += 1
             total += weights[v]
-    below = 0.0
-    for k in range(count):
-        below += weights[order[k]]
-        if below >= 0.5 * total:
-            return float(values[order[k]])
-    return float(values[order[count - 1]])
+    return count, total
 
 
 @njit(cache=True, nogil=True)
@@ -158,7 +154,7 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
     color : ndarray (V, N, 3) float32
         Colours.
     power, scatter : float
-        See :class:`BlendedTexture`.
+        See :class:`~thesisrecon.surface.texture_blending.BlendedTexture`.
     out : ndarray (N, 3) float32
         Receives the colours; points that no view shows are unchanged.
     """
@@ -175,7 +171,8 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
         for v in range(views):
             relative[v] = weight[v, n] / best
         for k in range(3):
-            middle[k] = _weighted_median(color[:, n, k], relative, order)
+            count, sum_of_weights = _sort_weighted(color[:, n, k], relative, order)
+            middle[k] = weighted_median(color[:, n, k], relative, order[:count], 0.5 * sum_of_weights)
         total = 0.0
         mean = np.zeros(3)
         for v in range(views):

@@ -36,7 +36,7 @@ def view_camera(view: PinholeView) -> Camera:
     return Camera.from_matrix(view.P, (view.rgb.shape[1], view.rgb.shape[0]))
 
 
-def project(camera: Camera, vertices: F64) -> tuple[F64, F64]:
+def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
     """Project vertices.
 
     Parameters
@@ -88,7 +88,7 @@ def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: i
     """
     quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
     for v, view in enumerate(views):
-        xy, depth = project(view_camera(view), mesh.vertices)
+        xy, depth = project_to_view(view_camera(view), mesh.vertices)
         seen = _visible_vertices(mesh, view, xy, depth, threads=threads)
         a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
         # y points down: faces that are anticlockwise from outside have a negative area.
@@ -142,7 +142,7 @@ def color_vertices(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads:
         share = np.zeros(len(mesh.vertices))
         for k in range(3):
             share += np.bincount(mesh.faces[:, k], quality[:, v], minlength=len(share))
-        xy = np.nan_to_num(project(view_camera(view), mesh.vertices)[0])
+        xy = np.nan_to_num(project_to_view(view_camera(view), mesh.vertices)[0])
         total += share[:, None] * sample_view(view, xy)
         weight += share
     mean = np.where(weight[:, None] > 0.0, total / np.maximum(weight, 1e-30)[:, None], 128.0)

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F32, F64
+from thesisrecon.geometry.raster import weighted_median
 
 ONE_SURFACE_PX = 1.0
 """Neighbouring disparities that differ by more belong to different surfaces."""
@@ -162,7 +163,7 @@ def filter_extrapolated_by_colour(
                     n += 1
             # On one surface there is nothing to choose.
             if most - least > ONE_SURFACE_PX:
-                out[y, x] = _weighted_median(values[:n], weights[:n], 0.5 * total)
+                out[y, x] = weighted_median(values[:n], weights[:n], np.argsort(values[:n]), 0.5 * total)
 
 
 @njit(cache=True, nogil=True)
@@ -193,17 +194,6 @@ def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, in
                         n += 1
             if values[:n].max() - values[:n].min() > ONE_SURFACE_PX:
                 out[y, x] = np.sort(values[:n])[n // 2]
-
-
-@njit(cache=True, nogil=True)
-def _weighted_median(values: F32, weights: F64, half: float) -> float:
-    """The smallest of ``values`` (N,) up to which the weights sum to ``half``."""
-    order, total = np.argsort(values), 0.0
-    for k in order:
-        total += weights[k]
-        if total >= half:
-            return float(values[k])
-    return float(values[order[-1]])
 
 
 @njit(cache=True, nogil=True)

@@ -131,7 +131,7 @@ class VirtualTensor:
         xy1, xy2 : ndarray (N, 2)
             Matches in pixels.
         lines : ndarray (N, 3), optional
-            Lines through x2 in image 2 other than epipolar lines; default: :meth:`lines_across`.
+            Lines through x2 in image 2 other than epipolar lines; default: :meth:`perpendicular_lines`.
 
         Returns
         -------

@@ -426,7 +426,7 @@ def prepare_synthesis(
     gain : array_like (3,)
         Factor of the exposure of the second image.
     seed : VirtualTensor, optional
-        Tensor that virtual cameras start from; default <1, 2, 2>, or that of :func:`seed_of_three`.
+        Tensor that virtual cameras start from; default <1, 2, 2>; see :mod:`thesisrecon.views.trilinear`.
     agree_px : float
         Tolerance of the forward-backward check; inf if all correspondences are right.
 

@@ -207,7 +207,7 @@ def pair_from_fundamental(
     xy1, xy2 : ndarray (N, 2)
         At least eight matches in pixels that agree with F; they select the decomposition.
     K1, K2 : ndarray (3, 3)
-        Intrinsics, known or guessed (:func:`guessed_intrinsics`).
+        Intrinsics, known or guessed (:func:`default_intrinsics`).
     orientation : Orientation, optional
         Default :class:`AnyRotation`; or :class:`SmallRotation`.
 

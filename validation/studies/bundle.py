@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from thesisrecon.arrays import B8, F64
+from thesisrecon.errors import UsageError
 from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_files import read_colmap_model
 from thesisrecon.numerics.losses import LossName
@@ -34,7 +35,7 @@ from validation.references.ceres_covariance import ceres_covariances
 from validation.scenes.real import load_real_scene
 from validation.scenes.streets import SIZE, Walk, make_walk, project
 from validation.studies.measuring import call_apart, exponent, timed
-from validation.studies.runner import Part, Rows, UsageError
+from validation.studies.runner import Part, Rows
 
 OURS, CERES = "ours", "Ceres"
 FOCAL_K1 = np.array([True, False, False, False, False, True])

@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from validation.studies.runner import Part, Rows, UsageError, pick
+from thesisrecon.errors import UsageError
+from validation.studies.runner import Part, Rows, pick
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"

@@ -25,7 +25,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io.files import write_text
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_scene, load_real_scene
@@ -103,10 +103,6 @@ SHIFTED = "Cones9"
 """Nine views of the Middlebury Cones, by a camera that moves without rotation."""
 Part = Sequence[Metric] | str
 StudyFunction = Callable[..., Iterable[Part]]
-
-
-class UsageError(ValueError):
-    """An option of a study has a value that does not exist."""
 
 
 def run_studies(arguments: Sequence[str]) -> int:

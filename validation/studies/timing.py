@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import prior_from_options
 from thesisrecon.io.files import write_text
 from thesisrecon.pipeline.reconstruction import reconstruct
@@ -38,7 +39,7 @@ from validation.references.colmap_mapping import map_database, mapper_options
 from validation.references.colmap_matching import match_with_pycolmap
 from validation.scenes.many_views import write_views
 from validation.studies.measuring import call_apart, timed
-from validation.studies.runner import Part, Rows, UsageError, scenes_here, text_table
+from validation.studies.runner import Part, Rows, scenes_here, text_table
 
 OURS, COLMAP = "thesisrecon", "COLMAP"
 STAGES = ("projective", "selfcalibration", "metric")
