@@ -372,7 +372,14 @@ def test_every_failed_check_is_reported_once(tmp_path):
 
 def test_a_failed_attempt_is_followed_by_another(tmp_path):
     result = run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=2)))
+    assert [c for c in CALLS if c.startswith("projective")] == [
+        "projective 0",
+        "projective 1",
+        "projective 2",
+    ]
     assert result.metric is not None
+    assert result.metric.trusted
+    assert result.warnings == ("3 initial pairs were tried; the best result is used",)
 
 
 def test_a_failure_keeps_results_and_states_the_reason(tmp_path):

@@ -128,7 +128,10 @@ def test_a_pair_without_pixels_or_matches_is_no_error():
     bare = dataclasses.replace(data.images[0], rgb=None)
     assert draw_pair(pair, bare, data.images[1]) is None
     empty = dataclasses.replace(pair, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
-    assert draw_pair(empty, data.images[0], data.images[1]) is not None
+    drawn = draw_pair(empty, data.images[0], data.images[1])
+    assert drawn is not None
+    assert opened(drawn.uri).size == (drawn.width, drawn.height)
+    assert min(drawn.width, drawn.height) > 100
 
 
 def test_lines_are_cut_at_the_edges_of_the_photograph():
@@ -153,7 +156,10 @@ def test_spread_matches_are_different_and_far_apart():
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
 def test_odd_pictures_have_thumbnails(shape):
     image = dataclasses.replace(made_up_run(points=50).images[0], rgb=np.zeros(shape, dtype=np.uint8))
-    assert thumbnail(image, 3) is not None
+    drawn = thumbnail(image, 3)
+    assert drawn is not None
+    assert opened(drawn.uri).size == (drawn.width, drawn.height)
+    assert drawn.width >= drawn.height >= 1
 
 
 def lightness(rgb):

@@ -1,3 +1,5 @@
+"""Rows and verdicts of the study of whole reconstructions."""
+
 from dataclasses import replace
 
 import pytest
