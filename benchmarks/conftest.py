@@ -37,7 +37,7 @@ def photographs() -> tuple[Image, ...]:
 @pytest.fixture
 def bench(benchmark: Any) -> Bench:
     """``bench(group, method, call)``: measured after one call that compiles and fills the caches; skipped
-    where the reference library is missing. ``call`` takes what ``setup`` makes anew each time, unmeasured."""
+    where the reference library is missing. ``call`` takes what ``setup`` makes for each call, unmeasured."""
 
     def run(group: str, method: str, call: Call, setup: Call | None = None) -> None:
         benchmark.group, benchmark.extra_info["method"] = group, method

@@ -7,8 +7,10 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-FILES = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
-FILES += [p for folder in ("thesisrecon", "tests") for p in (ROOT / folder).rglob("*.py")]
+FILES = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "fixtures" / "README.md"]
+FOLDERS = ("thesisrecon", "tests", "validation", "benchmarks")
+FILES += [p for folder in FOLDERS for p in (ROOT / folder).rglob("*.py")]
+FILES += [*(ROOT / "validation").rglob("*.toml"), *(p for p in (ROOT / "scripts").iterdir() if p.is_file())]
 FILES = sorted(set(FILES) - {Path(__file__)})
 ODD_WORDS = re.compile(
     r"(?<![\w/-])(told|tells? of|wish(es|ed)?|whoever|anew|mend(s|ed|ing)?|feign(s|ed)?|betrays?"
@@ -33,7 +35,10 @@ def strings_of(text):
 
 def offenders(path):
     text = path.read_text(encoding="utf-8")
-    pieces = strings_of(text) if path.suffix == ".py" else [(1, re.sub(r"(?s)```.*?```|`[^`\n]*`", "", text))]
+    if path.suffix == ".py" or text.startswith("#!/usr/bin/env python"):
+        pieces = strings_of(text)
+    else:
+        pieces = [(1, re.sub(r"(?s)```.*?```|`[^`\n]*`", "", text) if path.suffix == ".md" else text)]
     found = []
     for first, piece in pieces:
         for match in ODD_WORDS.finditer(piece):

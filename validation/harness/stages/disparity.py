@@ -88,7 +88,7 @@ class DisparityStage(Stage):
                 scene, "bad pixels over the better reference", "", over_better, OURS, definition=OVER_BETTER
             ),
             *_of_variants(scene, wrong, known),
-            Metric(scene, "told though hidden", "%", hidden, OURS, definition=HIDDEN),
+            Metric(scene, "known though hidden", "%", hidden, OURS, definition=HIDDEN),
             Metric(scene, "error on surfaces", "px", error, OURS, definition=ON_SURFACES),
             Metric(
                 scene,
