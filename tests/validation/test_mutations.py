@@ -49,6 +49,14 @@ def test_the_faults_are_many_and_everywhere():
     }  # fmt: skip
 
 
+def test_the_guide_names_the_file_of_every_fault():
+    guide = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
+    listed = guide.split("<!-- mutations: begin -->")[1].split("<!-- mutations: end -->")[0]
+    rows = [line.split(" | ")[:2] for line in listed.strip().splitlines()[2:]]
+    named = {name.removeprefix("| "): f"thesisrecon/{file.strip('`')}" for name, file in rows}
+    assert named == {mutation.name: mutation.file for mutation in MUTATIONS}
+
+
 WRONG = {
     'file = "a.py"\nold = "a"\nnew = "b"\ncheck = ["bundle/street"]': "a mutation has",
     'name = "n"\nfile = "a.py"\nold = "a"\nnew = "a"\ncheck = ["bundle/street"]': "old differs from new",
