@@ -4,6 +4,7 @@ Each test collects all offenders and names them in its message.
 """
 
 import ast
+import runpy
 import subprocess
 import sys
 from functools import cache
@@ -116,6 +117,12 @@ def test_chapters_export_nothing():
     chapters = [p for p in MODULES if p.name == "__init__.py" and p.parent != PACKAGE]
     code = {p: {ast.unparse(node) for node in tree_of(p).body[1:]} for p in chapters}
     assert report(code) == []
+
+
+def test_the_page_on_the_architecture_is_up_to_date():
+    """``scripts/make_architecture`` writes it."""
+    script = runpy.run_path(str(ROOT / "scripts" / "make_architecture"))
+    assert script["PAGE"].read_text(encoding="utf-8") == script["page"]()
 
 
 def test_array_types_are_defined_once():
