@@ -34,7 +34,7 @@ class Measure:
 class Task(Protocol):
     """Work of a row: a frozen dataclass whose fields are the parameters ``task.…``.
 
-    ``measures`` are its numbers. ``check`` raises :class:`UsageError` for an unknown or missing scene;
+    ``measures`` are its numbers. ``check`` raises ``UsageError`` for an unknown or missing scene;
     ``scene_key`` identifies the content of a scene. ``run`` works with a random seed in an empty folder
     ``place``, which is removed afterwards, and returns numbers by measure name. ``StageFailure`` means that
     the data could not be processed.

@@ -24,7 +24,7 @@ def read_study(path: str | Path) -> Study:
     """Read the study of a file.
 
     Raises :class:`UsageError` naming the file if it is missing, not TOML, or has an unknown key (naming the
-    nearest) or a wrong type. Paths, scenes and metrics are checked by :func:`plan_study`.
+    nearest) or a wrong type. Paths, scenes and metrics are checked by ``plan_study``.
     """
     path = Path(path)
     try:

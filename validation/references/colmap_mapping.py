@@ -53,7 +53,7 @@ def map_with_pycolmap(
     threads: int = 2,
     mapper: Literal["incremental", "global"] = "incremental",
 ) -> ReferenceRun:
-    """Map the matches of :func:`match_with_pycolmap` in ``matched`` from ``start``.
+    """Map the matches of ``match_with_pycolmap`` in ``matched`` from ``start``.
 
     ``out`` is another folder, emptied first; the global mapper (GLOMAP) refines what it refines by default.
     Raises :class:`StageFailure` if COLMAP makes no model.

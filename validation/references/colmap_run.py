@@ -20,7 +20,7 @@ def reconstruct_with_pycolmap(
     """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
 
     ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database, the
-    models and the times. Raises :class:`StageFailure` if COLMAP makes no model.
+    models and the times. Raises ``StageFailure`` if COLMAP makes no model.
     """
     match_with_pycolmap(images, out, shared_camera=shared_camera, threads=threads)
     return map_incrementally(images, out, mapper_options(threads, refine_principal_point))

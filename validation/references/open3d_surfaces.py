@@ -22,7 +22,7 @@ from validation.references.open3d_cameras import camera_of, median_footprint
 class OpenTsdf:
     """Truncated signed distances in a grid of blocks (``VoxelBlockGrid``), surface by marching cubes.
 
-    ``voxel_px``: side of a voxel in pixels at the median depth, as :class:`VolumetricFusion` has it.
+    ``voxel_px``: side of a voxel in pixels at the median depth, as ``VolumetricFusion`` has it.
     ``truncation_voxels``. ``least_views``: how many maps must have seen a voxel.
     """
 
