@@ -100,7 +100,7 @@ def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
 
 
 def _is_seed(seed: Any) -> bool:
-    return isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0
+    return isinstance(seed, int | np.integer) and not isinstance(seed, bool) and int(seed) >= 0
 
 
 @dataclass
