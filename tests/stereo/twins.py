@@ -4,7 +4,13 @@ import itertools
 
 import numpy as np
 
-from thesisrecon.stereo.plane_kernels import MIN_WINDOW_COVERAGE, MAX_EXCESS_COST, SAME_PLANE, TEXTURE, UNKNOWN
+from thesisrecon.stereo.plane_kernels import (
+    MAX_EXCESS_COST,
+    MIN_WINDOW_COVERAGE,
+    SAME_PLANE,
+    TEXTURE,
+    UNKNOWN,
+)
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED
 
 

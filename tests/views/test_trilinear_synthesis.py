@@ -8,7 +8,11 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.views.trilinear import seed_of_first, seed_of_two
-from thesisrecon.views.trilinear_synthesis import complete_correspondence, extrapolate_inverse_depth, prepare_synthesis
+from thesisrecon.views.trilinear_synthesis import (
+    complete_correspondence,
+    extrapolate_inverse_depth,
+    prepare_synthesis,
+)
 from thesisrecon.views.virtual_camera import CalibratedPair, VirtualCamera, camera_at, cameras_along
 from thesisrecon.views.warping import DIRECTIONS, distances_to_known
 
