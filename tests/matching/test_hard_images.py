@@ -46,7 +46,7 @@ def test_a_photograph_without_texture_is_named(name, level):
 @PRESETS
 def test_an_image_of_32_pixels_is_rejected_with_the_required_size(name):
     left, right = stereo()
-    with pytest.raises(StageFailure, match="32 x 32 pixels; 64 x 64"):
+    with pytest.raises(StageFailure, match="32 x 32 pixels; the minimum is 64 x 64"):
         match_pair(left[:32, :32].copy(), right[:32, :32].copy(), config=preset(name))
 
 

@@ -233,7 +233,7 @@ def test_a_dask_cluster_finds_the_same_and_is_missed_when_gone(tmp_path):
         named = ablate(knowledge, tmp_path / "named", executor=address)
     reported = [[(r.key, r.metrics) for r in rows] for rows in (here, given, named)]
     assert reported[0] == reported[1] == reported[2]
-    with pytest.raises(UsageError, match="a Dask scheduler is given as dask://HOST:PORT"):
+    with pytest.raises(UsageError, match="a Dask scheduler must be given as dask://HOST:PORT"):
         ablate(knowledge, tmp_path / "gone", executor="dask://nowhere")
 
 
