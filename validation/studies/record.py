@@ -58,6 +58,13 @@ def numbers_of(value: Any, place: str = "") -> dict[str, float]:
     return found
 
 
+def combined(digests: list[str] | str) -> str:
+    """Return the number of digests and a digest of them, in their order."""
+    if isinstance(digests, str):
+        return digests
+    return f"{len(digests)}:{hashlib.sha256(' '.join(digests).encode()).hexdigest()[:16]}"
+
+
 def arrays_of(record: Any) -> list[str]:
     """Return digests of all arrays in nested records."""
     if isinstance(record, np.ndarray):
@@ -71,15 +78,15 @@ def arrays_of(record: Any) -> list[str]:
     return []
 
 
-def stage_digests(out: Path) -> dict[str, list[str]]:
+def stage_digests(out: Path) -> dict[str, str]:
     """Return sorted digests of the arrays of every stage folder, by the number of the folder."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, str] = {}
     for folder in sorted(p for p in out.iterdir() if p.is_dir() and p.name[:2].isdigit()):
         every = []
         for path in sorted(folder.glob("*.npz")):
             with np.load(path) as file:
                 every += [digest(file[name]) for name in file.files if name != "description"]
-        found[folder.name[:2]] = sorted(every)
+        found[folder.name[:2]] = combined(sorted(every))
     return found
 
 
@@ -159,7 +166,8 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
     except StageFailure as failure:
         summary["/failed"] = 1.0
         print(f"{name} {preset_name}: {failure}")
-    return {"code": 0, "summary": summary, "files": {}, "stages": digests}
+    stages = {name: combined(every) for name, every in digests.items()}
+    return {"code": 0, "summary": summary, "files": {}, "stages": stages}
 
 
 def write(target: Path, folder: Path, sets: Sequence[str], presets: Sequence[str]) -> Iterator[str]:
@@ -183,7 +191,7 @@ def compare(before: Path, after: Path) -> Iterator[tuple[str, bool]]:
         lines = [] if a.get("code") == b.get("code") else [f"exit code {a.get('code')} -> {b.get('code')}"]
         for kind in ("files", "stages"):
             for name in sorted(set(a.get(kind, {})) | set(b.get(kind, {}))):
-                if a[kind].get(name) != b[kind].get(name):
+                if combined(a[kind].get(name, "")) != combined(b[kind].get(name, "")):
                     lines.append(f"{kind}: {name} differs")
         lines += summary_differences(a.get("summary", {}), b.get("summary", {}))
         yield "\n    ".join([f"{run}: {'' if lines else 'same bytes'}", *lines]), bool(lines)
