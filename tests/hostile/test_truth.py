@@ -82,7 +82,7 @@ STUDIES = [
     (links("/dev/zero"), "cannot be read: it is a pipe, a device"),
     (sparse(10**13), "cannot be read: it is larger"),
     (writes(f"a = {'[' * 50_000}"), "is not TOML"),
-    (writes("title = 3"), "title takes a text; got 3"),
+    (writes("title = 3"), "title takes text; got 3"),
     (writes("scenes = 3\naxes = 4"), "axes takes a table"),
     (writes("scenes = [3]\npreset = []\n[axes]"), "unknown preset []"),
     (writes("scenes = ['a']\nconfig = 3\n[axes]"), "config takes a table"),

@@ -118,7 +118,7 @@ def test_a_focal_without_a_solution_is_named_and_not_requested():
     prior = prior_for(reconstruction, IntrinsicsOptions(focal_px=1.0, focal_std_rel=0.05))
     with pytest.raises(StageFailure) as failure:
         HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=np.random.default_rng(0))
-    assert "near the focal length that was given" in str(failure.value)
+    assert "near the given focal length" in str(failure.value)
     assert "1 px (+- 5.0%)" in failure.value.evidence
     assert "the images contradict it" in failure.value.advice
     assert "give the focal length" not in str(failure.value)
@@ -133,7 +133,7 @@ def test_given_focals_without_a_solution_are_named(focals, reported):
     mean = prior.mean.copy()
     mean[:, 0] = np.resize(focals, len(mean))
     frame = normalized_frame(estimate, replace(prior, mean=mean))
-    with pytest.raises(StageFailure, match="near the focal length that was given") as failure:
+    with pytest.raises(StageFailure, match="near the given focal length") as failure:
         select_candidate(frame, estimate, RotationCriterion(), [], max_candidates=3, min_in_front_ratio=0.9)
     assert f"{reported} (+-" in failure.value.evidence
 
