@@ -159,12 +159,12 @@ def test_settings_are_judged_before_the_photographs_are_known(tmp_path):
     directory = RunDirectory(tmp_path)
     with directory.claim(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
-    wishes = {name: value for name, value in IDENTITY.items() if name != "photographs"}
-    with directory.claim(wishes, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
+    options = {name: value for name, value in IDENTITY.items() if name != "photographs"}
+    with directory.claim(options, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
         directory.adopt({**IDENTITY, "photographs": {"a.jpg": "1"}}, overwrite=False)
     with (
         pytest.raises(UsageError, match="seed was 0"),
-        directory.claim({**wishes, "seed": 2}, overwrite=False),
+        directory.claim({**options, "seed": 2}, overwrite=False),
     ):
         pass
 

@@ -205,8 +205,10 @@ def entry(group, method, seconds):
 
 
 def test_ratios_are_ours_over_each_reference(tmp_path, capsys):
-    told = {"benchmarks": [entry("F", "ours", 0.002), entry("F", "OpenCV", 0.008), entry("G", "OpenCV", 1.0)]}
-    (tmp_path / "b.json").write_text(json.dumps(told))
+    timings = {
+        "benchmarks": [entry("F", "ours", 0.002), entry("F", "OpenCV", 0.008), entry("G", "OpenCV", 1.0)]
+    }
+    (tmp_path / "b.json").write_text(json.dumps(timings))
     options = ["--benchmark", str(tmp_path / "b.json"), "--ratios", str(tmp_path / "r.json")]
     assert run_study("benchmark-table", options) == 0
     assert "| F | OpenCV | 8 | **0.25** |" in capsys.readouterr().out
