@@ -30,7 +30,7 @@ FILE_CALLS = {
 GLOBAL_RANDOMNESS = {
     "seed", "rand", "randn", "random", "randint", "choice", "shuffle", "permutation", "normal",
 }  # fmt: skip
-MOST_KERNEL_ARGUMENTS = 8
+MAX_KERNEL_ARGUMENTS = 8
 
 
 @cache
@@ -189,7 +189,7 @@ def all_kernels():
 def test_kernels_take_few_arguments():
     every = [kernel for named in all_kernels().values() for kernel in named]
     assert len(every) > 100
-    assert [f"{k.place}: {k.arguments}" for k in every if k.arguments > MOST_KERNEL_ARGUMENTS] == []
+    assert [f"{k.place}: {k.arguments}" for k in every if k.arguments > MAX_KERNEL_ARGUMENTS] == []
 
 
 def test_kernels_that_reorder_sums_are_inlined_into_their_callers():

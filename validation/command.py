@@ -23,7 +23,7 @@ from validation.harness.scenes import load_photographs
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
 
-LEAST_SIDE_PX = 64
+MIN_SIDE_PX = 64
 """Smallest long side of depth maps, for the matching window."""
 
 
@@ -110,8 +110,8 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
         raise ValueError("--methods needs --resume: name the folder of the earlier run")
     if parsed.threads < 1 or parsed.time_limit <= 0:
         raise ValueError("--threads and --time-limit must be positive")
-    if parsed.max_side and parsed.max_side < LEAST_SIDE_PX:
-        raise ValueError(f"--max-side must be at least {LEAST_SIDE_PX} px")
+    if parsed.max_side and parsed.max_side < MIN_SIDE_PX:
+        raise ValueError(f"--max-side must be at least {MIN_SIDE_PX} px")
     return ReportOptions(
         out=parsed.out.resolve(),
         scenes=tuple(dict.fromkeys([*scenes, *folders])),

@@ -26,7 +26,7 @@ from validation.harness.process import own_cores, run_process
 from validation.scenes.real import ROOT
 
 PACKAGES = ("geometry", "epipolar", "selfcalibration", "numerics")
-LEAST_SCORE = 0.85
+MIN_SCORE = 0.85
 LIMIT_S = 420.0
 """Time limit of a test run (s)."""
 COLD_S = 3600.0
@@ -366,7 +366,7 @@ def main(arguments: list[str] | None = None) -> int:
     score = sum(bool(v.by) for v in results.values()) / max(len(results), 1)
     faults = counted(len(results), "fault")
     print(f"{faults}, {100.0 * score:.0f} % caught; the table is {parsed.out / 'mutants.md'}")
-    return int(score < LEAST_SCORE)
+    return int(score < MIN_SCORE)
 
 
 if __name__ == "__main__":

@@ -174,7 +174,7 @@ def test_a_torn_write_leaves_no_half_file_under_its_name(tmp_path):
 def test_good_inputs_are_models(tmp_path):
     inputs = fuzz_colmap.valid_inputs()
     assert len(inputs) == len(MODEL_NUMBERS) + 6
-    assert max(map(len, inputs)) <= fuzz_colmap.LARGEST_INPUT
+    assert max(map(len, inputs)) <= fuzz_colmap.MAX_INPUT
     for data in inputs:
         fuzz_colmap.read_input(data)
         first, second = fuzz_colmap.LENGTHS.unpack_from(data)

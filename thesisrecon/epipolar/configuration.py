@@ -54,7 +54,7 @@ STANDARD_ERRORS = 4.0
 # Squared distance in sigma^2 beyond which a match is off the homography; noise exceeds it once in 3000.
 FAR = 16.0
 # Maximum log10 of the false alarms of the matches off the simpler model.
-LARGEST_CHANCE = -3.0
+MAX_CHANCE = -3.0
 BAND = 2.5
 # The F of a plane is also fitted to wrong matches, which therefore agree this much more often.
 FLEXIBLE = 2.0
@@ -299,7 +299,7 @@ def _classify(case: _InlierData, scale: float, seed: int) -> ConfigurationReport
         )
     ratio = _translation_ratio(case)
     kind = Configuration.GENERAL
-    if plane is not None and errors < STANDARD_ERRORS and chance > LARGEST_CHANCE:
+    if plane is not None and errors < STANDARD_ERRORS and chance > MAX_CHANCE:
         # F fits the noise of a plane, the homography does not: use the noise of the homography.
         sigma = noise
         rotated = rotation_errors < _rotation_limit(int(near.sum())) and np.isfinite(angle)
@@ -378,7 +378,7 @@ def _translation_ratio(case: _InlierData) -> float:
     f = _fit_translation(inliers, case.sigma)
     simple = np.asarray(sampson_distances(f, case.points))
     off = simple > np.sqrt(FAR) * case.sigma
-    if case.false_alarms(off, BEYOND_TRANSLATION) < LARGEST_CHANCE:
+    if case.false_alarms(off, BEYOND_TRANSLATION) < MAX_CHANCE:
         return float("inf")
     near = case.points[simple < TRANSLATED * case.sigma]
     degrees = len(near) - 7

@@ -47,16 +47,16 @@ FAR = 20.0
 MINIMUM = 8
 BAND_SIGMAS, BAND_FLOOR_PX, SIGMA_FLOOR_PX = 2.5, 0.3, 0.1
 # Maximum log10 of the false alarms of the matches off the plane.
-LARGEST_CHANCE = -2.0
+MAX_CHANCE = -2.0
 # Standard errors by which a competing model must be worse: right models of facades reach 7, wrong ones 2.
 # Not a probability, since matches of repeated structure are dependent.
-LEAST_MARGIN = 3.0
+MIN_MARGIN = 3.0
 # Smallest change, relative to the matches off the plane, that makes another model a competing one.
-LEAST_GAIN = 0.05
+MIN_GAIN = 0.05
 # Distance from epipolar lines that is relevant, px, or 2 sigma if that is larger.
-LARGEST_ERROR_PX = 1.0
+MAX_ERROR_PX = 1.0
 # Fraction of neighbours that contradict a match, maximum fraction of contradicted matches, and sample size.
-CONTRADICTED, MOST_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
+CONTRADICTED, MAX_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
 
 
 @njit(cache=True, nogil=True)
@@ -379,7 +379,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
         chance=max(by_model_chance, by_chance),
         free=2,
     )
-    relevant_px = max(LARGEST_ERROR_PX, 2.0 * fit.sigma_px)
+    relevant_px = max(MAX_ERROR_PX, 2.0 * fit.sigma_px)
     least = _least_gain(support, by_chance)
     different = [r for r in competing_models if r.gained >= least and _differs(r, relevant_px * frame.scale)]
     other = min(different, key=lambda r: r.margin, default=None)
@@ -398,7 +398,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
 def _least_gain(support: _OffPlaneWeights, chance: float) -> float:
     """Weight of matches that a competing model must gain: more than wrong matches agree by chance."""
     expected = 2.0 * chance * (support.tried - support.agreeing)
-    return float(max(LEAST_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
+    return float(max(MIN_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
 
 
 def _differs(competing_model: _CompetingModel, relevant: float) -> bool:
@@ -408,7 +408,7 @@ def _differs(competing_model: _CompetingModel, relevant: float) -> bool:
     are far from F.
     """
     return competing_model.apart > relevant or (
-        competing_model.error > relevant and competing_model.margin < -LEAST_MARGIN
+        competing_model.error > relevant and competing_model.margin < -MIN_MARGIN
     )
 
 
@@ -440,14 +440,14 @@ def _reasons(
 ) -> list[str]:
     off = f"{support.agreeing:.0f} of {support.tried:.0f} matches off the dominant plane agree with F"
     reasons = []
-    if chance > LARGEST_CHANCE:
+    if chance > MAX_CHANCE:
         reasons.append(f"{off}, no more than expected by chance")
-    if support.contradicted > MOST_CONTRADICTED * support.agreeing:
+    if support.contradicted > MAX_CONTRADICTED * support.agreeing:
         reasons.append(
             f"{off}, but {support.contradicted:.0f} of them lie among matches of the plane, as matches "
             "between repeated structures do"
         )
-    if competing_model is not None and competing_model.margin < LEAST_MARGIN:
+    if competing_model is not None and competing_model.margin < MIN_MARGIN:
         reasons.append(
             f"another F explains {competing_model.gained:.0f} matches that this F does not explain, and "
             f"misses {competing_model.lost:.0f} of its inliers"

@@ -13,7 +13,7 @@ from thesisrecon.geometry.two_view import unit_norm
 # Ratio of the spread across to the spread along the main direction below which points count as collinear.
 COLLINEAR = 1e-9
 # Above the first a double has no fraction of a pixel left; below the second fourth powers underflow.
-LARGEST_PX, SMALLEST_PX = 1e15, 1e-50
+MAX_PX, MIN_PX = 1e15, 1e-50
 
 
 def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
@@ -41,9 +41,9 @@ def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
         raise ValueError(f"a fundamental matrix needs two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
     if not (np.isfinite(xy1).all() and np.isfinite(xy2).all()):
         raise ValueError("a fundamental matrix needs finite pixel coordinates; some are NaN or infinite")
-    if max(np.abs(xy1).max(initial=0.0), np.abs(xy2).max(initial=0.0)) > LARGEST_PX:
+    if max(np.abs(xy1).max(initial=0.0), np.abs(xy2).max(initial=0.0)) > MAX_PX:
         raise ValueError(
-            f"a fundamental matrix needs pixel coordinates of images; some are beyond {LARGEST_PX:g}"
+            f"a fundamental matrix needs pixel coordinates of images; some are beyond {MAX_PX:g}"
         )
     return xy1, xy2
 
@@ -82,7 +82,7 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
             continue
         spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
         length = max(float(spread[0]), 1e-3 * float(np.abs(xy).max()))
-        if not spread[1] > max(COLLINEAR * length, SMALLEST_PX):
+        if not spread[1] > max(COLLINEAR * length, MIN_PX):
             raise StageFailure(
                 f"the matched points are collinear in the {name} image",
                 f"{len(xy)} points with a spread across the line of {spread[1] / np.sqrt(len(xy)):.3g} px",
@@ -96,7 +96,7 @@ def _clearly_spread(xy: F64) -> bool:
     centred = xy - xy.sum(axis=0) / len(xy)
     (a, b), (_, d) = centred.T @ centred
     size = a + d
-    large = size > max(1e-6 * len(xy) * float(xy[0] @ xy[0]), SMALLEST_PX**2)
+    large = size > max(1e-6 * len(xy) * float(xy[0] @ xy[0]), MIN_PX**2)
     return bool(large and a * d - b * b > 1e-6 * size**2)
 
 

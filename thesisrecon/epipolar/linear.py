@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.epipolar.frame import SMALLEST_PX, PairFrame, as_matches, check_matches
+from thesisrecon.epipolar.frame import MIN_PX, PairFrame, as_matches, check_matches
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import enforce_rank_two, unit_norm
@@ -130,7 +130,7 @@ def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
     xy1, xy2 = as_matches(xy1, xy2)
     if xy1.shape != (7, 2):
         raise ValueError(f"the seven-point algorithm needs two (7, 2) arrays; got {xy1.shape}, {xy2.shape}")
-    if not min(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()) > SMALLEST_PX:
+    if not min(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()) > MIN_PX:
         return np.empty((0, 3, 3))
     frame = PairFrame.of(xy1, xy2)
     solutions = np.empty((3, 9))

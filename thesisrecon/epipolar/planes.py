@@ -28,7 +28,7 @@ OFF_PLANE = 16.0
 GATE = 5.0
 SUBSET_STEPS, ALL_STEPS, MOST = 3, 4, 600
 # Twice the area of the smallest triangle of three matches, in squared frame units.
-SMALLEST_AREA = 1e-3
+MIN_AREA = 1e-3
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
@@ -182,7 +182,7 @@ def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: flo
     h[:] = 0.0
     wide = 1.0 / (gate * gate)
     for t in range(len(triples)):
-        if not _induced_homography(f, e2, points, triples[t], SMALLEST_AREA, trial):
+        if not _induced_homography(f, e2, points, triples[t], MIN_AREA, trial):
             continue
         total = 0.0
         for k in range(len(points)):

@@ -44,7 +44,7 @@ OFF_PLANE, PLANE_ROUNDS, PLANE_WIDTH = 4, 6, 6.0
 # Width of Huber's loss in sigma.
 HUBER = 3.0
 # Minimum number of tracks, and the spread below which powers underflow.
-NEEDED, SMALLEST_PX = 9, 1e-50
+NEEDED, MIN_PX = 9, 1e-50
 # Stricter than for matches without outliers: a plane with a few wrong tracks that fit has 0.25 to 0.4.
 WEAK = 0.2
 
@@ -284,7 +284,7 @@ class _Frame:
         centre = np.median(points, axis=1)
         offsets = points - points.mean(axis=1, keepdims=True)
         spread = np.linalg.svd(offsets, compute_uv=False) / np.sqrt(points.shape[1])
-        if not (spread[:, 1] > np.maximum(1e-9 * spread[:, 0], SMALLEST_PX)).all():
+        if not (spread[:, 1] > np.maximum(1e-9 * spread[:, 0], MIN_PX)).all():
             raise StageFailure(
                 "the tracked points of an image are collinear",
                 f"spread along and across {spread[:, 0].min():.3g} and {spread[:, 1].min():.3g} px",

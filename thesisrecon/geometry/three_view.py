@@ -31,7 +31,7 @@ from thesisrecon.geometry.lines_and_planes import unit_normals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import unit_norm
 
-LARGEST_PX = 1e15
+MAX_PX = 1e15
 """Largest coordinate: beyond, fourth powers overflow and a double resolves no fraction of a pixel."""
 NEEDED_EQUATIONS = 26
 """Seven points, thirteen lines, or a mixture (HZ 16.1)."""
@@ -534,8 +534,8 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
     points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
     require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
     require_finite("a trifocal tensor", points, segments)
-    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > LARGEST_PX:
-        raise ValueError(f"points and segments must be pixels of an image; some are beyond {LARGEST_PX:g}")
+    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
+        raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
     return points, segments

@@ -20,7 +20,7 @@ from thesisrecon.geometry.homogeneous import (
     require_shapes,
 )
 
-PARALLAX_PER_NOISE, LEAST_PARALLAX_PX = 3.0, 0.05
+PARALLAX_PER_NOISE, MIN_PARALLAX_PX = 3.0, 0.05
 """Least displacement that no homography explains (90 % quantile), over the epipolar distances and in px."""
 
 
@@ -422,7 +422,7 @@ def require_parallax_of_matches(
     else:
         residuals = homography_residuals(at_infinity, xy1, xy2)
     parallax = float(np.quantile(residuals, 0.9))
-    if parallax > PARALLAX_PER_NOISE * noise + LEAST_PARALLAX_PX:
+    if parallax > PARALLAX_PER_NOISE * noise + MIN_PARALLAX_PX:
         return
     what = "one homography" if at_infinity is None else "a scene at infinity"
     raise StageFailure(

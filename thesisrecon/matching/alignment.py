@@ -33,7 +33,7 @@ HALF = SIDE // 2
 # Below this correlation the windows show different things and the iteration does not converge.
 MIN_WINDOW_CORRELATION = 0.3
 # Minimum det / product of the diagonal of the normal matrix: structure in one direction gives no position.
-LEAST_CONDITION = 1e-4
+MIN_CONDITION = 1e-4
 # Squared step in pixels of the scale at which the iteration stops.
 SETTLED = 1e-6
 ITERATIONS = 12
@@ -82,7 +82,7 @@ def _align_windows(
             continue
         normal = _normal_matrix(gradient)
         d = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
-        if d <= LEAST_CONDITION * normal[0, 0] * normal[1, 1]:
+        if d <= MIN_CONDITION * normal[0, 0] * normal[1, 1]:
             continue
         value = _iterate(
             (pixels2, levels2[k2], to2),

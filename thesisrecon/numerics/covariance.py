@@ -19,7 +19,7 @@ MAD_TO_SIGMA = 1.4826
 # Trimming point and variance of a standard normal variable trimmed there.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
 # Least fraction of the variance that a coordinate must keep to contribute.
-LEAST_KEPT = 0.1
+MIN_KEPT = 0.1
 
 
 def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
@@ -41,7 +41,7 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     if not len(residual):
         return 0.0
     kept = 1.0 - leverage - max(dof, 0) / residual.size
-    informative = kept > LEAST_KEPT
+    informative = kept > MIN_KEPT
     if not informative.any():
         return 0.0
     size = np.abs(residual[informative]) / np.sqrt(kept[informative])

@@ -34,7 +34,7 @@ Result = TypeVar("Result")
 
 CHUNK = 16384
 # Every chunk has its own sums: few chunks if these are large.
-MOST_CHUNKS, CHUNK_BYTES = 16, 128e6
+MAX_CHUNKS, CHUNK_BYTES = 16, 128e6
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def build_layout(
     pair[row, column] = np.arange(len(row))
     solver = choose_solver(row, column, n, width, border)
     bytes_each = 8.0 * (len(row) * width**2 + n * width * border + border**2)
-    most = max(1, min(MOST_CHUNKS, int(CHUNK_BYTES / max(bytes_each, 1.0))))
+    most = max(1, min(MAX_CHUNKS, int(CHUNK_BYTES / max(bytes_each, 1.0))))
     count = int(np.clip(len(o.xy) // CHUNK, 1, most))
     bounds = np.searchsorted(o.start, np.linspace(0, len(o.xy), count + 1)[1:-1])
     ends = [0, *bounds.tolist(), len(o.start) - 1]

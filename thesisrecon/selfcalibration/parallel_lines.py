@@ -28,7 +28,7 @@ _NEAR_TOLERANCES = 4.0
 
 _AMBIGUOUS = -2
 
-_FIRST_NOISE_PX, _LEAST_NOISE_PX = 0.5, 1e-3
+_FIRST_NOISE_PX, _MIN_NOISE_PX = 0.5, 1e-3
 _MIN_SEGMENTS = 6
 _MIN_SPREAD = 1e-3
 
@@ -277,7 +277,7 @@ def _refine_plane(
         distances = np.abs(
             _plane_residuals(frame, segments, np.maximum(direction, 0), plane[None], v[None])[0]
         )
-        noise = max(1.4826 * float(np.median(distances[direction >= 0])), _LEAST_NOISE_PX)
+        noise = max(1.4826 * float(np.median(distances[direction >= 0])), _MIN_NOISE_PX)
         trimmed = (direction >= 0) & (distances <= 2.5 * noise)
         counts = np.bincount(direction[trimmed], minlength=len(v))
         if counts.min() < _MIN_SEGMENTS:

@@ -20,7 +20,7 @@ from thesisrecon.stereo.resampling import require_side, warp_image
 CROP_MARGIN = 1.0
 """Margin of the disparity range that limits the crop, as a share of the range of the matches."""
 
-MOST_MATCHES = 300
+MAX_MATCHES = 300
 """Limit of the number of matches to which disparity gradients are fitted."""
 
 
@@ -439,7 +439,7 @@ def disparity_gradients(left: F64, right: F64) -> F64:
     ndarray (M, 2)
         Gradients of x_left - x_right by the mean position at M <= 300 matches.
     """
-    every = max(len(left) // MOST_MATCHES, 1)
+    every = max(len(left) // MAX_MATCHES, 1)
     left, right = left[::every], right[::every]
     middle = 0.5 * (left + right)
     middle = middle - middle.mean(axis=0)

@@ -10,7 +10,7 @@ from numba import njit
 from thesisrecon.arrays import F32, F64
 from thesisrecon.geometry.raster import cubic_weights
 
-MOST_TAPS = 24
+MAX_TAPS = 24
 """Limit of the filter width: reductions by more than 6 alias."""
 NOT_SHRUNK = 1.1
 """Reduction up to which the filter is not widened."""
@@ -32,7 +32,7 @@ def _cubic(x: float) -> float:
 @njit(cache=True, nogil=True)
 def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
     """Weights of the pixels around ``at`` with the kernel ``spread`` times as wide; first pixel and count."""
-    reach = min(2.0 * spread, 0.5 * MOST_TAPS - 1.0)
+    reach = min(2.0 * spread, 0.5 * MAX_TAPS - 1.0)
     first = int(np.ceil(at - reach))
     count = int(np.floor(at + reach)) - first + 1
     total = 0.0
@@ -66,7 +66,7 @@ def _sample_image(image: F32, xy: F64, out: F32) -> None:
     pixels are left out.
     """
     height, width, channels = image.shape
-    wx, wy = np.empty(MOST_TAPS), np.empty(MOST_TAPS)
+    wx, wy = np.empty(MAX_TAPS), np.empty(MAX_TAPS)
     total = np.empty(channels)
     for i in range(out.shape[0]):
         for j in range(xy.shape[1]):

@@ -28,7 +28,7 @@ from thesisrecon.views.warping import fill_holes, forward_map, sample
 
 SHRINK = 0.8
 """Factor by which the quadrilateral is reduced until it lies in front of both cameras."""
-LEAST_DEPTH = 0.2
+MIN_DEPTH = 0.2
 """Minimum third coordinate of its corners, in units of that of its centre."""
 SLACK_PX = 0.5
 """Correspondences may cross by this much: less is noise of the disparities."""
@@ -101,7 +101,7 @@ class IntermediateFrame:
         middle = 0.5 * np.array([width - 1.0, height - 1.0])
         reach = np.maximum(middle, 0.5) * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         third = self.H[:, 2]
-        min_known_weight = LEAST_DEPTH * (third @ np.append(middle, 1.0))
+        min_known_weight = MIN_DEPTH * (third @ np.append(middle, 1.0))
         if not (min_known_weight > 0.0).all():
             raise ValueError("the image centre lies beyond the line at infinity of the rectification")
         while not (homogenize(middle + reach) @ third.T >= min_known_weight).all():

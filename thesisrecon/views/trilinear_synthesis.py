@@ -28,7 +28,7 @@ SPARSE = 16
 """Subsampling step for medians."""
 AGREE_PX = 1.5
 """Tolerance of the forward-backward check: half a pixel of rounding and a pixel of noise."""
-LEAST_SEEN = 0.05
+MIN_SEEN = 0.05
 """Minimum share of the image that must show the scene."""
 
 
@@ -346,10 +346,10 @@ class TensorSynthesis:
         step = surface_step(moved[0], self.places[0])
         layers = [self._layer(side, moved[side], camera.size, step, threads) for side in (0, 1)]
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
-        if not seen.mean() >= LEAST_SEEN:
+        if not seen.mean() >= MIN_SEEN:
             raise StageFailure(
                 "the virtual camera sees almost nothing of the scene",
-                f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * LEAST_SEEN:.0f} %",
+                f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * MIN_SEEN:.0f} %",
                 "move the camera less (in baselines) or rotate it back",
             )
         rgb, inverse_depth = self._mixed(layers, self._share_of_second(moved[0]), step)

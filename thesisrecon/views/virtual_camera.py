@@ -26,8 +26,8 @@ from thesisrecon.geometry.two_view import (
 
 USUAL_FOCAL = 1.0
 """Default focal length in units of the long side, between telephoto (2) and wide angle (0.6)."""
-LEAST_MATCHES = 8
-LARGEST_RESIDUAL = 0.005
+MIN_MATCHES = 8
+MAX_RESIDUAL = 0.005
 """Median distance of matches from their epipolar lines, in units of the long side, above which F is
 rejected."""
 RANK_ONE = 1e-9
@@ -379,10 +379,10 @@ def _checked(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64, F64]:
     if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
         raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
     require_finite("view synthesis, for its matches,", xy1, xy2)
-    if len(xy1) < LEAST_MATCHES:
+    if len(xy1) < MIN_MATCHES:
         raise StageFailure(
             "the two images have too few matches",
-            f"{len(xy1)}, needed at least {LEAST_MATCHES}",
+            f"{len(xy1)}, needed at least {MIN_MATCHES}",
             "choose images that overlap more",
         )
     return F, xy1, xy2
@@ -399,7 +399,7 @@ def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
         )
     distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
     extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
-    if not np.median(distance) <= LARGEST_RESIDUAL * extent:
+    if not np.median(distance) <= MAX_RESIDUAL * extent:
         raise StageFailure(
             "the fundamental matrix does not fit the matches",
             f"their median distance from the epipolar lines is {np.median(distance):.3g} px",

@@ -22,7 +22,7 @@ BACKGROUND_FRACTION = 0.4
 """Pixels in this farther part of the range of inverse depth count as background; a single far pixel
 may be an outlier."""
 
-LEAST_AREA = 1e-9
+MIN_AREA = 1e-9
 """Twice the area (px^2) of the smallest triangle that is drawn."""
 STRETCH = 3.0
 """Neighbouring pixels of one surface come at most this far apart (px)."""
@@ -52,7 +52,7 @@ def _draw_triangle(
     bx, by = target[yb, xb, 0] - ax, target[yb, xb, 1] - ay
     cx, cy = target[yc, xc, 0] - ax, target[yc, xc, 1] - ay
     area = bx * cy - by * cx
-    if area < LEAST_AREA:
+    if area < MIN_AREA:
         return
     low_y, high_y = min(0.0, by, cy) + ay - SLACK, max(0.0, by, cy) + ay + SLACK
     low_x, high_x = min(0.0, bx, cx) + ax - SLACK, max(0.0, bx, cx) + ax + SLACK
@@ -114,7 +114,7 @@ def _draw_footprint(
     if n_down == 0:
         down[0], down[1] = -across[1], across[0]
     area = across[0] * down[1] - across[1] * down[0]
-    if area < LEAST_AREA:
+    if area < MIN_AREA:
         return
     tx, ty, near = target[at[0], at[1], 0], target[at[0], at[1], 1], inverse_depth[at]
     reach_x = 0.5 * (abs(across[0]) + abs(down[0])) + SLACK

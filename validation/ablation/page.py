@@ -26,7 +26,7 @@ COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7
 SYMBOLS = ("circle", "square", "diamond")
 GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
 _MARGIN = {"l": 70, "r": 20, "t": 10, "b": 50}
-MOST_LEVELS = 40
+MAX_LEVELS = 40
 """Maximum number of rows in an interval plot."""
 
 
@@ -241,7 +241,7 @@ def _forest(
 ) -> dict[str, Any] | None:
     """The differences from the baseline with their intervals, a row each."""
     shown = [c for c in comparisons if math.isfinite(c.interval.mean)]
-    if not shown or len(shown) > MOST_LEVELS:
+    if not shown or len(shown) > MAX_LEVELS:
         return None
     ratio = all(c.ratio for c in shown)
     shown = [c for c in shown if c.ratio == ratio]

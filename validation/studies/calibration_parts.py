@@ -44,7 +44,7 @@ SUBSETS = 20
 SUBSET_SIZES = (5, 8)
 SUCCESS_PCT = 3.0
 KEPT_TRACKS = 0.7
-LEAST_HOLDING = 0.92
+MIN_HOLDING = 0.92
 WINDOW_SHARE = 0.35
 PLANE_SHARE = 0.004
 """Largest distance of a point to its plane over its depth."""
@@ -87,7 +87,7 @@ def check_subsets(title: str, matched: Matched, K: F64, cameras: Cameras) -> lis
         return rows
     rows.add("focal error of the worst camera, median over subsets, %", float(np.median(errors)))
     rows.add("focal error of the worst camera of all, %", float(np.max(errors)))
-    add_intervals(rows, join_scores(scores), LEAST_HOLDING)
+    add_intervals(rows, join_scores(scores), MIN_HOLDING)
     return rows
 
 
@@ -192,7 +192,7 @@ def check_weak(title: str, sets: Sequence[Weak], K: F64, *, common_prior: bool) 
     for kind in KINDS:
         found = [_judge(weak, K, common_prior) for weak in sets if weak.kind == kind]
         error, width, z, marked, others = (np.array(part) for part in zip(*found, strict=True))
-        _add_weak(rows, f"{kind}: ", error, z, marked.astype(bool), LEAST_HOLDING)
+        _add_weak(rows, f"{kind}: ", error, z, marked.astype(bool), MIN_HOLDING)
         rows.add(f"{kind}: stated standard deviation, median", float(np.nanmedian(width)), "%")
         rows.add(f"{kind}: focal error of the other images, median", float(np.nanmedian(others)), "%")
     return rows

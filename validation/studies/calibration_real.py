@@ -30,7 +30,7 @@ from validation.scenes.real import REAL_SCENES, Scene
 from validation.scenes.zoomed import central_scene, rezoom_scene, windowed_scene
 from validation.studies.calibration_parts import (
     COLUMNS,
-    LEAST_HOLDING,
+    MIN_HOLDING,
     MODES,
     SUCCESS_PCT,
     Cameras,
@@ -165,7 +165,7 @@ class CameraRows(Rows):
         """Add the error of the principal point."""
         self.error("principal point error", "px", lambda e: e.principal_point_error_px, bound)
 
-    def intervals(self, run: RunResult | None, least: float | None = LEAST_HOLDING) -> None:
+    def intervals(self, run: RunResult | None, least: float | None = MIN_HOLDING) -> None:
         """Add the coverage and the width of the 95 % intervals."""
         if run is None or run.metric is None:
             return
@@ -229,7 +229,7 @@ def check_against_shared(bench: Bench) -> Iterator[list[Metric]]:
         z = np.array([(f.value - shared[OURS]) / max(np.hypot(f.std, std), 1e-12) for f in stated])
         silent = sum(off[OURS][v] > SUCCESS_PCT and not named(run.metric, int(v)) for v in there)
         held = float(np.mean(np.abs(z) <= LEVEL))
-        rows.add("95 % intervals of the focal that hold the shared one", held, at_least=LEAST_HOLDING)
+        rows.add("95 % intervals of the focal that hold the shared one", held, at_least=MIN_HOLDING)
         rows.add(f"off by more than {SUCCESS_PCT:.0f} % and not marked", silent, at_most=0.0)
     yield rows
 
@@ -285,7 +285,7 @@ def check_cameras(bench: Bench) -> Iterator[list[Metric]]:
         rows.principal_point(target.principal_point_px)
         rows.poses(target.centre_mm, target.rotation_deg)
         # A shared camera is one value, inside its interval or not.
-        rows.intervals(run, 1.0 if cameras == "shared" else LEAST_HOLDING)
+        rows.intervals(run, 1.0 if cameras == "shared" else MIN_HOLDING)
         yield rows
 
 
@@ -388,7 +388,7 @@ def check_zoom(bench: Bench, seeds: Sequence[int]) -> Iterator[list[Metric]]:
     every = _pooled(f"{title}, all seeds", pooled)
     for name, columns in COLUMNS.items() if scores else ():
         share = join_scores(scores).holding(columns)
-        every.add(f"95 % intervals of the {name} that hold the truth", share, at_least=LEAST_HOLDING)
+        every.add(f"95 % intervals of the {name} that hold the truth", share, at_least=MIN_HOLDING)
     yield every
 
 

@@ -90,7 +90,7 @@ RIGHT_PX = 1.0
 NOISES_PX = (0.1, 0.25, 0.5, 1.0, 2.0)
 SIZE = (1280.0, 960.0)
 OURS = "ours"
-LEAST_TRUTH = 20
+MIN_TRUTH = 20
 CELLS = ("right and sure", "right and unsure", "wrong and unsure", "wrong and sure", "refused")
 
 
@@ -166,7 +166,7 @@ def _pairs_of(scene: Scene, i: int, j: int, cache: Path, ratios: Sequence[float]
     for ratio in ratios:
         xy1, xy2 = match_photographs(paths, cache, ratio=ratio, mutual=False)
         exact = exact_correspondences(P1, P2, xy1, xy2)
-        if len(exact) >= LEAST_TRUTH:
+        if len(exact) >= MIN_TRUTH:
             yield JudgedPair(f"{scene.name}, i + {j - i}", xy1, xy2, exact[:, :2], exact[:, 2:])
 
 

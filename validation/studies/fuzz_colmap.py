@@ -41,7 +41,7 @@ from validation.studies.runner import Part, Rows
 
 LENGTHS = struct.Struct("<HH")
 """Header of an input: bytes of the cameras and of the images; the rest are points."""
-LARGEST_INPUT = 4096
+MAX_INPUT = 4096
 GUIDED = """
 import sys, warnings
 import atheris
@@ -130,7 +130,7 @@ def changed(rng: np.random.Generator, whole: bytes) -> bytes:
         piece = (rng.bytes(size), rng.bytes(1), b"\xff" * 8, b"\0" * 8, number)[int(rng.integers(0, 5))]
         end = (at, at + len(piece), at + size)[int(rng.integers(0, 3))]
         data[at:end] = piece
-    return bytes(data[:LARGEST_INPUT])
+    return bytes(data[:MAX_INPUT])
 
 
 ODD = (np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 0.0, -1.0)
@@ -157,7 +157,7 @@ def fuzz_guided(seconds: int, seed: int, folder: Path, memory_mb: int) -> Findin
     folder.mkdir(parents=True, exist_ok=True)
     for n, data in enumerate(valid_inputs()):
         (folder / f"good-{n:02d}").write_bytes(data)
-    flags = [f"-max_total_time={seconds}", f"-max_len={LARGEST_INPUT}", f"-seed={seed + 1}", "-timeout=10"]
+    flags = [f"-max_total_time={seconds}", f"-max_len={MAX_INPUT}", f"-seed={seed + 1}", "-timeout=10"]
     flags += [f"-rss_limit_mb={memory_mb}", f"-artifact_prefix={folder}.found-", "-print_final_stats=1"]
     program = [sys.executable, "-c", GUIDED, str(folder), *flags]
     done = subprocess.run(program, capture_output=True, text=True, errors="replace", check=False)

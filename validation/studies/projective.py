@@ -224,7 +224,7 @@ FOCALS_PX = (800.0, 1600.0, 3200.0)
 SIGMA_PX, PAIR_POINTS = 0.5, 200
 IDENTITY, ROTATION = "nearest to the identity", "nearest to a rotation"
 KINDS = ("small turn", "30 degrees apart", "on its side", "upside down", "forward")
-MOST_CONDITION, MOST_BEYOND_PCT = 3.0, 2.0
+MAX_CONDITION, MAX_BEYOND_PCT = 3.0, 2.0
 
 
 def make_pair(kind: str, focal_px: float, rng: np.random.Generator) -> F64:
@@ -297,9 +297,9 @@ def check_kind(kind: str, trials: int) -> list[Metric]:
         {name: reduce(values, axis=0) for name, values in found.items()} for reduce in (np.max, np.mean)
     )
     rows = Rows(kind, ROTATION)
-    rows.add("condition number, worst", {n: float(v[0]) for n, v in worst.items()}, at_most=MOST_CONDITION)
+    rows.add("condition number, worst", {n: float(v[0]) for n, v in worst.items()}, at_most=MAX_CONDITION)
     beyond = {n: float(v[1]) for n, v in mean.items()}
-    rows.add("points beyond the plane, mean", beyond, "%", at_most=MOST_BEYOND_PCT)
+    rows.add("points beyond the plane, mean", beyond, "%", at_most=MAX_BEYOND_PCT)
     rows.add("linear over least residual, mean", {n: float(v[2]) for n, v in mean.items()})
     return rows
 

@@ -32,10 +32,10 @@ from validation.studies.runner import SHIFTED, Part, Rows, scenes_here, text_tab
 Mode = Literal["shared", "per-image"]
 MODES: tuple[Mode, ...] = ("shared", "per-image")
 SUCCESS_PCT = 3.0
-LEAST_SUCCESS = 0.98
+MIN_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8
 SHIFTED_REASONS = ("pure translation", "not determine the focal length", "at least 3 registered images")
-LEAST_SHARE = 0.3
+MIN_SHARE = 0.3
 LATEST_START = 4
 
 
@@ -188,7 +188,7 @@ def run_trial(
     most = min(views[1], matched.tracks.n_views)
     count = int(rng.integers(min(views[0], most), most + 1))
     chosen = np.sort(rng.choice(matched.tracks.n_views, count, replace=False))
-    kept = rng.random(matched.tracks.n_points) < rng.uniform(LEAST_SHARE, 1.0)
+    kept = rng.random(matched.tracks.n_points) < rng.uniform(MIN_SHARE, 1.0)
     subset = take_views(matched, chosen, kept)
     # Two images have a single pair.
     first = int(rng.integers(max(min(LATEST_START, sum(pair.accepted for pair in subset.pairs)), 1)))
@@ -261,7 +261,7 @@ def subsets_study(
             wanted = "refused" if matched.reasons else "right"
             share = sum(trial.outcome == wanted for trial in done) / len(done)
             bad = sum(trial.outcome in ("wrong", "crash") for trial in done)
-            judged.add(f"{matched.name}, {mode}: {wanted}", share, at_least=LEAST_SUCCESS)
+            judged.add(f"{matched.name}, {mode}: {wanted}", share, at_least=MIN_SUCCESS)
             judged.add(f"{matched.name}, {mode}: wrong or crash", bad, at_most=0.0)
     if rows:
         yield text_table([*HEAD, "median time, s"], rows)

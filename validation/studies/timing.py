@@ -45,7 +45,7 @@ OURS, COLMAP = "thesisrecon", "COLMAP"
 STAGES = ("projective", "selfcalibration", "metric")
 SHARE_OF_COLMAP = 0.5
 KINDS = {"one thread": (1, "local"), "two threads": (2, "local"), "two processes": (2, "processes")}
-LEAST_EFFICIENCY = 0.85
+MIN_EFFICIENCY = 0.85
 OVERHEAD_PCT = 5.0
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 Seconds = tuple[float, float]
@@ -165,7 +165,7 @@ def efficiency_rows(name: str, found: Mapping[str, Sequence[Seconds]]) -> list[M
     rows.add("processor", cpu, "s")
     rows.add("efficiency by the clock", {kind: wall[one] / (2.0 * wall[kind]) for kind in others})
     work = {kind: cpu[one] / cpu[kind] for kind in others}
-    rows.add("efficiency by work", work, at_least=LEAST_EFFICIENCY)
+    rows.add("efficiency by work", work, at_least=MIN_EFFICIENCY)
     return rows
 
 
@@ -227,7 +227,7 @@ def ablation_cost_study(seeds: int = 8, repeats: int = 5, long_seeds: int = 60) 
         done, wall, _ = timed(lambda: ablate(_ablation(long_seeds), folder, executor="processes", threads=2))
     share = sum(row.seconds for row in done) / (2.0 * wall)
     note = f"{len(done)} rows in {wall:.0f} s"
-    rows.add("efficiency on 2 processes", share, at_least=LEAST_EFFICIENCY, note=note)
+    rows.add("efficiency on 2 processes", share, at_least=MIN_EFFICIENCY, note=note)
     yield rows
 
 

@@ -15,7 +15,7 @@ from thesisrecon.io.pair_list import DEMO_IMAGES
 from validation.scenes.real import ROOT
 from validation.studies.package.environments import clean_environment, install, make_environment
 
-MOST_BYTES = 3_000_000
+MAX_BYTES = 3_000_000
 """Bound of the size of the wheel."""
 NEEDED = (
     "thesisrecon/py.typed",
@@ -67,8 +67,8 @@ def wheel_faults(names: Iterable[str], size: int) -> list[str]:
     images = sum(name.endswith(".jpg") for name in held)
     if images != DEMO_IMAGES:
         faults.append(f"{images} images instead of {DEMO_IMAGES}")
-    if size > MOST_BYTES:
-        faults.append(f"{size / 1e6:.2f} MB, at most {MOST_BYTES / 1e6:.2f}")
+    if size > MAX_BYTES:
+        faults.append(f"{size / 1e6:.2f} MB, at most {MAX_BYTES / 1e6:.2f}")
     return faults
 
 
