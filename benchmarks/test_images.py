@@ -12,7 +12,7 @@ from thesisrecon.config import preset
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.matching.seeds import _scan_correlations as scan_correlations
+from thesisrecon.matching._seeds import _scan_correlations as scan_correlations
 from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
 from thesisrecon.records import Image
 from thesisrecon.stereo.epipolar_pair import pair_of_fundamental

@@ -1,13 +1,11 @@
 """The configuration: one field per stage, each holding the object that does its work.
 
-Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis). In TOML and ``--set`` a stage
-is a table: ``kind`` selects the method, the other keys are its fields.
+Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis). Its text form, TOML and
+``--set``, is read and written by :mod:`thesisrecon.settings`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
@@ -18,13 +16,18 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.verification import PairVerification
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.overlap import MapAll
-from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
+from thesisrecon.matching.pair_selection import (
+    AllPairs,
+    ListedPairs,
+    MapAll,
+    OverlapEstimate,
+    SequenceWindow,
+)
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement
@@ -53,16 +56,6 @@ from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations
 from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric, ScannedQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
-from thesisrecon.settings import (
-    Table,
-    dataclass_from_table,
-    in_words,
-    parse_word,
-    table_from_dataclass,
-    toml_from_tables,
-    unknown_setting,
-    unknown_word,
-)
 from thesisrecon.stereo.correspondence import PairMatching, RectifiedPair
 from thesisrecon.stereo.depth import MultiViewScene, MultiViewStereo
 from thesisrecon.stereo.depth_fusion import SequenceLinking
@@ -73,9 +66,6 @@ from thesisrecon.surface.model import SurfaceModel
 
 PRECISE_SIGMAS = 2.5
 """Inlier gate of the default estimator: tracks are built from precise matches only."""
-
-MAX_DEPTH = 16
-"""Maximum nesting of a setting, from its stage to its field."""
 
 EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
@@ -122,7 +112,19 @@ class Detector(Protocol):
 class PairSelector(Protocol):
     """Select the pairs of images to match; ``check`` refuses invalid settings before anything is computed."""
 
-    def check(self, names: Sequence[str], left_out: Collection[str]) -> None: ...
+    def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
+        """Check the settings against the image names.
+
+        Parameters
+        ----------
+        names, left_out : collection of str
+            Names of the images, and of images that were not used.
+
+        Raises
+        ------
+        UsageError
+            If a listed name is unknown or no pair remains.
+        """
 
     def select(
         self,
@@ -131,13 +133,50 @@ class PairSelector(Protocol):
         *,
         map_all: MapAll,
         rng: np.random.Generator,
-    ) -> PairChoice: ...
+    ) -> PairChoice:
+        """Select pairs of images.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of the images.
+        features : sequence of Features
+            Features of the images, with seeds if overlap is estimated.
+        map_all : callable
+            Parallel map.
+        rng : numpy.random.Generator
+            Source of the vocabulary sample.
+
+        Returns
+        -------
+        PairChoice
+            The pairs.
+
+        Raises
+        ------
+        UsageError
+            If the features have no seeds but need them.
+        """
 
 
 class Matcher(Protocol):
     """Match the features of two images (4.2.2); ``prepare`` does the work that depends on one image."""
 
-    def prepare(self, image: Image, features: Features) -> Any: ...
+    def prepare(self, image: Image, features: Features) -> Any:
+        """Prepare an image for matching.
+
+        Parameters
+        ----------
+        image : Image
+            The image.
+        features : Features
+            Its features.
+
+        Returns
+        -------
+        Any
+            What ``match`` needs of the image.
+        """
 
     def match(
         self,
@@ -147,7 +186,30 @@ class Matcher(Protocol):
         pair: tuple[int, int],
         estimate_fundamental: EstimateFundamental,
         rng: np.random.Generator,
-    ) -> Matches: ...
+    ) -> Matches:
+        """Match the corners of two images one-to-one.
+
+        Parameters
+        ----------
+        view1, view2 : Any
+            The prepared images.
+        pair : tuple of int
+            Numbers of the views.
+        estimate_fundamental : callable
+            Robust estimator of F, for guided matching.
+        rng : numpy.random.Generator
+            Source of randomness; not used by deterministic methods.
+
+        Returns
+        -------
+        Matches
+            Matches, possibly none.
+
+        Raises
+        ------
+        UsageError
+            If the features have no seeds but need them.
+        """
 
 
 class FundamentalEstimator(Protocol):
@@ -165,9 +227,23 @@ class Verifier(Protocol):
 class TrackBuilder(Protocol):
     """Join pairwise matches to tracks."""
 
-    def build(
-        self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator
-    ) -> Tracks: ...
+    def build(self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
+        """Build tracks from the matches of accepted pairs.
+
+        Parameters
+        ----------
+        prepared : sequence
+            The prepared images.
+        pairs : sequence of TwoView
+            The verified pairs.
+        rng : numpy.random.Generator
+            Source of randomness; not used by deterministic methods.
+
+        Returns
+        -------
+        Tracks
+            Tracks of at least two views with at most one corner per view.
+        """
 
 
 class ProjectiveReconstructor(Protocol):
@@ -246,7 +322,30 @@ class MetricRefiner(Protocol):
         *,
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
-    ) -> MetricResult: ...
+    ) -> MetricResult:
+        """Refine a projective reconstruction to the final metric model.
+
+        Parameters
+        ----------
+        reconstruction : Reconstruction
+            Projective reconstruction.
+        calibration : SelfCalibration
+            Its self-calibration; all candidates are tried.
+        prior : IntrinsicsPrior
+            Prior of the views.
+        rng : numpy.random.Generator
+            Source of randomness.
+
+        Returns
+        -------
+        MetricResult
+            Cameras, points, intrinsics with intervals, and the self-check.
+
+        Raises
+        ------
+        StageFailure
+            If no candidate gives a metric model.
+        """
 
 
 class DepthEstimator(Protocol):
@@ -316,30 +415,10 @@ class PipelineConfig:
 
     Parameters
     ----------
-    images : ImageOptions
-    intrinsics : IntrinsicsOptions
-        Prior knowledge of the cameras.
-    features : Detector
-        Feature detection.
-    pairs : PairSelector
-        Selection of the pairs to match.
-    matching : Matcher
-        Matching of two images.
-    epipolar : FundamentalEstimator
-        Robust estimation of F.
-    verification : Verifier
-        Acceptance of pairs.
-    tracks : TrackBuilder
-    projective : ProjectiveReconstructor
-        Projective reconstruction.
-    selfcalibration : SelfCalibrator
-        Self-calibration.
-    metric : MetricRefiner
-        Metric refinement.
-    dense : DepthEstimator
-        Depth maps.
-    model : ModelBuilder
-        Surface model.
+    images, intrinsics : ImageOptions, IntrinsicsOptions
+        How images are read, and prior knowledge of the cameras.
+    features, pairs, matching, ... : Detector, PairSelector, Matcher, ...
+        The method of each stage; its ``Protocol`` states what the stage calls.
 
     Examples
     --------
@@ -396,16 +475,11 @@ def preset(name: Any) -> PipelineConfig:
     Parameters
     ----------
     name : str
-        "default" or "thesis".
+        "default" or "thesis"; another one is a ``UsageError``.
 
     Returns
     -------
     PipelineConfig
-
-    Raises
-    ------
-    UsageError
-        If the name is unknown.
 
     Examples
     --------
@@ -423,10 +497,8 @@ def kind_of(stage: str, variant: Any) -> str:
 
     Parameters
     ----------
-    stage : str
-        Field of the config.
-    variant : object
-        The method.
+    stage, variant : str, object
+        Field of the config, and the method.
 
     Returns
     -------
@@ -434,202 +506,3 @@ def kind_of(stage: str, variant: Any) -> str:
         Its word in :data:`KINDS`, else its class name.
     """
     return next((k for k, cls in KINDS[stage].items() if cls is type(variant)), type(variant).__name__)
-
-
-def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
-    """Return the complete configuration as plain tables.
-
-    Parameters
-    ----------
-    config : PipelineConfig
-
-    Returns
-    -------
-    dict
-        Stage -> field -> value.
-    """
-    tables = {}
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        head = {"kind": kind_of(item.name, value)} if item.name in KINDS else {}
-        tables[item.name] = head | table_from_dataclass(value)
-    return tables
-
-
-def toml_from_config(config: PipelineConfig) -> str:
-    """Return the configuration as TOML, which :func:`config_from_toml` reads back.
-
-    Parameters
-    ----------
-    config : PipelineConfig
-
-    Returns
-    -------
-    str
-        TOML text.
-    """
-    return toml_from_tables(tables_from_config(config))
-
-
-def config_from_toml(
-    text: str,
-    base: PipelineConfig | None = None,
-    *,
-    fixed_preset: bool = False,
-    changes: Sequence[Mapping[str, Any]] = (),
-) -> PipelineConfig:
-    """Read a configuration.
-
-    All tables are merged before values are checked, so settings that need each other may come from different
-    tables.
-
-    Parameters
-    ----------
-    text : str
-        TOML. A line ``preset = "thesis"`` at its top selects the base.
-    base : PipelineConfig, optional
-        Base; None: the preset ``default``.
-    fixed_preset : bool
-        Ignore the preset of the text.
-    changes : sequence of mapping
-        Further tables, later ones override.
-
-    Returns
-    -------
-    PipelineConfig
-
-    Raises
-    ------
-    UsageError
-        For invalid TOML, unknown stages, kinds or settings, and values of the wrong type.
-
-    Examples
-    --------
-    >>> from thesisrecon.config import config_from_toml
-    >>> config_from_toml("[images]\\nmax_size_px = 800").images.max_size_px
-    800
-    """
-    try:
-        tables = tomllib.loads(text)
-    except ValueError as error:
-        raise UsageError(f"the configuration is not TOML: {error}") from None
-    except RecursionError:
-        raise UsageError("the configuration is nested too deeply") from None
-    name = tables.pop("preset", None)
-    if name is not None and not fixed_preset:
-        base = preset(name)
-    base = base or PipelineConfig()
-    merged: dict[str, Any] = {}
-    for change in (tables, *changes):
-        merged = _merged_stages(merged, change, base)
-    return config_from_tables(merged, base)
-
-
-def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
-    """``over`` merged into ``under``; another kind drops the settings of the old one."""
-    merged = dict(under)
-    for stage, table in over.items():
-        old = under.get(stage)
-        if isinstance(old, Mapping) and isinstance(table, Mapping):
-            kind = old.get("kind", kind_of(stage, getattr(base, stage))) if stage in KINDS else None
-            merged[stage] = table if table.get("kind", kind) != kind else _merged(old, table)
-        else:
-            merged[stage] = table
-    return merged
-
-
-def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``over`` merged into ``under``, table by table."""
-    merged = dict(under)
-    for key, value in over.items():
-        old = merged.get(key)
-        both = isinstance(old, Mapping) and isinstance(value, Mapping)
-        merged[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
-    return merged
-
-
-def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = None) -> PipelineConfig:
-    """Change a configuration by plain tables.
-
-    Parameters
-    ----------
-    tables : mapping
-        Stage -> field -> value.
-    base : PipelineConfig, optional
-        Base; None: the preset ``default``.
-
-    Returns
-    -------
-    PipelineConfig
-
-    Raises
-    ------
-    UsageError
-        As :func:`config_from_toml`.
-    """
-    config = base or PipelineConfig()
-    stages = [item.name for item in dataclasses.fields(config)]
-    for stage, table in tables.items():
-        if stage not in stages:
-            raise UsageError(unknown_word("stage", stage, ["preset", *stages]))
-        if not isinstance(table, Mapping):
-            raise UsageError(f"{stage} takes a table of settings; got {in_words(table)}")
-        config = dataclasses.replace(
-            config, **{stage: _stage_from_table(stage, table, getattr(config, stage))}
-        )
-    return config
-
-
-def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any:
-    if stage not in KINDS:
-        return dataclass_from_table(type(current), table, stage, current)
-    fields = {key: value for key, value in table.items() if key != "kind"}
-    kind = table.get("kind", kind_of(stage, current))
-    if not isinstance(kind, str) or (kind not in KINDS[stage] and type(current).__name__ != kind):
-        raise UsageError(unknown_word(f"kind of {stage}", kind, KINDS[stage]))
-    variant = KINDS[stage].get(kind, type(current))
-    names = [item.name for item in dataclasses.fields(variant)]
-    for key in fields:
-        if key not in names:
-            raise unknown_setting(stage, key, ["kind", *names])
-    return dataclass_from_table(variant, fields, stage, current if type(current) is variant else None)
-
-
-def tables_from_settings(settings: Sequence[str]) -> dict[str, Any]:
-    """Parse the values of ``--set``.
-
-    Parameters
-    ----------
-    settings : sequence of str
-        ``stage.field=value``, or ``stage.field.field=value`` for nested ones; later ones override.
-
-    Returns
-    -------
-    dict
-        Tables for :func:`config_from_tables`.
-
-    Raises
-    ------
-    UsageError
-        If a text has another form.
-
-    Examples
-    --------
-    >>> from thesisrecon.config import tables_from_settings
-    >>> tables_from_settings(["features.kind=harris-corners", "images.max_size_px=800"])
-    {'features': {'kind': 'harris-corners'}, 'images': {'max_size_px': 800}}
-    """
-    tables: dict[str, Any] = {}
-    for setting in settings:
-        place, equals, text = setting.partition("=")
-        path = place.strip().split(".")
-        if not equals or not 2 <= len(path) <= MAX_DEPTH or not all(path):
-            raise UsageError(
-                "--set takes stage.field=value, for example features.kind=harris-corners; "
-                f"got {in_words(setting)}"
-            )
-        value = parse_word(text)
-        for key in reversed(path):
-            value = {key: value}
-        tables = _merged(tables, value)
-    return tables

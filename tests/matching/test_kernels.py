@@ -5,11 +5,15 @@ from scipy.ndimage import map_coordinates
 from tests.synthetic import disparity, photograph, stereo_scene, texture
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.matching.alignment import _align_windows
+from thesisrecon.matching._alignment import _align_windows
+from thesisrecon.matching._prepared import _corner_patches, prepare_image
+from thesisrecon.matching._seeds import _scan_correlations, _update_column_best
 from thesisrecon.matching.growth import _fit_local_affines, _match_guided
-from thesisrecon.matching.prepared import _corner_patches, prepare_image
-from thesisrecon.matching.seeds import _scan_correlations, _update_column_best
-from thesisrecon.matching.strength import displacement_weight, relative_difference_weight, strength_of_match
+from thesisrecon.matching.strength import (
+    _displacement_weight,
+    _relative_difference_weight,
+    _strength_of_match,
+)
 from thesisrecon.matching.tracks import _chain_affines, _union_corners
 from thesisrecon.records import Features, Image
 
@@ -80,11 +84,12 @@ def test_corner_patches_equal_their_numpy_twin_at_every_level():
     view = prepared(texture(120, 150))
     xy = np.array([[60.3, 50.6], [70.0, 64.5], [3.0, 60.0]])
     scale = np.array([1.0, 2.0, 1.0], np.float32)
-    found = _corner_patches(view.pixels, view.levels, view.base, xy, scale)
+    pixels, levels, base = view.pyramid
+    found = _corner_patches(pixels, levels, base, xy, scale)
     b, a = np.mgrid[-7:8, -7:8]
     for n in range(2):
-        offset, height, width = view.levels[n]
-        gray = view.pixels[offset : offset + height * width].reshape(height, width)
+        offset, height, width = levels[n]
+        gray = pixels[offset : offset + height * width].reshape(height, width)
         x, y = (xy[n] + 0.5) / scale[n] - 0.5
         twin = unit(map_coordinates(gray, [y + b, x + a], order=1).ravel())
         assert np.abs(found[n] - twin).max() < 1e-4
@@ -190,31 +195,28 @@ def test_alignment_drops_patches_with_weak_gradients():
     assert kept == [True, False]
 
 
-def product_twin(a, b, closeness, terms):
+def product_twin(a, b, closeness):
     lengths = np.linalg.norm(a), np.linalg.norm(b)
-    factors = [max(float(a @ b) / (lengths[0] * lengths[1]), 0.0)]
-    factors += [max(min(lengths), 1.0) / max(lengths), closeness]
-    return float(np.prod([f for f, used in zip(factors, terms, strict=True) if used]))
+    return (
+        max(float(a @ b) / (lengths[0] * lengths[1]), 0.0) * max(min(lengths), 1.0) / max(lengths) * closeness
+    )
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
-@pytest.mark.parametrize("terms", [(True, True, True), (False, True, False), (True, False, True)])
-def test_strength_of_match_equals_its_brute_force_twin(tolerance, terms):
+def test_strength_of_match_equals_its_brute_force_twin(tolerance):
     xy1, xy2 = RNG.uniform(0, 60, (25, 2)), RNG.uniform(0, 60, (30, 2))
     correlation = RNG.uniform(-1, 1, (25, 30)).astype(np.float32)
     near1, near2 = (
         np.linalg.norm(xy[:, None] - xy[None], axis=2).argsort(axis=1)[:, 1:6] for xy in (xy1, xy2)
     )
     near1[3, 2:] = -1
-    index, strength = strength_of_match(
-        correlation, (xy1, xy2), (near1, near2), (30.0, 4, 0.1), (tolerance, terms)
-    )
+    index, strength = _strength_of_match(correlation, (xy1, xy2), (near1, near2), (30.0, 4, 0.1), tolerance)
 
     def agreement(u, v, m, n):
         a, b, apart = xy2[v] - xy1[u], xy2[n] - xy1[m], float(np.linalg.norm(xy1[m] - xy1[u]))
         if tolerance:
             return float(np.exp(-0.5 * (np.linalg.norm(a - b) / (0.3 * apart + 1.0)) ** 2))
-        return product_twin(a, b, 1 - apart / 30.0, terms)
+        return product_twin(a, b, 1 - apart / 30.0)
 
     for u in range(25):
         c = np.where(np.linalg.norm(xy2 - xy1[u], axis=1) <= 30.0, correlation[u], -1.0)
@@ -231,18 +233,15 @@ def test_strength_of_match_equals_its_brute_force_twin(tolerance, terms):
 
 
 def test_displacements_that_agree_weigh_one():
-    a, every = np.array([10.0, 0.0]), (True, True, True)
-    assert displacement_weight(a, a, 1.0, every) == pytest.approx(1.0)
-    assert displacement_weight(a, 0.5 * a, 1.0, every) == pytest.approx(0.5)
-    assert displacement_weight(a, -a, 1.0, every) == 0.0
-    assert displacement_weight(a, np.array([10.0, 10.0]), 0.8, every) == pytest.approx(0.4)
-    assert displacement_weight(a, np.array([10.0, 10.0]), 0.8, (True, False, False)) == pytest.approx(
-        0.5**0.5
-    )
-    assert displacement_weight(0.01 * a, -0.01 * a, 0.8, every) == pytest.approx(0.8)
-    assert relative_difference_weight(a, a, 5.0, 0.3) == 1.0
-    assert relative_difference_weight(a, -a, 5.0, 0.3) < 1e-6
-    near, far = (relative_difference_weight(a, a + 3.0, apart, 0.3) for apart in (5.0, 50.0))
+    a = np.array([10.0, 0.0])
+    assert _displacement_weight(a, a, 1.0) == pytest.approx(1.0)
+    assert _displacement_weight(a, 0.5 * a, 1.0) == pytest.approx(0.5)
+    assert _displacement_weight(a, -a, 1.0) == 0.0
+    assert _displacement_weight(a, np.array([10.0, 10.0]), 0.8) == pytest.approx(0.4)
+    assert _displacement_weight(0.01 * a, -0.01 * a, 0.8) == pytest.approx(0.8)
+    assert _relative_difference_weight(a, a, 5.0, 0.3) == 1.0
+    assert _relative_difference_weight(a, -a, 5.0, 0.3) < 1e-6
+    near, far = (_relative_difference_weight(a, a + 3.0, apart, 0.3) for apart in (5.0, 50.0))
     assert near < 0.5 < far
 
 

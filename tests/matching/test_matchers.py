@@ -5,8 +5,8 @@ from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.matching._seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.records import Image
 
@@ -24,7 +24,6 @@ SWITCHED = [
     SeedsAndGrowth(align=False),
     SeedsAndGrowth(growth=False, align=False),
     StrengthOfMatch(weight="relative-difference", min_correlation=0.7, min_strength=0.15),
-    StrengthOfMatch(use_direction=False, use_distance=False),
     StrengthOfMatch(window=11, colour=True),
     StrengthOfMatch(align=True),
 ]

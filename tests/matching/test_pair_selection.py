@@ -15,22 +15,20 @@ from tests.synthetic import photograph, texture
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.matching.overlap import (
-    OverlapTest,
-    _count_agreeing,
-    bow_similarity,
-    pair_array,
-    subset_seeds,
-)
+from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.matching.pair_selection import (
     AllPairs,
     ListedPairs,
     OverlapEstimate,
     SequenceWindow,
+    _bow_similarity,
     _connecting_pairs,
+    _count_agreeing,
     _most_similar,
+    _overlap_evidence,
+    _pair_array,
+    _subset_seeds,
 )
-from thesisrecon.matching.seeds import mutual_best
 from thesisrecon.records import Features
 
 SIDE, CROPS = 260, 14
@@ -198,17 +196,19 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
     assert other is not None
     strange = [f.seeds for f in windows.features]
     for kind, least in ((True, 20.0), (False, -10.0)):
-        test, sketch = OverlapTest(), subset_seeds(one, rotated=kind, per_scale=200)
-        assert test.score(sketch, subset_seeds(other, rotated=kind, per_scale=200)) > least
-        assert test.score(sketch, sketch) > 20.0
+        sketch = _subset_seeds(one, rotated=kind, per_scale=200)
+        assert _overlap_evidence(sketch, _subset_seeds(other, rotated=kind, per_scale=200)) > least
+        assert _overlap_evidence(sketch, sketch) > 20.0
         # The number of false alarms bounds how often chance reaches an evidence.
-        chance = [test.score(sketch, subset_seeds(s, rotated=kind, per_scale=200)) for s in strange if s]
+        chance = [
+            _overlap_evidence(sketch, _subset_seeds(s, rotated=kind, per_scale=200)) for s in strange if s
+        ]
         assert max(chance) < 2.0
 
 
 def test_photographs_of_one_wall_use_the_same_words(windows):
-    sketches = [subset_seeds(f.seeds, rotated=False, per_scale=200) for f in windows.features if f.seeds]
-    alike = bow_similarity(
+    sketches = [_subset_seeds(f.seeds, rotated=False, per_scale=200) for f in windows.features if f.seeds]
+    alike = _bow_similarity(
         [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
     )
     np.testing.assert_allclose(alike, alike.T, atol=1e-12)
@@ -239,7 +239,7 @@ def test_connecting_pairs_join_separate_groups_by_their_best_pairs_only(n, seed)
     order = rng.random((n, n))
     order += order.T
     every = list(combinations(range(n), 2))
-    chosen = pair_array([pair for pair in every if rng.random() < 0.2])
+    chosen = _pair_array([pair for pair in every if rng.random() < 0.2])
     added = _connecting_pairs(chosen, order)
     parts, part = _parts(n, chosen)
     assert len(added) == parts - 1

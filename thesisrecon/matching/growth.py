@@ -11,11 +11,11 @@ from numba import njit
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.matching.alignment import align_matches, strongest_distinct
-from thesisrecon.matching.prepared import (
+from thesisrecon.matching._alignment import align_matches, strongest_distinct
+from thesisrecon.matching._prepared import (
     SAMPLES,
     SIDE,
-    FundamentalEstimator,
+    EstimateFundamental,
     PreparedImage,
     affine_determinant,
     dot,
@@ -27,8 +27,8 @@ from thesisrecon.matching.prepared import (
     sample_window,
     select_matches,
 )
-from thesisrecon.matching.seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
-from thesisrecon.records import Features, Image, Matches
+from thesisrecon.matching._seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.records import Features, Image, Matches, Seeds
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
 APART = 3.0
@@ -253,32 +253,24 @@ def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> 
     return float(second_best)
 
 
-Found = tuple[I64, I64, SeedMatches]
-"""Corners of image 1, corners of image 2, and the matches."""
-
-
 @dataclass(frozen=True)
 class SeedsAndGrowth:
     """Seeds give F; F and local affine maps of known matches guide the search for each corner.
 
     Parameters
     ----------
-    ratio : float
-        Maximum ratio of the distances of a seed to its best and second best match.
+    ratio, grown_ratio : float
+        Maximum ratio of the distances to the best and second best match, of seeds and of guided matches
+        (within their part of the epipolar band).
     min_support : float
         Minimum strength of match (at most 10) of a seed in the filtered trial.
     min_seeds : int
         Minimum number of verified seeds of a pair.
-    band_rel : float
-        Half width of the epipolar band, relative to the long side.
-    radius_rel : float
-        Maximum search radius around the prediction, relative to the long side.
-    min_correlation : float
-        Minimum correlation of a guided match at its corner.
-    aligned_correlation : float
-        Minimum correlation after alignment.
-    grown_ratio : float
-        As ``ratio`` for a guided match, within its part of the epipolar band.
+    band_rel, radius_rel : float
+        Half width of the epipolar band and maximum search radius around the prediction, relative to the long
+        side.
+    min_correlation, aligned_correlation : float
+        Minimum correlation of a guided match, at its corner and after alignment.
     neighbours : int
         Number of matches that define a local affine map.
     affine_std : float
@@ -327,20 +319,7 @@ class SeedsAndGrowth:
             raise ValueError(f"affine_std must be at least 0; got {self.affine_std}")
 
     def prepare(self, image: Image, features: Features) -> PreparedImage:
-        """Prepare an image for matching.
-
-        Parameters
-        ----------
-        image : Image
-            The image.
-        features : Features
-            Its features.
-
-        Returns
-        -------
-        PreparedImage
-            The prepared image.
-        """
+        """See `thesisrecon.config.Matcher.prepare`."""
         return prepare_image(image, features)
 
     def match(
@@ -349,38 +328,17 @@ class SeedsAndGrowth:
         view2: PreparedImage,
         *,
         pair: tuple[int, int],
-        estimate_fundamental: FundamentalEstimator,
+        estimate_fundamental: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match the corners of two images one-to-one.
-
-        Parameters
-        ----------
-        view1, view2 : PreparedImage
-            The images.
-        pair : tuple of int
-            Numbers of the views.
-        estimate_fundamental : callable
-            Robust estimator of F.
-        rng : numpy.random.Generator
-            Source of the samples.
-
-        Returns
-        -------
-        Matches
-            Matches aligned to sub-pixel, possibly none.
-
-        Raises
-        ------
-        UsageError
-            If the features have no seeds.
-        """
-        if view1.features.seeds is None or view2.features.seeds is None:
+        """See `thesisrecon.config.Matcher.match`."""
+        seeds1, seeds2 = view1.features.seeds, view2.features.seeds
+        if seeds1 is None or seeds2 is None:
             raise UsageError(
                 "seeds-and-growth matching needs features with seeds; set "
                 "features.kind=multi-scale-corners, or matching.kind=strength-of-match"
             )
-        start = self._verified_seeds(view1, view2, estimate_fundamental, rng)
+        start = self._verified_seeds(seeds1, seeds2, estimate_fundamental, rng)
         if start is None:
             return empty_matches(pair)
         if self.growth:
@@ -391,23 +349,12 @@ class SeedsAndGrowth:
         if not self.align:
             return select_matches(matches, strongest_distinct(matches))
         return align_matches(
-            view1,
-            view2,
-            matches,
-            affine_std=self.affine_std,
-            min_correlation=self.aligned_correlation,
+            view1, view2, matches, affine_std=self.affine_std, min_correlation=self.aligned_correlation
         )
 
     def _verified_seeds(
-        self,
-        view1: PreparedImage,
-        view2: PreparedImage,
-        estimate: FundamentalEstimator,
-        rng: np.random.Generator,
+        self, seeds1: Seeds, seeds2: Seeds, estimate: EstimateFundamental, rng: np.random.Generator
     ) -> tuple[SeedMatches, F64] | None:
-        seeds1, seeds2 = view1.features.seeds, view2.features.seeds
-        assert seeds1 is not None
-        assert seeds2 is not None
         best: tuple[SeedMatches, F64] | None = None
         for rotated in {"auto": (False, True), "upright": (False,), "rotated": (True,)}[self.orientation]:
             seeds = match_seeds(seeds1, seeds2, rotated=rotated, ratio=self.ratio)
@@ -436,9 +383,9 @@ class SeedsAndGrowth:
         view1: PreparedImage,
         view2: PreparedImage,
         start: tuple[SeedMatches, F64],
-        estimate: FundamentalEstimator,
+        estimate: EstimateFundamental,
         rng: np.random.Generator,
-    ) -> Found:
+    ) -> tuple[I64, I64, SeedMatches]:
         """Match the corners of the coarser scale, then all twice, guided by the previous matches."""
         known, F = start
         scale = view1.features.scale
@@ -458,7 +405,8 @@ class SeedsAndGrowth:
 
     def _grow(
         self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: SeedMatches, F: F64
-    ) -> Found:
+    ) -> tuple[I64, I64, SeedMatches]:
+        """Corners of both images, and the matches."""
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
         # With a list of ranks the result keeps two dimensions even for one neighbour.
         ranks = np.arange(1, min(self.neighbours, len(known)) + 1)
@@ -466,12 +414,11 @@ class SeedsAndGrowth:
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, self.radius_rel * long_side)
-        corners2 = (view2.features.xy, view2.features.scale, view2.patches)
         index, score, second_best = _match_guided(
             view1.pyramid,
             (xy1, scale1),
             (affine, position, radius),
-            corners2,
+            (view2.features.xy, view2.features.scale, view2.patches),
             view2.cells,
             (F, self.band_rel * long_side, self.min_correlation),
         )

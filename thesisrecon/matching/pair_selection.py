@@ -1,30 +1,51 @@
-"""Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap."""
+"""Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap.
+
+Overlap is estimated by a geometric test of small patch sets and by bag-of-words similarity, after J. Sivic
+and A. Zisserman, "Video Google: a text retrieval approach to object matching in videos", ICCV 2003, with a
+vocabulary made from the images themselves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 import scipy
+from numba import njit
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.errors import UsageError
-from thesisrecon.matching.overlap import (
-    FeatureSubset,
-    MapAll,
-    OverlapTest,
-    bow_similarity,
-    every_pair,
-    pair_array,
-    subset_seeds,
-)
-from thesisrecon.records import Features, PairChoice
+from thesisrecon.matching._seeds import mutual_best
+from thesisrecon.records import Features, PairChoice, Seeds
 
 # ruff: noqa: ARG002 (all selectors have the same arguments)
 
+MapAll = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
+"""Apply a function to each item, possibly in several threads, and return the results in order."""
+# Minimum correlation of two patches of the same surface: half of the variance in common.
+MIN_CORRELATION = 0.5
+# Maximum ratio of the distances to the best and to the second best patch.
+RATIO = 0.8
+MAX_MATCHES = 150
+# Maximum deviation of a match from the prediction: position relative to the long side (wide because of
+# parallax and perspective), log scale and angle.
+RADIUS_REL, LOG_SCALE, ANGLE_RAD = 0.1, 0.8, 0.8
 # Evidence of the upright patches at which the rotated ones are not compared: one false alarm in a million.
 DECIDED = 6.0
+# Below this the tail of the binomial distribution underflows.
+MIN_LOG10 = -300.0
+SAMPLES_PER_WORD = 8
+ROUNDS = 4
+ROWS_AT_ONCE = 4096
+
+
+def _pair_array(pairs: Iterable[Iterable[int]]) -> I64:
+    """Pairs (M, 2), smaller number first, sorted and without duplicates."""
+    rows = sorted({(min(pair), max(pair)) for pair in (tuple(p) for p in pairs)})
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -32,18 +53,13 @@ class AllPairs:
     """Every image with every other: N (N - 1) / 2 pairs."""
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Accept all image names."""
+        """See `thesisrecon.config.PairSelector.check`."""
 
     def select(
-        self,
-        names: Sequence[str],
-        features: Sequence[Features],
-        *,
-        map_all: MapAll,
-        rng: np.random.Generator,
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
     ) -> PairChoice:
-        """Select all pairs."""
-        return PairChoice(every_pair(len(names)), "all pairs")
+        """See `thesisrecon.config.PairSelector.select`."""
+        return PairChoice(_pair_array(combinations(range(len(names)), 2)), "all pairs")
 
 
 @dataclass(frozen=True)
@@ -68,24 +84,19 @@ class SequenceWindow:
             )
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Accept all image names."""
+        """See `thesisrecon.config.PairSelector.check`."""
 
     def select(
-        self,
-        names: Sequence[str],
-        features: Sequence[Features],
-        *,
-        map_all: MapAll,
-        rng: np.random.Generator,
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
     ) -> PairChoice:
-        """Select the pairs of the window."""
+        """See `thesisrecon.config.PairSelector.select`."""
         n = len(names)
         steps = range(1, min(self.window, n - 1) + 1)
         ends = n if self.loop else 0
         pairs = {tuple(sorted((i, (i + s) % n))) for i in range(n) for s in steps if i + s < n + ends}
         what = "the next image" if self.window == 1 else f"the next {self.window} images"
         around = ", continuing at the first" if self.loop else ""
-        return PairChoice(pair_array(pairs), f"each image with {what} by file name{around}")
+        return PairChoice(_pair_array(pairs), f"each image with {what} by file name{around}")
 
 
 @dataclass(frozen=True)
@@ -112,20 +123,7 @@ class ListedPairs:
             seen.add(pair)
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Check the list against the image names.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Names of the images.
-        left_out : collection of str
-            Names of images that were not used.
-
-        Raises
-        ------
-        UsageError
-            If a name is unknown or no pair remains.
-        """
+        """See `thesisrecon.config.PairSelector.check`."""
         known = {*names, *left_out}
         unknown = sorted({name for pair in self.listed for name in pair} - known)
         if unknown:
@@ -140,34 +138,12 @@ class ListedPairs:
             raise UsageError(f"the pair list leaves no pair to match{without}")
 
     def select(
-        self,
-        names: Sequence[str],
-        features: Sequence[Features],
-        *,
-        map_all: MapAll,
-        rng: np.random.Generator,
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
     ) -> PairChoice:
-        """Select the listed pairs of the images in use.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Names of the images.
-        features : sequence of Features
-            Features of the images.
-        map_all : callable
-            Parallel map.
-        rng : numpy.random.Generator
-            Random generator.
-
-        Returns
-        -------
-        PairChoice
-            The pairs.
-        """
+        """See `thesisrecon.config.PairSelector.select`."""
         number = {name: i for i, name in enumerate(names)}
         there = (pair for pair in self.listed if pair[0] in number and pair[1] in number)
-        return PairChoice(pair_array((number[one], number[two]) for one, two in there), "the listed pairs")
+        return PairChoice(_pair_array((number[one], number[two]) for one, two in there), "the listed pairs")
 
 
 @dataclass(frozen=True)
@@ -185,15 +161,13 @@ class OverlapEstimate:
     per_scale : int
         Seeds of each scale that represent an image, upright and rotated.
     min_evidence : float
-        Minimum -log10 of the number of false alarms (:class:`OverlapTest`).
+        Minimum -log10 of the number of false alarms.
     nearest : int
         Pairs of each image that are always taken.
     shortlist : int
         Number of images that each is compared with.
     words : int
         Vocabulary size.
-    test : OverlapTest
-        Comparison of two images.
     """
 
     all_up_to: int = 30
@@ -202,7 +176,6 @@ class OverlapEstimate:
     nearest: int = 3
     shortlist: int = 40
     words: int = 1024
-    test: OverlapTest = field(default_factory=OverlapTest)
 
     def __post_init__(self) -> None:
         least = {"all_up_to": 0, "per_scale": 1, "nearest": 1, "shortlist": 1, "words": 1}
@@ -211,49 +184,22 @@ class OverlapEstimate:
                 raise ValueError(f"{name} must be at least {bound}; got {getattr(self, name)}")
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Accept all image names."""
+        """See `thesisrecon.config.PairSelector.check`."""
 
     def select(
-        self,
-        names: Sequence[str],
-        features: Sequence[Features],
-        *,
-        map_all: MapAll,
-        rng: np.random.Generator,
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
     ) -> PairChoice:
-        """Select the pairs that probably overlap.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Names of the images.
-        features : sequence of Features
-            Features of the images, with seeds in a large set.
-        map_all : callable
-            Parallel map.
-        rng : numpy.random.Generator
-            Source of the vocabulary sample.
-
-        Returns
-        -------
-        PairChoice
-            The pairs.
-
-        Raises
-        ------
-        UsageError
-            If the set is large and the features have no seeds.
-        """
+        """See `thesisrecon.config.PairSelector.select`."""
         n = len(names)
         if n <= self.all_up_to:
             how = f"all pairs (at most {self.all_up_to} images)"
-            return PairChoice(every_pair(n), how)
+            return PairChoice(_pair_array(combinations(range(n), 2)), how)
         subsets = map_all(self._subsets, features)
         similarity = np.zeros((n, n))
         if n - 1 > self.shortlist:
             for kind in (0, 1):
                 patches = [subset[kind].patches for subset in subsets]
-                similarity += bow_similarity(patches, self.words, map_all=map_all, rng=rng)
+                similarity += _bow_similarity(patches, self.words, map_all=map_all, rng=rng)
         compared = _most_similar(similarity, self.shortlist)
         evidence = np.array(
             map_all(lambda pair: self._evidence(subsets[pair[0]], subsets[pair[1]]), compared.tolist())
@@ -265,35 +211,32 @@ class OverlapEstimate:
         )
         return PairChoice(chosen, how, compared=len(compared))
 
-    def _subsets(self, features: Features) -> tuple[FeatureSubset, FeatureSubset]:
+    def _subsets(self, features: Features) -> tuple[_FeatureSubset, _FeatureSubset]:
         if features.seeds is None:
             raise UsageError(
                 f"the overlap of more than {self.all_up_to} images is estimated from seeds, which these "
                 "features do not have; set features.kind=multi-scale-corners, or pairs.kind=all-pairs"
             )
         upright, rotated = (
-            subset_seeds(features.seeds, rotated=rotated, per_scale=self.per_scale)
+            _subset_seeds(features.seeds, rotated=rotated, per_scale=self.per_scale)
             for rotated in (False, True)
         )
         return upright, rotated
 
     def _evidence(
-        self, a: tuple[FeatureSubset, FeatureSubset], b: tuple[FeatureSubset, FeatureSubset]
+        self, a: tuple[_FeatureSubset, _FeatureSubset], b: tuple[_FeatureSubset, _FeatureSubset]
     ) -> float:
-        upright = self.test.score(a[0], b[0])
-        return upright if upright >= DECIDED else max(upright, self.test.score(a[1], b[1]))
+        upright = _overlap_evidence(a[0], b[0])
+        return upright if upright >= DECIDED else max(upright, _overlap_evidence(a[1], b[1]))
 
     def _choose(self, similarity: F64, compared: I64, evidence: F64) -> I64:
         """Pairs (M, 2) with enough evidence, the best of each image, and those that connect the set."""
-        n = len(similarity)
         # Pairs that were not compared follow all that were, ordered by bag-of-words similarity.
         order = similarity - 1e6
         order[compared[:, 0], compared[:, 1]] = order[compared[:, 1], compared[:, 0]] = evidence
-        np.fill_diagonal(order, -np.inf)
-        best = np.argsort(-order, axis=1, kind="stable")[:, : min(self.nearest, n - 1)]
-        near = np.column_stack([np.repeat(np.arange(n), best.shape[1]), best.ravel()])
-        chosen = pair_array([*compared[evidence >= self.min_evidence].tolist(), *near.tolist()])
-        return pair_array([*chosen.tolist(), *_connecting_pairs(chosen, order).tolist()])
+        near = _most_similar(order, self.nearest)
+        chosen = _pair_array([*compared[evidence >= self.min_evidence].tolist(), *near.tolist()])
+        return _pair_array([*chosen.tolist(), *_connecting_pairs(chosen, order).tolist()])
 
 
 def _most_similar(similarity: F64, count: int) -> I64:
@@ -302,7 +245,7 @@ def _most_similar(similarity: F64, count: int) -> I64:
     others = similarity.copy()
     np.fill_diagonal(others, -np.inf)
     best = np.argsort(-others, axis=1, kind="stable")[:, : min(count, n - 1)]
-    return pair_array(np.column_stack([np.repeat(np.arange(n), best.shape[1]), best.ravel()]).tolist())
+    return _pair_array(np.column_stack([np.repeat(np.arange(n), best.shape[1]), best.ravel()]).tolist())
 
 
 def _connecting_pairs(chosen: I64, order: F64) -> I64:
@@ -321,3 +264,132 @@ def _connecting_pairs(chosen: I64, order: F64) -> I64:
     tree = scipy.sparse.csgraph.minimum_spanning_tree(cost).tocoo()
     new = tree.data > len(i)
     return np.column_stack([tree.row[new], tree.col[new]]).astype(np.int64).reshape(-1, 2)
+
+
+@njit(cache=True, nogil=True)
+def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> int:
+    """Largest number of other matches predicted by the similarity of one match.
+
+    Match m has positions ``xy1[m]``, ``xy2[m]``, ``scale[m]`` (image 2 per image 1) and ``angle[m]`` rad.
+    ``limits`` are the position error in px, the difference of log scales and the difference of angles.
+    """
+    most, radius2 = 0, limits[0] * limits[0]
+    for h in range(len(xy1)):
+        c, s = scale[h] * np.cos(angle[h]), scale[h] * np.sin(angle[h])
+        count = 0
+        for m in range(len(xy1)):
+            x, y = xy1[m, 0] - xy1[h, 0], xy1[m, 1] - xy1[h, 1]
+            dx = xy2[h, 0] + c * x - s * y - xy2[m, 0]
+            dy = xy2[h, 1] + s * x + c * y - xy2[m, 1]
+            turn = np.cos(angle[m] - angle[h])
+            similarity = abs(np.log(scale[m] / scale[h])) <= limits[1] and turn >= np.cos(limits[2])
+            if m != h and similarity and dx * dx + dy * dy <= radius2:
+                count += 1
+        most = max(most, count)
+    return most
+
+
+@dataclass(frozen=True)
+class _FeatureSubset:
+    """Seeds of one image: px, angles rad, unit patches (S, D), and the extent of all its seeds px."""
+
+    xy: F64
+    scale: F64
+    angle: F64
+    patches: F32
+    size: F64
+
+
+def _subset_seeds(seeds: Seeds, *, rotated: bool, per_scale: int) -> _FeatureSubset:
+    """Select the strongest seeds of each scale, of patches ``rotated`` to their dominant gradient or not."""
+    use = np.flatnonzero((seeds.angle != 0.0) == rotated)
+    parts = [use[seeds.scale[use] == scale][:per_scale] for scale in np.unique(seeds.scale[use])]
+    kept = np.concatenate([np.empty(0, np.int64), *parts])
+    extent = np.ptp(seeds.xy, axis=0) + 1.0 if len(seeds.xy) else np.ones(2)
+    return _FeatureSubset(
+        np.ascontiguousarray(seeds.xy[kept]),
+        seeds.scale[kept].astype(np.float64),
+        seeds.angle[kept].astype(np.float64),
+        np.ascontiguousarray(seeds.patches[kept]),
+        extent,
+    )
+
+
+def _overlap_evidence(a: _FeatureSubset, b: _FeatureSubset) -> float:
+    """Evidence that mutually best patches agree with one similarity, -log10 of the number of false alarms.
+
+    M B(M - 1, k, p) for M matches, k that agree with the best similarity and p the relative area around a
+    prediction, with B the tail of the binomial distribution (A. Desolneux, L. Moisan and J.-M. Morel,
+    "Meaningful alignments", IJCV 40, 2000). 0 means one false alarm is expected.
+    """
+    one, two = _match_subsets(a, b)
+    if len(one) < 2:
+        return -float(np.log10(max(len(one), 1)))
+    radius = RADIUS_REL * float(b.size.max())
+    k = _count_agreeing(
+        a.xy[one],
+        b.xy[two],
+        b.scale[two] / a.scale[one],
+        b.angle[two] - a.angle[one],
+        np.array([radius, LOG_SCALE, ANGLE_RAD]),
+    )
+    chance = min(1.0, np.pi * radius**2 / float(np.prod(b.size)))
+    tail = float(scipy.special.bdtrc(k - 1, len(one) - 1, chance)) if k > 0 else 1.0
+    return -(float(np.log10(len(one))) + max(float(np.log10(max(tail, 1e-320))), MIN_LOG10))
+
+
+def _match_subsets(a: _FeatureSubset, b: _FeatureSubset) -> tuple[I64, I64]:
+    if not (len(a.xy) and len(b.xy)):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    correlation = a.patches @ b.patches.T
+    apart2 = ((8.0 * b.scale) ** 2).astype(np.float32)
+    index, value, second_best = mutual_best([correlation], b.xy.astype(np.float32), apart2)
+    one = np.flatnonzero(index >= 0)
+    value, second_best = value[one], second_best[one]
+    distinct = (value > MIN_CORRELATION) & ((1.0 - value) < RATIO**2 * (1.0 - second_best))
+    one, value = one[distinct], value[distinct]
+    one = one[np.argsort(-value, kind="stable")[:MAX_MATCHES]]
+    return one, index[one]
+
+
+def _bow_similarity(patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator) -> F64:
+    """Bag-of-words similarity (N, N) of all pairs of images with unit patches (S, D).
+
+    Cosine of the weighted word counts; a word is weighted by how few images contain it. A patch counts for
+    its three nearest words, and square roots of the counts limit the effect of repeated structure.
+    """
+    everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
+    if not len(everything):
+        return np.zeros((len(patches), len(patches)))
+    vocabulary = _vocabulary(everything, min(words, len(everything)), rng)
+    counts = np.stack(map_all(lambda given: _count_words(given, vocabulary), patches))
+    used = np.maximum((counts > 0).sum(axis=0), 1)
+    weighed = np.sqrt(counts) * np.log(len(patches) / used)
+    weighed /= np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-12)
+    similarity: F64 = weighed @ weighed.T
+    return similarity
+
+
+def _vocabulary(patches: F32, words: int, rng: np.random.Generator) -> F32:
+    """Centres (words, D) of spherical k-means over a sample of the patches."""
+    sample = patches[rng.permutation(len(patches))[: SAMPLES_PER_WORD * words]]
+    centres = sample[:words]
+    for _ in range(ROUNDS):
+        nearest = np.concatenate(
+            [
+                np.argmax(rows @ centres.T, axis=1)
+                for rows in np.split(sample, range(ROWS_AT_ONCE, len(sample), ROWS_AT_ONCE))
+            ]
+        )
+        order = np.argsort(nearest, kind="stable")
+        found, start = np.unique(nearest[order], return_index=True)
+        sums = centres.copy()
+        sums[found] = np.add.reduceat(sample[order], start, axis=0)
+        centres = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.float32(1e-6))
+    return centres
+
+
+def _count_words(patches: F32, vocabulary: F32) -> F64:
+    words = len(vocabulary)
+    nearest = np.argpartition(-(patches @ vocabulary.T), min(2, words - 1), axis=1)[:, :3]
+    return np.bincount(nearest.ravel(), minlength=words).astype(np.float64)

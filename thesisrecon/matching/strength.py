@@ -10,10 +10,10 @@ import scipy
 from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching.alignment import align_matches
-from thesisrecon.matching.prepared import (
+from thesisrecon.matching._alignment import align_matches
+from thesisrecon.matching._prepared import (
     SIDE,
-    FundamentalEstimator,
+    EstimateFundamental,
     PreparedImage,
     empty_matches,
     one_to_one,
@@ -23,85 +23,40 @@ from thesisrecon.records import Features, Image, Matches
 
 
 @njit(cache=True, nogil=True)
-def displacement_weight(a: F64, b: F64, closeness: float, terms: tuple[bool, bool, bool]) -> float:
-    """Compute lambda of figure 4.4: direction x length x distance of two displacement vectors.
+def _displacement_weight(a: F64, b: F64, closeness: float) -> float:
+    """Lambda of figure 4.4: direction x length x distance of two displacements (2,) px.
 
-    Parameters
-    ----------
-    a, b : ndarray (2,)
-        Displacements, px; below one pixel they have no direction and count as one pixel long.
-    closeness : float
-        Distance factor, 1 for equal positions.
-    terms : tuple of bool
-        Use of the direction, length and distance factors.
-
-    Returns
-    -------
-    float
-        Weight in [0, 1].
+    Displacements below one pixel have no direction and count as one pixel long; ``closeness`` is 1 for equal
+    positions.
     """
-    direction, length, distance = terms
-    weight = closeness if distance else 1.0
     na, nb = np.hypot(a[0], a[1]), np.hypot(b[0], b[1])
     if na < 1.0 and nb < 1.0:
-        return float(weight)
+        return float(closeness)
     cosine = (a[0] * b[0] + a[1] * b[1]) / max(na * nb, 1e-12)
     shorter, longer = max(min(na, nb), 1.0), max(na, nb)
-    along = max(cosine, 0.0) if direction else 1.0
-    return float(along * (shorter / longer if length else 1.0) * weight)
+    return float(max(cosine, 0.0) * (shorter / longer) * closeness)
 
 
 @njit(cache=True, nogil=True)
-def relative_difference_weight(a: F64, b: F64, apart: float, tolerance: float) -> float:
-    """Compute exp(-1/2 (|a - b| / (tolerance apart + 1 px))^2), independent of displacement lengths.
-
-    Parameters
-    ----------
-    a, b : ndarray (2,)
-        Displacements, px.
-    apart : float
-        Distance of the two corners, px.
-    tolerance : float
-        Relative difference of displacements.
-
-    Returns
-    -------
-    float
-        Weight in (0, 1].
-    """
+def _relative_difference_weight(a: F64, b: F64, apart: float, tolerance: float) -> float:
+    """Lambda exp(-1/2 (|a - b| / (tolerance apart + 1 px))^2) of displacements of corners ``apart`` px."""
     strain = np.hypot(a[0] - b[0], a[1] - b[1]) / (tolerance * apart + 1.0)
     return float(np.exp(-0.5 * strain * strain))
 
 
 @njit(cache=True, nogil=True)
-def strength_of_match(
+def _strength_of_match(
     correlation: F32,
     xy: tuple[F64, F64],
     near: tuple[I64, I64],
     search: tuple[float, int, float],
-    weight: tuple[float, tuple[bool, bool, bool]],
+    tolerance: float,
 ) -> tuple[I64, F32]:
-    """Find the candidate of largest strength of each corner, SM_k = c_k sum_m max_n (c_mn lambda_n) (4.1).
+    """Corner of image 2 of largest strength SM_k = c_k sum_m max_n (c_mn lambda_n) (4.1), and SM; -1: none.
 
-    Parameters
-    ----------
-    correlation : ndarray (N1, N2)
-        Correlations of all corners.
-    xy : tuple of ndarray
-        Corners of both images, px.
-    near : tuple of ndarray of int
-        Neighbours (N1, M) and (N2, N) of each corner in its image, -1 for none.
-    search : tuple
-        Radius px, number of candidates, correlation that a candidate must exceed.
-    weight : tuple
-        Tolerance of the relative difference (0: product of figure 4.4) and factors of the product.
-
-    Returns
-    -------
-    index : ndarray (N1,) of int
-        Corner of image 2, -1 without a candidate.
-    strength : ndarray (N1,)
-        Strength of match.
+    ``correlation`` (N1, N2); ``near`` = neighbours (N1, M) and (N2, N) of each corner in its image, -1 for
+    none; ``search`` = radius px, number of candidates, correlation that a candidate must exceed;
+    ``tolerance`` of the relative difference, 0: product of figure 4.4.
     """
     xy1, xy2 = xy
     index = np.full(len(xy1), -1, np.int64)
@@ -111,7 +66,8 @@ def strength_of_match(
         count = _best_candidates(correlation[u], xy1[u], xy2, search, held)
         for k in range(count):
             v = held[k]
-            total = _neighbours_agree(correlation, xy, (near[0][u], near[1][v]), (u, v), (search[0], weight))
+            around, rule = (near[0][u], near[1][v]), (search[0], tolerance)
+            total = _neighbours_agree(correlation, xy, around, (u, v), rule)
             if correlation[u, v] * total > strength[u]:
                 index[u], strength[u] = v, correlation[u, v] * total
     return index, strength
@@ -145,12 +101,12 @@ def _neighbours_agree(
     xy: tuple[F64, F64],
     near: tuple[I64, I64],
     pair: tuple[int, int],
-    rule: tuple[float, tuple[float, tuple[bool, bool, bool]]],
+    rule: tuple[float, float],
 ) -> float:
     """sum_m max_n (c_mn lambda_n) of one pair of corners, figure 4.3 step 1 (a) i."""
     xy1, xy2 = xy
     u, v = pair
-    radius, (tolerance, terms) = rule
+    radius, tolerance = rule
     moved, other = np.empty(2), np.empty(2)
     moved[0], moved[1] = xy2[v, 0] - xy1[u, 0], xy2[v, 1] - xy1[u, 1]
     total = 0.0
@@ -164,9 +120,9 @@ def _neighbours_agree(
             if n >= 0 and correlation[m, n] > best:
                 other[0], other[1] = xy2[n, 0] - xy1[m, 0], xy2[n, 1] - xy1[m, 1]
                 if tolerance > 0.0:
-                    agreement = relative_difference_weight(moved, other, apart, tolerance)
+                    agreement = _relative_difference_weight(moved, other, apart, tolerance)
                 else:
-                    agreement = displacement_weight(moved, other, 1.0 - apart / radius, terms)
+                    agreement = _displacement_weight(moved, other, 1.0 - apart / radius)
                 best = max(best, correlation[m, n] * agreement)
         total += best
     return total
@@ -176,11 +132,11 @@ def _neighbours_agree(
 class StrengthOfMatch:
     """The thesis' matching: a corner matches the one whose neighbours' displacements agree best.
 
-    Each corner is compared with those within a radius; the strength SM_k = c_k sum_m max_n (c_mn lambda_n)
-    (4.1) of its best candidates is computed over its neighbours, and of matches that share a corner the
-    strongest is kept. Figure 4.4 with the weight functions is lost; lambda is the product of direction max(0,
-    cos), length min / max and distance 1 - d / radius as in the text. The fields after ``neighbours`` and
-    ``weight`` = "relative-difference" extend the thesis and are off.
+    Each corner is compared with those within a radius; the strength (4.1) of its best candidates is computed
+    over its neighbours, and of matches that share a corner the strongest is kept. Figure 4.4 with the weight
+    functions is lost; lambda is the product of direction max(0, cos), length min / max and distance 1 - d /
+    radius as in the text. ``colour`` is of the thesis; ``weight`` = "relative-difference" and the fields
+    after it extend it and are off.
 
     Parameters
     ----------
@@ -196,9 +152,8 @@ class StrengthOfMatch:
         Mean correlation of red, green and blue instead of grey values.
     weight : {"product", "relative-difference"}
         Product of figure 4.4, or exp(-1/2 (|d_m - d| / (tolerance |u_m - u| + 1 px))^2) of displacements d,
-        which also suits short displacements and deep scenes.
-    use_direction, use_length, use_distance : bool
-        Factors of the product.
+        which also suits short displacements and
+        deep scenes.
     tolerance : float
         Tolerance of the relative difference.
     min_correlation : float
@@ -215,9 +170,6 @@ class StrengthOfMatch:
     window: int = SIDE
     colour: bool = False
     weight: Literal["product", "relative-difference"] = "product"
-    use_direction: bool = True
-    use_length: bool = True
-    use_distance: bool = True
     tolerance: float = 0.3
     min_correlation: float = 0.0
     min_strength: float = 0.0
@@ -238,20 +190,7 @@ class StrengthOfMatch:
             raise ValueError(f"min_strength must lie in [0, 1); got {self.min_strength}")
 
     def prepare(self, image: Image, features: Features) -> PreparedImage:
-        """Prepare an image for matching.
-
-        Parameters
-        ----------
-        image : Image
-            The image.
-        features : Features
-            Its features.
-
-        Returns
-        -------
-        PreparedImage
-            The prepared image.
-        """
+        """See `thesisrecon.config.Matcher.prepare`."""
         return prepare_image(image, features, window=self.window, colour=self.colour)
 
     def match(
@@ -260,54 +199,33 @@ class StrengthOfMatch:
         view2: PreparedImage,
         *,
         pair: tuple[int, int],
-        estimate_fundamental: FundamentalEstimator,
+        estimate_fundamental: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match the corners of two images one-to-one.
-
-        Parameters
-        ----------
-        view1, view2 : PreparedImage
-            The images.
-        pair : tuple of int
-            Numbers of the views.
-        estimate_fundamental : callable
-            Not used by this variant.
-        rng : numpy.random.Generator
-            Not used by this variant.
-
-        Returns
-        -------
-        Matches
-            Matches at the corners with identity maps; none if an image has fewer than two corners.
-        """
+        """See `thesisrecon.config.Matcher.match`."""
         del estimate_fundamental, rng
         if min(len(view1.features.xy), len(view2.features.xy)) < 2:
             return empty_matches(pair)
-        matches = self._strongest(view1, view2, pair)
-        if not self.align:
-            return matches
-        return align_matches(view1, view2, matches, affine_std=0.02, min_correlation=0.8)
-
-    def _strongest(self, view1: PreparedImage, view2: PreparedImage, pair: tuple[int, int]) -> Matches:
         xy1, xy2 = view1.features.xy, view2.features.xy
         correlation = view1.patches @ view2.patches.T
         radius = self.radius_rel * max(view1.long_side, view2.long_side)
         near1 = _nearest(xy1, self.neighbours, radius)
         near2 = _nearest(xy2, self.neighbours + self.neighbours // 2, radius)
-        terms = (self.use_direction, self.use_length, self.use_distance)
-        index, strength = strength_of_match(
+        index, strength = _strength_of_match(
             correlation,
             (xy1, xy2),
             (near1, near2),
             (radius, self.candidates, self.min_correlation),
-            (self.tolerance if self.weight == "relative-difference" else 0.0, terms),
+            self.tolerance if self.weight == "relative-difference" else 0.0,
         )
         index[strength < self.min_strength * self.neighbours] = -1
         rows = one_to_one(index, strength)
         two = index[rows]
         maps = np.tile(np.eye(2), (len(rows), 1, 1))
-        return Matches(*pair, rows, two, xy1[rows], xy2[two], correlation[rows, two], maps)
+        matches = Matches(*pair, rows, two, xy1[rows], xy2[two], correlation[rows, two], maps)
+        if not self.align:
+            return matches
+        return align_matches(view1, view2, matches, affine_std=0.02, min_correlation=0.8)
 
 
 def _nearest(xy: F64, count: int, radius: float) -> I64:

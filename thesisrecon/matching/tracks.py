@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.matching.alignment import align_corners
-from thesisrecon.matching.prepared import PreparedImage
+from thesisrecon.matching._alignment import align_corners
+from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Tracks, TwoView
 
@@ -128,27 +128,30 @@ def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle:
 
 @dataclass(frozen=True)
 class _Chains:
-    """Corners ``view, corner, track`` (K,), sorted by track and view, and the ``count`` of tracks.
+    """Corners ``view, corner, track`` (K,), ``xy`` (K, 2), sorted by track and view.
 
-    ``node`` (K,) is the index of the corner among all corners of all views.
+    ``edges`` (E, 2) are the two observations of each match, ``count`` is the number of tracks.
     """
 
     view: I64
     corner: I64
     track: I64
-    node: I64
+    xy: F64
+    edges: I64
     count: int
 
 
-def _link_matches(corners: Sequence[int], pairs: Sequence[TwoView]) -> _Chains:
-    """Unite the matches of all pairs, best pairs first.
+def _link_matches(corners: Sequence[F64], pairs: Sequence[TwoView]) -> _Chains:
+    """Unite the matches of all pairs, pairs with more verified matches first.
 
     A union that puts two corners of one view into a track is rejected, so that the track splits at the weaker
     link.
     """
-    first = np.concatenate([[0], np.cumsum(corners)]).astype(np.int64)
-    view_of = np.repeat(np.arange(len(corners)), corners).astype(np.int64)
-    edges = _edges(first, pairs)
+    counts = [len(xy) for xy in corners]
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    view_of = np.repeat(np.arange(len(corners)), counts).astype(np.int64)
+    ends = [np.stack([first[p.i] + p.index1, first[p.j] + p.index2], 1) for p in pairs]
+    edges = np.concatenate([np.empty((0, 2), np.int64), *ends])
     parent = _union_corners(edges, view_of, len(corners))
     used, size = np.unique(parent, return_counts=True)
     root = used[size >= 2]
@@ -156,46 +159,29 @@ def _link_matches(corners: Sequence[int], pairs: Sequence[TwoView]) -> _Chains:
     track = np.searchsorted(root, parent[node])
     order = np.lexsort((node, track))
     node, track = node[order], track[order]
-    return _Chains(view_of[node], node - first[view_of[node]], track, node, len(root))
+    xy = np.concatenate([*corners, np.empty((0, 2))])[node]
+    observation = np.full(first[-1], -1, np.int64)
+    observation[node] = np.arange(len(node))
+    return _Chains(view_of[node], node - first[view_of[node]], track, xy, observation[edges], len(root))
 
 
-def _edges(first: I64, pairs: Sequence[TwoView]) -> I64:
-    """Corner numbers (E, 2) of all matches, pairs with more verified matches first."""
-    order = sorted(range(len(pairs)), key=lambda n: (-pairs[n].inliers, pairs[n].i, pairs[n].j))
-    if not order:
-        return np.empty((0, 2), np.int64)
-    return np.concatenate(
-        [
-            np.stack([first[pairs[n].i] + pairs[n].index1, first[pairs[n].j] + pairs[n].index2], 1)
-            for n in order
-        ]
-    )
-
-
-def _affines_from_middle_view(
-    chains: _Chains, corners: Sequence[F64], pairs: Sequence[TwoView]
-) -> tuple[F64, F64, I64]:
+def _affines_from_middle_view(chains: _Chains, pairs: Sequence[TwoView]) -> tuple[F64, F64, I64]:
     """Predict the corner of each track's middle view in the other views by chaining local affine maps.
 
     Returns the position (K, 2) px, the map from the middle view (K, 2, 2) and the middle observation (K,) of
     the track: the one with most matches in the track, the first of equals.
     """
-    counts = [len(c) for c in corners]
-    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    observation = np.full(first[-1], -1, np.int64)
-    observation[chains.node] = np.arange(len(chains.node))
-    order = sorted(range(len(pairs)), key=lambda n: (-pairs[n].inliers, pairs[n].i, pairs[n].j))
-    edges = observation[_edges(first, pairs)]
-    xy = np.concatenate([*corners, np.empty((0, 2))])[chains.node]
+    xy, edges = chains.xy, chains.edges
     if not len(edges):
         return xy, np.tile(np.eye(2), (len(xy), 1, 1)), np.arange(len(xy))
     inside = chains.track[edges[:, 0]] == chains.track[edges[:, 1]]
     edges = edges[inside]
     # Pair by pair: all matches of hundreds of images need gigabytes.
-    used = np.split(inside, np.cumsum([len(pairs[n].xy1) for n in order])[:-1])
-    xy1 = np.concatenate([pairs[n].xy1[rows] for n, rows in zip(order, used, strict=True)])
-    xy2 = np.concatenate([pairs[n].xy2[rows] for n, rows in zip(order, used, strict=True)])
-    affine = np.concatenate([pairs[n].affine[rows] for n, rows in zip(order, used, strict=True)])
+    used = np.split(inside, np.cumsum([len(p.xy1) for p in pairs])[:-1])
+    xy1, xy2, affine = (
+        np.concatenate([getattr(p, name)[rows] for p, rows in zip(pairs, used, strict=True)])
+        for name in ("xy1", "xy2", "affine")
+    )
     degree = np.bincount(edges.ravel(), minlength=len(xy))
     best = np.lexsort((np.arange(len(xy)), -degree, chains.track))
     middle_of = best[np.searchsorted(chains.track[best], np.arange(chains.count))]
@@ -210,32 +196,18 @@ class PlainTracks:
     def build(
         self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
     ) -> Tracks:
-        """Build tracks from the matches of accepted pairs.
-
-        Parameters
-        ----------
-        prepared : sequence of PreparedImage
-            The images.
-        pairs : sequence of TwoView
-            The verified pairs.
-        rng : numpy.random.Generator
-            Not used by this variant.
-
-        Returns
-        -------
-        Tracks
-            Tracks of at least two views with at most one corner per view.
-        """
+        """See `thesisrecon.config.TrackBuilder.build`."""
         del rng
-        corners = [p.features.xy for p in prepared]
-        chains = _link_matches([len(xy) for xy in corners], [p for p in pairs if p.accepted])
-        xy = np.concatenate([*corners, np.empty((0, 2))])[chains.node]
-        return _tracks(chains, xy, np.ones(len(xy), np.bool_), len(prepared))
+        chains = _link_matches([p.features.xy for p in prepared], _best_first(pairs))
+        return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(prepared))
 
 
 @dataclass(frozen=True)
 class AlignedTracks:
     """Tracks whose observations are aligned by least squares with the window of their middle view.
+
+    The middle view of a track has most direct matches in it; local maps to the other views are chained along
+    the matches.
 
     Parameters
     ----------
@@ -254,43 +226,25 @@ class AlignedTracks:
     def build(
         self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
     ) -> Tracks:
-        """Build tracks whose observations show the same point to sub-pixel accuracy.
-
-        The middle view of a track has most direct matches in it; local maps to the other views are chained
-        along the matches.
-
-        Parameters
-        ----------
-        prepared : sequence of PreparedImage
-            The images.
-        pairs : sequence of TwoView
-            The verified pairs.
-        rng : numpy.random.Generator
-            Not used by this variant.
-
-        Returns
-        -------
-        Tracks
-            Tracks of at least two views with at most one corner per view.
-        """
+        """See `thesisrecon.config.TrackBuilder.build`."""
         del rng
-        accepted = [p for p in pairs if p.accepted]
-        corners = [p.features.xy for p in prepared]
-        chains = _link_matches([len(xy) for xy in corners], accepted)
-        start, affine, middle = _affines_from_middle_view(chains, corners, accepted)
+        accepted = _best_first(pairs)
+        chains = _link_matches([p.features.xy for p in prepared], accepted)
+        start, affine, middle = _affines_from_middle_view(chains, accepted)
         xy, kept = start.copy(), np.ones(len(start), np.bool_)
         for i, j, group in _groups(chains.view[middle], chains.view, len(prepared)):
-            view1, view2 = prepared[i], prepared[j]
-            corner = chains.corner[middle[group]]
+            view1, corner = prepared[i], chains.corner[middle[group]]
+            matches = (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group])
             found, _, score = align_corners(
-                view1,
-                view2,
-                (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group]),
-                affine_std=self.affine_std,
-                max_shift=self.max_shift,
+                view1, prepared[j], matches, affine_std=self.affine_std, max_shift=self.max_shift
             )
             xy[group], kept[group] = found, score >= self.min_correlation
         return _tracks(chains, xy, kept, len(prepared))
+
+
+def _best_first(pairs: Sequence[TwoView]) -> list[TwoView]:
+    """Accepted pairs, those with more verified matches first."""
+    return sorted((p for p in pairs if p.accepted), key=lambda p: (-p.inliers, p.i, p.j))
 
 
 def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64]]:

@@ -13,7 +13,7 @@ import scipy
 from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching.prepared import (
+from thesisrecon.matching._prepared import (
     FAST,
     SAMPLES,
     SIDE,
@@ -37,6 +37,10 @@ MIN_CONDITION = 1e-4
 # Squared step in pixels of the scale at which the iteration stops.
 SETTLED = 1e-6
 ITERATIONS = 12
+# Maximum distance of aligned matches from their corners, in pixels of the corner's scale.
+MAX_SHIFT = 3.0
+# Two matches closer than this in (x1, y1, x2, y2) px are the same.
+APART_PX = 1.0
 # A window of half the width must fit better and stay near the result of the wider one.
 FINE_CORRELATION = 0.85
 FINE_SHIFT = 1.0
@@ -101,12 +105,7 @@ def _align_windows(
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _read_template(
-    pixels: F32,
-    level: I64,
-    to_level: float,
-    place: tuple[F64, float],
-    border: F32,
-    out: tuple[F32, F32],
+    pixels: F32, level: I64, to_level: float, place: tuple[F64, float], border: F32, out: tuple[F32, F32]
 ) -> bool:
     """Sample the normalised window of image 1 and its derivatives by the unknowns.
 
@@ -257,40 +256,20 @@ def align_corners(
     """Align corners of image 1 with image 2 to sub-pixel positions.
 
     Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and
-    affine map, the latter with a prior at its start. Corners of a coarser scale are aligned there first (wide
-    convergence) and then at the finest scale (smaller noise), which is used if it fits.
-
-    Parameters
-    ----------
-    view1, view2 : PreparedImage
-        The images.
-    matches : tuple
-        xy1 (M, 2) px, scale1 (M,), start of xy2 (M, 2) px, start of the affine maps (M, 2, 2).
-    affine_std : float
-        Prior standard deviation of the affine coefficients; 0 keeps them fixed.
-    max_shift : float
-        Maximum distance from the start, in pixels of the corner's scale.
-
-    Returns
-    -------
-    xy2 : ndarray (M, 2)
-        Positions in image 2, px; the start if the alignment failed.
-    affine : ndarray (M, 2, 2)
-        Local affine maps.
-    score : ndarray (M,)
-        Correlations; 0 if the alignment failed or its expected error exceeds MAX_STD px of the scale.
+    affine map, the latter with a prior at its start (standard deviation ``affine_std``; 0 keeps it). Corners
+    of a coarser scale are aligned there first (wide convergence) and then at the finest scale (smaller
+    noise), which is used if it fits. ``matches`` = xy1 (M, 2), scale1 (M,), start of xy2 (M, 2), start of the
+    maps (M, 2, 2); ``max_shift`` in pixels of the corner's scale. Returns xy2, maps and correlations, 0 if
+    the alignment failed or its expected error exceeds MAX_STD px of the scale.
     """
-    xy1, scale1, start, maps = matches
-    xy2, affine, score = _align_windows(
-        view1.pyramid,
-        view2.pyramid,
-        (xy1, scale1, start, maps),
-        (ITERATIONS, affine_std, max_shift, MAX_STD),
-    )
-    coarse = np.flatnonzero((scale1 > 1.5 * view1.base) & (score > 0.0))
+    xy1, scale1, _, _ = matches
+    base = view1.pyramid[2]
+    limits = (ITERATIONS, affine_std, max_shift, MAX_STD)
+    xy2, affine, score = _align_windows(view1.pyramid, view2.pyramid, matches, limits)
+    coarse = np.flatnonzero((scale1 > 1.5 * base) & (score > 0.0))
     if not len(coarse):
         return xy2, affine, score
-    finest = np.full(len(coarse), view1.base, np.float32)
+    finest = np.full(len(coarse), base, np.float32)
     fine_xy2, _, fine_score = _align_windows(
         view1.pyramid,
         view2.pyramid,
@@ -303,66 +282,23 @@ def align_corners(
 
 
 def align_matches(
-    view1: PreparedImage,
-    view2: PreparedImage,
-    matches: Matches,
-    *,
-    affine_std: float,
-    min_correlation: float,
-    max_shift: float = 3.0,
+    view1: PreparedImage, view2: PreparedImage, matches: Matches, *, affine_std: float, min_correlation: float
 ) -> Matches:
-    """Align matches of corners to sub-pixel positions and drop those that fail or repeat a better one.
-
-    Parameters
-    ----------
-    view1, view2 : PreparedImage
-        The images.
-    matches : Matches
-        Matches at the corners.
-    affine_std : float
-        Prior standard deviation of the affine coefficients.
-    min_correlation : float
-        Minimum correlation after alignment.
-    max_shift : float
-        Maximum distance from the start, in pixels of the corner's scale.
-
-    Returns
-    -------
-    Matches
-        The aligned matches.
-    """
-    xy2, affine, score = align_corners(
-        view1,
-        view2,
-        (matches.xy1, view1.features.scale[matches.index1], matches.xy2, matches.affine),
-        affine_std=affine_std,
-        max_shift=max_shift,
-    )
+    """Align matches of corners to sub-pixel positions and drop those that fail or repeat a better one."""
+    start = (matches.xy1, view1.features.scale[matches.index1], matches.xy2, matches.affine)
+    xy2, affine, score = align_corners(view1, view2, start, affine_std=affine_std, max_shift=MAX_SHIFT)
     moved = replace(matches, xy2=xy2, affine=affine, score=score)
     good = select_matches(moved, np.flatnonzero(score >= min_correlation))
     return select_matches(good, strongest_distinct(good))
 
 
-def strongest_distinct(matches: Matches, *, apart_px: float = 1.0) -> I64:
-    """Select the matches that do not repeat a stronger one.
-
-    Parameters
-    ----------
-    matches : Matches
-        The matches.
-    apart_px : float
-        Distance in (x1, y1, x2, y2) within which two matches are the same.
-
-    Returns
-    -------
-    ndarray (K,) of int
-        Rows, sorted.
-    """
+def strongest_distinct(matches: Matches) -> I64:
+    """Rows, sorted, of the matches that do not repeat a stronger one."""
     rows = np.argsort(-matches.score, kind="stable")
     keep = np.ones(len(rows), np.bool_)
     if len(rows) >= 2:
         places = np.hstack([matches.xy1, matches.xy2])[rows]
-        for a, b in sorted(scipy.spatial.cKDTree(places).query_pairs(apart_px)):
+        for a, b in sorted(scipy.spatial.cKDTree(places).query_pairs(APART_PX)):
             if keep[a]:
                 keep[b] = False
     kept: I64 = np.sort(rows[keep])

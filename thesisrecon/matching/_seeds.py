@@ -13,6 +13,9 @@ from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.records import Seeds
 
 BLOCK = 256
+NEIGHBOURS, TOLERANCE = 10, 0.3
+# Maximum distance of a corner from its seed or prediction.
+REACH_PX = 4.0
 
 
 @njit(cache=True, nogil=True)
@@ -55,25 +58,12 @@ def _update_column_best(correlation: F32, first_row: int, value: F32, index: I64
 
 
 def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
-    """Find the pairs of rows and columns that are each other's best correlation.
+    """Pairs of rows and columns that are each other's best correlation.
 
-    Parameters
-    ----------
-    blocks : iterable of ndarray (B, N)
-        Blocks of rows of the correlation matrix.
-    xy2 : ndarray (N, 2)
-        Positions of the columns, px, float32.
-    apart2 : ndarray (N,)
-        Squared distance from the best column beyond which another column counts as elsewhere.
-
-    Returns
-    -------
-    index : ndarray (M,) of int
-        Column of each row, -1 if the best is not mutual. The first of equal values counts.
-    value : ndarray (M,)
-        Best correlation of each row.
-    second_best : ndarray (M,)
-        Best correlation elsewhere; -1 if there is none or the best is not mutual.
+    ``blocks`` (B, N) are rows of the matrix; columns within the squared distance ``apart2`` (N,) of the best,
+    at ``xy2`` (N, 2), are the same position. Returns the column of each row (-1 if the best is not mutual;
+    the first of equal values counts), its correlation and the second best elsewhere (-1: none, or not
+    mutual).
     """
     column_value, back = np.full(len(xy2), -2.0, np.float32), np.zeros(len(xy2), np.int64)
     parts, first = [], 0
@@ -88,17 +78,7 @@ def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32,
 
 @dataclass(frozen=True)
 class SeedMatches:
-    """Matches of seeds.
-
-    Parameters
-    ----------
-    xy1, xy2 : ndarray (M, 2)
-        Positions, px.
-    affine : ndarray (M, 2, 2)
-        Initial local affine maps from image 1 to image 2.
-    score : ndarray (M,)
-        Correlations.
-    """
+    """Positions (M, 2) px, initial local affine maps (M, 2, 2) from image 1 to 2, and correlations (M,)."""
 
     xy1: F64
     xy2: F64
@@ -106,22 +86,9 @@ class SeedMatches:
     score: F32
 
     def __len__(self) -> int:
-        """Number of matches."""
         return len(self.xy1)
 
     def at(self, chosen: B8 | I64) -> SeedMatches:
-        """Return a subset of the matches.
-
-        Parameters
-        ----------
-        chosen : ndarray of bool or int
-            Mask or indices.
-
-        Returns
-        -------
-        SeedMatches
-            The subset.
-        """
         return SeedMatches(self.xy1[chosen], self.xy2[chosen], self.affine[chosen], self.score[chosen])
 
 
@@ -129,21 +96,7 @@ def match_seeds(seeds1: Seeds, seeds2: Seeds, *, rotated: bool, ratio: float) ->
     """Match seeds that are mutually nearest and pass the ratio test.
 
     The distance of unit patches is sqrt(2 - 2 correlation). Other seeds count as elsewhere beyond a quarter
-    of the patch (8 pixels of its level).
-
-    Parameters
-    ----------
-    seeds1, seeds2 : Seeds
-        Seeds of both images.
-    rotated : bool
-        Use the patches rotated to their dominant gradient, else the upright ones.
-    ratio : float
-        Maximum ratio of the distances to the best and to the second best seed.
-
-    Returns
-    -------
-    SeedMatches
-        The matches.
+    of the patch (8 pixels of its level). ``rotated``: use the patches rotated to their dominant gradient.
     """
     use1, use2 = (np.flatnonzero((s.angle != 0.0) == rotated) for s in (seeds1, seeds2))
     if not (len(use1) and len(use2)):
@@ -159,24 +112,11 @@ def match_seeds(seeds1: Seeds, seeds2: Seeds, *, rotated: bool, ratio: float) ->
     one, two = use1[rows], use2[index[rows]]
     turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
     grow = (seeds2.scale[two] / seeds1.scale[one]).astype(np.float64)
-    return SeedMatches(seeds1.xy[one], seeds2.xy[two], similarity(grow, turn), value[rows])
+    return SeedMatches(seeds1.xy[one], seeds2.xy[two], _similarity(grow, turn), value[rows])
 
 
-def similarity(scale: F64, angle: F64) -> F64:
-    """Compute scaled rotations.
-
-    Parameters
-    ----------
-    scale : ndarray (M,)
-        Scales.
-    angle : ndarray (M,)
-        Angles, rad.
-
-    Returns
-    -------
-    ndarray (M, 2, 2)
-        The matrices.
-    """
+def _similarity(scale: F64, angle: F64) -> F64:
+    """Scaled rotations (M, 2, 2)."""
     c, s = scale * np.cos(angle), scale * np.sin(angle)
     maps: F64 = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
     return maps
@@ -193,73 +133,41 @@ def _common_similarity(matches: SeedMatches) -> F64:
     mode = edges[np.argmax(counts)] + np.pi / 36
     around = np.angle(np.exp(1j * (angle - mode)))
     near = np.abs(around) < np.pi / 6
-    common: F64 = similarity(np.array([scale]), np.array([mode + np.median(around[near])]))[0]
+    common: F64 = _similarity(np.array([scale]), np.array([mode + np.median(around[near])]))[0]
     return common
 
 
-def neighbour_support(matches: SeedMatches, *, neighbours: int = 10, tolerance: float = 0.3) -> F64:
-    """Compute the strength of each match: the number of neighbours that move alike ((4.1) with c = 1).
+def neighbour_support(matches: SeedMatches) -> F64:
+    """Strength (M,) of each match: the number of neighbours that move alike ((4.1) with c = 1).
 
-    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (tolerance |u_m - u_k|))^2), with d the displacement
+    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (TOLERANCE |u_m - u_k|))^2), with d the displacement
     after removing the common rotation and scale; both images serve as the first in turn.
-
-    Parameters
-    ----------
-    matches : SeedMatches
-        The matches.
-    neighbours : int
-        Number of neighbours.
-    tolerance : float
-        Relative difference of displacements.
-
-    Returns
-    -------
-    ndarray (M,)
-        Strengths, at most ``neighbours``.
     """
     if len(matches) < 2:
         return np.zeros(len(matches))
     a = _common_similarity(matches)
     u, v = matches.xy1 @ a.T, matches.xy2
-    k = min(neighbours + 1, len(matches))
+    k = min(NEIGHBOURS + 1, len(matches))
     support = np.zeros(len(matches))
     for here, there in ((u, v), (v, u)):
         near = scipy.spatial.cKDTree(here).query(here, k)[1][:, 1:]
         apart = np.linalg.norm(here[near] - here[:, None], axis=2)
         strain = np.linalg.norm((there[near] - there[:, None]) - (here[near] - here[:, None]), axis=2)
-        support += np.exp(-0.5 * (strain / (tolerance * apart + 1.0)) ** 2).sum(axis=1)
+        support += np.exp(-0.5 * (strain / (TOLERANCE * apart + 1.0)) ** 2).sum(axis=1)
     return 0.5 * support
 
 
-def corners_of_seeds(
-    xy1: F64, xy2: F64, known: SeedMatches, *, reach_px: float = 4.0
-) -> tuple[I64, I64, SeedMatches]:
-    """Find the pairs of corners at the positions of seed matches.
+def corners_of_seeds(xy1: F64, xy2: F64, known: SeedMatches) -> tuple[I64, I64, SeedMatches]:
+    """Pairs of corners at the positions of seed matches: indices (M,), (M,) and the matches.
 
     The corner nearest to a seed in image 1 and the corner nearest to its prediction by the local affine map
     in image 2; one-to-one, best correlations first.
-
-    Parameters
-    ----------
-    xy1, xy2 : ndarray (N, 2), ndarray (K, 2)
-        Corners of both images, px.
-    known : SeedMatches
-        The seed matches.
-    reach_px : float
-        Maximum distance of a corner.
-
-    Returns
-    -------
-    one, two : ndarray (M,) of int
-        Indices of the corners.
-    matches : SeedMatches
-        Matches at the corners.
     """
     apart1, one = scipy.spatial.cKDTree(xy1).query(known.xy1)
     led = known.xy2 + np.einsum("mij,mj->mi", known.affine, xy1[one] - known.xy1)
     apart2, two = scipy.spatial.cKDTree(xy2).query(led)
     order = np.argsort(-known.score, kind="stable")
-    order = order[(apart1[order] <= reach_px) & (apart2[order] <= reach_px)]
+    order = order[(apart1[order] <= REACH_PX) & (apart2[order] <= REACH_PX)]
     for corner in (one, two):
         order = order[np.sort(np.unique(corner[order], return_index=True)[1])]
     order = order[np.argsort(one[order], kind="stable")]

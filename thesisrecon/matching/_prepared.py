@@ -1,4 +1,4 @@
-"""Data of an image that the matching needs, its windows, and helpers of all matching variants.
+"""Windows and pyramids of an image prepared for matching, and helpers of all matching variants.
 
 A pyramid is stored as ``pixels``, all levels one after the other, and ``levels`` (L, 3): offset, height and
 width of each; a pixel of level k spans ``base * 2^k`` pixels of the image.
@@ -25,53 +25,17 @@ PYRAMID_LEVELS = 4
 
 @njit(cache=True, nogil=True)
 def pyramid_level(scale: float, base: float, count: int) -> int:
-    """Return the pyramid level whose pixel size is nearest to a scale (logarithmic).
-
-    Parameters
-    ----------
-    scale : float
-        Scale, px.
-    base : float
-        Pixel size of level 0, px.
-    count : int
-        Number of levels.
-
-    Returns
-    -------
-    int
-        The level.
-    """
+    """Level whose pixel size is nearest to ``scale`` px (logarithmic); ``base`` = pixel size of level 0."""
     k = int(np.floor(np.log2(scale / base) + 0.5))
     return min(max(k, 0), count - 1)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, side: int, out: F32) -> bool:
-    """Sample a square window bilinearly.
+    """Sample a square window bilinearly to ``out`` (side^2,); False if it leaves the image.
 
-    Sample (column a, row b), counted from the centre, is at ``xy + step @ (a, b)``.
-
-    Parameters
-    ----------
-    pixels : ndarray
-        All levels of the pyramid, float32.
-    level : ndarray (3,) of int
-        Offset, height and width of the level.
-    to_level : float
-        Level pixels per image pixel.
-    xy : ndarray (2,)
-        Centre, px.
-    step : ndarray (2, 2)
-        Sample spacing, px.
-    side : int
-        Samples per side, odd.
-    out : ndarray (side^2,)
-        Output: the samples.
-
-    Returns
-    -------
-    bool
-        False if the window leaves the image.
+    Sample (column a, row b), counted from the centre, is at ``xy + step @ (a, b)``; ``to_level`` = level
+    pixels per image pixel.
     """
     offset, height, width = level[0], level[1], level[2]
     x0 = (xy[0] + 0.5) * to_level - 0.5
@@ -101,17 +65,9 @@ def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, 
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def normalize_window(window: F32) -> float:
-    """Subtract the mean and divide by the norm, in place.
+    """Subtract the mean and divide by the norm in place; return the norm.
 
-    Parameters
-    ----------
-    window : ndarray (n,)
-        Samples; zeros if the contrast is below half a grey level.
-
-    Returns
-    -------
-    float
-        Norm before the division, 0 without contrast.
+    Samples and norm are 0 if the contrast is below half a grey level.
     """
     total = np.float32(0.0)
     for n in range(len(window)):
@@ -134,18 +90,7 @@ def normalize_window(window: F32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def dot(a: F32, b: F32) -> float:
-    """Compute the inner product of two float32 vectors.
-
-    Parameters
-    ----------
-    a, b : ndarray (n,)
-        Vectors.
-
-    Returns
-    -------
-    float
-        The product.
-    """
+    """Inner product of two float32 vectors."""
     total = np.float32(0.0)
     for n in range(len(a)):
         total += a[n] * b[n]
@@ -169,18 +114,7 @@ def _corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, 
 
 @njit(cache=True, nogil=True)
 def affine_determinant(a: F64) -> float:
-    """Compute the determinant of a local affine map.
-
-    Parameters
-    ----------
-    a : ndarray (2, 2)
-        The map.
-
-    Returns
-    -------
-    float
-        Determinant; 0 for an implausible map (mirrored, or scaled by more than five).
-    """
+    """Determinant of a local affine map, 0 if it is implausible (mirrored, or scaled by more than five)."""
     determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     return determinant if determinant > 0.04 and determinant < 25.0 else 0.0
 
@@ -189,84 +123,30 @@ def affine_determinant(a: F64) -> float:
 class PreparedImage:
     """An image prepared for matching.
 
-    Parameters
-    ----------
-    size : tuple of int
-        Width and height, px.
-    features : Features
-        Features of the image.
-    pixels : ndarray
-        Grey pyramid, all levels one after the other.
-    levels : ndarray (L, 3) of int
-        Offset, height and width of each level.
-    base : float
-        Pixel size of level 0, px.
-    patches : ndarray (N, 225)
-        Normalised 15 x 15 window of each corner at its scale (other sizes on request); zero outside the
-        image.
-    cell_px : float
-        Side of the square cells that the corners are sorted into.
-    cell_shape, cell_start, cell_order : ndarray of int
-        Rows and columns of cells, start of each cell and corners in cell order.
+    ``size`` = (width, height); ``patches`` (N, 225) = normalised 15 x 15 window of each corner at its scale
+    (other sizes on request), zero outside the image; ``pyramid`` = pixels, levels, base and ``cells`` = side
+    px, shape, start and order of the corner cells are arguments of the kernels.
     """
 
     size: tuple[int, int]
     features: Features
-    pixels: F32
-    levels: I64
-    base: float
+    pyramid: tuple[F32, I64, float]
     patches: F32
-    cell_px: float
-    cell_shape: I64
-    cell_start: I64
-    cell_order: I64
-
-    @property
-    def pyramid(self) -> tuple[F32, I64, float]:
-        """Pixels, levels, base: arguments of the kernels."""
-        return self.pixels, self.levels, self.base
-
-    @property
-    def cells(self) -> tuple[float, I64, I64, I64]:
-        """Cell size, shape, start, order: arguments of the kernels."""
-        return self.cell_px, self.cell_shape, self.cell_start, self.cell_order
+    cells: tuple[float, I64, I64, I64]
 
     @property
     def long_side(self) -> int:
-        """Larger of width and height, px."""
         return max(self.size)
 
 
 def prepare_image(
     image: Image, features: Features, *, window: int = SIDE, colour: bool = False
 ) -> PreparedImage:
-    """Compute the grey pyramid, corner windows and corner cells of an image.
+    """Compute the grey pyramid, corner windows (``window`` odd) and corner cells of an image.
 
-    The pyramid starts at twice the image size if corners were found there (scale below 1).
-
-    Parameters
-    ----------
-    image : Image
-        The image.
-    features : Features
-        Its features.
-    window : int
-        Side of the correlation windows, odd.
-    colour : bool
-        Windows of the three colours side by side, each normalised: products are mean correlations.
-
-    Returns
-    -------
-    PreparedImage
-        The prepared image.
-
-    Raises
-    ------
-    ValueError
-        If ``window`` is even or below 3.
+    The pyramid starts at twice the image size if corners were found there (scale below 1). With ``colour``
+    the windows of the three colours stand side by side, each normalised: products are mean correlations.
     """
-    if window < 3 or window % 2 == 0:
-        raise ValueError(f"window must be odd and at least 3; got {window}")
     doubled = len(features.scale) > 0 and float(features.scale.min()) < 0.75
     base = 0.5 if doubled else 1.0
     pixels, levels = _pyramid(image.gray, doubled)
@@ -276,8 +156,8 @@ def prepare_image(
     parts = [_corner_patches(c, levels, base, features.xy, features.scale, window) for c in channels]
     patches = np.hstack(parts) / np.float32(np.sqrt(3.0)) if colour else parts[0]
     cell_px = max(4.0, 0.01 * max(image.size))
-    shape, start, order = _cells(features.xy, image.size, cell_px)
-    return PreparedImage(image.size, features, pixels, levels, base, patches, cell_px, shape, start, order)
+    cells = (cell_px, *_cells(features.xy, image.size, cell_px))
+    return PreparedImage(image.size, features, (pixels, levels, base), patches, cells)
 
 
 def _pyramid(gray: F32, doubled: bool) -> tuple[F32, I64]:
@@ -301,68 +181,23 @@ def _cells(xy: F64, size: tuple[int, int], cell_px: float) -> tuple[I64, I64, I6
     return shape, start, order
 
 
-FundamentalEstimator = Callable[[F64, F64, np.random.Generator], FundamentalFit]
+EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
 
 def empty_matches(pair: tuple[int, int]) -> Matches:
-    """Return an empty set of matches.
-
-    Parameters
-    ----------
-    pair : tuple of int
-        Numbers of the two views.
-
-    Returns
-    -------
-    Matches
-        No matches.
-    """
     index, xy = np.empty(0, np.int64), np.empty((0, 2))
     return Matches(*pair, index, index, xy, xy, np.empty(0, np.float32), np.empty((0, 2, 2)))
 
 
 def one_to_one(index: I64, score: F32) -> I64:
-    """Select for each corner of image 2 the best of the rows that claim it.
-
-    Parameters
-    ----------
-    index : ndarray (N,) of int
-        Corner of image 2 claimed by each row, -1 for none.
-    score : ndarray (N,)
-        Score of each row.
-
-    Returns
-    -------
-    ndarray (M,) of int
-        Selected rows, sorted.
-    """
+    """Rows, sorted, of the best ``score`` for each corner of image 2; ``index`` (N,) claims it, -1: none."""
     rows = np.flatnonzero(index >= 0)
     rows = rows[np.lexsort((rows, -score[rows]))]
     return np.sort(rows[np.unique(index[rows], return_index=True)[1]])
 
 
 def select_matches(matches: Matches, rows: I64) -> Matches:
-    """Return a subset of matches.
-
-    Parameters
-    ----------
-    matches : Matches
-        The matches.
-    rows : ndarray of int
-        Rows to keep.
-
-    Returns
-    -------
-    Matches
-        The subset.
-    """
+    m = matches
     return Matches(
-        matches.i,
-        matches.j,
-        matches.index1[rows],
-        matches.index2[rows],
-        matches.xy1[rows],
-        matches.xy2[rows],
-        matches.score[rows],
-        matches.affine[rows],
+        m.i, m.j, m.index1[rows], m.index2[rows], m.xy1[rows], m.xy2[rows], m.score[rows], m.affine[rows]
     )
