@@ -106,7 +106,19 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
 class Detector(Protocol):
     """Detect the features of one image (4.2.1)."""
 
-    def detect(self, image: Image) -> Features: ...
+    def detect(self, image: Image) -> Features:
+        """Detect the corners and, for some detectors, the seeds of an image.
+
+        Parameters
+        ----------
+        image : Image
+            The image.
+
+        Returns
+        -------
+        Features
+            Corners, strongest first, in pixels of the image; possibly none.
+        """
 
 
 class PairSelector(Protocol):
@@ -215,13 +227,50 @@ class Matcher(Protocol):
 class FundamentalEstimator(Protocol):
     """Estimate F from matches with outliers (chapter 5)."""
 
-    def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit: ...
+    def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
+        """Estimate F of matches with outliers.
+
+        Parameters
+        ----------
+        xy1, xy2 : array_like (N, 2)
+            Matched points, N >= 8, px.
+        rng : numpy.random.Generator
+            Source of the samples.
+
+        Returns
+        -------
+        FundamentalFit
+            F, inliers, noise, covariance and competing models; always finite.
+
+        Raises
+        ------
+        ValueError
+            If the shapes differ or coordinates are not finite.
+        StageFailure
+            If there are too few or collinear matches, or no F has 8 inliers.
+        """
 
 
 class Verifier(Protocol):
     """Decide whether a pair and its F are accepted, and which matches are inliers."""
 
-    def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView: ...
+    def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
+        """Verify the matches of a pair.
+
+        Parameters
+        ----------
+        matches : Matches
+            All matches of the pair.
+        fit : FundamentalFit
+            Robust estimate of F from these matches.
+        rng : numpy.random.Generator
+            Source of the samples.
+
+        Returns
+        -------
+        TwoView
+            The pair with its verified matches, its configuration and the decision.
+        """
 
 
 class TrackBuilder(Protocol):

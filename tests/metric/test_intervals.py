@@ -8,9 +8,9 @@ import pytest
 from tests.metric.test_population import true_calibration
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric.adjustment import tail_width
+from thesisrecon.metric._adjustment import tail_width
+from thesisrecon.metric._uncertainty import FocalShrinkage, lack_of_fit
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.metric.uncertainty import FocalShrinkage, lack_of_fit
 from thesisrecon.numerics.block_scatter import BlockScatter
 
 

@@ -8,11 +8,11 @@ import pytest
 from tests.metric.test_population import true_calibration
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
-from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.metric._resection import resect_calibrated
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.metric.resection import resect_calibrated
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from validation.metrics.similarity import estimate_similarity
 
 
 def run(scene, *, shared=True, reconstruction=None, variant=None, options=None):

@@ -7,13 +7,13 @@ import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.metric.uncertainty import (
+from thesisrecon.metric._uncertainty import (
     PerCameraEstimates,
     estimate_hierarchical_prior,
     estimate_spread,
     find_outliers,
 )
+from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.records import SelfCalibration, Upgrade
 
 

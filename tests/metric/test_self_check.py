@@ -7,15 +7,20 @@ import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric.adjustment import BundleAdjustment
-from thesisrecon.metric.checks import check_views, self_check, triangulable_observations
-from thesisrecon.metric.model import MetricEstimate, camera_rows, reproject_observations, retriangulate_tracks
-from thesisrecon.metric.shared_camera import (
+from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._checks import check_views, self_check, triangulable_observations
+from thesisrecon.metric._model import (
+    MetricEstimate,
+    camera_rows,
+    reproject_observations,
+    retriangulate_tracks,
+)
+from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
     inconsistent_principal_point,
 )
-from thesisrecon.metric.uncertainty import widen_unverified_focals
+from thesisrecon.metric._uncertainty import widen_unverified_focals
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
@@ -67,7 +72,7 @@ def test_a_camera_that_stands_elsewhere_is_named(view):
     t = model.cameras.t.copy()
     t[view] += [0.4, -0.3, 0.2]
     spoiled = retriangulate_tracks(
-        model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE
+        replace(model, cameras=replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE
     )
     check, failed_checks = doubts_of(spoiled, scene)
     assert check["confirmed_share_worst_view"] < 0.5
@@ -79,7 +84,7 @@ def test_several_wrong_cameras_share_a_sentence():
     t = model.cameras.t.copy()
     t[[1, 6]] += [0.4, -0.3, 0.2]
     spoiled = retriangulate_tracks(
-        model.with_cameras(replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE
+        replace(model, cameras=replace(model.cameras, t=t)), sigmas=SIGMAS, min_angle=ANGLE
     )
     failed_checks = doubts_of(spoiled, scene)[1]
     assert any("1" in doubt and "6" in doubt and doubt.startswith("Images ") for doubt in failed_checks)
@@ -105,7 +110,7 @@ def test_points_behind_a_camera_are_detected():
     R, t = model.cameras.R.copy(), model.cameras.t.copy()
     about = np.diag([-1.0, 1.0, -1.0])
     R[4], t[4] = about @ R[4], about @ t[4]
-    behind = model.with_cameras(replace(model.cameras, R=R, t=t))
+    behind = replace(model, cameras=replace(model.cameras, R=R, t=t))
     assert check_views(behind, sigmas=SIGMAS).behind[4] > 0.5
     assert any("#4" in doubt for doubt in doubts_of(behind, scene)[1])
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.adjustment import FOCAL_AND_CENTRE, BundleAdjustment, with_initial_gate
-from thesisrecon.metric.checks import self_check
-from thesisrecon.metric.model import (
+from thesisrecon.metric._adjustment import FOCAL_AND_CENTRE, BundleAdjustment, with_initial_gate
+from thesisrecon.metric._checks import self_check
+from thesisrecon.metric._model import (
     K1,
     MetricEstimate,
     residual_norms,
@@ -24,13 +24,13 @@ from thesisrecon.metric.model import (
     truncated_cost,
     upgraded_model,
 )
-from thesisrecon.metric.resection import MissingCameraRegistration
-from thesisrecon.metric.shared_camera import (
+from thesisrecon.metric._resection import MissingCameraRegistration
+from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
     inconsistent_principal_point,
 )
-from thesisrecon.metric.uncertainty import (
+from thesisrecon.metric._uncertainty import (
     PerCameraEstimates,
     apply_hierarchical_prior,
     estimate_hierarchical_prior,
@@ -97,28 +97,7 @@ class MetricRefinement:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> MetricResult:
-        """Refine a projective reconstruction to the final metric model.
-
-        Parameters
-        ----------
-        reconstruction : Reconstruction
-            Projective reconstruction.
-        calibration : SelfCalibration
-            Its self-calibration; all candidates are tried.
-        prior : IntrinsicsPrior
-            Prior of the views.
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        MetricResult
-            Cameras, points, intrinsics with intervals, and the self-check.
-
-        Raises
-        ------
-        StageFailure
-            If no candidate gives a metric model.
-        """
+        """See `thesisrecon.config.MetricRefiner.refine`."""
         adjustment = BundleAdjustment(prior, self.lens_std, self.noise_floor_px)
         trials = [self._start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
@@ -130,10 +109,10 @@ class MetricRefinement:
             self.outlier_sigmas, np.radians(self.min_angle_deg), self.min_points
         )
         model, rejected = registration.run(models[int(costs.argmin())], adjustment, rng)
-        reasons = [
+        reasons = tuple(
             "" if model.registered[v] else rejected.get(v, reconstruction.reasons[v] or NO_COMMON_POINTS)
             for v in range(len(model.registered))
-        ]
+        )
         model, adjustment, own, scatter = self._finish(model, adjustment)
         model = select_inliers(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
         sharing = check_shared_cameras(model, adjustment)
@@ -222,7 +201,7 @@ def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:
     )
 
 
-def _as_reconstruction(model: MetricEstimate, reasons: list[str]) -> Reconstruction:
+def _as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> Reconstruction:
     registered = model.registered
     P = np.where(registered[:, None, None], model.cameras.P, 0.0)
     K = np.where(registered[:, None, None], model.cameras.K, 0.0)
@@ -230,17 +209,5 @@ def _as_reconstruction(model: MetricEstimate, reasons: list[str]) -> Reconstruct
     X = np.where(model.valid[:, None], np.column_stack([model.X, np.ones(len(model.X))]), 0.0)
     norms = residual_norms(model)
     sigma = noise_from_distances(norms) if len(norms) else model.sigma_px
-    return Reconstruction(
-        "metric",
-        P,
-        X,
-        registered,
-        model.valid,
-        model.inlier,
-        model.tracks,
-        model.sizes,
-        sigma,
-        tuple(reasons),
-        K,
-        distortion,
-    )
+    seen = (registered, model.valid, model.inlier, model.tracks, model.sizes)
+    return Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.model import MetricEstimate, camera_rows
+from thesisrecon.metric._model import MetricEstimate, camera_rows
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.records import Reconstruction
 
@@ -54,7 +54,7 @@ def _direction(rng: np.random.Generator) -> F64:
 
 def _placed(model: MetricEstimate, R: F64, C: F64) -> MetricEstimate:
     t = -np.einsum("vab,vb->va", R, C)
-    return model.with_cameras(replace(model.cameras, R=R, t=t))
+    return replace(model, cameras=replace(model.cameras, R=R, t=t))
 
 
 def move_cameras(
@@ -108,7 +108,7 @@ def _transformed(model: MetricEstimate, H: F64, focal_factor: float) -> MetricEs
     P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
     U, _, Vt = np.linalg.svd(P[:, :, :3])
     C = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
-    return _placed(model.with_cameras(cameras), U @ Vt, C)
+    return _placed(replace(model, cameras=cameras), U @ Vt, C)
 
 
 def wrong_infinity(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 import thesisrecon
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
-from thesisrecon.metric.adjustment import BundleAdjustment
-from thesisrecon.metric.checks import self_check
-from thesisrecon.metric.model import MetricEstimate, retriangulate_tracks
-from thesisrecon.metric.shared_camera import check_shared_cameras, contradicted_focal_priors
+from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._checks import self_check
+from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
+from thesisrecon.metric._shared_camera import check_shared_cameras, contradicted_focal_priors
 from thesisrecon.records import IntrinsicInterval, RunResult, SelfCalibration
 from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
 from validation.studies.runner import Part, Rows, scenes_here, text_table
@@ -130,7 +130,7 @@ def _focal_held(model: MetricEstimate, prior: IntrinsicsPrior) -> tuple[MetricEs
     mean, std = prior.mean.copy(), prior.std.copy()
     mean[:, 0], std[:, 0] = intrinsics[model.cameras.group, 0], 0.0
     return (
-        model.with_cameras(replace(model.cameras, intrinsics=intrinsics)),
+        replace(model, cameras=replace(model.cameras, intrinsics=intrinsics)),
         replace(prior, mean=mean, std=std),
     )
 

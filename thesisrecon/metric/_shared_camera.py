@@ -1,8 +1,8 @@
 """Tests of shared intrinsics and given focal lengths against the images.
 
-Small zoom differences and crops deform a model quietly. The model is adjusted again with own values per view
-(``_PerViewFit``): twice the decrease in cost is chi-square under the hypothesis of one camera (likelihood
-ratio). If own focal lengths stay undetermined, the test cannot decide and the interval is widened.
+Small zoom differences and crops deform a model quietly. The model is adjusted again with own values per view:
+twice the decrease in cost is chi-square under the hypothesis of one camera (likelihood ratio). If own focal
+lengths stay undetermined, the test cannot decide and the interval is widened.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import scipy
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.adjustment import BundleAdjustment
-from thesisrecon.metric.model import CENTRE, FOCAL, WIDTH, MetricEstimate
-from thesisrecon.metric.uncertainty import MIN_BLOCKS, USUAL_INFLATION
+from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._model import CENTRE, FOCAL, WIDTH, MetricEstimate
+from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.metric_bundle import MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics.metric_cameras import MetricCameras
@@ -45,7 +45,7 @@ MAX_OVERDISPERSION = 8.0
 
 
 def _subsample_inliers(model: MetricEstimate) -> I64:
-    """Return the inliers of every n-th point, at most about ``MAX_OBSERVATIONS``."""
+    """Inliers of every n-th point, at most about ``MAX_OBSERVATIONS``."""
     index = np.flatnonzero(model.inlier)
     point = model.tracks.point_index[index]
     chosen = np.zeros(model.tracks.n_points, dtype=bool)
@@ -53,67 +53,50 @@ def _subsample_inliers(model: MetricEstimate) -> I64:
     return np.asarray(index[chosen[point]], dtype=np.int64)
 
 
-@dataclass(frozen=True)
-class _PerViewFit:
-    """Bundle adjustments of the registered views with own intrinsics per view."""
+def _adjust_per_view(
+    model: MetricEstimate,
+    adjustment: BundleAdjustment,
+    columns: tuple[int, ...],
+    *,
+    focal_spread: float = np.inf,
+) -> MetricBundleResult:
+    """Adjust the registered views with own, unknown values in some columns of intrinsics, with covariances.
 
-    model: MetricEstimate
-    adjustment: BundleAdjustment
-    views: I64
-
-    def adjusted(self, columns: tuple[int, ...], *, focal_spread: float = np.inf) -> MetricBundleResult:
-        """Adjust with own, unknown values in some columns.
-
-        Parameters
-        ----------
-        columns : tuple of int
-            Columns of intrinsics with a value per view.
-        focal_spread : float
-            Relative scatter of the formerly shared focals about their common mean; inf: no prior.
-
-        Returns
-        -------
-        MetricBundleResult
-            The adjustment with covariances.
-        """
-        model, views, adjustment = self.model, self.views, replace(self.adjustment, hierarchical=None)
-        t, cameras, index = model.tracks, model.cameras, _subsample_inliers(model)
-        assert cameras.shared is not None
-        rows = cameras.group[views]
-        shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
-        prior, free = adjustment.row_prior(model), adjustment.free(model)
-        std = prior.std[rows].copy()
-        for column in columns:
-            shared[:, column], free[column] = own, True
-            longest = model.sizes[views].max(axis=1)
-            std[:, column] = CENTRE_STD * longest if column in CENTRE else np.inf
-        known = IntrinsicsPrior.unshared(prior.mean[rows], std)
-        if np.isfinite(focal_spread):
-            spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
-            known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
-        options = replace(adjustment, inflation=1.0).options(model, iterations=ITERATIONS)
-        return refine_metric_bundle(
-            MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
-            model.X,
-            Observations(np.searchsorted(views, t.view_index[index]), t.point_index[index], t.xy[index]),
-            free=free,
-            prior=known,
-            options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
-        )
+    ``focal_spread`` is the relative scatter of the formerly shared focals about their common mean; inf: no
+    prior.
+    """
+    views, adjustment = np.flatnonzero(model.registered), replace(adjustment, hierarchical=None)
+    t, cameras, index = model.tracks, model.cameras, _subsample_inliers(model)
+    assert cameras.shared is not None
+    rows = cameras.group[views]
+    shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
+    prior, free = adjustment.row_prior(model), adjustment.free(model)
+    std = prior.std[rows].copy()
+    for column in columns:
+        shared[:, column], free[column] = own, True
+        longest = model.sizes[views].max(axis=1)
+        std[:, column] = CENTRE_STD * longest if column in CENTRE else np.inf
+    known = IntrinsicsPrior.unshared(prior.mean[rows], std)
+    if np.isfinite(focal_spread):
+        spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
+        known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
+    options = replace(adjustment, inflation=1.0).options(model, iterations=ITERATIONS)
+    return refine_metric_bundle(
+        MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
+        model.X,
+        Observations(np.searchsorted(views, t.view_index[index]), t.point_index[index], t.xy[index]),
+        free=free,
+        prior=known,
+        options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
+    )
 
 
 @dataclass(frozen=True)
 class SharedCameraTest:
-    """Result of :func:`check_shared_cameras`.
+    """A sentence for each set of views that contradicts a shared value, and for each that cannot be tested.
 
-    Attributes
-    ----------
-    failed_checks : tuple of str
-        A sentence for each set of views that contradicts a shared value.
-    warnings : tuple of str
-        A sentence for each set of views that cannot be tested.
-    focal_std : ndarray (V,)
-        Relative standard deviation of focal lengths whose sharing cannot be tested, NaN elsewhere.
+    ``focal_std`` (V,) is the relative standard deviation of focal lengths whose sharing cannot be tested, NaN
+    elsewhere.
     """
 
     failed_checks: tuple[str, ...]
@@ -137,37 +120,27 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
     """Test shared focals, and shared or known principal points, against the images.
 
     A chi-square test of the decrease in cost with own values per view, for sets of at least three views.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-    adjustment : BundleAdjustment
-
-    Returns
-    -------
-    SharedCameraTest
-        Empty if nothing is shared.
     """
     views = np.flatnonzero(model.registered)
     focal_std = np.full(len(model.registered), np.nan)
     focals, centres = _sets(model, adjustment, views, FOCAL), _sets(model, adjustment, views, CENTRE[0])
     if not focals and not centres:
         return SharedCameraTest((), (), focal_std)
-    fit = _PerViewFit(model, adjustment, views)
     freed: tuple[int, ...] = (FOCAL,) if focals else ()
-    before, failed_checks, warnings = fit.adjusted(()), list[str](), list[str]()
+    failed_checks, warnings = list[str](), list[str]()
+    before = _adjust_per_view(model, adjustment, ())
     if focals:
-        alone = fit.adjusted(freed)
+        alone = _adjust_per_view(model, adjustment, freed)
         apart = [s for s in _contradicted(before, alone, focals, 1) if _focals_apart(alone, s)]
         failed_checks += [_focals_differ(views, alone, s) for s in apart]
         for s in [s for s in focals if s not in apart and _focal_std(alone, s).max() > MAX_OWN_FOCAL_STD]:
-            focal_std[views[s.places]] = _std_of_a_kind(model, fit, s)
+            focal_std[views[s.places]] = _std_of_a_kind(model, adjustment, s)
             warnings.append(_untestable(float(_focal_std(alone, s).max())))
         before = alone
         bent = [set(s.places.tolist()) for s in apart]
         centres = [s for s in centres if not any(b & set(s.places.tolist()) for b in bent)]
     if centres:
-        both = fit.adjusted((*freed, *CENTRE))
+        both = _adjust_per_view(model, adjustment, (*freed, *CENTRE))
         for s in _contradicted(before, both, centres, 2):
             off = _centres_off(model, adjustment, views, both, s)
             if np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
@@ -192,11 +165,8 @@ def _contradicted(
 ) -> list[_SharedGroup]:
     """All sets if own values reduce the cost by more than chance, else none."""
     saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
-    return (
-        sets
-        if saved > scipy.special.chdtri(values * sum(s.degrees_of_freedom for s in sets), FALSE_ALARM_RATE)
-        else []
-    )
+    freedom = values * sum(s.degrees_of_freedom for s in sets)
+    return sets if saved > scipy.special.chdtri(freedom, FALSE_ALARM_RATE) else []
 
 
 def _focal_std(alone: MetricBundleResult, s: _SharedGroup) -> F64:
@@ -212,11 +182,11 @@ def _focals_apart(alone: MetricBundleResult, s: _SharedGroup) -> bool:
     return bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE)
 
 
-def _std_of_a_kind(model: MetricEstimate, fit: _PerViewFit, s: _SharedGroup) -> float:
+def _std_of_a_kind(model: MetricEstimate, adjustment: BundleAdjustment, s: _SharedGroup) -> float:
     """Relative standard deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
     # Standard deviations are inflated afterwards, the assumed scatter must not be.
-    scattered = fit.adjusted((FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
-    rows = model.cameras.group[fit.views[s.places]]
+    scattered = _adjust_per_view(model, adjustment, (FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
+    rows = model.cameras.group[np.flatnonzero(model.registered)[s.places]]
     off = np.log(scattered.cameras.intrinsics[s.places, FOCAL] / model.cameras.intrinsics[rows, FOCAL])
     return float(np.hypot(_focal_std(scattered, s), off).max())
 
@@ -267,23 +237,13 @@ def _untestable(std: float) -> str:
 def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustment) -> list[str]:
     """Test given focal lengths against an adjustment without them.
 
-    Parameters
-    ----------
-    model : MetricEstimate
-    adjustment : BundleAdjustment
-
-    Returns
-    -------
-    list of str
-        A sentence for each focal length that differs by more than ``MAX_SIGMAS`` of both uncertainties.
+    Returns a sentence for each that differs by more than ``MAX_SIGMAS`` of both uncertainties.
     """
     prior = adjustment.prior
     given = np.flatnonzero(prior.focal_known & model.registered)
     if len(given) == 0:
         return []
-    number = _numbers_when_free(model, adjustment)
-    focal, std = _free_focals(model, adjustment, number)
-    number = number[model.cameras.group]
+    focal, std, number = _free_focals(model, adjustment)
     failed_checks = []
     for k in np.unique(number[given]):
         view = int(given[number[given] == k][0])
@@ -305,18 +265,6 @@ def inconsistent_principal_point(
     """Detect a deformed model by its principal point and the disagreement of blocks of the scene.
 
     Images cropped in the same way move the principal point, but their blocks agree.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-    adjustment : BundleAdjustment
-    scatter : BlockScatter
-        Scatter of the last adjustment.
-
-    Returns
-    -------
-    list of str
-        One sentence, or none.
     """
     views = np.flatnonzero(model.registered)
     if scatter.blocks < MIN_BLOCKS or not scatter.overdispersion > MAX_OVERDISPERSION:
@@ -337,34 +285,29 @@ def inconsistent_principal_point(
     ]
 
 
-def _numbers_when_free(model: MetricEstimate, adjustment: BundleAdjustment) -> I64:
-    """(G,) numbers of the focals without prior; known focals of one value share a number."""
-    assert model.cameras.shared is not None
-    prior, number = adjustment.row_prior(model), model.cameras.shared[:, FOCAL].copy()
-    known = np.flatnonzero(prior.std[:, FOCAL] == 0.0)
-    number[known] = number.max() + 1 + np.unique(prior.mean[known, FOCAL], return_inverse=True)[1].reshape(-1)
-    return np.asarray(number)
+def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment) -> tuple[F64, F64, I64]:
+    """Focals (V,) without prior, relative standard deviations, and numbers: equal ones share their focal.
 
-
-def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment, number: I64) -> tuple[F64, F64]:
-    """Focals (V,) and relative standard deviations (V,) without prior; equal ``number``: shared."""
-    t, cameras = model.tracks, model.cameras
-    index = _subsample_inliers(model)
+    Known focals of one value share a number.
+    """
+    t, cameras, index = model.tracks, model.cameras, _subsample_inliers(model)
     assert cameras.shared is not None
-    shared = cameras.shared.copy()
-    shared[:, FOCAL] = number
-    prior = adjustment.row_prior(model)
+    prior, shared = adjustment.row_prior(model), cameras.shared.copy()
+    known = np.flatnonzero(prior.std[:, FOCAL] == 0.0)
+    alike = np.unique(prior.mean[known, FOCAL], return_inverse=True)[1].reshape(-1)
+    shared[known, FOCAL] = shared[:, FOCAL].max() + 1 + alike
     std, free = prior.std.copy(), adjustment.free(model)
     std[:, FOCAL], free[FOCAL] = np.inf, True
+    options = adjustment.options(model, iterations=ITERATIONS)
     result = refine_metric_bundle(
-        replace(cameras, shared=shared), model.X,
-        Observations(t.view_index[index], t.point_index[index], t.xy[index]), free=free,
+        replace(cameras, shared=shared),
+        model.X,
+        Observations(t.view_index[index], t.point_index[index], t.xy[index]),
+        free=free,
         prior=IntrinsicsPrior.unshared(prior.mean, std),
-        options=replace(
-            adjustment.options(model, iterations=ITERATIONS), covariance=True, noise_floor_px=model.sigma_px
-        ),
-    )  # fmt: skip
+        options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
+    )
     focal = result.cameras.intrinsics[:, FOCAL]
     variance = np.maximum(result.intrinsics_covariance[:, FOCAL, FOCAL], 0.0)
     deviation = np.hypot(USUAL_INFLATION * np.sqrt(variance) / focal, STD_FLOOR)
-    return focal[cameras.group], deviation[cameras.group]
+    return focal[cameras.group], deviation[cameras.group], shared[cameras.group, FOCAL]

@@ -9,8 +9,8 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import counted
 from thesisrecon.geometry.resection import pose_from_three_points
-from thesisrecon.metric.adjustment import BundleAdjustment
-from thesisrecon.metric.model import (
+from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._model import (
     K1,
     WIDTH,
     MetricEstimate,
@@ -24,6 +24,8 @@ ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 """Factors tried on the focal length of a camera that shares it with no registered view."""
 WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
 """k1 is free from the start: without it gates would have to admit wrong points."""
+SAMPLES = 300
+"""Three-point samples of one camera."""
 MAX_ROUNDS = 6
 MIN_GAIN = 0.003
 """Increase of the inlier ratio below which the rounds end."""
@@ -31,29 +33,16 @@ MIN_INLIER_RATIO = 0.5
 
 
 def resect_calibrated(
-    X: F64, normalized: F64, *, threshold: float, rng: np.random.Generator, samples: int = 300
+    X: F64, normalized: F64, *, threshold: float, rng: np.random.Generator
 ) -> tuple[F64, F64, B8] | None:
     """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score.
 
-    Parameters
-    ----------
-    X : ndarray (M, 3)
-    normalized : ndarray (M, 2)
-        Their normalised image points.
-    threshold : float
-        Inlier threshold in the same unit.
-    rng : numpy.random.Generator
-    samples : int
-        Number of three-point samples.
-
-    Returns
-    -------
-    tuple (R, t, inliers) or None
-        R (3, 3), t (3,), inliers (M,); None below four points or if no sample has a pose.
+    ``normalized`` (M, 2) are the image points of ``X`` (M, 3), ``threshold`` is in their unit. Returns R, t
+    and inliers (M,), or None below four points or if no sample has a pose.
     """
     if len(X) < 4:
         return None
-    chosen = rng.random((samples, len(X))).argpartition(2, axis=1)[:, :3]
+    chosen = rng.random((SAMPLES, len(X))).argpartition(2, axis=1)[:, :3]
     rays = np.column_stack([normalized, np.ones(len(X))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     R, t, _ = pose_from_three_points(X[chosen], rays[chosen])
@@ -73,19 +62,14 @@ def _squared(R: F64, t: F64, X: F64, xy: F64) -> F64:
 
 
 def _register_missing_cameras(
-    model: MetricEstimate,
-    *,
-    sigmas: float,
-    min_points: int,
-    rng: np.random.Generator,
-    allowed: B8 | None = None,
+    model: MetricEstimate, *, sigmas: float, min_points: int, rng: np.random.Generator, allowed: B8
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Register every view that sees enough of the model by calibrated resection."""
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
     rejected: dict[int, str] = {}
     for view in np.argsort(-counts, kind="stable"):
-        if model.registered[view] or not (allowed is None or allowed[view]):
+        if model.registered[view] or not allowed[view]:
             continue
         if counts[view] < min_points:
             rejected[int(view)] = (
@@ -107,9 +91,11 @@ def _register(
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
     row = int(cameras.group[view])
-    focals = np.arange(len(cameras.intrinsics)) if cameras.shared is None else cameras.shared[:, 0]
+    assert cameras.shared is not None
+    focals = cameras.shared[:, 0]
     alone = not model.registered[focals[cameras.group] == focals[row]].any()
-    found = _pose_and_focal(model, k, row, 2.0 * sigmas * model.gate_px, (ZOOMS if alone else (1.0,), rng))
+    zooms = ZOOMS if alone else (1.0,)
+    found = _pose_and_focal(model, k, row, 2.0 * sigmas * model.gate_px, zooms, rng)
     support = 0 if found is None else int(found[3].sum())
     if found is None or support < min_points or support < 0.3 * len(k):
         return f"only {support} of its {counted(len(k), 'point')} are inliers of one camera"
@@ -122,7 +108,8 @@ def _register(
     Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
     registered = model.registered.copy()
     registered[view] = True
-    return model.with_cameras(replace(cameras, R=Rs, t=ts, intrinsics=intrinsics), registered)
+    cameras = replace(cameras, R=Rs, t=ts, intrinsics=intrinsics)
+    return replace(model, cameras=cameras, registered=registered)
 
 
 def _pose_and_focal(
@@ -130,11 +117,11 @@ def _pose_and_focal(
     k: I64,
     row: int,
     threshold_px: float,
-    tried: tuple[tuple[float, ...], np.random.Generator],
+    zooms: tuple[float, ...],
+    rng: np.random.Generator,
 ) -> tuple[F64, F64, F64, B8] | None:
     """R, t, intrinsics and inliers with most support of observations ``k`` over the tried focal lengths."""
     t, best = model.tracks, None
-    zooms, rng = tried
     for zoom in zooms:
         table = model.cameras.intrinsics.copy()
         table[row, 0] *= zoom
@@ -153,14 +140,8 @@ def _pose_and_focal(
 class MissingCameraRegistration:
     """Rounds of triangulation, resection and adjustment that register the missing cameras.
 
-    Parameters
-    ----------
-    gates : tuple of float
-        Gates in noise sigmas of the early and the late rounds.
-    min_angle : float
-        Smallest triangulation angle in radians.
-    min_points : int
-        Points of the model that a new camera must see.
+    ``gates`` of the early and the late rounds in noise sigmas; ``min_angle`` of triangulation in radians;
+    ``min_points`` of the model that a new camera must see.
     """
 
     gates: tuple[float, float]
@@ -172,19 +153,7 @@ class MissingCameraRegistration:
     ) -> tuple[MetricEstimate, dict[int, str]]:
         """Register missing cameras, and those again that disagree with the rest.
 
-        Parameters
-        ----------
-        model : MetricEstimate
-            The upgraded core.
-        adjustment : BundleAdjustment
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        model : MetricEstimate
-            The complete model.
-        rejected : dict
-            View -> reason for every view that was not registered.
+        Returns the complete model, and view -> reason for every view that was not registered.
         """
         model, rejected = self._grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
         suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)

@@ -22,27 +22,10 @@ FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8
 class MetricEstimate:
     """Metric cameras and points of one adjustment round.
 
-    Attributes
-    ----------
-    tracks : Tracks
-    sizes : ndarray (V, 2)
-        Image sizes (width, height).
-    cameras : MetricCameras
-        One entry per view, valid where ``registered``.
-    registered : ndarray (V,) of bool
-        Registered views.
-    X : ndarray (N, 3)
-        Points, zero where not ``valid``.
-    valid : ndarray (N,) of bool
-        Triangulated points.
-    inlier : ndarray (K,) of bool
-        Inlier observations in registered views.
-    sigma_px : float
-        Noise of the inliers.
-    loss_sigmas : float
-        Width of Huber's loss in sigmas.
-    tail : float
-        Width of the residuals' tail relative to normal noise; gates are widened by it.
+    ``sizes`` (V, 2) = (width, height); ``cameras`` has one entry per view, valid where ``registered`` (V,);
+    points ``X`` (N, 3) are zero where not ``valid`` (N,); ``inlier`` (K,) are inlier observations in
+    registered views of noise ``sigma_px``; ``loss_sigmas`` is the width of Huber's loss in sigmas, ``tail``
+    the width of the residuals' tail relative to normal noise, by which gates are widened.
     """
 
     tracks: Tracks
@@ -61,73 +44,21 @@ class MetricEstimate:
         """Noise times tail width: the unit of gates in sigmas."""
         return self.sigma_px * self.tail
 
-    def with_cameras(self, cameras: MetricCameras, registered: B8 | None = None) -> MetricEstimate:
-        """Return a copy with other cameras.
-
-        Parameters
-        ----------
-        cameras : MetricCameras
-            New cameras.
-        registered : ndarray (V,) of bool, optional
-            New mask; None: unchanged.
-
-        Returns
-        -------
-        MetricEstimate
-        """
-        return replace(
-            self, cameras=cameras, registered=self.registered if registered is None else registered
-        )
-
 
 def reproject_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) -> tuple[F64, F64]:
-    """Project the points of observations, with distortion.
-
-    Parameters
-    ----------
-    cameras : MetricCameras
-        Cameras of all views.
-    X : ndarray (N, 3)
-    view, point : ndarray (K,) of int
-        View and point of each observation.
-
-    Returns
-    -------
-    xy : ndarray (K, 2)
-        Pixels.
-    depth : ndarray (K,)
-        Depths in the camera frame.
-    """
+    """Pixels (K, 2), with distortion, and depths (K,) of the points of observations."""
     Y = np.einsum("kab,kb->ka", cameras.R[view], X[point]) + cameras.t[view]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         xy = Y[:, :2] / Y[:, 2:]
-        distortion = cameras.intrinsics[cameras.group[view], K1:]
-        return _apply_calibration(cameras, view, distort(xy, distortion)), Y[:, 2]
-
-
-def _apply_calibration(cameras: MetricCameras, view: I64, xy: F64) -> F64:
-    """Normalised image points to pixels."""
-    f, aspect, skew, cx, cy = cameras.intrinsics[cameras.group[view], :K1].T
-    return np.column_stack([f * xy[:, 0] + skew * xy[:, 1] + cx, aspect * f * xy[:, 1] + cy])
+        rows = cameras.intrinsics[cameras.group[view]]
+        xy = distort(xy, rows[:, K1:])
+        f, aspect, skew, cx, cy = rows[:, :K1].T
+        xy = np.column_stack([f * xy[:, 0] + skew * xy[:, 1] + cx, aspect * f * xy[:, 1] + cy])
+    return xy, Y[:, 2]
 
 
 def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
-    """Return the undistorted normalised image points of observations.
-
-    Parameters
-    ----------
-    cameras : MetricCameras
-        Cameras of all views.
-    view : ndarray (K,) of int
-        View of each observation.
-    xy : ndarray (K, 2)
-        Pixels.
-
-    Returns
-    -------
-    ndarray (K, 2)
-        Normalised image points.
-    """
+    """Undistorted normalised image points (K, 2) of observations ``xy`` (K, 2) px."""
     rows = cameras.intrinsics[cameras.group[view]]
     f, aspect, skew, cx, cy = rows[:, :K1].T
     y = (xy[:, 1] - cy) / (aspect * f)
@@ -140,20 +71,7 @@ def retriangulate_tracks(model: MetricEstimate, *, sigmas: float, min_angle: flo
     """Triangulate all tracks from the registered views and select the inliers.
 
     Observations are undistorted first. Points with outliers are triangulated again from their inliers.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        Cameras and tracks.
-    sigmas : float
-        Gate in noise sigmas.
-    min_angle : float
-        Smallest triangulation angle in radians.
-
-    Returns
-    -------
-    MetricEstimate
-        The model with new points and inliers.
+    ``sigmas`` is the gate in noise sigmas, ``min_angle`` the smallest triangulation angle in radians.
     """
     t = model.tracks
     near = np.flatnonzero(model.registered[t.view_index])
@@ -184,20 +102,7 @@ def _triangulate(poses: F64, xy: F64, view: I64, point: I64, n_points: int, loss
 
 
 def inlier_mask(model: MetricEstimate, *, sigmas: float) -> B8:
-    """Return the observations within the gate and in front of their camera, at any angle.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        Cameras and points.
-    sigmas : float
-        Gate in noise sigmas.
-
-    Returns
-    -------
-    ndarray (K,) of bool
-        Mask of the observations; False in views that are not registered.
-    """
+    """Observations (K,) within the gate and in front of their registered camera, at any angle."""
     t = model.tracks
     k = np.flatnonzero(model.registered[t.view_index])
     view, point = t.view_index[k], t.point_index[k]
@@ -210,47 +115,18 @@ def inlier_mask(model: MetricEstimate, *, sigmas: float) -> B8:
 
 
 def select_inliers(model: MetricEstimate, *, sigmas: float, min_angle: float) -> MetricEstimate:
-    """Update inliers and valid points.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        Cameras and points.
-    sigmas : float
-        Gate in noise sigmas.
-    min_angle : float
-        Smallest triangulation angle (rad) of a valid point, which also needs two inliers.
-
-    Returns
-    -------
-    MetricEstimate
-        The model with new ``inlier`` and ``valid``.
-    """
+    """Update inliers and valid points (two inliers and a triangulation angle above ``min_angle`` rad)."""
     t = model.tracks
     inlier = inlier_mask(model, sigmas=sigmas)
-    angle = _largest_angle(model, inlier)
-    valid = (np.bincount(t.point_index[inlier], minlength=t.n_points) >= 2) & (angle > min_angle)
+    centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
+    view, point = t.view_index[inlier], t.point_index[inlier]
+    angle = triangulation_angles(centres, view, point, model.X, t.n_points)
+    valid = (np.bincount(point, minlength=t.n_points) >= 2) & (angle > min_angle)
     return replace(model, inlier=inlier & valid[t.point_index], valid=valid)
 
 
-def _largest_angle(model: MetricEstimate, inlier: B8) -> F64:
-    t = model.tracks
-    centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
-    return triangulation_angles(centres, t.view_index[inlier], t.point_index[inlier], model.X, t.n_points)
-
-
 def residual_norms(model: MetricEstimate) -> F64:
-    """Return the reprojection residuals of the inliers.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-
-    Returns
-    -------
-    ndarray (number of inliers,)
-        Lengths in pixels.
-    """
+    """Lengths px of the reprojection residuals of the inliers."""
     t = model.tracks
     view, point = t.view_index[model.inlier], t.point_index[model.inlier]
     xy, _ = reproject_observations(model.cameras, model.X, view, point)
@@ -258,20 +134,9 @@ def residual_norms(model: MetricEstimate) -> F64:
 
 
 def truncated_cost(model: MetricEstimate, gate_px: float) -> float:
-    """Return the truncated quadratic cost, mean of min(r^2, gate^2) / gate^2 over all observations.
+    """Truncated quadratic cost, mean of min(r^2, gate^2) / gate^2 over all observations.
 
     Observations without a camera or a point cost 1, so that a model cannot win by rejecting observations.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-    gate_px : float
-        Truncation in pixels.
-
-    Returns
-    -------
-    float
-        Cost in [0, 1].
     """
     squared = np.ones(len(model.tracks.xy))
     squared[model.inlier] = np.minimum(residual_norms(model) ** 2 / gate_px**2, 1.0)
@@ -279,17 +144,7 @@ def truncated_cost(model: MetricEstimate, gate_px: float) -> float:
 
 
 def inlier_ratios(model: MetricEstimate) -> F64:
-    """Return the inlier ratio of each view.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-
-    Returns
-    -------
-    ndarray (V,)
-        Inliers over observations of valid points; 1 for a view without any.
-    """
+    """Inliers over observations of valid points in each view (V,); 1 for a view without any."""
     t = model.tracks
     seen = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
     good = np.bincount(t.view_index[model.inlier], minlength=t.n_views)
@@ -297,22 +152,10 @@ def inlier_ratios(model: MetricEstimate) -> F64:
 
 
 def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
-    """Return the parameter table of the intrinsics that views share.
+    """Row of intrinsics (V,) of each view, and the table (G, 8) of sharing: equal numbers share the value.
 
-    Views share a row if they share all unknown intrinsics and have the same prior. k2 and k3 are shared as
-    k1 is.
-
-    Parameters
-    ----------
-    prior : IntrinsicsPrior
-        Prior of the V views.
-
-    Returns
-    -------
-    group : ndarray (V,) of int
-        Row of each view.
-    shared : ndarray (G, 8) of int
-        Rows with equal numbers in a column share the value.
+    Views share a row if they share all unknown intrinsics and have the same prior. k2 and k3 are shared as k1
+    is.
     """
     moves = (prior.std > 0.0).any(axis=0)
     knowledge = np.nan_to_num(np.concatenate([prior.mean, prior.std], axis=1), nan=-1.0, posinf=-1.0)
@@ -326,24 +169,10 @@ def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
 def upgraded_model(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior, max_rotation_residual: float
 ) -> MetricEstimate | None:
-    """Upgrade a projective reconstruction to a metric model.
+    """Upgrade a projective reconstruction to a metric model; None if fewer than three cameras remain.
 
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    upgrade : Upgrade
-        Candidate calibration.
-    prior : IntrinsicsPrior
-        Prior of the views.
-    max_rotation_residual : float
-        Cameras C = K^-1 P H further from a scaled rotation (Frobenius norm of 3 C C' / tr(C C') - I) are
-        left out.
-
-    Returns
-    -------
-    MetricEstimate or None
-        None if fewer than three cameras remain.
+    Cameras C = K^-1 P H further than ``max_rotation_residual`` from a scaled rotation (Frobenius norm of
+    3 C C' / tr(C C') - I) are left out.
     """
     views = np.flatnonzero(reconstruction.registered)
     P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)

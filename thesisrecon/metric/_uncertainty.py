@@ -20,8 +20,8 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.adjustment import BundleAdjustment, HierarchicalPrior
-from thesisrecon.metric.model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
+from thesisrecon.metric._adjustment import BundleAdjustment, HierarchicalPrior
+from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.records import IntrinsicInterval
 
@@ -52,19 +52,9 @@ _COLUMNS = {
 
 
 def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
-    """Return the evidence for an inexact camera or noise model.
+    """Evidence for an inexact camera or noise model: 0 for normal noise only, 1 for certain lack of fit.
 
-    Parameters
-    ----------
-    scatter : BlockScatter
-        Overdispersion between blocks of the scene.
-    tail : float
-        Tail width of the residuals.
-
-    Returns
-    -------
-    float
-        0: normal noise only; 1: certain lack of fit, or too few blocks to measure it.
+    It is 1 too if too few blocks of the scene measure it; ``tail`` is the tail width of the residuals.
     """
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(scatter.overdispersion):
         return 1.0
@@ -73,7 +63,7 @@ def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
 
 
 def _std_floor(model: MetricEstimate, scatter: BlockScatter, floor_rel: float) -> F64:
-    """Return the lower bound of the standard deviations due to model error."""
+    """Lower bound of the standard deviations due to model error."""
     with np.errstate(divide="ignore", invalid="ignore"):
         alone = np.maximum(np.nan_to_num(scatter.variance / scatter.shared_variance), 1.0) ** 0.25
     units = np.ones_like(model.cameras.intrinsics)
@@ -83,18 +73,9 @@ def _std_floor(model: MetricEstimate, scatter: BlockScatter, floor_rel: float) -
 
 @dataclass(frozen=True)
 class PerCameraEstimates:
-    """Intrinsics of each camera from its own matches, before the hierarchical prior.
+    """Intrinsics (G, 8) of each camera from its own matches, without hierarchical prior; the focal as log f.
 
-    Attributes
-    ----------
-    value : ndarray (G, 8)
-        Estimates, the focal as log f.
-    std : ndarray (G, 8)
-        Standard deviations due to noise.
-    floor : ndarray (G, 8)
-        Standard deviations due to model error.
-    kind : ndarray (G,) of int
-        Kind of each camera, -1 for none.
+    ``std`` is due to noise, ``floor`` due to model error; ``kind`` (G,) of each camera, -1 for none.
     """
 
     value: F64
@@ -106,22 +87,10 @@ class PerCameraEstimates:
 def per_camera_estimates(
     model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter, floor_rel: float
 ) -> PerCameraEstimates:
-    """Return the intrinsics of each camera with their standard deviations.
+    """Intrinsics of each camera of a model that was adjusted without hierarchical prior.
 
-    Parameters
-    ----------
-    model : MetricEstimate
-        The model, adjusted without hierarchical prior.
-    adjustment : BundleAdjustment
-    scatter : BlockScatter
-        Scatter of the adjustment.
-    floor_rel : float
-        Lower bound of standard deviations due to model error, relative to the focal length.
-
-    Returns
-    -------
-    PerCameraEstimates
-        Cameras without a registered view have kind -1.
+    ``floor_rel`` is the lower bound of their standard deviations due to model error, relative to the focal
+    length. Cameras without a registered view have kind -1.
     """
     group = model.cameras.group
     first = np.unique(group, return_index=True)[1]
@@ -136,19 +105,10 @@ def per_camera_estimates(
 
 
 def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> HierarchicalPrior | None:
-    """Estimate how much the intrinsics of cameras of one kind scatter.
+    """Estimate how much the intrinsics of cameras of one kind scatter; None if no intrinsic has such a prior.
 
-    Parameters
-    ----------
-    own : PerCameraEstimates
-        Estimates of each camera by itself.
-    shared : ndarray (G, 8) of int
-        Which values the cameras share; kinds with fewer than ``MIN_MEMBERS`` distinct values get no prior.
-
-    Returns
-    -------
-    HierarchicalPrior or None
-        None if no intrinsic of any kind has one.
+    ``shared`` (G, 8): which values the cameras share. Kinds with fewer than ``MIN_MEMBERS`` distinct values
+    get no prior.
     """
     kinds = own.kind.copy()
     spread = np.full((len(kinds), WIDTH), np.inf)
@@ -170,18 +130,7 @@ def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> Hierarc
 
 
 def find_outliers(value: F64, std: F64) -> B8:
-    """Detect values far from the median in units of their noise and the scatter of all (MAD).
-
-    Parameters
-    ----------
-    value, std : ndarray (n,)
-        Values and their standard deviations.
-
-    Returns
-    -------
-    ndarray (n,) of bool
-        Whether a value is more than ``OUTLIER_SIGMAS`` away.
-    """
+    """Values more than ``OUTLIER_SIGMAS`` of their noise and the scatter of all (MAD) from the median."""
     off = np.abs(value - np.median(value))
     scatter = 1.4826 * float(np.median(off))
     return np.asarray(off > OUTLIER_SIGMAS * np.hypot(scatter, std))
@@ -190,19 +139,8 @@ def find_outliers(value: F64, std: F64) -> B8:
 def estimate_spread(value: F64, std: F64, total: F64) -> float:
     """Estimate the standard deviation tau of true values behind noisy ones by REML (Harville 1977).
 
-    Parameters
-    ----------
-    value : ndarray (n,)
-        Noisy values.
-    std : ndarray (n,)
-        Their noise.
-    total : ndarray (n,)
-        Noise and model error together.
-
-    Returns
-    -------
-    float
-        tau, at least ``MIN_SPREAD_SIGMAS`` times the median noise; inf for fewer than two values.
+    ``std`` is their noise, ``total`` noise and model error together. tau is at least ``MIN_SPREAD_SIGMAS``
+    times the median noise; inf for fewer than two values.
     """
     if len(value) < 2:
         return np.inf
@@ -221,20 +159,7 @@ def estimate_spread(value: F64, std: F64, total: F64) -> float:
 def apply_hierarchical_prior(
     model: MetricEstimate, adjustment: BundleAdjustment, hierarchical: HierarchicalPrior
 ) -> tuple[MetricEstimate, BundleAdjustment]:
-    """Add the hierarchical prior, and share k2 and k3 among cameras of one zoom setting.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-    adjustment : BundleAdjustment
-    hierarchical : HierarchicalPrior
-
-    Returns
-    -------
-    model : MetricEstimate
-        The model with new sharing.
-    adjustment : BundleAdjustment
-    """
+    """Add the hierarchical prior, and share k2 and k3 among cameras of one zoom setting."""
     assert model.cameras.shared is not None
     shared = model.cameras.shared.copy()
     for kind in np.unique(hierarchical.kind[hierarchical.kind >= 0]):
@@ -247,50 +172,21 @@ def apply_hierarchical_prior(
 
 @dataclass(frozen=True)
 class FocalShrinkage:
-    """How much each view's focal length was shrunk towards those of its kind.
+    """How much the focal length of each view (V,) was shrunk towards those of its kind.
 
-    Attributes
-    ----------
-    own_std : ndarray (V,)
-        Relative standard deviation from the view's own matches, model error included.
-    weight : ndarray (V,)
-        Weight of the own matches, tau^2 / (tau^2 + s^2); 1 without shrinkage.
+    ``own_std`` is the relative standard deviation from the view's own matches, model error included;
+    ``weight`` that of the own matches, tau^2 / (tau^2 + s^2); 1 without shrinkage.
     """
 
     own_std: F64
     weight: F64
 
     def is_shrunk(self, view: int, std: float) -> bool:
-        """Return whether the prior of the kind outweighs the view's own matches.
-
-        Parameters
-        ----------
-        view : int
-        std : float
-            Relative standard deviation stated for its focal length.
-
-        Returns
-        -------
-        bool
-            True if the stated value rests mainly on the other cameras.
-        """
+        """Whether a stated relative ``std`` rests mainly on the other cameras of the kind."""
         return bool(self.weight[view] < 0.5 and self.own_std[view] > std)
 
     def warnings(self, registered: Sequence[int], least: float) -> tuple[str, ...]:
-        """Return a sentence for each focal length that its own matches determine poorly.
-
-        Parameters
-        ----------
-        registered : sequence of int
-            Registered views.
-        least : float
-            Relative standard deviation above which a view is reported.
-
-        Returns
-        -------
-        tuple of str
-            Sentences that name views as ``#number``.
-        """
+        """A sentence for each view whose matches determine its focal worse than ``least`` (relative)."""
         return tuple(
             f"Image #{view}: its own matches determine the focal length only to {self.own_std[view]:.0%} "
             + (
@@ -306,22 +202,7 @@ class FocalShrinkage:
 def focal_shrinkage(
     own: PerCameraEstimates, hierarchical: HierarchicalPrior | None, group: I64
 ) -> FocalShrinkage:
-    """Return the shrinkage of each view's focal length.
-
-    Parameters
-    ----------
-    own : PerCameraEstimates
-        Estimates of each camera by itself.
-    hierarchical : HierarchicalPrior or None
-        Prior of the kinds.
-    group : ndarray (V,) of int
-        Camera of each view.
-
-    Returns
-    -------
-    FocalShrinkage
-        Own standard deviations and weights of the views.
-    """
+    """Shrinkage of the focal length of each view; ``group`` (V,) = camera of each view."""
     std = own.std[:, FOCAL]
     weight = np.ones(len(std))
     if hierarchical is not None:
@@ -341,28 +222,11 @@ def intrinsic_intervals(
     shrinkage: FocalShrinkage,
     noise_inflation: float = 1.0,
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
-    """Return value, standard deviation and source of each intrinsic of each view.
+    """Value, standard deviation and source of each intrinsic of each view; empty where not registered.
 
-    +- 1.96 std is a 95 % interval: the inflation contains Student's t for the number of blocks.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-    scatter : BlockScatter
-        Scatter of its last adjustment.
-    prior : IntrinsicsPrior
-        Prior of each row of intrinsics.
-    floor_rel : float
-        Lower bound of standard deviations due to model error, relative to the focal length.
-    shrinkage : FocalShrinkage
-        Shrinkage of the focal lengths.
-    noise_inflation : float
-        Factor on the noise in the weights of the adjustment.
-
-    Returns
-    -------
-    tuple of mapping
-        Per view the entries of ``MetricResult.intrinsics``; empty where not registered.
+    +- 1.96 std is a 95 % interval: the inflation contains Student's t for the number of blocks. ``prior`` is
+    that of each row of intrinsics, ``noise_inflation`` the factor on the noise in the weights of the
+    adjustment.
     """
     floors = _std_floor(model, scatter, floor_rel)
     answer: list[Mapping[str, IntrinsicInterval]] = []
@@ -381,9 +245,14 @@ def intrinsic_intervals(
             inflation, floor = _inflation(scatter, g, column), float(floors[g, column])
             measured = float(inflation * np.sqrt(variance))
             std = min(float(np.hypot(measured, floor)), float(prior.std[g, column]))
-            how = _source(measured, floor, inflation * noise_inflation)
-            if column == FOCAL and floor > measured:
-                how += f" of {floor:.1%}"
+            if floor > measured:
+                how = "bundle adjustment; the interval is the camera-model error floor"
+                how += f" of {floor:.1%}" if column == FOCAL else ""
+            else:
+                how = (
+                    f"bundle adjustment; standard deviation x {inflation * noise_inflation:.1f} "
+                    "from the scatter between blocks of the scene"
+                )
             if column == FOCAL and shrinkage.is_shrunk(view, std):
                 how = (
                     "shrunk towards the other cameras of its kind; own matches alone: "
@@ -400,16 +269,7 @@ def widen_unverified_focals(
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
     """Widen the intervals of shared focal lengths that the images cannot verify.
 
-    Parameters
-    ----------
-    intervals : sequence of mapping
-        Intervals of each view.
-    focal_std : ndarray (V,)
-        Relative standard deviation if the focal lengths differ a little, NaN elsewhere.
-
-    Returns
-    -------
-    tuple of mapping
+    ``focal_std`` (V,) is the relative standard deviation if the focal lengths differ a little, NaN elsewhere.
     """
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own, rel in zip(intervals, focal_std, strict=True):
@@ -426,12 +286,3 @@ def _inflation(scatter: BlockScatter, g: int, column: int) -> float:
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(ratio):
         return USUAL_INFLATION
     return float(np.sqrt(ratio) * scipy.special.stdtrit(scatter.blocks - 1, 0.975) / NORMAL_95)
-
-
-def _source(measured: float, floor: float, factor: float) -> str:
-    """Source of a standard deviation: the model-error floor, or bundle adjustment inflated by ``factor``."""
-    if floor > measured:
-        return "bundle adjustment; the interval is the camera-model error floor"
-    return (
-        f"bundle adjustment; standard deviation x {factor:.1f} from the scatter between blocks of the scene"
-    )

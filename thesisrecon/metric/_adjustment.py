@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric.model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
+from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
 from thesisrecon.numerics.block_scatter import BlockScatter, block_scatter
 from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics.noise import best_huber_width, noise_from_distances
@@ -27,14 +27,10 @@ FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
 
 @dataclass(frozen=True)
 class HierarchicalPrior:
-    """Hierarchical prior of cameras of one kind.
+    """Prior of cameras of one kind: ``kind`` (G,) of each row of intrinsics, -1 for none.
 
-    Attributes
-    ----------
-    kind : ndarray (G,) of int
-        Kind of each row of intrinsics, -1 for none.
-    spread : ndarray (G, 8)
-        Standard deviation of each intrinsic about the mean of its kind (relative for the focal, inf = none).
+    ``spread`` (G, 8) is the standard deviation of each intrinsic about the mean of its kind (relative for the
+    focal, inf = none).
     """
 
     kind: I64
@@ -45,18 +41,9 @@ class HierarchicalPrior:
 class BundleAdjustment:
     """Settings of the bundle adjustments of one metric stage.
 
-    Parameters
-    ----------
-    prior : IntrinsicsPrior
-        Prior of the V views.
-    lens_std : float
-        Prior standard deviation of k2 and k3 about 0; 0 fixes them at 0.
-    noise_floor_px : float
-        Lower bound of the measured noise.
-    hierarchical : HierarchicalPrior, optional
-        Prior of cameras of one kind; None before it is estimated.
-    inflation : float
-        Factor on the noise in the weights, for correlated residuals.
+    ``lens_std`` is the prior standard deviation of k2 and k3 about 0 (0 fixes them), ``noise_floor_px`` the
+    lower bound of the measured noise, ``inflation`` a factor on the noise in the weights, for correlated
+    residuals.
     """
 
     prior: IntrinsicsPrior
@@ -65,21 +52,8 @@ class BundleAdjustment:
     hierarchical: HierarchicalPrior | None = None
     inflation: float = 1.0
 
-    def options(self, model: MetricEstimate, *, iterations: int = 0) -> BundleOptions:
-        """Return weights and loss for the noise of a model.
-
-        Parameters
-        ----------
-        model : MetricEstimate
-            Its noise and loss width are used.
-        iterations : int
-            Maximum number of iterations.
-
-        Returns
-        -------
-        BundleOptions
-            Options of :func:`~thesisrecon.numerics.metric_bundle.refine_metric_bundle`.
-        """
+    def options(self, model: MetricEstimate, *, iterations: int) -> BundleOptions:
+        """Weights and loss for the noise of a model."""
         return BundleOptions(
             sigma_px=self.inflation * model.sigma_px,
             loss_px=model.loss_sigmas * model.sigma_px,
@@ -87,24 +61,13 @@ class BundleAdjustment:
         )
 
     def row_prior(self, model: MetricEstimate) -> IntrinsicsPrior:
-        """Return the prior of each row of the model's intrinsics.
-
-        Parameters
-        ----------
-        model : MetricEstimate
-
-        Returns
-        -------
-        IntrinsicsPrior
-            One row per row of ``model.cameras.intrinsics``, 8 columns.
-        """
+        """Prior of each row of ``model.cameras.intrinsics``, 8 columns."""
         group = model.cameras.group
         first = np.unique(group, return_index=True)[1]
         mean, std = np.zeros((len(first), WIDTH)), np.zeros((len(first), WIDTH))
         mean[:, : K1 + 1], std[:, : K1 + 1] = self.prior.mean[first], self.prior.std[first]
-        std[:, K1 + 1 :] = np.where(self._shares_a_lens(model) & (std[:, K1] > 0.0), self.lens_std, 0.0)[
-            :, None
-        ]
+        has_lens = _shares_a_lens(model) & (std[:, K1] > 0.0)
+        std[:, K1 + 1 :] = np.where(has_lens, self.lens_std, 0.0)[:, None]
         # Images may be crops: a principal point far from its mean gets the weight of a Cauchy distribution,
         # (1 + (off / std)^2)^-1.
         for column in CENTRE:
@@ -112,24 +75,13 @@ class BundleAdjustment:
             std[:, column] = np.hypot(std[:, column], np.where(std[:, column] > 0.0, off, 0.0))
         unknown = ~np.isfinite(mean)
         mean[unknown] = model.cameras.intrinsics[unknown]
-        if self.hierarchical is None:
+        kinds = self.hierarchical
+        if kinds is None:
             return IntrinsicsPrior.unshared(mean, std)
-        return IntrinsicsPrior.unshared(
-            mean, std, kind=self.hierarchical.kind, spread=self.hierarchical.spread
-        )
+        return IntrinsicsPrior.unshared(mean, std, kind=kinds.kind, spread=kinds.spread)
 
     def free(self, model: MetricEstimate) -> B8:
-        """Return which of the 8 intrinsics are estimated in some camera.
-
-        Parameters
-        ----------
-        model : MetricEstimate
-
-        Returns
-        -------
-        ndarray (8,) of bool
-            Mask of the columns.
-        """
+        """Which of the 8 intrinsics are estimated in some camera."""
         return np.asarray((self.row_prior(model).std > 0.0).any(axis=0))
 
     def run(
@@ -137,26 +89,8 @@ class BundleAdjustment:
     ) -> tuple[MetricEstimate, MetricBundleResult]:
         """Adjust the model to its inliers and measure the noise again.
 
-        Parameters
-        ----------
-        model : MetricEstimate
-            Start.
-        free : ndarray (8,) of bool, optional
-            Intrinsics that may move; None: all that the prior leaves open.
-        iterations : int
-            Maximum number of iterations.
-
-        Returns
-        -------
-        model : MetricEstimate
-            The adjusted model.
-        result : MetricBundleResult
-            The bundle adjustment's own result.
-
-        Raises
-        ------
-        StageFailure
-            If fewer than ``MIN_OBSERVATIONS`` inliers are left.
+        Only the intrinsics ``free`` (8,) move, by default all that the prior leaves open. Raises StageFailure
+        if fewer than ``MIN_OBSERVATIONS`` inliers are left.
         """
         prior, moves = self.row_prior(model), self.free(model)
         result = refine_metric_bundle(
@@ -169,22 +103,19 @@ class BundleAdjustment:
         )
         norms = np.linalg.norm(result.residual_px, axis=1)
         sigma = max(noise_from_distances(norms), self.noise_floor_px)
-        model = replace(model, cameras=result.cameras, X=result.X, sigma_px=sigma)
-        loss = _best_loss(result.residual_px, sigma)
-        return replace(model, loss_sigmas=loss, tail=tail_width(norms, sigma)), result
+        width = best_huber_width(np.abs(result.residual_px).ravel(), sigma)
+        model = replace(
+            model,
+            cameras=result.cameras,
+            X=result.X,
+            sigma_px=sigma,
+            loss_sigmas=min(width / sigma, MAX_LOSS_SIGMAS),
+            tail=tail_width(norms, sigma),
+        )
+        return model, result
 
     def scatter(self, model: MetricEstimate) -> BlockScatter:
-        """Measure how far blocks of the scene disagree about the cameras.
-
-        Parameters
-        ----------
-        model : MetricEstimate
-
-        Returns
-        -------
-        BlockScatter
-            Covariance of the cameras and its inflation by the blocks.
-        """
+        """Covariance of the cameras, and how far blocks of the scene disagree about them."""
         return block_scatter(
             model.cameras,
             model.X,
@@ -194,16 +125,16 @@ class BundleAdjustment:
             noise=(self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px),
         )
 
-    def _shares_a_lens(self, model: MetricEstimate) -> B8:
-        """(G,) rows whose k2 and k3 at least ``MIN_VIEWS_PER_LENS`` registered views share."""
-        assert model.cameras.shared is not None
-        lens = np.unique(model.cameras.shared[:, K1 + 1], return_inverse=True)[1].reshape(-1)
-        views = np.bincount(lens[model.cameras.group[model.registered]], minlength=int(lens.max()) + 1)
-        return np.asarray(views[lens] >= MIN_VIEWS_PER_LENS)
+
+def _shares_a_lens(model: MetricEstimate) -> B8:
+    """(G,) rows whose k2 and k3 at least ``MIN_VIEWS_PER_LENS`` registered views share."""
+    assert model.cameras.shared is not None
+    lens = np.unique(model.cameras.shared[:, K1 + 1], return_inverse=True)[1].reshape(-1)
+    views = np.bincount(lens[model.cameras.group[model.registered]], minlength=int(lens.max()) + 1)
+    return np.asarray(views[lens] >= MIN_VIEWS_PER_LENS)
 
 
 def _inlier_observations(model: MetricEstimate) -> Observations:
-    """Return the inlier observations."""
     t, k = model.tracks, np.flatnonzero(model.inlier)
     if len(k) < MIN_OBSERVATIONS:
         raise StageFailure(
@@ -215,28 +146,10 @@ def _inlier_observations(model: MetricEstimate) -> Observations:
     return Observations(t.view_index[k], t.point_index[k], t.xy[k])
 
 
-def _best_loss(residual_px: F64, sigma: float) -> float:
-    """Return the width of Huber's loss with the least predicted variance."""
-    width = best_huber_width(np.abs(residual_px).ravel(), sigma)
-    return min(width / sigma, MAX_LOSS_SIGMAS)
-
-
 def tail_width(norms: F64, sigma: float) -> float:
-    """Return the tail width of residual lengths relative to normal noise, from their 90 % quantile.
+    """Tail width, 1 to 3, of residual lengths px relative to normal noise, from their 90 % quantile.
 
     Correct matches have a tail wider than their core suggests: a gate in sigmas of the core would reject it.
-
-    Parameters
-    ----------
-    norms : ndarray (K,)
-        Residual lengths (px).
-    sigma : float
-        Noise of the core (px).
-
-    Returns
-    -------
-    float
-        Factor from 1 to 3.
     """
     wide = float(np.quantile(norms, 0.9)) / RAYLEIGH_90
     return float(np.clip(wide / sigma, 1.0, 3.0))
@@ -246,16 +159,6 @@ def with_initial_gate(model: MetricEstimate) -> MetricEstimate:
     """Widen loss and gates to the residuals before the first adjustment.
 
     ``sigma_px`` stays: a larger one would give the prior too much weight.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-        The upgraded model.
-
-    Returns
-    -------
-    MetricEstimate
-        The model with new ``tail`` and ``loss_sigmas``.
     """
     norms = residual_norms(model)
     norms = norms[np.isfinite(norms)]

@@ -6,14 +6,14 @@ pipeline replaces it by the file name.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.metric.model import MetricEstimate, inlier_mask, reproject_observations, residual_norms
-from thesisrecon.metric.uncertainty import USUAL_INFLATION
+from thesisrecon.metric._model import MetricEstimate, inlier_mask, reproject_observations, residual_norms
+from thesisrecon.metric._uncertainty import USUAL_INFLATION
 from thesisrecon.numerics.noise import MAD_FACTOR, noise_from_distances
 from thesisrecon.numerics.partial_bundle import refine_pose
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
@@ -47,21 +47,11 @@ MAX_OWN_SIGMAS = 5.0
 class PerViewChecks:
     """Measurements of each view (V,), NaN where not registered or not measurable.
 
-    Attributes
-    ----------
-    inlier_ratio : ndarray
-        Inlier ratio of the triangulable observations.
-    confirmed : ndarray
-        The same for points that two or more other views determine; two-view points fit any two cameras along
-        their epipolar lines.
-    behind : ndarray
-        Share of observations whose point lies behind the camera.
-    noise_px : ndarray
-        Noise of one coordinate, corrected for the redundancy of the points.
-    focal_off, aspect_off : ndarray
-        Log ratio of the view's own focal length (aspect), from its points alone, to the model's.
-    focal_off_std, aspect_off_std : ndarray
-        Their standard deviations.
+    ``inlier_ratio`` of the triangulable observations; ``confirmed`` the same for points that two or more
+    other views determine (two-view points fit any two cameras along their epipolar lines); ``behind`` the
+    share of observations whose point lies behind the camera; ``noise_px`` of one coordinate, corrected for
+    the redundancy of the points; ``focal_off`` the log ratio of the view's own focal length, from its points
+    alone, to the model's.
     """
 
     inlier_ratio: F64
@@ -70,28 +60,28 @@ class PerViewChecks:
     noise_px: F64
     focal_off: F64
     focal_off_std: F64
-    aspect_off: F64
-    aspect_off_std: F64
+
+    @property
+    def noise_ratio(self) -> F64:
+        """Noise of each view over the median of all."""
+        known = self.noise_px[np.isfinite(self.noise_px)]
+        return np.asarray(self.noise_px / max(float(np.median(known)), 1e-9) if len(known) else self.noise_px)
+
+    @property
+    def focal_off_sigmas(self) -> F64:
+        """Own focal offset in its standard deviations."""
+        return np.asarray(np.abs(self.focal_off) / np.maximum(USUAL_INFLATION * self.focal_off_std, 1e-9))
 
 
 def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
-    """Measure every registered view.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-    sigmas : float
-        Gate of inliers in noise sigmas.
-
-    Returns
-    -------
-    PerViewChecks
-    """
+    """Measure every registered view; ``sigmas`` is the gate of inliers in noise sigmas."""
     t = model.tracks
     n = t.n_views
     agree = inlier_mask(model, sigmas=sigmas)
     near = triangulable_observations(model)
-    fixed = _fixed_by_others(model, agree)
+    # Points that are inliers in two or more other views.
+    count = np.bincount(t.point_index[agree], minlength=t.n_points)
+    fixed = count[t.point_index] - agree >= 2
     known = near & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
     _, depth = reproject_observations(model.cameras, model.X, t.view_index, t.point_index)
     own = [_own_camera(model, view, np.flatnonzero(agree & (t.view_index == view))) for view in range(n)]
@@ -105,17 +95,7 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
 
 
 def triangulable_observations(model: MetricEstimate) -> B8:
-    """Return the observations whose points can be triangulated.
-
-    Parameters
-    ----------
-    model : MetricEstimate
-
-    Returns
-    -------
-    ndarray (K,) of bool
-        Observations of points seen by two or more registered views with a baseline between them.
-    """
+    """Observations (K,) of points seen by two or more registered views with a baseline between them."""
     t = model.tracks
     near = model.registered[t.view_index]
     seen = np.bincount(t.point_index[near], minlength=t.n_points)
@@ -143,13 +123,6 @@ def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
     return np.where(all_ > 0, right / np.maximum(all_, 1), np.nan)
 
 
-def _fixed_by_others(model: MetricEstimate, agree: B8) -> B8:
-    """(K,) whether an observation's point is an inlier in two or more other views."""
-    t = model.tracks
-    count = np.bincount(t.point_index[agree], minlength=t.n_points)
-    return np.asarray(count[t.point_index] - agree >= 2)
-
-
 def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
     """Estimate the noise of one coordinate in each view."""
     t, cameras = model.tracks, model.cameras
@@ -175,11 +148,10 @@ def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
     return noise
 
 
-def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, float, float, float]:
-    """Own log focal and log aspect offsets of a view with standard deviations; NaN with few observations."""
-    nothing = (np.nan,) * 4
+def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, float]:
+    """Own log focal offset of a view and its standard deviation; NaN with few observations."""
     if not model.registered[view] or len(index) < MIN_OBSERVATIONS:
-        return nothing
+        return np.nan, np.nan
     index = index[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]
     t, cameras = model.tracks, model.cameras
     X, xy = model.X[t.point_index[index]], t.xy[index]
@@ -193,16 +165,10 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
             cameras.R[view], cameras.t[view], intrinsics, X, xy, free=free, loss_px=2.0 * noise, iterations=10
         )
     except ValueError:
-        return nothing
+        return np.nan, np.nan
     left = max(noise_from_distances(np.linalg.norm(fit.residual_px, axis=1)), 1e-3)
-    std = left * np.sqrt(np.maximum(np.diag(fit.covariance)[6:8], 0.0))
-    focal = float(np.log(fit.intrinsics[0] / intrinsics[0]))
-    return (
-        focal,
-        float(std[0]),
-        float(np.log(max(fit.intrinsics[1] / intrinsics[1], 1e-9))),
-        float(std[1]),
-    )
+    std = left * np.sqrt(max(fit.covariance[6, 6], 0.0))
+    return float(np.log(fit.intrinsics[0] / intrinsics[0])), float(std)
 
 
 def self_check(
@@ -212,38 +178,26 @@ def self_check(
     *,
     sigmas: float,
 ) -> tuple[dict[str, float], list[str]]:
-    """Check a metric model.
+    """Check a metric model: measured numbers by name, and a sentence for each failed check (none: trusted).
 
-    Parameters
-    ----------
-    model : MetricEstimate
-    calibration : SelfCalibration
-        The self-calibration it came from.
-    intervals : sequence of mapping
-        Intrinsics of each view as in ``MetricResult``.
-    sigmas : float
-        Gate of inliers in noise sigmas.
-
-    Returns
-    -------
-    check : dict
-        Measured numbers by name.
-    failed_checks : list of str
-        A sentence for each failed check; empty if the result is trusted.
+    ``intervals`` are the intrinsics of each view as in ``MetricResult``; ``sigmas`` is the gate of inliers.
     """
     check = _whole(model, calibration, intervals, sigmas)
     views = check_views(model, sigmas=sigmas)
-    own = _own_focal_sigmas(views)
-    check |= {
-        "explained_share_worst_view": _worst(views.inlier_ratio, np.nanmin),
-        "confirmed_share_worst_view": _worst(views.confirmed, np.nanmin),
-        "behind_share_worst_view": _worst(views.behind, np.nanmax),
-        "noise_ratio_worst_view": _worst(_noise_ratio(views), np.nanmax),
-        "own_focal_off_worst_view": _worst(np.abs(views.focal_off), np.nanmax),
-        "own_focal_sigmas_worst_view": _worst(own, np.nanmax),
+    worst = {
+        "explained_share_worst_view": (views.inlier_ratio, np.nanmin),
+        "confirmed_share_worst_view": (views.confirmed, np.nanmin),
+        "behind_share_worst_view": (views.behind, np.nanmax),
+        "noise_ratio_worst_view": (views.noise_ratio, np.nanmax),
+        "own_focal_off_worst_view": (np.abs(views.focal_off), np.nanmax),
+        "own_focal_sigmas_worst_view": (views.focal_off_sigmas, np.nanmax),
     }
-    failed_checks = list(calibration.reasons) if not calibration.identifiable else []
-    return check, [*failed_checks, *_failed_views(views, model), *_failed_model(check)]
+    check |= {
+        name: float(edge(values)) if np.isfinite(values).any() else np.nan
+        for name, (values, edge) in worst.items()
+    }
+    failed = list(calibration.reasons) if not calibration.identifiable else []
+    return check, [*failed, *_failed_views(views, model), *_failed_model(check)]
 
 
 def _whole(
@@ -278,24 +232,8 @@ def _whole(
     }
 
 
-def _worst(values: F64, worst: Callable[[F64], float]) -> float:
-    """The worst of the values that are known; NaN where none is."""
-    return float(worst(values)) if np.isfinite(values).any() else np.nan
-
-
-def _noise_ratio(views: PerViewChecks) -> F64:
-    """Noise of each view over the median of all."""
-    known = views.noise_px[np.isfinite(views.noise_px)]
-    return np.asarray(views.noise_px / max(float(np.median(known)), 1e-9) if len(known) else views.noise_px)
-
-
-def _own_focal_sigmas(views: PerViewChecks) -> F64:
-    return np.asarray(np.abs(views.focal_off) / np.maximum(USUAL_INFLATION * views.focal_off_std, 1e-9))
-
-
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> list[str]:
     """A sentence for the views that fail a check; each view is reported once, for its most severe failure."""
-    ratio, own = _noise_ratio(views), _own_focal_sigmas(views)
     left = model.registered.copy()
 
     def take(bad: B8) -> I64:
@@ -303,34 +241,31 @@ def _failed_views(views: PerViewChecks, model: MetricEstimate) -> list[str]:
         left[taken] = False
         return taken
 
-    failed_checks = []
+    failed = []
     if len(wrong := take(views.confirmed < MIN_CONFIRMED_RATIO)):
-        failed_checks.append(
+        failed.append(
             f"{_named(wrong)}: only {_range(views.confirmed[wrong])} of the points that other images "
             "determine agree: the camera or its matches are wrong. Leave the image out, or add images "
             "between it and the rest"
         )
     if len(wrong := take(~(views.inlier_ratio >= MIN_INLIER_RATIO))):
-        failed_checks.append(
+        failed.append(
             f"{_named(wrong)}: only {_range(views.inlier_ratio[wrong])} of the matches are inliers: the "
             "camera, or one it is matched with, is wrong"
         )
     if len(wrong := take(views.behind > MAX_BEHIND)):
-        failed_checks.append(
-            f"{_named(wrong)}: {_range(views.behind[wrong])} of the points lie behind the camera"
-        )
-    for view in take((np.abs(views.focal_off) > MAX_OWN_FOCAL) & (own > MAX_OWN_SIGMAS)):
+        failed.append(f"{_named(wrong)}: {_range(views.behind[wrong])} of the points lie behind the camera")
+    for view in take((np.abs(views.focal_off) > MAX_OWN_FOCAL) & (views.focal_off_sigmas > MAX_OWN_SIGMAS)):
         off = float(np.expm1(views.focal_off[view]))
-        failed_checks.append(
+        failed.append(
             f"Image #{view}: its own focal length is {abs(off):.1%} "
             f"{'longer' if off > 0.0 else 'shorter'} than the model's: it is from another camera or zoomed, "
             "or the model is deformed"
         )
-    if len(wrong := take(ratio > MAX_NOISE_RATIO)):
-        failed_checks.append(
-            f"{_named(wrong)}: reprojection noise is {ratio[wrong].max():.1f} times that of the other images"
-        )
-    return failed_checks
+    if len(wrong := take(views.noise_ratio > MAX_NOISE_RATIO)):
+        ratio = views.noise_ratio[wrong].max()
+        failed.append(f"{_named(wrong)}: reprojection noise is {ratio:.1f} times that of the other images")
+    return failed
 
 
 def _named(views: I64) -> str:
@@ -348,24 +283,21 @@ def _range(shares: F64) -> str:
 
 def _failed_model(check: Mapping[str, float]) -> list[str]:
     """A sentence for each failed check of the model as a whole."""
-    failed_checks = []
     low, high = check["focal_min_long_sides"], check["focal_max_long_sides"]
-    if not (_FOCAL_RANGE[0] < low and high < _FOCAL_RANGE[1]):
-        failed_checks.append(
-            f"Focal lengths of {low:.2f} to {high:.2f} long sides are implausible for images"
-        )
-    if not check["focal_std_rel_max"] < _MAX_FOCAL_STD:
-        failed_checks.append(f"A focal length is determined only to {check['focal_std_rel_max']:.0%}")
-    if not check["explained_share"] > _MIN_MODEL_INLIER_RATIO:
-        failed_checks.append(f"Only {check['explained_share']:.0%} of the triangulable matches are inliers")
-    if not check["sigma_rel"] < _MAX_SIGMA_REL:
-        failed_checks.append(f"The reprojection noise is {check['sigma_rel']:.2%} of the long side")
-    shift = check["principal_shift_max_long_sides"]
-    if not shift < _MAX_PRINCIPAL_SHIFT:
-        failed_checks.append(f"A principal point is {shift:.0%} of the long side away from the image centre")
-    if not check["focal_change_since_calibration"] < _MAX_FOCAL_CHANGE:
-        failed_checks.append(
-            f"Bundle adjustment changed a focal length by {check['focal_change_since_calibration']:.0%} "
-            "since self-calibration"
-        )
-    return failed_checks
+    std, share, noise = check["focal_std_rel_max"], check["explained_share"], check["sigma_rel"]
+    shift, change = check["principal_shift_max_long_sides"], check["focal_change_since_calibration"]
+    passed = {
+        f"Focal lengths of {low:.2f} to {high:.2f} long sides are implausible for images": (
+            _FOCAL_RANGE[0] < low and high < _FOCAL_RANGE[1]
+        ),
+        f"A focal length is determined only to {std:.0%}": std < _MAX_FOCAL_STD,
+        f"Only {share:.0%} of the triangulable matches are inliers": share > _MIN_MODEL_INLIER_RATIO,
+        f"The reprojection noise is {noise:.2%} of the long side": noise < _MAX_SIGMA_REL,
+        f"A principal point is {shift:.0%} of the long side away from the image centre": (
+            shift < _MAX_PRINCIPAL_SHIFT
+        ),
+        f"Bundle adjustment changed a focal length by {change:.0%} since self-calibration": (
+            change < _MAX_FOCAL_CHANGE
+        ),
+    }
+    return [sentence for sentence, ok in passed.items() if not ok]
