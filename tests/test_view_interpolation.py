@@ -1,7 +1,6 @@
 """Views between photographs: the front door, what is refused, and the command."""
 
 import json
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,12 +12,14 @@ import pytest
 import thesisrecon
 from tests.synthetic import texture
 from thesisrecon import view_interpolation as between
+from thesisrecon.cli import _view_sequences as sequences
 from thesisrecon.cli.main import run_command
-from thesisrecon.cli.view_files import METHODS, InterpolateOptions, interpolate_images
+from thesisrecon.cli.view_files import InterpolateOptions, interpolate_images
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.records import Image
-from thesisrecon.views.interpolation import pair_from_rectified, with_full_confidence
+from thesisrecon.records import DisparityMap, Image
+from thesisrecon.views.interpolation import InterpolatedPair
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
 SHIFT = 6
@@ -31,6 +32,14 @@ def wall():
     return rgb[:, :160], np.ascontiguousarray(rgb[:, SHIFT : 160 + SHIFT])
 
 
+def known_map(d):
+    return DisparityMap(d, np.ones(d.shape, np.float32), 0.0)
+
+
+def interpolated_sequence(images, frames):
+    return sequences.interpolated_sequence(images, frames, config=PipelineConfig(), seed=0)
+
+
 def photograph(seed, size=(40, 30)):
     rgb = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     return Image(f"{seed}.jpg", rgb, size)
@@ -40,7 +49,7 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
     left, right = wall
     expected = np.roll(left, -SHIFT // 2, axis=1)[:, 10:-20].astype(int)
     d = np.full(left.shape[:2], SHIFT, dtype=np.float32)
-    for known in (None, d, (d, d), (with_full_confidence(d), with_full_confidence(d))):
+    for known in (None, d, (d, d), (known_map(d), known_map(d))):
         view = thesisrecon.interpolate_view(left, right, 0.5, disparity=known)
         assert view.dtype == np.uint8
         assert view.shape == left.shape
@@ -80,9 +89,9 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         between.prepare_pair(a, photograph(2, (40, 20)))
     with pytest.raises(UsageError, match="same image"):
-        between.interpolated_sequence([a, b, a], 3)
+        interpolated_sequence([a, b, a], 3)
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
-        between.interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
+        interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
     # Forward motion: both epipoles at (21, 14).
     e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
     xy = rng.uniform((0.0, 0.0), (40.0, 30.0), (100, 2))
@@ -124,10 +133,10 @@ def still(monkeypatch):
 
     def prepare_pair(first, second, **_):
         related.append((first.name, second.name))
-        nothing = with_full_confidence(np.zeros(first.rgb.shape[:2], np.float32))
-        return pair_from_rectified(first.rgb, second.rgb, (nothing, nothing))
+        nothing = known_map(np.zeros(first.rgb.shape[:2], np.float32))
+        return InterpolatedPair((first.rgb, second.rgb), np.stack([np.eye(3)] * 2), nothing, nothing)
 
-    monkeypatch.setattr(between, "prepare_pair", prepare_pair)
+    monkeypatch.setattr(sequences, "prepare_pair", prepare_pair)
     return related
 
 
@@ -136,7 +145,7 @@ def even(name, level):
 
 
 def test_a_film_of_two_goes_from_one_to_the_other(still):
-    film = between.interpolated_sequence([even("a", 100), even("b", 200)], 5)
+    film = interpolated_sequence([even("a", 100), even("b", 200)], 5)
     assert film.captions[1] == "75 % a, 25 % b"
     assert film.frame_metadata[4] == {"weights": [0.0, 1.0]}
     levels = [float(film.draw(k, 1).mean()) for k in range(5)]
@@ -147,14 +156,11 @@ def test_a_film_of_two_goes_from_one_to_the_other(still):
     assert film.metadata["violating_monotonicity"] == [0.0]
     assert "0.0 % of these violate monotonicity" in film.notes[0]
     assert still == [("a", "b")]
-    assert between.interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ("50 % a, 50 % b",)
-    for photographs, frames in (([even("a", 1)], 3), ([even("a", 1), even("b", 2)], 0)):
-        with pytest.raises(ValueError, match="2 or 3"):
-            between.interpolated_sequence(photographs, frames)
+    assert interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ("50 % a, 50 % b",)
 
 
 def test_a_film_of_three_crosses_the_triangle(still):
-    film = between.interpolated_sequence([even("a", 100), even("b", 200), even("c", 50)], 5)
+    film = interpolated_sequence([even("a", 100), even("b", 200), even("c", 50)], 5)
     assert [place["weights"] for place in film.frame_metadata] == [
         [1.0, 0.0, 0.0],
         [0.75, 0.25, 0.0],
@@ -168,23 +174,6 @@ def test_a_film_of_three_crosses_the_triangle(still):
     assert levels[4] == 50.0
     assert levels[1] < levels[2] > levels[3] > levels[4]
     assert len(film.notes) == 2
-
-
-def test_a_place_in_the_triangle_is_reached_by_interpolating_twice(still):
-    three = [even("a", 100), even("b", 100), even("c", 100)]
-    for weights, expected in (
-        ((0.2, 0.3, 0.5), [("a", "b"), ("the interpolated view", "c")]),
-        ((0.4, 0.6, 0.0), [("a", "b")]),
-        ((0.5, 0.0, 0.5), [("the interpolated view", "c")]),
-        ((0.0, 0.0, 1.0), []),
-        ((0.0, 0.0, 1.0 - 1e-7), []),
-    ):
-        still.clear()
-        np.testing.assert_array_equal(between.interpolate_three(three, weights), 100)
-        assert still == expected
-    for weights in ((0.5, 0.6, 0.0), (-0.1, 0.6, 0.5)):
-        with pytest.raises(ValueError, match="sum to 1"):
-            between.interpolate_three(three, weights)
 
 
 def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
@@ -264,9 +253,3 @@ def test_option_errors_name_the_fault(tmp_path):
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(UsageError, match="which this command did not create"):
         interpolate_images(tmp_path, InterpolateOptions(photographs))
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_has_its_film(method):
-    module, name = METHODS[method]
-    assert callable(getattr(import_module(module), name))

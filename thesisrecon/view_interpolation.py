@@ -1,9 +1,8 @@
-"""Views between two or three images: rectified, matched and interpolated (thesis, section 1.2)."""
+"""Views between two images: rectified, matched and interpolated (thesis, section 1.2)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -18,13 +17,7 @@ from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.features_to_tracks import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo.semi_global import match_both_sides
-from thesisrecon.views.interpolation import (
-    InterpolatedPair,
-    check_monotonicity,
-    disparity_of_right,
-    pair_from_rectified,
-    with_full_confidence,
-)
+from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right
 
 _COARSE = 4
 """Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""
@@ -32,33 +25,7 @@ _MIN_SIDE = 64
 """Smaller images are not reduced."""
 _MIN_CONFIDENCE = 0.3
 """Of the disparities that determine the largest one."""
-_MIDWAY = 0.5
-_MIDDLE_NAME = "the interpolated view"
-
-
-@dataclass(frozen=True)
-class ViewSequence:
-    """Views that are computed on demand.
-
-    Parameters
-    ----------
-    captions : tuple of str
-        One per view.
-    draw : callable
-        Takes the number of a view and of threads; returns (H, W, 3) uint8.
-    notes : tuple of str
-        Sentences about the whole sequence, without full stops.
-    metadata : dict
-        Numbers about the whole sequence, for ``frames.json``.
-    frame_metadata : tuple of dict
-        Numbers about each view.
-    """
-
-    captions: tuple[str, ...]
-    draw: Callable[[int, int], U8]
-    notes: tuple[str, ...]
-    metadata: dict[str, Any]
-    frame_metadata: tuple[dict[str, Any], ...]
+_SIDE_BY_SIDE = "take the images side by side, not one behind the other"
 
 
 def interpolate_view(
@@ -69,7 +36,7 @@ def interpolate_view(
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
     config: PipelineConfig | None = None,
 ) -> U8:
-    """Interpolate the view between two rectified images.
+    """Interpolate the view between two rectified images (thesis, section 1.2; Seitz and Dyer 1995).
 
     Parameters
     ----------
@@ -99,10 +66,6 @@ def interpolate_view(
     Notes
     -----
     For many views of one pair call :func:`prepare_rectified_pair` once.
-
-    References
-    ----------
-    Thesis, section 1.2; S. Seitz and C. Dyer, "Physically-valid view synthesis by image interpolation", 1995.
 
     Examples
     --------
@@ -136,24 +99,23 @@ def prepare_rectified_pair(
     -------
     InterpolatedPair
         Its ``view(s)`` interpolates.
-
-    Raises
-    ------
-    ValueError
-        If the images differ in size or the disparities in shape.
     """
-    images = [_pixels(side) for side in (left, right)]
-    if images[0].shape != images[1].shape:
-        raise ValueError(
-            f"rectified images must have one size; got {images[0].shape[:2]} and {images[1].shape[:2]}"
-        )
+    images = _pixels(left), _pixels(right)
+    shapes = [image.shape[:2] for image in images]
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"rectified images must have one size; got {shapes[0]} and {shapes[1]}")
     if disparity is None:
-        maps = _matched_both_ways(images[0], images[1], config or PipelineConfig())
+        maps = _matched_both_ways(*images, config or PipelineConfig())
     elif isinstance(disparity, tuple):
         maps = _as_map(disparity[0]), _as_map(disparity[1])
     else:
         maps = _as_map(disparity), disparity_of_right(_as_map(disparity))
-    return pair_from_rectified(images[0], images[1], maps)
+    for found in maps:
+        if found.disparity.shape != shapes[0]:
+            raise ValueError(
+                f"disparities must have the shape of the images {shapes[0]}; got {found.disparity.shape}"
+            )
+    return InterpolatedPair(images, np.stack([np.eye(3)] * 2), *maps)
 
 
 def _pixels(side: Any) -> U8:
@@ -165,18 +127,18 @@ def _pixels(side: Any) -> U8:
 
 
 def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
+    """The disparities as a map; plain ones have confidence 1 where they are known."""
     if isinstance(disparity, DisparityMap):
         return disparity
     disparity = np.asarray(disparity, dtype=np.float32)
     if disparity.ndim != 2:
         raise ValueError(f"disparities must be (H, W), or a tuple of two such maps; got {disparity.shape}")
-    return with_full_confidence(disparity)
+    return DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.0)
 
 
 def _matched_both_ways(left: U8, right: U8, config: PipelineConfig) -> tuple[DisparityMap, DisparityMap]:
     most = _largest_disparity(left, right, config)
-    match = partial(config.dense.match_rectified, max_disparity_px=most)
-    return match_both_sides(match, left, right)
+    return match_both_sides(partial(config.dense.match_rectified, max_disparity_px=most), left, right)
 
 
 def _largest_disparity(left: U8, right: U8, config: PipelineConfig) -> float:
@@ -184,8 +146,7 @@ def _largest_disparity(left: U8, right: U8, config: PipelineConfig) -> float:
     widest = 0.5 * float(left.shape[1])
     if min(left.shape[:2]) < _MIN_SIDE:
         return widest
-    small = [_reduced(image) for image in (left, right)]
-    found = config.dense.match_rectified(small[0], small[1], max_disparity_px=widest / _COARSE)
+    found = config.dense.match_rectified(_reduced(left), _reduced(right), max_disparity_px=widest / _COARSE)
     sure = found.disparity[np.isfinite(found.disparity) & (found.confidence > _MIN_CONFIDENCE)]
     if len(sure) == 0:
         return widest
@@ -229,7 +190,7 @@ def prepare_pair(
         become rows, and every view in between is one of the images, scaled.
     """
     config = config or PipelineConfig()
-    _check_images((first, second))
+    require_comparable_images((first, second))
     pair = match_pair(first.rgb, second.rgb, config=config, seed=seed)
     _require_sideways_motion(pair, (first, second))
     try:
@@ -237,16 +198,21 @@ def prepare_pair(
     except StageFailure as failure:
         if "polar" not in failure.advice:
             raise
-        advice = "take the images side by side, not one behind the other"
-        raise StageFailure(failure.reason, failure.evidence, advice) from None
+        raise StageFailure(failure.reason, failure.evidence, _SIDE_BY_SIDE) from None
     H1, H2 = getattr(dense.frame, "H1", None), getattr(dense.frame, "H2", None)
     assert H1 is not None
     assert H2 is not None
     return InterpolatedPair((first.rgb, second.rgb), np.stack([H1, H2]), dense.left, dense.right)
 
 
-def _check_images(images: Sequence[Image]) -> None:
-    """Require images of one size and of different content."""
+def require_comparable_images(images: Sequence[Image]) -> None:
+    """Raise ``UsageError`` unless the images have one size and different content.
+
+    Parameters
+    ----------
+    images : sequence of Image
+        The images.
+    """
     for first, second in combinations(images, 2):
         if first.size != second.size:
             sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
@@ -268,126 +234,5 @@ def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None
             raise StageFailure(
                 "there is no view between the images: the camera moved towards the scene or away from it",
                 f"the epipole lies at ({x:.0f}, {y:.0f}) px, inside {image.name}",
-                "take the images side by side, not one behind the other",
+                _SIDE_BY_SIDE,
             )
-
-
-def interpolated_sequence(
-    images: Sequence[Image], frames: int, *, config: PipelineConfig | None = None, seed: int = 0
-) -> ViewSequence:
-    """Interpolate from the first image to the second and, of three, across their triangle.
-
-    With three images the path leads half way to the second image and from there to the third.
-
-    Parameters
-    ----------
-    images : sequence of Image
-        Two or three images of one size.
-    frames : int
-        Number of views.
-    config : PipelineConfig, optional
-        The default configuration if None.
-    seed : int
-        Random seed.
-
-    Returns
-    -------
-    ViewSequence
-        The views.
-
-    Raises
-    ------
-    ValueError
-        For another number of images, or fewer than one frame.
-    UsageError, StageFailure
-        As :func:`prepare_pair`.
-    """
-    if len(images) not in (2, 3) or frames < 1:
-        raise ValueError(f"a sequence needs 2 or 3 images and a frame; got {len(images)} and {frames}")
-    _check_images(images)
-    path = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([_MIDWAY])
-    pair = prepare_pair(images[0], images[1], config=config, seed=seed)
-    weights: list[tuple[float, ...]]
-    if len(images) == 2:
-        weights = [(1.0 - float(s), float(s)) for s in path]
-        legs, stops = [pair], [(0, float(s)) for s in path]
-    else:
-        middle = Image(_MIDDLE_NAME, pair.view(_MIDWAY), images[0].original_size)
-        legs = [pair, prepare_pair(middle, images[2], config=config, seed=seed)]
-        stops = [(0, float(u)) if u <= _MIDWAY else (1, float(2.0 * u - 1.0)) for u in path]
-        weights = [
-            (1 - s, s, 0.0) if leg == 0 else (_MIDWAY * (1 - s), _MIDWAY * (1 - s), s) for leg, s in stops
-        ]
-
-    def draw(k: int, threads: int) -> U8:
-        leg, s = stops[k]
-        return legs[leg].view(s, threads=threads)
-
-    names = [image.name for image in images]
-    violations = [check_monotonicity(leg.left.disparity).share for leg in legs]
-    metadata = {
-        "images": names,
-        "violating_monotonicity": violations,
-        "known": [leg.known for leg in legs],
-    }
-    captions = tuple(
-        ", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights
-    )
-    notes = tuple(
-        f"{100.0 * leg.known:.0f} % of the pixels have a correspondence; {100.0 * share:.1f} % of these "
-        "violate monotonicity, where near surfaces occlude far ones"
-        for share, leg in zip(violations, legs, strict=True)
-    )
-    return ViewSequence(captions, draw, notes, metadata, tuple({"weights": list(w)} for w in weights))
-
-
-def interpolate_three(
-    images: Sequence[Image],
-    weights: tuple[float, float, float],
-    *,
-    config: PipelineConfig | None = None,
-    seed: int = 0,
-) -> U8:
-    """Interpolate a view inside the triangle of three images by interpolating twice (section 1.2).
-
-    First between two images, then between the result and the third. The pixels are resampled twice, and the
-    errors of both steps add up.
-
-    Parameters
-    ----------
-    images : sequence of Image
-        Three images of one size.
-    weights : tuple of float
-        Barycentric coordinates: not negative, sum 1.
-    config : PipelineConfig, optional
-        The default configuration if None.
-    seed : int
-        Random seed.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8
-        The view.
-
-    Raises
-    ------
-    ValueError
-        For other weights or numbers of images.
-    UsageError, StageFailure
-        As :func:`prepare_pair`.
-    """
-    w = np.asarray(weights, dtype=np.float64)
-    if len(images) != 3 or w.shape != (3,) or not (w >= 0.0).all() or abs(w.sum() - 1.0) > 1e-6:
-        raise ValueError(f"weights of three images must not be negative and must sum to 1; got {weights}")
-    first, second, third = images
-    # Below this the weights of the first two images are rounding.
-    if w[0] + w[1] <= 1e-6:
-        return third.rgb.copy()
-    s = float(w[1] / (w[0] + w[1]))
-    rgb = {0.0: first.rgb, 1.0: second.rgb}.get(s)
-    if rgb is None:
-        rgb = prepare_pair(first, second, config=config, seed=seed).view(s)
-    if w[2] <= 0.0:
-        return rgb.copy()
-    middle = Image(_MIDDLE_NAME, rgb, first.original_size)
-    return prepare_pair(middle, third, config=config, seed=seed).view(float(w[2]))

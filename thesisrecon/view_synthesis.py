@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,19 +10,14 @@ from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.intrinsics import prior_from_options
 from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.features_to_tracks import match_pair
 from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
-from thesisrecon.view_interpolation import ViewSequence
+from thesisrecon.views.trilinear import VirtualCamera, default_intrinsics, pair_from_fundamental
 from thesisrecon.views.trilinear_synthesis import TensorSynthesis, prepare_synthesis
-from thesisrecon.views.virtual_camera import VirtualCamera, default_intrinsics, pair_from_fundamental
-
-_BEYOND = 0.5
-"""Baselines by which a sequence extends beyond either camera."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +28,8 @@ class MatchedImages:
     ----------
     images : tuple of Image
         At working size.
-    pair : TwoView
-        Verified matches and F.
-    dense : RectifiedPair
-        Dense correspondences.
+    pair, dense : TwoView, RectifiedPair
+        Verified matches and F; dense correspondences.
     exif_focal_px : ndarray (2,)
         Focal lengths of the originals from EXIF, NaN = unknown.
     """
@@ -45,7 +37,7 @@ class MatchedImages:
     images: tuple[Image, Image]
     pair: TwoView
     dense: RectifiedPair
-    exif_focal_px: F64 = field(default_factory=lambda: np.full(2, np.nan))
+    exif_focal_px: F64
 
 
 def match_images(
@@ -177,75 +169,6 @@ def synthesize_view(
         match_images(image1, image2, config=config, seed=seed), K=K, config=config
     )
     return views.render(VirtualCamera(rotation, translation, views.pair.K2, views.sizes[1]))
-
-
-def trilinear_sequence(
-    images: Sequence[Image], frames: int, *, config: PipelineConfig | None = None, seed: int = 0
-) -> ViewSequence:
-    """Compute views on the line through both cameras, from half a baseline before to half beyond.
-
-    Parameters
-    ----------
-    images : sequence of Image
-        Two images.
-    frames : int
-        Number of views.
-    config : PipelineConfig, optional
-        The default configuration if None.
-    seed : int
-        Random seed.
-
-    Returns
-    -------
-    ViewSequence
-        The views.
-
-    Raises
-    ------
-    UsageError
-        For another number of images, or the same image twice.
-    StageFailure
-        As :func:`match_images` and :func:`prepare_trilinear_views`.
-    ValueError
-        For fewer than one frame.
-    """
-    if len(images) != 2:
-        raise UsageError(f"the trilinear tensor takes 2 images; got {len(images)}")
-    first, second = images
-    if np.array_equal(first.rgb, second.rgb):
-        raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
-    matched = match_images(first, second, config=config, seed=seed)
-    views = prepare_trilinear_views(matched, config=config)
-    path = views.along(frames, beyond=_BEYOND)
-    positions = np.linspace(-_BEYOND, 1.0 + _BEYOND, frames).tolist() if frames > 1 else [0.5]
-
-    def draw(k: int, threads: int) -> U8:
-        return views.render(path[k], threads=threads)
-
-    K = views.pair.K1, views.pair.K2
-    metadata = {
-        "images": [first.name, second.name],
-        "K": list(K),
-        "second_from_first": {"R": views.pair.R, "t": views.pair.t},
-    }
-    frame_metadata = tuple(
-        {"baselines": s, "R": camera.rotation, "t": camera.translation, "K": camera.K}
-        for s, camera in zip(positions, path, strict=True)
-    )
-    captions = tuple(_caption(s, first.name, second.name) for s in positions)
-    note = (
-        f"the focal lengths are assumed to be {K[0][0, 0]:.0f} and {K[1][0, 0]:.0f} px; lengths are in units "
-        "of the distance between the two cameras"
-    )
-    return ViewSequence(captions, draw, (note,), metadata, frame_metadata)
-
-
-def _caption(s: float, first: str, second: str) -> str:
-    if s < 0.0:
-        return f"{-s:.2f} baselines before {first}"
-    if s > 1.0:
-        return f"{s - 1.0:.2f} baselines beyond {second}"
-    return f"{100.0 * s:.0f} % of the way from {first} to {second}"
 
 
 def _given_intrinsics(K: ArrayLike | None) -> F64 | None:

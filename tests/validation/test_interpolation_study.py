@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import texture
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
+from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.rectification import rectify_cameras
-from thesisrecon.views.interpolation import InterpolatedPair, with_full_confidence
+from thesisrecon.views.interpolation import InterpolatedPair
 from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
 
 SIZE = (160, 120)
@@ -24,7 +25,7 @@ def pair():
     frame = rectify_cameras(first, second, SIZE, SIZE, method="least-distortion")
     image, nothing = (
         np.zeros((SIZE[1], SIZE[0], 3), np.uint8),
-        with_full_confidence(np.zeros((9, 9), np.float32)),
+        DisparityMap(np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32), 0.0),
     )
     H = np.stack([frame.H1, frame.H2])
     return InterpolatedPair((image, image), H, nothing, nothing), (first, second), centres

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thesisrecon.views.virtual_camera import CalibratedPair
+from thesisrecon.views.trilinear import CalibratedPair
 from validation.studies.tensor_views import Measured, Place, draw, linear_range
 
 

@@ -7,15 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import texture
 from thesisrecon.geometry.camera_matrix import compose_camera, project
-from thesisrecon.views.interpolation import (
-    IntermediateFrame,
-    InterpolatedPair,
-    check_monotonicity,
-    disparity_of_right,
-    pair_from_rectified,
-    with_full_confidence,
-)
-from thesisrecon.views.interpolation_kernels import (
+from thesisrecon.records import DisparityMap
+from thesisrecon.views._interpolation_kernels import (
     NEAR,
     ONE_SURFACE_PX,
     REACH,
@@ -29,11 +22,26 @@ from thesisrecon.views.interpolation_kernels import (
     intermediate_positions,
     mark_crossings,
 )
+from thesisrecon.views.interpolation import (
+    IntermediateFrame,
+    InterpolatedPair,
+    detect_monotonicity_violations,
+    disparity_of_right,
+)
 
 SIZE = (160, 120)
 
 
 SHIFTS = np.linspace(0.0, 1.0, 7)
+
+
+def sure(disparity):
+    """Disparities that are certain where they are known."""
+    return DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.0)
+
+
+def rectified_pair(left, right, maps):
+    return InterpolatedPair((left, right), np.stack([np.eye(3)] * 2), *maps)
 
 
 def cloud(rng):
@@ -154,7 +162,7 @@ def disparities(stage):
         inside = (at >= 0) & (at < SIZE[0])
         other = np.take_along_axis(there, np.clip(at, 0, SIZE[0] - 1), axis=1)
         seen = inside & (np.abs(other - here) < 1.0)
-        found.append(with_full_confidence(np.where(seen, here, np.nan).astype(np.float32)))
+        found.append(sure(np.where(seen, here, np.nan).astype(np.float32)))
     return found[0], found[1]
 
 
@@ -169,7 +177,7 @@ def psnr(a, b):
 
 def test_views_between_are_those_of_the_scene(stage):
     left, right = photographs(stage)
-    pair = pair_from_rectified(left, right, disparities(stage))
+    pair = rectified_pair(left, right, disparities(stage))
     for s in (0.25, 0.5, 0.8):
         truth = stage.at(s)[0]
         view = pair.view(s, threads=2)
@@ -180,7 +188,7 @@ def test_views_between_are_those_of_the_scene(stage):
         # Away from the rims of the box only rounding is left.
         off = np.abs(view - truth).max(axis=-1)
         assert np.quantile(off, 0.9) < 3.0
-        colors, near = pair.seen(s)
+        colors, near = pair._seen(s)
         assert np.isnan(colors[..., 0]).mean() < 0.02
         known = np.isfinite(near)
         # At the left border lies what only the first photograph shows, at a guessed depth.
@@ -215,7 +223,7 @@ def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage
 
 def test_a_turned_view_is_the_view_through_a_homography(stage):
     left, right = photographs(stage)
-    pair = pair_from_rectified(left, right, disparities(stage))
+    pair = rectified_pair(left, right, disparities(stage))
     shift = np.array([[1.0, 0.0, 7.0], [0.0, 1.0, -3.0], [0.0, 0.0, 1.0]])
     for s in (0.0, 0.5):
         off = np.abs(pair.view(s, turn=shift)[2:-8, 12:-2] - pair.view(s)[5:-5, 5:-9].astype(float))
@@ -227,7 +235,7 @@ def test_exposures_are_interpolated_too(stage):
     left, right = photographs(stage)
     factor = np.array([0.8, 0.7, 0.75])
     darker = np.rint(right * factor).astype(np.uint8)
-    pair = pair_from_rectified(left, darker, disparities(stage))
+    pair = rectified_pair(left, darker, disparities(stage))
     np.testing.assert_allclose(pair.gain, factor, rtol=0.02)
     view = pair.view(0.5)
     off = np.abs(view - stage.at(0.5)[0] * np.sqrt(factor)).max(axis=-1)
@@ -235,23 +243,18 @@ def test_exposures_are_interpolated_too(stage):
 
 
 def test_monotonicity_fails_with_a_thin_thing_in_front(stage):
-    wall = check_monotonicity(np.full((20, 50), 3.0, np.float32))
-    assert wall.holds
-    assert wall.known == 1.0
+    assert not detect_monotonicity_violations(np.full((20, 50), 3.0, np.float32)).any()
     d = np.full((20, 50), 3.0, np.float32)
     d[:, 30:33] = 13.0
-    thin = check_monotonicity(d)
+    violated = detect_monotonicity_violations(d)
     # Its left rim passes nine pixels and meets the tenth.
-    assert thin.violated[:, 30:33].all()
-    assert thin.violated[:, 21:30].all()
-    assert thin.share == pytest.approx(12 / 50)
-    slanted = check_monotonicity((3.0 + 0.3 * np.arange(50) * np.ones((20, 1))).astype(np.float32))
-    assert slanted.holds
+    assert violated[:, 21:33].all()
+    assert violated.mean() == pytest.approx(12 / 50)
+    slanted = (3.0 + 0.3 * np.arange(50) * np.ones((20, 1))).astype(np.float32)
+    assert not detect_monotonicity_violations(slanted).any()
     # What both photographs see of a broad thing keeps its order; with what it hides it does not.
-    assert check_monotonicity(disparities(stage)[0].disparity).holds
-    assert not check_monotonicity(stage.at(0.0)[1].astype(np.float32)).holds
-    with pytest.raises(ValueError, match=r"\(H, W\)"):
-        check_monotonicity(np.zeros(4, np.float32))
+    assert not detect_monotonicity_violations(disparities(stage)[0].disparity).any()
+    assert detect_monotonicity_violations(stage.at(0.0)[1].astype(np.float32)).any()
 
 
 def test_the_right_side_follows_from_the_left(stage):
@@ -265,21 +268,21 @@ def test_the_right_side_follows_from_the_left(stage):
 def test_a_pair_of_which_nothing_is_known_dissolves():
     rng = np.random.default_rng(0)
     left, right = (rng.integers(0, 256, (20, 30, 3), dtype=np.uint8) for _ in range(2))
-    nothing = with_full_confidence(np.full((20, 30), np.nan, np.float32))
-    view = pair_from_rectified(left, right, (nothing, nothing)).view(0.25)
+    nothing = sure(np.full((20, 30), np.nan, np.float32))
+    view = rectified_pair(left, right, (nothing, nothing)).view(0.25)
     np.testing.assert_allclose(view, 0.75 * left + 0.25 * right, atol=0.6)
 
 
 def test_wrong_calls_are_refused():
-    image, nothing = np.zeros((20, 30, 3), np.uint8), with_full_confidence(np.zeros((20, 30), np.float32))
-    pair = pair_from_rectified(image, image, (nothing, nothing))
+    image, nothing = np.zeros((20, 30, 3), np.uint8), sure(np.zeros((20, 30), np.float32))
+    pair = rectified_pair(image, image, (nothing, nothing))
     for s in (-0.1, 1.01, np.nan):
         with pytest.raises(ValueError, match="from 0"):
             pair.view(s)
     with pytest.raises(ValueError, match="one size"):
-        pair_from_rectified(image, image[:-1], (nothing, nothing))
-    with pytest.raises(ValueError, match="shape"):
-        pair_from_rectified(image, image, (nothing, with_full_confidence(np.zeros((20, 29), np.float32))))
+        rectified_pair(image, image[:-1], (nothing, nothing))
+    with pytest.raises(ValueError, match="one shape"):
+        rectified_pair(image, image, (nothing, sure(np.zeros((20, 29), np.float32))))
 
 
 def field(seed, shape=(14, 23), holes=0.1):

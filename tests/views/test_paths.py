@@ -13,9 +13,9 @@ from tests.surface.sphere import K, looking_at_origin
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.views.paths import (
+    _fit_to_size,
+    _geometric_median,
     estimate_up,
-    fit_to_size,
-    geometric_median,
     interpolate_cameras,
     orbit,
     sample_surface,
@@ -70,7 +70,7 @@ def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed):
     turn = Rotation.random(random_state=seed).as_matrix()
     shift, X = rng.normal(size=3), ball(800, seed)
     path = orbit(moved(cameras, turn, shift), X @ turn.T + shift, 12)
-    middle, up = geometric_median(X @ turn.T + shift), turn @ UP
+    middle, up = _geometric_median(X @ turn.T + shift), turn @ UP
     for camera in path:
         np.testing.assert_allclose(project(camera, middle), [79.5, 59.5], atol=1e-6)
         assert abs(camera.R[0] @ up) < 0.06
@@ -218,7 +218,7 @@ def test_coincident_cameras_and_one_camera_stand_still():
 def test_other_shapes_of_pictures_show_all_that_the_camera_saw():
     camera = ring(np.array([0.3]))[0]
     for size in ((320, 240), (400, 100), (30, 90)):
-        other = fit_to_size(camera, size)
+        other = _fit_to_size(camera, size)
         rays = np.linalg.inv(camera.K) @ np.array(
             [[-0.5, 159.5, -0.5, 159.5], [-0.5, -0.5, 119.5, 119.5], [1, 1, 1, 1]]
         )

@@ -15,7 +15,7 @@ from thesisrecon.surface.linear import surface_from_depth
 from thesisrecon.surface.texture_atlas import TextureAtlas
 from thesisrecon.surface.texture_views import color_vertices
 from thesisrecon.views.image_similarity import GREY, covered_pixels, match_exposure, psnr_db, ssim, ssim_map
-from thesisrecon.views.render import Light, Shading, render, without_texture
+from thesisrecon.views.render import Light, Shading, render
 
 K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
 
@@ -85,10 +85,8 @@ def test_nothing_is_seen_where_nothing_is():
     assert render(needle, camera).valid.sum() <= 64
 
 
-def test_a_shape_alone_has_no_colours():
-    mesh = wall(colors=np.zeros((4, 3), dtype=np.uint8))
-    assert without_texture(mesh).colors is None
-    assert (render(without_texture(mesh), Camera(K, np.eye(3), np.zeros(3), SIZE)).color == 200).all()
+def test_a_shape_alone_is_grey():
+    assert (render(wall(), Camera(K, np.eye(3), np.zeros(3), SIZE)).color == 200).all()
 
 
 def test_wrong_calls_are_refused():

@@ -8,17 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project
-from thesisrecon.geometry.three_view import estimate_tensor_linear, tensor_from_cameras, unit_tensor
+from thesisrecon.geometry.three_view import tensor_from_cameras, unit_tensor
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.views.trilinear import seed_of_three, seed_of_two
-from thesisrecon.views.trilinear_synthesis import transfer_rows
-from thesisrecon.views.virtual_camera import (
-    AnyRotation,
+from thesisrecon.views.trilinear import (
     CalibratedPair,
-    SmallRotation,
     default_intrinsics,
     pair_from_fundamental,
+    seed_of_three,
+    seed_of_two,
 )
+from thesisrecon.views.trilinear_synthesis import _transfer_rows
 
 exact = settings(derandomize=True, deadline=None, max_examples=60)
 
@@ -96,13 +95,13 @@ def test_the_pair_of_f_is_the_one_that_made_it(turn, baseline):
     np.testing.assert_allclose(found.t, pair.t, atol=1e-9)
 
 
-@pytest.mark.parametrize("orientation", [AnyRotation(), SmallRotation()])
-def test_wrong_intrinsics_leave_f_and_both_photographs_as_they_are(orientation):
+@pytest.mark.parametrize("small", [False, True])
+def test_wrong_intrinsics_leave_f_and_both_photographs_as_they_are(small):
     """New views are then right but for a projective transform: what both see stays one point."""
     pair = _pair((0.02, -0.1, 0.03), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(1))
-    F, guess = _fundamental(pair), default_intrinsics((1000, 700), focal=1.3)
-    found = pair_from_fundamental(F, xy1, xy2, K1=guess, K2=guess, orientation=orientation)
+    F, guess = _fundamental(pair), calibration_matrix(1300.0, 1300.0, 499.5, 349.5)
+    found = pair_from_fundamental(F, xy1, xy2, K1=guess, K2=guess, small_rotation=small)
     again = _fundamental(found)
     np.testing.assert_allclose(again * np.sign(np.sum(again * F)), F, atol=1e-9)
     # As it stands where the first photograph was taken, and where the second one was.
@@ -117,9 +116,7 @@ def test_wrong_intrinsics_leave_f_and_both_photographs_as_they_are(orientation):
 def test_small_rotations_are_right_to_second_order(degrees):
     pair = _pair(np.radians(degrees) * np.array([0.6, -0.64, 0.48]), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(1))
-    found = pair_from_fundamental(
-        _fundamental(pair), xy1, xy2, K1=pair.K1, K2=pair.K2, orientation=SmallRotation()
-    )
+    found = pair_from_fundamental(_fundamental(pair), xy1, xy2, K1=pair.K1, K2=pair.K2, small_rotation=True)
     off = np.degrees((Rotation.from_matrix(found.R) * Rotation.from_matrix(pair.R).inv()).magnitude())
     assert off < np.radians(degrees) * degrees
     np.testing.assert_allclose(found.t, pair.t, atol=np.radians(degrees) ** 2)
@@ -131,7 +128,7 @@ def test_three_photographs_give_the_seed_that_their_cameras_have():
     t3 = np.array([-1.3, 0.2, 0.1])
     third = compose_camera(K3, R3, t3)
     xy1, xy2 = _images(pair, X)
-    T = estimate_tensor_linear(np.stack([xy1, xy2, project(third, X)]), np.empty((3, 0, 2, 2)))
+    T = -3.0 * tensor_from_cameras(pair.K1 @ np.eye(3, 4), compose_camera(pair.K2, pair.R, pair.t), third)
     found, seed = seed_of_three(T, xy1, xy2, K=(pair.K1, pair.K2, K3))
     np.testing.assert_allclose(found.R, pair.R, atol=1e-6)
     np.testing.assert_allclose(seed.transfer(xy1, xy2)[0], project(third, X), atol=1e-5)
@@ -141,25 +138,17 @@ def test_three_photographs_give_the_seed_that_their_cameras_have():
     np.testing.assert_allclose(seed.moved(R, t).transfer(xy1, xy2)[0], moved, atol=1e-4)
 
 
-def test_without_motion_the_second_view_is_kept_for_any_line_through_a_match():
+def test_without_motion_the_second_view_is_kept():
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(2))
-    seed = seed_of_two(pair)
-    np.testing.assert_allclose(seed.transfer(xy1, xy2)[0], xy2, atol=1e-8)
-    one, zero = np.ones(len(xy1)), np.zeros(len(xy1))
-    virtual = seed.moved(np.eye(3), np.array([0.2, 0.3, 0.1]))
-    across, inverse_depth = virtual.transfer(xy1, xy2)
-    for lines in ([one, zero, -xy2[:, 0]], [one, one, -xy2.sum(axis=1)]):
-        xy, near = virtual.transfer(xy1, xy2, lines=np.stack(lines, axis=1))
-        np.testing.assert_allclose(xy, across, atol=1e-6)
-        np.testing.assert_allclose(near, inverse_depth, rtol=1e-7)
+    np.testing.assert_allclose(seed_of_two(pair).transfer(xy1, xy2)[0], xy2, atol=1e-8)
 
 
 def test_matches_beside_their_epipolar_lines_go_where_their_nearest_place_on_it_goes():
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(2))
     virtual = seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, 0.1]))
-    lines = virtual.perpendicular_lines(xy1, xy2)
+    lines = virtual._perpendicular_lines(xy1, xy2)
     across = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
     np.testing.assert_allclose(
         virtual.transfer(xy1, xy2 + 2.0 * across)[0], virtual.transfer(xy1, xy2)[0], atol=1e-7
@@ -213,7 +202,7 @@ def test_the_kernel_is_its_numpy_twin():
     places = rng.uniform(0, 600, (20, 30, 2)).astype(np.float32)
     places[3, 4] = np.nan
     xy, inverse_depth = np.empty((20, 30, 2)), np.empty((20, 30), np.float32)
-    transfer_rows(virtual.T, virtual.P2, places, 7, xy, inverse_depth)
+    _transfer_rows(virtual.T, virtual.P2, places, 7, xy, inverse_depth)
     x, y = np.meshgrid(np.arange(30.0), 7 + np.arange(20.0))
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     expected = virtual.transfer(pixels, places.reshape(-1, 2).astype(np.float64))
@@ -226,10 +215,6 @@ def _bad_pair(problem):
     pair, X = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False)), _scene(6)
     xy1, xy2 = _images(pair, X)
     F = _fundamental(pair)
-    if problem == "few":
-        xy1, xy2 = xy1[:7], xy2[:7]
-    if problem == "rank 1":
-        F = np.outer([1.0, 2.0, 3.0], [1.0, 0.0, 1.0])
     if problem == "of others":
         F = _fundamental(_pair((0.0, 0.3, 0.0), (-0.1, 1.0, 0.2, False)))
     if problem == "turned":
@@ -244,8 +229,6 @@ def _bad_pair(problem):
 @pytest.mark.parametrize(
     ("problem", "sentence"),
     [
-        ("few", "too few matches; 7, needed at least 8"),
-        ("rank 1", "rank 1 and no epipolar lines"),
         ("of others", "the fundamental matrix does not fit the matches"),
         ("turned", "show no parallax"),
         ("behind", "the scene is not in front of both cameras"),
@@ -262,8 +245,8 @@ def test_a_half_turn_is_not_a_small_rotation():
     xy1, xy2 = _images(pair, _scene(1))
     F = _fundamental(pair)
     with pytest.raises(StageFailure):
-        pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2, orientation=SmallRotation())
-    found = pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2, orientation=AnyRotation())
+        pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2, small_rotation=True)
+    found = pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2)
     np.testing.assert_allclose(found.R, pair.R, atol=1e-9)
 
 
@@ -290,5 +273,3 @@ def test_invalid_motions_are_value_errors(rotation, translation, K, sentence):
 def test_intrinsics_are_guessed_from_the_size():
     K = default_intrinsics((1000, 700))
     np.testing.assert_array_equal(K, [[1000.0, 0.0, 499.5], [0.0, 1000.0, 349.5], [0.0, 0.0, 1.0]])
-    with pytest.raises(ValueError, match="positive"):
-        default_intrinsics((1000, 700), focal=0.0)

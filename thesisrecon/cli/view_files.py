@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib import import_module
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
+from thesisrecon.cli._view_sequences import interpolated_sequence, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import OutputError, UsageError, counted
+from thesisrecon.errors import OutputError, UsageError, counted, in_words, unknown_word
 from thesisrecon.io.exports import read_cameras
 from thesisrecon.io.files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
@@ -21,18 +21,13 @@ from thesisrecon.io.meshes import read_mesh
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report.page import strip_page
 from thesisrecon.runtime.executors import Workers
-from thesisrecon.settings import in_words, unknown_word
-from thesisrecon.view_interpolation import ViewSequence
 from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.render import Light, Shading, render
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
 PATHS, LIGHTS = ("orbit", "interpolate"), ("none", "camera", "sun")
-METHODS = {
-    "interpolation": ("thesisrecon.view_interpolation", "interpolated_sequence"),
-    "tensor": ("thesisrecon.view_synthesis", "trilinear_sequence"),
-}
-"""Method -> module and function that returns its :class:`ViewSequence`."""
+METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
+"""Method -> function that returns its :class:`ViewSequence`."""
 _FRAME_MS = 100
 """Time per frame of an animation of ``interpolate``."""
 _MAX_SIDE_PX = 8192
@@ -256,9 +251,7 @@ def interpolate_images(
     images = [read_image(path, max_size_px=config.images.max_size_px).images[0] for path in options.images]
     report, count = progress or (lambda *_: None), options.frames
     report("correspondence", 0, 1)
-    module, name = METHODS[options.method]
-    make_sequence: Callable[..., ViewSequence] = getattr(import_module(module), name)
-    sequence = make_sequence(images, count, config=config, seed=options.seed)
+    sequence = METHODS[options.method](images, count, config=config, seed=options.seed)
     report("correspondence", 1, 1)
     listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(sequence.frame_metadata)]
     write_json(folder / FRAMES, {"method": options.method, **sequence.metadata, "frames": listed})

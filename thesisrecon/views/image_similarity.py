@@ -1,4 +1,7 @@
-"""Similarity of a rendered and a real image over the pixels that both show: PSNR and SSIM."""
+"""Similarity of a rendered and a real image over the pixels that both show: PSNR and SSIM.
+
+Images are ndarray (H, W, 3) of uint8; ``compared`` (H, W) selects the pixels.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +13,14 @@ from thesisrecon.records import RenderedView
 
 WINDOW_PX = 1.5
 """Standard deviation of the Gaussian window of SSIM."""
-
 GREY = np.array([0.299, 0.587, 0.114])
 """Luma weights of Rec. 601."""
-
 FLOOR_LUMINANCE, FLOOR_CONTRAST = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 """Stabilising constants of SSIM for dark and uniform regions."""
 
 
 def covered_pixels(rendered: RenderedView) -> B8:
-    """Return the pixels whose eight neighbours are covered by the surface too.
-
-    The colour of other pixels is partly that of the background.
+    """Return the pixels whose eight neighbours are covered too; others have the colour of the background.
 
     Parameters
     ----------
@@ -41,20 +40,13 @@ def match_exposure(real: U8, rendered: U8, compared: B8) -> U8:
 
     Parameters
     ----------
-    real, rendered : ndarray (H, W, 3) of uint8
-        The images.
-    compared : ndarray (H, W) of bool
-        Pixels to compare.
+    real, rendered, compared : ndarray
+        Images and the pixels to compare.
 
     Returns
     -------
     ndarray (H, W, 3) of uint8
         The rendered image with the exposure of the real one.
-
-    Raises
-    ------
-    ValueError
-        If the shapes disagree or no pixel is compared.
     """
     _check(real, rendered, compared)
     a, b = real[compared].astype(np.float64), rendered[compared].astype(np.float64)
@@ -63,24 +55,17 @@ def match_exposure(real: U8, rendered: U8, compared: B8) -> U8:
 
 
 def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
-    """Return the peak signal-to-noise ratio of two images.
+    """Return the peak signal-to-noise ratio of two images over all channels; infinite for equal images.
 
     Parameters
     ----------
-    real, rendered : ndarray (H, W, 3) of uint8
-        The images.
-    compared : ndarray (H, W) of bool
-        Pixels to compare.
+    real, rendered, compared : ndarray
+        Images and the pixels to compare.
 
     Returns
     -------
     float
-        PSNR in dB over all channels; infinite for equal images.
-
-    Raises
-    ------
-    ValueError
-        If the shapes disagree or no pixel is compared.
+        PSNR in dB.
     """
     _check(real, rendered, compared)
     apart = (real.astype(np.float64) - rendered)[compared]
@@ -93,46 +78,31 @@ def ssim(real: U8, rendered: U8, compared: B8) -> float:
 
     Parameters
     ----------
-    real, rendered : ndarray (H, W, 3) of uint8
-        The images.
-    compared : ndarray (H, W) of bool
-        Pixels to compare.
+    real, rendered, compared : ndarray
+        Images and the pixels to compare.
 
     Returns
     -------
     float
         Mean SSIM over the compared pixels.
-
-    Raises
-    ------
-    ValueError
-        If the shapes disagree or no pixel is compared.
     """
     return float(np.mean(ssim_map(real, rendered, compared)[compared]))
 
 
 def ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
-    """Return the structural similarity of two images at each pixel.
+    """Return the structural similarity of two images at each pixel (Wang, Bovik, Sheikh and Simoncelli 2004).
 
-    Luma in Gaussian windows of 1.5 px with the constants 0.01 and 0.03 (Wang, Bovik, Sheikh and Simoncelli,
-    IEEE Transactions on Image Processing 2004). Windows use compared pixels only.
+    Luma in Gaussian windows of 1.5 px with the constants 0.01 and 0.03. Windows use compared pixels only.
 
     Parameters
     ----------
-    real, rendered : ndarray (H, W, 3) of uint8
-        The images.
-    compared : ndarray (H, W) of bool
-        Pixels to compare.
+    real, rendered, compared : ndarray
+        Images and the pixels to compare.
 
     Returns
     -------
     ndarray (H, W)
         SSIM of each pixel.
-
-    Raises
-    ------
-    ValueError
-        If the shapes disagree or no pixel is compared.
     """
     _check(real, rendered, compared)
     a, b = (np.where(compared, picture @ GREY, 0.0) for picture in (real, rendered))
@@ -148,9 +118,8 @@ def ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
 
 def _check(real: U8, rendered: U8, compared: B8) -> None:
     if real.shape != rendered.shape or real.shape != (*compared.shape, 3):
-        raise ValueError(
-            f"images and mask must have one size; got {real.shape}, {rendered.shape} and {compared.shape}"
-        )
+        shapes = f"{real.shape}, {rendered.shape} and {compared.shape}"
+        raise ValueError(f"images and mask must have one size; got {shapes}")
     if not compared.any():
         raise ValueError("no pixel is shown by both images")
 

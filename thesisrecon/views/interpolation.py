@@ -1,19 +1,17 @@
-"""View interpolation between two images with known dense correspondence (thesis, section 1.2; Seitz and Dyer
-1995).
-"""
+"""View interpolation between two images (thesis, section 1.2; Seitz and Dyer 1995)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.zbuffer import run_in_strips
 from thesisrecon.records import DisparityMap
-from thesisrecon.views.interpolation_kernels import (
+from thesisrecon.views._interpolation_kernels import (
     ONE_SURFACE_PX,
     blend,
     blending_weights,
@@ -38,6 +36,14 @@ PREPARING = 2
 """Threads that prepare an image."""
 DARK, BRIGHT = 8.0, 247.0
 """Range of levels used for the ratio of exposures."""
+SAME_SURFACE_PX = 1.5
+"""Largest difference of disparity between pixels of one surface."""
+COLOUR = 30.0
+"""Difference of colour (sum over channels) at which weights of guessed disparities fall to 1 / e."""
+GUESS_WEIGHT = 0.5
+"""Weight of guessed disparities relative to known ones in the median."""
+UNKNOWN_WEIGHT, MIN_KNOWN_WEIGHT, EDGE_FACTOR = 0.01, 0.2, 0.2
+"""Blending weight of guessed pixels, minimum of known ones, and factor beside a depth discontinuity."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +51,8 @@ class IntermediateFrame:
     """Image frames of the views between two images.
 
     In the rectified frame a point of the view at s is (1 - s) x_left + s x_right, its exact image in a camera
-    on the baseline (all three cameras are parallel). A homography leads out of the rectified frame; it takes
-    a quadrilateral to the image corners. The quadrilateral is that of the first image for s = 0, that of the
-    second for s = 1, and linear in between, so that both ends are the images themselves.
+    on the baseline. A homography leads out of that frame; it takes a quadrilateral to the image corners: that
+    of the first image for s = 0, that of the second for s = 1, and linear in between.
 
     Parameters
     ----------
@@ -74,7 +79,7 @@ class IntermediateFrame:
             The homography; its determinant is positive where those of H are.
         """
         corners = self._corners()
-        ends = [_mapped(H, corners) for H in self.H]
+        ends = [dehomogenize(homogenize(corners) @ H.T) for H in self.H]
         return _homography((1.0 - s) * ends[0] + s * ends[1], corners)
 
     def points(self, xy1: F64, xy2: F64, s: float) -> F64:
@@ -92,8 +97,9 @@ class IntermediateFrame:
         ndarray (N, 2)
             Pixels of the view.
         """
-        left, right = _mapped(self.H[0], xy1), _mapped(self.H[1], xy2)
-        return _mapped(self.original_from_rectified(s), (1.0 - s) * left + s * right)
+        left, right = (dehomogenize(homogenize(xy) @ H.T) for xy, H in zip((xy1, xy2), self.H, strict=True))
+        between = (1.0 - s) * left + s * right
+        return dehomogenize(homogenize(between) @ self.original_from_rectified(s).T)
 
     def _corners(self) -> F64:
         """Corners (4, 2) of the quadrilateral: the image corners, moved inwards where necessary."""
@@ -101,18 +107,13 @@ class IntermediateFrame:
         middle = 0.5 * np.array([width - 1.0, height - 1.0])
         reach = np.maximum(middle, 0.5) * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         third = self.H[:, 2]
-        min_known_weight = MIN_DEPTH * (third @ np.append(middle, 1.0))
-        if not (min_known_weight > 0.0).all():
+        min_depth = MIN_DEPTH * (third @ np.append(middle, 1.0))
+        if not (min_depth > 0.0).all():
             raise ValueError("the image centre lies beyond the line at infinity of the rectification")
-        while not (homogenize(middle + reach) @ third.T >= min_known_weight).all():
+        while not (homogenize(middle + reach) @ third.T >= min_depth).all():
             reach *= SHRINK
         corners: F64 = middle + reach
         return corners
-
-
-def _mapped(H: F64, xy: F64) -> F64:
-    xh = homogenize(np.asarray(xy, dtype=np.float64)) @ H.T
-    return np.asarray(xh[:, :2] / xh[:, 2:])
 
 
 def _homography(source: F64, target: F64) -> F64:
@@ -128,32 +129,8 @@ def _homography(source: F64, target: F64) -> F64:
     return np.asarray(H * np.sign(H[2] @ np.append(source[0], 1.0)))
 
 
-@dataclass(frozen=True)
-class Monotonicity:
-    """Result of the monotonicity test.
-
-    Parameters
-    ----------
-    violated : ndarray (H, W) of bool
-        Pixels whose order relative to another pixel of their row differs between the images.
-    share : float
-        Share of violating pixels among those with known disparity.
-    known : float
-        Share of pixels with known disparity.
-    """
-
-    violated: B8
-    share: float
-    known: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether no pixel violates the constraint; every view between then shows the same points."""
-        return self.share == 0.0
-
-
-def check_monotonicity(disparity: F32, *, slack_px: float = SLACK_PX) -> Monotonicity:
-    """Test the monotonicity constraint (figure 1.1) on a rectified image.
+def detect_monotonicity_violations(disparity: F32) -> B8:
+    """Find the pixels of a rectified image that violate the monotonicity constraint (figure 1.1).
 
     If u1 is left of v1 then their correspondences must satisfy u2 left of v2; u is then left of v in every
     view between. A thin object in front of a distant background violates it, together with the background
@@ -163,64 +140,15 @@ def check_monotonicity(disparity: F32, *, slack_px: float = SLACK_PX) -> Monoton
     ----------
     disparity : ndarray (H, W)
         Disparities, NaN if unknown.
-    slack_px : float
-        Tolerance in pixels.
 
     Returns
     -------
-    Monotonicity
-        Violating pixels and their share.
-
-    Raises
-    ------
-    ValueError
-        If ``disparity`` is not two-dimensional.
+    ndarray (H, W) of bool
+        Pixels whose order relative to another pixel of their row differs between the images.
     """
-    disparity = np.ascontiguousarray(disparity, dtype=np.float32)
-    if disparity.ndim != 2:
-        raise ValueError(f"disparities must be (H, W); got {disparity.shape}")
     violated = np.zeros(disparity.shape, dtype=np.bool_)
-    mark_crossings(disparity, slack_px, violated)
-    known = np.isfinite(disparity)
-    count = max(int(known.sum()), 1)
-    return Monotonicity(violated, float(violated.sum() / count), float(known.mean()) if known.size else 0.0)
-
-
-@dataclass(frozen=True)
-class Blending:
-    """Parameters of blending two warped images.
-
-    Parameters
-    ----------
-    same_surface_px : float
-        Largest difference of disparity between pixels of one surface.
-    colour : float
-        Difference of colour (sum over channels) at which weights of guessed disparities fall to 1 / e.
-    extrapolated_weight : float
-        Weight of guessed disparities relative to known ones.
-    min_known_weight : float
-        Minimum weight of pixels with known disparity; otherwise the weight is the confidence.
-    unknown_pixel_weight : float
-        Weight of pixels with guessed disparity.
-    edge_factor : float
-        Factor of the weight beside a depth discontinuity.
-    """
-
-    same_surface_px: float = 1.5
-    colour: float = 30.0
-    extrapolated_weight: float = 0.5
-    min_known_weight: float = 0.2
-    unknown_pixel_weight: float = 0.01
-    edge_factor: float = 0.2
-
-
-@dataclass(frozen=True)
-class WarpedImage:
-    """One image warped to an intermediate view: colours, disparity (``near``) and source pixels."""
-
-    colors: F32
-    near: F32
-    source: F32
+    mark_crossings(np.ascontiguousarray(disparity, dtype=np.float32), SLACK_PX, violated)
+    return violated
 
 
 @dataclass(frozen=True)
@@ -249,9 +177,7 @@ class InterpolatedPair:
     H : ndarray (2, 3, 3)
         Homographies to the rectified frame, third coordinate positive for visible pixels.
     left, right : DisparityMap
-        Disparities of the first and the second image in the rectified frame (x_right = x_left - d in both).
-    blending : Blending
-        Parameters of blending.
+        Disparities of both images in the rectified frame (x_right = x_left - d in both).
 
     Raises
     ------
@@ -263,7 +189,6 @@ class InterpolatedPair:
     H: F64
     left: DisparityMap
     right: DisparityMap
-    blending: Blending = field(default_factory=Blending)
 
     def __post_init__(self) -> None:
         a, b = (image.shape for image in self.images)
@@ -287,18 +212,12 @@ class InterpolatedPair:
 
     @cached_property
     def _sides(self) -> tuple[_Side, _Side]:
-        sides = [
-            _side(image, H, found, self.blending)
-            for image, H, found in zip(self.images, self.H, (self.left, self.right), strict=True)
-        ]
-        return sides[0], sides[1]
+        return _side(self.images[0], self.H[0], self.left), _side(self.images[1], self.H[1], self.right)
 
     @cached_property
     def known(self) -> float:
         """Share of the pixels of both images with known correspondence."""
-        return float(
-            np.mean([side.weight > 1.5 * self.blending.unknown_pixel_weight for side in self._sides])
-        )
+        return float(np.mean([side.weight > 1.5 * UNKNOWN_WEIGHT for side in self._sides]))
 
     @cached_property
     def gain(self) -> F32:
@@ -312,7 +231,7 @@ class InterpolatedPair:
         with np.errstate(divide="ignore", invalid="ignore"):
             source = np.where(at[..., 2:] > 0.0, at[..., :2] / at[..., 2:], np.nan).astype(np.float32)
         levels = first.levels[grid], sample(self._sides[1].levels, source)
-        known = first.weight[grid] > self.blending.unknown_pixel_weight
+        known = first.weight[grid] > UNKNOWN_WEIGHT
         with np.errstate(invalid="ignore"):
             for level in levels:
                 known &= ((level > DARK) & (level < BRIGHT)).all(axis=2)
@@ -346,64 +265,34 @@ class InterpolatedPair:
             raise ValueError(f"s must be from 0 (first image) to 1 (second image); got {s}")
         if turn is None and s in (0.0, 1.0):
             return self.images[int(s)].copy()
-        rgb, near = self.seen(s, turn=turn, threads=threads)
+        rgb, near = self._seen(s, turn, threads)
         filled = fill_holes(rgb, near, step=ONE_SURFACE_PX)
         return np.clip(np.rint(np.nan_to_num(filled)), 0.0, 255.0).astype(np.uint8)
 
-    def seen(self, s: float, *, turn: F64 | None = None, threads: int = 1) -> tuple[F32, F32]:
-        """Render the view at s before holes are filled.
-
-        Parameters
-        ----------
-        s : float
-            Position between the images, 0 to 1.
-        turn : ndarray (3, 3), optional
-            Homography of a rotation or zoom of the camera, in pixels.
-        threads : int
-            Number of threads.
-
-        Returns
-        -------
-        tuple of ndarray
-            Colours (h, w, 3) and disparities (h, w), NaN where neither image shows the scene.
-        """
-        warped = [self.warped(side, s, turn=turn, threads=threads) for side in (0, 1)]
-        sides, blending = self._sides, self.blending
-        out = np.empty_like(warped[0].colors), np.empty_like(warped[0].near)
+    def _seen(self, s: float, turn: F64 | None = None, threads: int = 1) -> tuple[F32, F32]:
+        """Colours (h, w, 3) and disparities (h, w), NaN where neither image shows the scene."""
+        (colors0, near0, source0), (colors1, near1, source1) = (
+            self._warped(side, s, turn, threads) for side in (0, 1)
+        )
+        weights = self._sides[0].weight, self._sides[1].weight
+        out = np.empty_like(colors0), np.empty_like(near0)
 
         def work(rows: tuple[int, int]) -> None:
             part = slice(*rows)
             blend(
-                (warped[0].colors[part], warped[1].colors[part]),
-                (warped[0].near[part], warped[1].near[part]),
-                (warped[0].source[part], warped[1].source[part]),
-                (sides[0].weight, sides[1].weight),
-                (blending.same_surface_px, 1.5 * blending.unknown_pixel_weight, s),
+                (colors0[part], colors1[part]),
+                (near0[part], near1[part]),
+                (source0[part], source1[part]),
+                weights,
+                (SAME_SURFACE_PX, 1.5 * UNKNOWN_WEIGHT, s),
                 (out[0][part], out[1][part]),
             )
 
         run_in_strips(work, self.size[1], threads)
         return out
 
-    def warped(self, side: int, s: float, *, turn: F64 | None = None, threads: int = 1) -> WarpedImage:
-        """Warp one image to the view at s, with the exposure of that view.
-
-        Parameters
-        ----------
-        side : int
-            0 for the first image, 1 for the second.
-        s : float
-            Position between the images, 0 to 1.
-        turn : ndarray (3, 3), optional
-            Homography of a rotation or zoom of the camera, in pixels.
-        threads : int
-            Number of threads.
-
-        Returns
-        -------
-        Warped
-            Colours, disparities and source pixels.
-        """
+    def _warped(self, side: int, s: float, turn: F64 | None, threads: int) -> tuple[F32, F32, F32]:
+        """Image ``side`` in the view at s: colours with its exposure, disparities and source pixels."""
         this = self._sides[side]
         target = np.empty_like(this.places)
         G = self.frame.original_from_rectified(s)
@@ -422,10 +311,10 @@ class InterpolatedPair:
         )
         colors = sample(this.levels, source, threads=threads)
         colors *= self.gain ** np.float32(share)
-        return WarpedImage(colors, near, source)
+        return colors, near, source
 
 
-def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
+def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
     whole = np.ascontiguousarray(found.filled())
     fill_empty_rows(whole)
     # Without any known disparity the views are cross-dissolved.
@@ -435,67 +324,17 @@ def _side(image: U8, H: F64, found: DisparityMap, blending: Blending) -> _Side:
     disparity, sure, weight = (np.empty(shape, dtype=np.float32) for _ in range(3))
     disparity_from_rectified(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
     levels, filtered = image.astype(np.float32), np.empty_like(disparity)
-    weighting = (blending.colour, blending.extrapolated_weight)
+    limits = (COLOUR, GUESS_WEIGHT)
     run_in_strips(
-        lambda rows: filter_extrapolated_by_colour(levels, disparity, sure, rows, weighting, filtered),
+        lambda rows: filter_extrapolated_by_colour(levels, disparity, sure, rows, limits, filtered),
         shape[0],
         PREPARING,
     )
     run_in_strips(
         lambda rows: filter_extrapolated_by_median(filtered, sure, rows, disparity), shape[0], PREPARING
     )
-    blending_weights(
-        disparity,
-        sure,
-        (blending.unknown_pixel_weight, blending.min_known_weight, blending.edge_factor),
-        weight,
-    )
+    blending_weights(disparity, sure, (UNKNOWN_WEIGHT, MIN_KNOWN_WEIGHT, EDGE_FACTOR), weight)
     return _Side(levels, places, disparity, weight)
-
-
-def pair_from_rectified(left: U8, right: U8, maps: tuple[DisparityMap, DisparityMap]) -> InterpolatedPair:
-    """Build the pair of two images that are already rectified.
-
-    Parameters
-    ----------
-    left, right : ndarray (h, w, 3) of uint8
-        The rectified images.
-    maps : tuple of DisparityMap
-        Disparities of both images.
-
-    Returns
-    -------
-    InterpolatedPair
-        The pair with identity homographies.
-
-    Raises
-    ------
-    ValueError
-        If the maps do not have the shape of the images.
-    """
-    for found in maps:
-        if found.disparity.shape != left.shape[:2]:
-            raise ValueError(
-                f"disparities must have the shape of the images {left.shape[:2]}; got {found.disparity.shape}"
-            )
-    return InterpolatedPair((left, right), np.stack([np.eye(3)] * 2), *maps)
-
-
-def with_full_confidence(disparity: F32) -> DisparityMap:
-    """Wrap plain disparities as a map with confidence 1 where they are known.
-
-    Parameters
-    ----------
-    disparity : ndarray (H, W)
-        Disparities, NaN if unknown.
-
-    Returns
-    -------
-    DisparityMap
-        The map.
-    """
-    known = np.isfinite(disparity)
-    return DisparityMap(disparity, known.astype(np.float32), 0.0)
 
 
 def disparity_of_right(left: DisparityMap) -> DisparityMap:
@@ -523,13 +362,7 @@ def disparity_of_right(left: DisparityMap) -> DisparityMap:
     seen = disparity[y, at] == d
     confidence[y[seen], at[seen]] = left.confidence[y[seen], x[seen]]
     disparity[np.isinf(disparity)] = np.nan
-    return replace(left, disparity=_cracks_closed(disparity), confidence=confidence)
-
-
-def _cracks_closed(disparity: F32) -> F32:
-    """Fill single unknown pixels between two known ones of a row with the smaller value."""
-    closed = disparity.copy()
-    between = np.fmin(disparity[:, :-2], disparity[:, 2:])
-    both = np.isfinite(disparity[:, :-2]) & np.isfinite(disparity[:, 2:]) & np.isnan(disparity[:, 1:-1])
-    closed[:, 1:-1] = np.where(both, between, disparity[:, 1:-1])
-    return closed
+    before, here, after = disparity[:, :-2], disparity[:, 1:-1], disparity[:, 2:]
+    gap = np.isfinite(before) & np.isfinite(after) & np.isnan(here)
+    here[gap] = np.fmin(before, after)[gap]
+    return replace(left, disparity=disparity, confidence=confidence)

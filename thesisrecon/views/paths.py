@@ -43,21 +43,8 @@ SAMPLE = 5000
 """Model points that are used to choose an orbit."""
 
 
-def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Fit the camera to another image size: the whole field of view, as large as possible, centred.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    size : tuple of int
-        Width and height in pixels.
-
-    Returns
-    -------
-    Camera
-        The same pose with scaled intrinsics.
-    """
+def _fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The camera with another image size: the whole field of view, as large as possible, centred."""
     factor = min(size[0] / camera.size[0], size[1] / camera.size[1])
     S = np.diag([factor, factor, 1.0])
     S[:2, 2] = 0.5 * (np.array(size) - 1.0) - factor * 0.5 * (np.array(camera.size) - 1.0)
@@ -72,9 +59,8 @@ def orbit(
     The centre is the geometric median of X; radius and height are medians over the cameras; the field of view
     is that of the first camera. If the cameras surround the scene (no gap above 120 degrees) the path is a
     full circle from the first camera; otherwise it swings over the arc that they cover (at least 30 degrees),
-    because the rest was not observed. Both can be repeated without a jump. The radius grows up to threefold
-    until the circle keeps half the median camera distance from X and every frame shows about as much of X as
-    the cameras do.
+    because the rest was not observed. The radius grows up to threefold until the circle keeps half the median
+    camera distance from X and every frame shows about as much of X as the cameras do.
 
     Parameters
     ----------
@@ -100,10 +86,10 @@ def orbit(
     _check(cameras, frames)
     X = _sample(X)
     size = size or cameras[0].size
-    middle, up = geometric_median(X), estimate_up(cameras)
+    middle, up = _geometric_median(X), estimate_up(cameras)
     offset = np.array([camera.centre for camera in cameras]) - middle
     radius, height = _typical(offset, up, float(np.median(np.linalg.norm(X - middle, axis=1))))
-    K = fit_to_size(cameras[0], size).K.copy()
+    K = _fit_to_size(cameras[0], size).K.copy()
     K[:2, 2] = 0.5 * (np.array(size) - 1.0)
     right, ahead = _level_axes(up)
     azimuth = _azimuths(np.arctan2(offset @ ahead, offset @ right), frames)
@@ -114,7 +100,7 @@ def orbit(
         lift = height * (factor if height > 0.0 else 1.0)
         return [_looking_at(K, middle + factor * radius * a + lift * up, middle, up, size) for a in around]
 
-    return circle(_widening(circle, [fit_to_size(camera, size) for camera in cameras], X))
+    return circle(_widening(circle, [_fit_to_size(camera, size) for camera in cameras], X))
 
 
 def interpolate_cameras(
@@ -146,7 +132,7 @@ def interpolate_cameras(
         Without a camera or a frame.
     """
     _check(cameras, frames)
-    shown = [fit_to_size(camera, size or cameras[0].size) for camera in cameras]
+    shown = [_fit_to_size(camera, size or cameras[0].size) for camera in cameras]
     if len(shown) == 1 or frames == 1:
         return [shown[0]] * frames
     centres = np.array([camera.centre for camera in shown])
@@ -185,26 +171,13 @@ def estimate_up(cameras: Sequence[Camera]) -> F64:
     return np.asarray(up * (-1.0 if up @ side < 0.0 else 1.0))
 
 
-def geometric_median(X: F64, rounds: int = 100) -> F64:
-    """Return the point with the least sum of distances to X (Weiszfeld's iteration).
-
-    Parameters
-    ----------
-    X : ndarray (N, 3)
-        Points.
-    rounds : int
-        Number of iterations.
-
-    Returns
-    -------
-    ndarray (3,)
-        The geometric median, robust against up to half of the points.
-    """
+def _geometric_median(X: F64) -> F64:
+    """The point (3,) with the least sum of distances to X (N, 3), by Weiszfeld's iteration."""
     middle = X.mean(axis=0)
     least = 1e-9 * float(np.abs(X - middle).max())
     if not least > 0.0:
         return np.asarray(middle)
-    for _ in range(rounds):
+    for _ in range(100):
         weight = 1.0 / np.maximum(np.linalg.norm(X - middle, axis=1), least)
         middle = weight @ X / weight.sum()
     return np.asarray(middle)
@@ -293,9 +266,7 @@ def _looking_at(K: F64, centre: F64, target: F64, up: F64, size: tuple[int, int]
 
 
 def _widening(circle: Callable[[float], list[Camera]], cameras: Sequence[Camera], X: F64) -> float:
-    """The first radius factor that is clear of X and shows enough of it; otherwise the clear one that shows
-    most.
-    """
+    """The first radius factor that keeps clear of X and shows enough; else the clear one that shows most."""
     tree, nearest = scipy.spatial.cKDTree(X), [1 + len(X) // 1000]
 
     def distances(path: Sequence[Camera]) -> F64:
@@ -350,9 +321,7 @@ def _spline(centres: F64, place: F64) -> F64:
 
 
 def _evenly(centres: F64, turning: F64, frames: int) -> F64:
-    """Spline parameters (frames,) at equal times; ``turning`` (n - 1,) is the rotation between neighbours in
-    rad.
-    """
+    """Spline parameters (frames,) at equal times; ``turning`` (n - 1,): rotations in rad."""
     place = np.linspace(0.0, len(centres) - 1, STEPS * (len(centres) - 1) + 1)
     way = np.linalg.norm(np.diff(_spline(centres, place), axis=0), axis=1)
     turn = np.repeat(turning / STEPS, STEPS)

@@ -5,13 +5,12 @@ Lighting follows Lambert's law with a Blinn highlight. Each kernel has a NumPy t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import Raster, rasterize, run_in_strips, sample_texture
 from thesisrecon.records import RenderedView, TexturedMesh
@@ -23,62 +22,19 @@ BARE = (200, 200, 200)
 
 
 @njit(cache=True, nogil=True)
-def sum_face_normals(vertices: F64, faces: I64, total: F64) -> None:
-    """Add the cross products of the sides of each face to its vertices, in ``total`` (N, 3).
-
-    Parameters
-    ----------
-    vertices : ndarray (N, 3)
-        Vertices.
-    faces : ndarray (M, 3)
-        Vertex numbers.
-    total : ndarray (N, 3)
-        Area-weighted normals, added to.
-    """
-    for m in range(faces.shape[0]):
-        i, j, l = faces[m, 0], faces[m, 1], faces[m, 2]
-        ux, uy, uz = (
-            vertices[j, 0] - vertices[i, 0],
-            vertices[j, 1] - vertices[i, 1],
-            vertices[j, 2] - vertices[i, 2],
-        )
-        vx, vy, vz = (
-            vertices[l, 0] - vertices[i, 0],
-            vertices[l, 1] - vertices[i, 1],
-            vertices[l, 2] - vertices[i, 2],
-        )
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        for v in (i, j, l):
-            total[v, 0] += nx
-            total[v, 1] += ny
-            total[v, 2] += nz
-
-
-@njit(cache=True, nogil=True)
 def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
     length = max(np.sqrt(x * x + y * y + z * z), 1e-20)
     return x / length, y / length, z / length
 
 
 @njit(cache=True, nogil=True)
-def shade_points(
+def _shade_points(
     color: F32, points: F32, normals: F32, eye: F64, lamps: F64, surface: tuple[float, float, float]
 ) -> None:
-    """Shade colours in place.
+    """Shade colours (P, 3), 0 to 255, in place; normals are flipped towards the eye.
 
-    Parameters
-    ----------
-    color : ndarray (P, 3)
-        Unlit colours, 0 to 255; overwritten.
-    points, normals : ndarray (P, 3)
-        Surface points and normals of any length. Normals are flipped towards the eye; zero normals get no
-        light.
-    eye : ndarray (3,)
-        Camera centre.
-    lamps : ndarray (L, 7)
-        1 and a position, or 0 and the direction towards the light; then its colour.
-    surface : tuple of float
-        Ambient light, strength and exponent of the highlight.
+    ``lamps`` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
+    ``surface``: ambient light, strength and exponent of the highlight.
     """
     ambient, specular, shininess = surface
     for p in range(color.shape[0]):
@@ -110,22 +66,8 @@ def shade_points(
 
 
 @njit(cache=True, nogil=True)
-def average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: np.ndarray) -> None:
-    """Average ``samples`` x ``samples`` blocks of pixels into an 8-bit image.
-
-    Parameters
-    ----------
-    color : ndarray (samples H, samples W, 3)
-        Colours, 0 to 255.
-    drawn : ndarray (samples H, samples W)
-        Face numbers; negative values take the background colour.
-    samples : int
-        Samples per pixel side.
-    background : ndarray (3,)
-        Background colour.
-    out : ndarray (H, W, 3) of uint8
-        The result.
-    """
+def _average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: U8) -> None:
+    """Average blocks of ``samples`` x ``samples`` pixels; those with negative ``drawn`` are background."""
     total = np.empty(3, dtype=np.float32)
     share = np.float32(1.0 / (samples * samples))
     for y in range(out.shape[0]):
@@ -169,11 +111,10 @@ class Light:
             raise ValueError("the direction of a Light must not be zero")
 
     @property
-    def row(self) -> list[float]:
-        """The row that :func:`shade_points` takes."""
-        if self.position is not None:
-            return [1.0, *self.position, *self.color]
-        return [0.0, *(self.direction or (0.0, 0.0, 0.0)), *self.color]
+    def _row(self) -> list[float]:
+        """Row of ``lamps`` in :func:`_shade_points`."""
+        place = self.direction if self.position is None else self.position
+        return [float(self.position is not None), *(place or (0.0, 0.0, 0.0)), *self.color]
 
 
 @dataclass(frozen=True)
@@ -195,38 +136,13 @@ class Shading:
     specular: float = 0.0
     shininess: float = 30.0
 
-    def shade(self, color: F32, points: F32, normals: F32, eye: F64) -> None:
-        """Shade colours in place.
 
-        Parameters
-        ----------
-        color : ndarray (P, 3)
-            Unlit colours, 0 to 255; overwritten.
-        points, normals : ndarray (P, 3)
-            Surface points and normals of any length.
-        eye : ndarray (3,)
-            Camera centre.
-        """
-        lamps = np.array([light.row for light in self.lights], dtype=np.float64).reshape(-1, 7)
-        surface = (float(self.ambient), float(self.specular), float(self.shininess))
-        shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lamps, surface)
-
-
-def vertex_normals(mesh: TexturedMesh) -> F64:
-    """Return unit vertex normals, the area-weighted mean over the adjacent faces.
-
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        The mesh, N vertices.
-
-    Returns
-    -------
-    ndarray (N, 3)
-        Unit normals, zero for unused vertices.
-    """
-    total = np.zeros_like(mesh.vertices)
-    sum_face_normals(mesh.vertices, mesh.faces, total)
+def _vertex_normals(mesh: TexturedMesh) -> F64:
+    """Unit normals (N, 3), area-weighted means over the adjacent faces; zero for unused vertices."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    count, corner = len(mesh.vertices), mesh.faces.ravel()
+    total = np.stack([np.bincount(corner, normal[:, d], count) for d in range(3)], axis=1)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])
 
 
@@ -239,7 +155,7 @@ class _Surface:
     normals: F32 | None
     colors: F32 | None
     uv: F32 | None
-    texture: NDArray[np.uint8] | None
+    texture: U8 | None
 
 
 def render(
@@ -308,7 +224,7 @@ def render(
             color = _colors(surface, part)
             if shading is not None:
                 _light(surface, part, color, camera.centre, shading)
-            average_blocks(color, part.face, samples, behind, rgb[first:last])
+            _average_blocks(color, part.face, samples, behind, rgb[first:last])
 
     run_in_strips(paint, len(rgb), threads)
     return RenderedView(rgb, depth, valid)
@@ -328,7 +244,7 @@ def _prepared(mesh: TexturedMesh, *, lit: bool) -> _Surface:
     return _Surface(
         mesh.faces,
         points=mesh.vertices.astype(np.float32) if lit else None,
-        normals=vertex_normals(mesh).astype(np.float32) if lit else None,
+        normals=_vertex_normals(mesh).astype(np.float32) if lit else None,
         colors=None if mesh.colors is None or textured else mesh.colors.astype(np.float32),
         uv=None if mesh.uv is None or not textured else np.ascontiguousarray(mesh.uv, dtype=np.float32),
         texture=mesh.texture if textured else None,
@@ -342,7 +258,7 @@ def _colors(surface: _Surface, raster: Raster) -> F32:
         sample_texture(surface.texture, raster.interpolate(surface.uv), raster.face, color)
         return color
     if surface.colors is not None:
-        return raster.interpolate_vertices(surface.faces, surface.colors)
+        return raster.interpolate(surface.colors, surface.faces)
     return np.tile(np.asarray(BARE, dtype=np.float32), (*raster.face.shape, 1))
 
 
@@ -350,22 +266,13 @@ def _light(surface: _Surface, raster: Raster, color: F32, eye: F64, shading: Sha
     """Shade the colours (H, W, 3) in place."""
     assert surface.points is not None
     assert surface.normals is not None
-    points = raster.interpolate_vertices(surface.faces, surface.points).reshape(-1, 3)
-    normals = raster.interpolate_vertices(surface.faces, surface.normals).reshape(-1, 3)
-    shading.shade(color.reshape(-1, 3), points, normals, eye)
+    points = raster.interpolate(surface.points, surface.faces).reshape(-1, 3)
+    normals = raster.interpolate(surface.normals, surface.faces).reshape(-1, 3)
+    _shade(color.reshape(-1, 3), points, normals, eye, shading)
 
 
-def without_texture(mesh: TexturedMesh) -> TexturedMesh:
-    """Return the mesh without texture and colours.
-
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        The mesh.
-
-    Returns
-    -------
-    TexturedMesh
-        The shape alone.
-    """
-    return replace(mesh, colors=None, uv=None, texture=None)
+def _shade(color: F32, points: F32, normals: F32, eye: F64, shading: Shading) -> None:
+    """Shade the colours (P, 3) of surface points in place."""
+    lamps = np.array([light._row for light in shading.lights], dtype=np.float64).reshape(-1, 7)
+    surface = (float(shading.ambient), float(shading.specular), float(shading.shininess))
+    _shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lamps, surface)

@@ -1,11 +1,12 @@
-"""The trilinear tensor of virtual cameras (thesis, section 1.3; Avidan and Shashua 1997).
+"""View synthesis in tensor space: cameras of two images, virtual cameras and their tensors (section 1.3).
 
-Cameras P1 = [I 0], P2 = [a, a_4], P3 = [b, b_4] have the tensor T_i^jk = a_i^j b_4^k - a_4^j b_i^k. If the
-third camera rotates and moves to [Rb, R b_4 + t], the tensor becomes
+After Avidan and Shashua (CVPR 1997, PAMI 1998). Cameras P1 = [I 0], P2 = [a, a_4], P3 = [b, b_4] have the
+tensor T_i^jk = a_i^j b_4^k - a_4^j b_i^k. If the third camera rotates and moves to [Rb, R b_4 + t],
 
     T'_i^jk = R_l^k T_i^jl + t^k a_i^j
 
-One seed tensor gives all others; neither cameras nor scene points are needed.
+One seed tensor gives all others; neither cameras nor scene points are needed. Unknown intrinsics are guessed,
+as in the thesis; new views are then correct up to a projective transform of space.
 """
 
 from __future__ import annotations
@@ -13,20 +14,315 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, require_finite
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import calibration_matrix, rq
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, require_finite
 from thesisrecon.geometry.three_view import cameras_from_tensor, fundamentals_from_tensor
-from thesisrecon.views.virtual_camera import (
-    CalibratedPair,
-    Orientation,
-    nearest_plane,
-    pair_from_fundamental,
-    require_intrinsics,
-    require_rotation,
-    require_translation,
+from thesisrecon.geometry.two_view import (
+    enforce_rank_two,
+    epipoles,
+    require_parallax_of_matches,
+    sampson_residuals,
 )
+
+MAX_RESIDUAL = 0.005
+"""Median distance of matches from their epipolar lines, in units of the long side, above which F is
+rejected."""
+OFF_ROTATION = 1e-4
+"""Tolerance of R'R - I: a rotation written with four digits passes."""
+IN_FRONT = 0.75
+"""Share of matches that must lie in front of both cameras."""
+
+
+def _require_motion(R: F64, t: F64) -> None:
+    """Check that R is a rotation within ``OFF_ROTATION`` and t three finite numbers."""
+    R = np.asarray(R, dtype=np.float64)
+    if R.shape != (3, 3) or not np.isfinite(R).all():
+        raise ValueError(f"a rotation is a finite matrix (3, 3); got shape {R.shape}")
+    off, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
+    if not (off <= OFF_ROTATION and det > 0.0):
+        raise ValueError(f"a rotation has R'R = I and det R = 1; this one is off by {off:.2g}, det {det:.3g}")
+    if np.shape(t) != (3,) or not np.isfinite(t).all():
+        raise ValueError(f"a translation is three finite numbers; got {t}")
+
+
+def _require_intrinsics(K: F64) -> None:
+    """Check that K is upper triangular with positive focal lengths and K33 = 1."""
+    K = np.asarray(K, dtype=np.float64)
+    if K.shape != (3, 3) or not np.isfinite(K).all():
+        raise ValueError(f"intrinsics are a finite matrix (3, 3); got shape {K.shape}")
+    lower = float(np.abs(np.tril(K, -1)).max())
+    if not (min(K[0, 0], K[1, 1]) > 0.0 and K[2, 2] == 1.0 and lower == 0.0):
+        raise ValueError("intrinsics are [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]] with positive focals")
+
+
+@dataclass(frozen=True)
+class CalibratedPair:
+    """Two calibrated cameras, X_2 = R X_1 + t. For two images |t| = 1 is the unit of length.
+
+    Parameters
+    ----------
+    K1, K2 : ndarray (3, 3)
+        Intrinsics.
+    R, t : ndarray (3, 3), (3,)
+        Rotation and translation from the first to the second camera frame.
+
+    Raises
+    ------
+    ValueError
+        If the arguments are no intrinsics, rotation or non-zero translation.
+    """
+
+    K1: F64
+    K2: F64
+    R: F64
+    t: F64
+
+    def __post_init__(self) -> None:
+        _require_intrinsics(self.K1)
+        _require_intrinsics(self.K2)
+        _require_motion(self.R, self.t)
+        if not np.linalg.norm(self.t) > 0.0:
+            raise ValueError("CalibratedPair needs a translation other than 0")
+
+    @property
+    def P2(self) -> F64:
+        """The second camera [a, a_4] = [K2 R K1^-1, K2 t] (3, 4) beside P1 = [I 0].
+
+        Space points are K1 X_1, so a point is (x, 1 / depth) for its pixel x in view 1 and a is the infinite
+        homography.
+        """
+        return np.column_stack([self.K2 @ self.R @ np.linalg.inv(self.K1), self.K2 @ self.t])
+
+    @property
+    def centre2(self) -> F64:
+        """Centre (3,) of the second camera in the frame of the first."""
+        return np.asarray(-self.R.T @ self.t)
+
+    def swapped(self) -> CalibratedPair:
+        """Return the same cameras in the other order.
+
+        Returns
+        -------
+        CalibratedPair
+            The pair with the first and second camera exchanged.
+        """
+        return CalibratedPair(self.K2, self.K1, self.R.T, self.centre2)
+
+
+def default_intrinsics(size: tuple[int, int]) -> F64:
+    """Return typical intrinsics: the focal length is the long side, the principal point the image centre.
+
+    Parameters
+    ----------
+    size : tuple of int
+        Width and height in pixels.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        K.
+    """
+    f = float(max(size))
+    return calibration_matrix(f, f, 0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0))
+
+
+def pair_from_fundamental(
+    F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64, small_rotation: bool = False
+) -> CalibratedPair:
+    """Compute the two cameras of F for given intrinsics (thesis, section 1.3).
+
+    The fundamental matrix of the result is F exactly. The first camera has K1; of all second cameras that F
+    allows, the left part is nearest to K2 R K1^-1 (least squares in coordinates of K2 and K1) with R from the
+    essential matrix. Its intrinsics differ from K2 where F contradicts them.
+
+    Parameters
+    ----------
+    F : ndarray (3, 3)
+        Fundamental matrix, x2' F x1 = 0.
+    xy1, xy2 : ndarray (N, 2)
+        At least eight matches in pixels that agree with F; they select the decomposition.
+    K1, K2 : ndarray (3, 3)
+        Intrinsics, known or guessed (:func:`default_intrinsics`).
+    small_rotation : bool
+        Whether R is computed as I + [w]x, as in Avidan and Shashua; otherwise it may be any rotation.
+
+    Returns
+    -------
+    CalibratedPair
+        Cameras with a baseline of length 1.
+
+    Raises
+    ------
+    ValueError
+        For non-finite values or invalid intrinsics.
+    StageFailure
+        For an F of other matches, no parallax, or points behind the cameras.
+    """
+    require_finite("pair_from_fundamental", F, xy1, xy2)
+    _require_intrinsics(K1)
+    _require_intrinsics(K2)
+    _require_theirs(F, xy1, xy2)
+    E = K2.T @ F @ K1
+    rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
+    candidates = (_decompose_small if small_rotation else _decompose)(E / np.linalg.norm(E))
+    shares = [_ratio_in_front(R, t, rays1, rays2) for R, t in candidates]
+    best = int(np.argmax(shares))
+    if not shares[best] >= IN_FRONT:
+        raise StageFailure(
+            "the scene is not in front of both cameras",
+            f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, for the best of {len(shares)} cameras",
+            "check the fundamental matrix and the intrinsics",
+        )
+    return _pair_with(F, K1, K2, *candidates[best])
+
+
+def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
+    """The pair that has F and is nearest to K1, K2, R, t."""
+    F = enforce_rank_two(F)
+    e2 = epipoles(F)[1]
+    H = -cross_matrix(e2) @ F
+    m, v = _nearest_plane(H, e2, K2 @ R @ np.linalg.inv(K1), K1=K1, K2=K2)
+    left = m * (H + np.outer(e2, v)) @ K1
+    if not np.linalg.det(left) > 0.0:
+        raise StageFailure(
+            "the fundamental matrix contradicts the intrinsics",
+            "no second camera that it allows is close to these intrinsics",
+            "set another focal length, or none",
+        )
+    own, turn = rq(left)
+    baseline: F64 = np.asarray(np.linalg.solve(own, e2), dtype=np.float64)
+    baseline *= np.sign(baseline @ t) / np.linalg.norm(baseline)
+    return CalibratedPair(np.asarray(K1, dtype=np.float64), own / own[2, 2], turn, baseline)
+
+
+def _nearest_plane(a: F64, a4: F64, wanted: F64, *, K1: F64, K2: F64) -> tuple[float, F64]:
+    """m and v for which m (a + a_4 v') is nearest to ``wanted``: least squares of K2^-1 (.) K1."""
+    back = np.linalg.inv(K2)
+    members = [a, *(np.outer(a4, axis) for axis in np.eye(3))]
+    design = np.stack([(back @ member @ K1).ravel() for member in members], axis=1)
+    m, *mv = np.linalg.lstsq(design, (back @ wanted @ K1).ravel(), rcond=None)[0]
+    return float(m), np.asarray(mv) / m
+
+
+def _ratio_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
+    """Share of ray pairs (N, 3) that meet, at their closest points, in front of both cameras."""
+    turned = rays1 @ R.T
+    normal = np.cross(turned, rays2)
+    first = -np.sum(np.cross(t, rays2) * normal, axis=1)
+    second = -np.sum(np.cross(t, turned) * normal, axis=1)
+    return float(np.mean((first > 0.0) & (second > 0.0)))
+
+
+def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
+    """Reject matches that do not fit F, and matches without parallax."""
+    distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
+    extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
+    if not np.median(distance) <= MAX_RESIDUAL * extent:
+        raise StageFailure(
+            "the fundamental matrix does not fit the matches",
+            f"their median distance from the epipolar lines is {np.median(distance):.3g} px",
+            "estimate it from these matches",
+        )
+    require_parallax_of_matches(F, xy1, xy2)
+
+
+def _decompose(E: F64) -> list[tuple[F64, F64]]:
+    """The four R = U W V' or U W' V' and unit t = +-u_3 of an essential matrix (HZ 9.6.2)."""
+    U, _, Vt = np.linalg.svd(E)
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turns = [U @ W @ Vt for W in (quarter, quarter.T)]
+    turns = [R * np.sign(np.linalg.det(R)) for R in turns]
+    return [(R, sign * U[:, 2]) for R in turns for sign in (1.0, -1.0)]
+
+
+def _decompose_small(E: F64) -> list[tuple[F64, F64]]:
+    """R = I + [w]x to first order, with both signs of t (Avidan and Shashua; Rousso et al., CVPR 1996).
+
+    E ~ [t]x (I + [w]x) is linear in the scale s of E and in s w: nine equations for four unknowns. The
+    returned rotation is that of the rotation vector w.
+    """
+    _, t = epipoles(E)
+    across = cross_matrix(t)
+    columns = [across, *(across @ cross_matrix(axis) for axis in np.eye(3))]
+    design = np.stack([column.ravel() for column in columns], axis=1)
+    solution = np.linalg.lstsq(design, E.ravel(), rcond=None)[0]
+    if not abs(solution[0]) > 1e-6 * np.linalg.norm(solution):
+        raise StageFailure(
+            "the rotation between the two images is not small",
+            "no small rotation explains the fundamental matrix",
+            "allow any rotation",
+        )
+    R = scipy.spatial.transform.Rotation.from_rotvec(solution[1:] / solution[0]).as_matrix()
+    return [(R, t), (R, -t)]
+
+
+@dataclass(frozen=True)
+class VirtualCamera:
+    """The third camera of the seed after a motion from X_3 to R X_3 + t.
+
+    Parameters
+    ----------
+    rotation, translation : ndarray (3, 3), (3,)
+        R, and t in baselines.
+    K : ndarray (3, 3)
+        Intrinsics.
+    size : tuple of int
+        Width and height in pixels.
+
+    Raises
+    ------
+    ValueError
+        If the arguments are no rotation, translation or intrinsics, or the size is below 1 px.
+    """
+
+    rotation: F64
+    translation: F64
+    K: F64
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        _require_motion(self.rotation, self.translation)
+        _require_intrinsics(self.K)
+        if min(self.size) < 1:
+            raise ValueError(f"an image is at least 1 x 1 px; got {self.size}")
+
+
+def camera_at(
+    pair: CalibratedPair,
+    s: float,
+    *,
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+) -> VirtualCamera:
+    """Place a virtual camera on the baseline: the rotation about its axis is a share of that of the pair.
+
+    K is interpolated if both sizes are equal, otherwise it is K2.
+
+    Parameters
+    ----------
+    pair : CalibratedPair
+        The cameras.
+    s : float
+        Position in baselines from the first image (0) to the second (1), or beyond.
+    sizes : tuple
+        Width and height of both images; the view has the size of the second.
+
+    Returns
+    -------
+    VirtualCamera
+        The camera.
+    """
+    turned = scipy.spatial.transform.Rotation.from_rotvec(
+        s * scipy.spatial.transform.Rotation.from_matrix(pair.R).as_rotvec()
+    ).as_matrix()
+    share = min(max(s, 0.0), 1.0) if sizes[0] == sizes[1] else 1.0
+    K = (1.0 - share) * pair.K1 + share * pair.K2
+    # X_s = turned (X_1 - s C_2) and X_1 = R'(X_2 - t).
+    motion = turned @ pair.R.T
+    return VirtualCamera(motion, -s * turned @ pair.centre2 - motion @ pair.t, K, sizes[1])
 
 
 @dataclass(frozen=True)
@@ -56,11 +352,6 @@ class VirtualTensor:
             design[i, :, i] = -self.P2[:, 3]
         return np.asarray(np.linalg.lstsq(design.reshape(9, 4), self.T.reshape(9, 3), rcond=None)[0].T)
 
-    @property
-    def centre(self) -> F64:
-        """Homogeneous centre (4,) of the third camera."""
-        return camera_centre(self.P3)
-
     def swapped(self) -> VirtualTensor:
         """Return the tensor <2, 1, 3> in the frame of the swapped pair.
 
@@ -77,10 +368,8 @@ class VirtualTensor:
 
         Parameters
         ----------
-        rotation : ndarray (3, 3)
-            R.
-        translation : ndarray (3,)
-            t in units of the baseline.
+        rotation, translation : ndarray (3, 3), (3,)
+            R, and t in units of the baseline.
         K : ndarray (3, 3), optional
             New intrinsics; default: unchanged.
 
@@ -94,44 +383,31 @@ class VirtualTensor:
         ValueError
             If the arguments are no rotation, translation or intrinsics.
         """
-        require_rotation(rotation)
-        require_translation(translation)
+        _require_motion(rotation, translation)
         K = self.K if K is None else K
-        require_intrinsics(K)
+        _require_intrinsics(K)
         turn, shift = K @ rotation @ np.linalg.inv(self.K), K @ translation
         T = np.einsum("kl,ijl->ijk", turn, self.T) + np.einsum("k,ji->ijk", shift, self.P2[:, :3])
         return VirtualTensor(T, self.P2, K)
 
-    def perpendicular_lines(self, xy1: F64, xy2: F64) -> F64:
-        """Return lines in image 2 through x2, perpendicular to the epipolar lines of x1.
+    def _perpendicular_lines(self, xy1: F64, xy2: F64) -> F64:
+        """Lines (..., 3) through x2, perpendicular to the epipolar lines of x1; zero at the epipole.
 
         Of all lines through x2 these carry the most information: an x2 off its epipolar line acts as its
         nearest point on the line.
-
-        Parameters
-        ----------
-        xy1, xy2 : ndarray (..., 2)
-            Matches in pixels.
-
-        Returns
-        -------
-        ndarray (..., 3)
-            Lines; zero at the epipole.
         """
         epipolar = np.cross(self.P2[:, 3], homogenize(xy1) @ self.P2[:, :3].T)
         norm = np.linalg.norm(epipolar[..., :2], axis=-1, keepdims=True)
         along = np.stack([epipolar[..., 1], -epipolar[..., 0]], axis=-1) / np.where(norm > 0.0, norm, 1.0)
         return np.concatenate([along, -np.sum(along * xy2, axis=-1, keepdims=True)], axis=-1)
 
-    def transfer(self, xy1: F64, xy2: F64, *, lines: F64 | None = None) -> tuple[F64, F64]:
-        """Transfer matches to the third image, x''^k = x^i l_j T_i^jk.
+    def transfer(self, xy1: F64, xy2: F64) -> tuple[F64, F64]:
+        """Transfer matches to the third image, x''^k = x^i l_j T_i^jk, l perpendicular to epipolar lines.
 
         Parameters
         ----------
         xy1, xy2 : ndarray (N, 2)
             Matches in pixels.
-        lines : ndarray (N, 3), optional
-            Lines through x2 in image 2 other than epipolar lines; default: :meth:`perpendicular_lines`.
 
         Returns
         -------
@@ -141,7 +417,7 @@ class VirtualTensor:
             1 / z in the third camera (z in baselines); negative beyond infinity.
         """
         x = homogenize(xy1)
-        lines = self.perpendicular_lines(xy1, xy2) if lines is None else lines
+        lines = self._perpendicular_lines(xy1, xy2)
         places = np.einsum("ni,nj,ijk->nk", x, lines, self.T)
         # With X = (x, rho), l'(a x + rho a_4) = 0 and the places are -(l'a_4) (b x + rho b_4).
         sweep = lines @ self.P2[:, 3]
@@ -167,7 +443,7 @@ class VirtualTensor:
         """
         x = homogenize(xy1)
         a, a4 = x @ self.P2[:, :3].T, self.P2[:, 3]
-        lines, third = self.perpendicular_lines(xy1, xy2), self.P3[2]
+        lines, third = self._perpendicular_lines(xy1, xy2), self.P3[2]
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = -np.sum(lines * a, axis=1) / (lines @ a4)
             # x_2 = (a + rho a_4) / w_2, and the inverse depth is rho / w_3.
@@ -176,45 +452,32 @@ class VirtualTensor:
             return np.asarray(along * w3**2 / np.abs(x @ third[:3]))
 
 
-def seed_of_two(pair: CalibratedPair) -> VirtualTensor:
-    """Return the seed tensor <1, 2, 2> of two views, in which the second view is also the third.
+def seed_of_two(pair: CalibratedPair, *, first: bool = False) -> VirtualTensor:
+    """Return the seed tensor <1, 2, 2> of two views, in which one view is also the third.
 
     Parameters
     ----------
     pair : CalibratedPair
         The cameras.
+    first : bool
+        Whether the first view is the third one, <1, 2, 1>; otherwise the second.
 
     Returns
     -------
     VirtualTensor
         The tensor; it holds the same information as F.
     """
-    return VirtualTensor(_tensor(pair.P2, pair.P2), pair.P2, pair.K2)
-
-
-def seed_of_first(pair: CalibratedPair) -> VirtualTensor:
-    """Return the tensor <1, 2, 1> of two views; its inverse depth is that in view 1.
-
-    Parameters
-    ----------
-    pair : CalibratedPair
-        The cameras.
-
-    Returns
-    -------
-    VirtualTensor
-        The tensor.
-    """
-    return VirtualTensor(_tensor(pair.P2, np.eye(3, 4)), pair.P2, pair.K1)
+    P3, K = (np.eye(3, 4), pair.K1) if first else (pair.P2, pair.K2)
+    return VirtualTensor(_tensor(pair.P2, P3), pair.P2, K)
 
 
 def seed_of_three(
-    T: F64, xy1: F64, xy2: F64, *, K: tuple[F64, F64, F64], orientation: Orientation | None = None
+    T: F64, xy1: F64, xy2: F64, *, K: tuple[F64, F64, F64]
 ) -> tuple[CalibratedPair, VirtualTensor]:
     """Return the tensor <1, 2, 3> of three images in the frame of the first two cameras.
 
-    The plane at infinity is that of :func:`pair_from_fundamental`; the scale of the third camera makes
-    its left part a rotation.
+    The plane at infinity is that of :func:`pair_from_fundamental`; the scale of the third camera makes its
+    left part a rotation.
 
     Parameters
     ----------
@@ -224,8 +487,6 @@ def seed_of_three(
         Matches of the first two images in pixels.
     K : tuple of ndarray (3, 3)
         Intrinsics of the three images.
-    orientation : Orientation, optional
-        Decomposition of the essential matrix.
 
     Returns
     -------
@@ -238,14 +499,12 @@ def seed_of_three(
         As :func:`pair_from_fundamental`.
     """
     require_finite("seed_of_three", T)
-    require_intrinsics(K[2])
+    _require_intrinsics(K[2])
     _, P2, P3 = cameras_from_tensor(T)
-    pair = pair_from_fundamental(
-        fundamentals_from_tensor(T)[0], xy1, xy2, K1=K[0], K2=K[1], orientation=orientation
-    )
+    pair = pair_from_fundamental(fundamentals_from_tensor(T)[0], xy1, xy2, K1=K[0], K2=K[1])
     # P2 of the pair is m (a + a_4 v', s a_4).
     a, a4 = P2[:, :3], P2[:, 3]
-    m, v = nearest_plane(a, a4, pair.P2[:, :3], K1=pair.K1, K2=pair.K2)
+    m, v = _nearest_plane(a, a4, pair.P2[:, :3], K1=pair.K1, K2=pair.K2)
     change = np.eye(4)
     change[3, :3] = v
     change[3, 3] = a4 @ pair.P2[:, 3] / (m * (a4 @ a4))

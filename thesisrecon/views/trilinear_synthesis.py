@@ -1,8 +1,8 @@
 """View synthesis from two images by the trilinear tensor (thesis, section 1.3).
 
-Every pixel is transferred by the tensor of the virtual camera and drawn there, nearer pixels in front. No
-surface is built. A pixel without correspondence is occluded in the other image; it takes the depth of the
-nearest surrounding surface that would not stand in front of anything the other image shows.
+Every pixel is transferred by the tensor of the virtual camera and drawn there, nearer pixels in front. A
+pixel without correspondence is occluded in the other image; it takes the depth of the nearest surrounding
+surface that would not stand in front of anything the other image shows.
 """
 
 from __future__ import annotations
@@ -10,16 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numba import njit
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8, F32, F64, I16, I32, U8
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.zbuffer import run_in_strips
-from thesisrecon.views.trilinear import VirtualTensor, seed_of_first, seed_of_two
-from thesisrecon.views.virtual_camera import CalibratedPair, VirtualCamera, cameras_along
+from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, VirtualTensor, seed_of_two
 from thesisrecon.views.warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 
 SURFACE_PX = 1.0
@@ -33,24 +32,8 @@ MIN_SEEN = 0.05
 
 
 @njit(cache=True, nogil=True)
-def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_depth: F32) -> None:
-    """Transfer the pixels of some rows to the third view, as :meth:`VirtualTensor.transfer` does.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Tensor.
-    P2 : ndarray (3, 4)
-        Second camera.
-    places : ndarray (H, W, 2)
-        Corresponding pixels in image 2, NaN if unknown.
-    first : int
-        Number of the first row.
-    xy : ndarray (H, W, 2)
-        Output: pixels of the third view, NaN if unknown.
-    inverse_depth : ndarray (H, W)
-        Output: inverse depth in the third view, NaN if unknown.
-    """
+def _transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_depth: F32) -> None:
+    """Transfer the pixels of rows from ``first`` to the third view, see :meth:`VirtualTensor.transfer`."""
     height, width = inverse_depth.shape
     for row in range(height):
         y = float(first + row)
@@ -82,29 +65,13 @@ def transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_dep
 
 
 @njit(cache=True, nogil=True)
-def extrapolate_inverse_depth(
+def _extrapolate_inverse_depth(
     inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
 ) -> None:
-    """Complete the inverse depth of the pixels of an image from the pixels around them.
+    """Complete the inverse depth of an image, given with that of the other one, from the pixels around.
 
-    Of the known pixels around, the nearest is taken whose surface would not stand in front of what the
-    other image shows; if all would, the nearest of all.
-
-    Parameters
-    ----------
-    inverse_depth : tuple of ndarray
-        Inverse depth of this image (H, W) and of the other (h, w), each in its own view, NaN if
-        unknown.
-    P2 : ndarray (3, 4)
-        The other camera.
-    steps : ndarray (K, 2)
-        Search directions (down, right).
-    distance : ndarray (K, H, W)
-        Steps to the next known pixel in each direction.
-    step : float
-        Tolerance of inverse depth.
-    out : ndarray (H, W)
-        The result, NaN if no pixel was found.
+    Of the known pixels around (``distance`` steps away, see :func:`distances_to_known`) the nearest is taken
+    whose surface would not stand in front of what the other image shows; if all would, the nearest of all.
     """
     own, other = inverse_depth
     for y in range(own.shape[0]):
@@ -140,35 +107,10 @@ def _occludes(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> b
     return bool(rho / w > other[int(row), int(column)] + step)
 
 
-Both32 = tuple[F32, F32]
-
-
-def complete_correspondence(
-    pair: CalibratedPair, places: Both32, *, agree_px: float
-) -> tuple[Both32, tuple[B8, B8]]:
-    """Complete the correspondence of two images.
-
-    Parameters
-    ----------
-    pair : CalibratedPair
-        The cameras.
-    places : tuple of ndarray (H, W, 2)
-        Corresponding pixels in the other image, NaN if unknown.
-    agree_px : float
-        Tolerance of the forward-backward check; inf accepts all correspondences.
-
-    Returns
-    -------
-    places : tuple of ndarray (H, W, 2)
-        Complete correspondences, float32.
-    known : tuple of ndarray (H, W)
-        Pixels whose correspondence is known, not guessed.
-
-    Raises
-    ------
-    StageFailure
-        If no pixel of an image has a known correspondence.
-    """
+def _complete_correspondence(
+    pair: CalibratedPair, places: tuple[F32, F32], agree_px: float
+) -> tuple[tuple[F32, F32], tuple[B8, B8]]:
+    """Correspondences of all pixels, and which of them are known instead of guessed."""
     known = _agreeing(places[0], places[1], agree_px), _agreeing(places[1], places[0], agree_px)
     for side in (0, 1):
         if not known[side].any():
@@ -179,9 +121,9 @@ def complete_correspondence(
             )
     pairs = pair, pair.swapped()
     sure = [np.where(known[side][..., None], places[side], np.nan) for side in (0, 1)]
-    own = [seed_of_first(one) for one in pairs]
-    inverse_depth = [transfer_image(own[side], sure[side])[1] for side in (0, 1)]
-    steps = [surface_step(own[side], sure[side]) for side in (0, 1)]
+    own = [seed_of_two(one, first=True) for one in pairs]
+    inverse_depth = [_transfer_image(own[side], sure[side])[1] for side in (0, 1)]
+    steps = [_surface_step(own[side], sure[side]) for side in (0, 1)]
     complete = [
         _completed(pairs[side], sure[side], (inverse_depth[side], inverse_depth[1 - side]), steps[1 - side])
         for side in (0, 1)
@@ -189,50 +131,20 @@ def complete_correspondence(
     return (complete[0], complete[1]), known
 
 
-def transfer_image(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
-    """Transfer all pixels of image 1; see :meth:`VirtualTensor.transfer`.
-
-    Parameters
-    ----------
-    virtual : VirtualTensor
-        The tensor.
-    places : ndarray (H, W, 2)
-        Corresponding pixels in image 2.
-    threads : int
-        Number of threads.
-
-    Returns
-    -------
-    xy : ndarray (H, W, 2)
-        Pixels of the third view.
-    inverse_depth : ndarray (H, W)
-        Inverse depth in the third view.
-    """
+def _transfer_image(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
+    """Pixels (H, W, 2) of image 1 in the third view, and their inverse depth."""
     xy, inverse_depth = np.empty(places.shape), np.empty(places.shape[:2], dtype=np.float32)
 
     def work(rows: tuple[int, int]) -> None:
         part = slice(*rows)
-        transfer_rows(virtual.T, virtual.P2, places[part], rows[0], xy[part], inverse_depth[part])
+        _transfer_rows(virtual.T, virtual.P2, places[part], rows[0], xy[part], inverse_depth[part])
 
     run_in_strips(work, len(places), threads)
     return xy, inverse_depth
 
 
-def surface_step(virtual: VirtualTensor, places: F32) -> float:
-    """Convert ``SURFACE_PX`` to inverse depth of the third view, for the median pixel.
-
-    Parameters
-    ----------
-    virtual : VirtualTensor
-        The tensor.
-    places : ndarray (H, W, 2)
-        Corresponding pixels in image 2.
-
-    Returns
-    -------
-    float
-        Difference of inverse depth.
-    """
+def _surface_step(virtual: VirtualTensor, places: F32) -> float:
+    """``SURFACE_PX`` as a difference of inverse depth in the third view, for the median pixel."""
     known = np.isfinite(places[::SPARSE, ::SPARSE]).all(axis=2)
     y, x = (SPARSE * index for index in np.nonzero(known))
     pixels = np.stack([x, y], axis=1).astype(np.float64)
@@ -260,7 +172,7 @@ def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32]
     distance = np.empty((len(DIRECTIONS), *own.shape), dtype=np.int16)
     distances_to_known(own, DIRECTIONS, distance)
     guessed = np.empty_like(own)
-    extrapolate_inverse_depth(
+    _extrapolate_inverse_depth(
         inverse_depth, np.ascontiguousarray(pair.P2), DIRECTIONS, distance, step, guessed
     )
     y, x = np.nonzero(np.isnan(own))
@@ -278,8 +190,6 @@ class TensorSynthesis:
     ----------
     pair : CalibratedPair
         The cameras.
-    seeds : tuple of VirtualTensor
-        The tensors <1, 2, 2> and <2, 1, 2>, or those with a third image.
     levels : tuple of ndarray (H, W, 4)
         Colours, and 1 where the correspondence is known, 0 where it is guessed.
     places : tuple of ndarray (H, W, 2)
@@ -289,7 +199,6 @@ class TensorSynthesis:
     """
 
     pair: CalibratedPair
-    seeds: tuple[VirtualTensor, VirtualTensor]
     levels: tuple[F32, F32]
     places: tuple[F32, F32]
     gain: F32
@@ -300,30 +209,11 @@ class TensorSynthesis:
         (h1, w1), (h2, w2) = (levels.shape[:2] for levels in self.levels)
         return (w1, h1), (w2, h2)
 
-    def along(self, frames: int, *, beyond: float = 0.0) -> list[VirtualCamera]:
-        """Place virtual cameras on the baseline; see :func:`cameras_along`.
-
-        Parameters
-        ----------
-        frames : int
-            Number of cameras.
-        beyond : float
-            Extension at both ends, in baselines.
-
-        Returns
-        -------
-        list of VirtualCamera
-            The cameras.
-        """
-        third = np.linalg.inv(self.seeds[0].K) @ self.seeds[0].P3
-        R3 = scipy.spatial.transform.Rotation.from_matrix(third[:, :3] @ self.pair.K1).as_matrix()
-        return cameras_along(self.pair, frames, sizes=self.sizes, beyond=beyond, third=(R3, third[:, 3]))
-
     def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:
         """Render the image of a virtual camera.
 
-        Pixels that both images show are blended by the position of the camera; what neither shows is
-        filled from behind.
+        Pixels that both images show are blended by the position of the camera; what neither shows is filled
+        from behind.
 
         Parameters
         ----------
@@ -342,8 +232,9 @@ class TensorSynthesis:
         StageFailure
             If the camera sees almost nothing of the scene.
         """
-        moved = [seed.moved(camera.rotation, camera.translation, K=camera.K) for seed in self.seeds]
-        step = surface_step(moved[0], self.places[0])
+        seed = seed_of_two(self.pair)
+        moved = [s.moved(camera.rotation, camera.translation, K=camera.K) for s in (seed, seed.swapped())]
+        step = _surface_step(moved[0], self.places[0])
         layers = [self._layer(side, moved[side], camera.size, step, threads) for side in (0, 1)]
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
         if not seen.mean() >= MIN_SEEN:
@@ -358,7 +249,7 @@ class TensorSynthesis:
 
     def _share_of_second(self, virtual: VirtualTensor) -> np.float32:
         """Position of the camera along the baseline, clipped to 0 (first image) and 1 (second image)."""
-        centre, baseline = virtual.centre, self.pair.centre2
+        centre, baseline = camera_centre(virtual.P3), self.pair.centre2
         along = np.linalg.solve(self.pair.K1, centre[:3]) @ baseline / (centre[3] * baseline @ baseline)
         return np.float32(np.clip(along, 0.0, 1.0))
 
@@ -366,7 +257,7 @@ class TensorSynthesis:
         self, side: int, virtual: VirtualTensor, size: tuple[int, int], step: float, threads: int
     ) -> tuple[F32, F32]:
         """The camera's view of one image (H, W, 4) and its inverse depth (H, W), NaN if empty."""
-        xy, inverse_depth = transfer_image(virtual, self.places[side], threads=threads)
+        xy, inverse_depth = _transfer_image(virtual, self.places[side], threads=threads)
         source, front = forward_map(xy, inverse_depth, size=size, step=step, threads=threads)
         return sample(self.levels[side], source, threads=threads), front
 
@@ -410,7 +301,6 @@ def prepare_synthesis(
     places: tuple[F32, F32],
     *,
     gain: ArrayLike = (1.0, 1.0, 1.0),
-    seed: VirtualTensor | None = None,
     agree_px: float = AGREE_PX,
 ) -> TensorSynthesis:
     """Prepare everything that does not depend on the virtual camera.
@@ -425,8 +315,6 @@ def prepare_synthesis(
         Corresponding pixels in the other image, NaN if unknown.
     gain : array_like (3,)
         Factor of the exposure of the second image.
-    seed : VirtualTensor, optional
-        Tensor that virtual cameras start from; default <1, 2, 2>; see :mod:`thesisrecon.views.trilinear`.
     agree_px : float
         Tolerance of the forward-backward check; inf if all correspondences are right.
 
@@ -437,23 +325,13 @@ def prepare_synthesis(
 
     Raises
     ------
-    ValueError
-        If the shapes do not fit.
     StageFailure
         If no correspondence is known.
     """
     rgb = [np.asarray(image, dtype=np.float32) for image in images]
-    for side, (image, there) in enumerate(zip(rgb, places, strict=True)):
-        if image.ndim != 3 or image.shape[2] != 3 or there.shape != (*image.shape[:2], 2):
-            raise ValueError(
-                f"image {side + 1} must be (H, W, 3) with places (H, W, 2); got {image.shape} and "
-                f"{there.shape}"
-            )
-    complete, known = complete_correspondence(pair, places, agree_px=agree_px)
+    complete, known = _complete_correspondence(pair, places, agree_px)
     levels = [
         np.concatenate([image, sure[..., None].astype(np.float32)], axis=2)
         for image, sure in zip(rgb, known, strict=True)
     ]
-    seed = seed_of_two(pair) if seed is None else seed
-    seeds = seed, seed.swapped()
-    return TensorSynthesis(pair, seeds, (levels[0], levels[1]), complete, np.asarray(gain, dtype=np.float32))
+    return TensorSynthesis(pair, (levels[0], levels[1]), complete, np.asarray(gain, dtype=np.float32))

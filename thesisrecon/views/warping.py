@@ -1,8 +1,7 @@
 """Forward warping of an image, nearer pixels in front (thesis, sections 1.2 and 1.3).
 
 McMillan and Bishop (1995) order the pixels so that nearer ones overwrite farther ones. Here the inverse
-depth of each pixel is compared, which gives the same image in any order. Each kernel has a NumPy
-twin in the tests.
+depth of each pixel is compared, which gives the same image in any order.
 """
 
 from __future__ import annotations
@@ -138,8 +137,7 @@ def _draw_footprint(
 
 @njit(cache=True, nogil=True)
 def _outside_rows(target: F64, a: tuple[int, int], reach: float, rows: tuple[int, int]) -> bool:
-    """Whether nothing that four pixels make can be seen in the rows: all lie farther from these on one side
-    than a pixel and its neighbours of one surface reach."""
+    """Whether four pixels lie farther above or below the rows than a pixel of one surface reaches."""
     least, most = np.inf, -np.inf
     for y in range(a[0], min(a[0] + 2, target.shape[0])):
         for x in range(a[1], min(a[1] + 2, target.shape[1])):
@@ -150,28 +148,14 @@ def _outside_rows(target: F64, a: tuple[int, int], reach: float, rows: tuple[int
 
 
 @njit(cache=True, nogil=True)
-def draw_surface(
+def _draw_surface(
     target: F64, inverse_depth: F32, limits: F64, rows: tuple[int, int], source: F32, front: F32
 ) -> None:
     """Draw the surface of an image's pixels into some rows of another view, nearest in front.
 
+    ``limits``: largest differences of inverse depth and of position (px) between neighbours of one surface.
     Four pixels around a point form two triangles, three connected ones form one; at discontinuities and
     borders a pixel covers half a pixel to each side.
-
-    Parameters
-    ----------
-    target : ndarray (h, w, 2)
-        Position of each pixel in the view, NaN for none.
-    inverse_depth : ndarray (h, w)
-        Inverse depth, NaN for none.
-    limits : ndarray (2,)
-        Largest differences of inverse depth and of position (px) between neighbours of one surface.
-    rows : tuple of int
-        First and last row (exclusive) of the view.
-    source : ndarray (H, W, 2)
-        Output: position in the image shown at each pixel.
-    front : ndarray (H, W)
-        Output: its inverse depth, NaN if empty.
     """
     height, width = inverse_depth.shape
     for y in range(height):
@@ -209,20 +193,8 @@ def draw_surface(
 
 
 @njit(cache=True, nogil=True)
-def sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
-    """Sample rows of an image by cubic convolution; bilinear beside the border, NaN beside NaN.
-
-    Parameters
-    ----------
-    image : ndarray (h, w, C)
-        Levels.
-    source : ndarray (H, W, 2)
-        Positions in pixels.
-    rows : tuple of int
-        First and last row (exclusive).
-    out : ndarray (H, W, C)
-        The samples.
-    """
+def _sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
+    """Sample rows of an image by cubic convolution; bilinear beside the border, NaN beside NaN."""
     height, width, channels = image.shape
     wx, wy = np.empty(4, np.float32), np.empty(4, np.float32)
     for y in range(rows[0], rows[1]):
@@ -266,16 +238,9 @@ def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.floa
 
 @njit(cache=True, nogil=True)
 def distances_to_known(inverse_depth: F32, steps: I32, distance: I16) -> None:
-    """Count the steps from each pixel to the next known pixel in each direction.
+    """Count the ``steps`` (K, 2) (down, right) from each pixel to the next known one, ``distance`` (K, H, W).
 
-    Parameters
-    ----------
-    inverse_depth : ndarray (H, W)
-        Inverse depth, NaN if unknown.
-    steps : ndarray (K, 2)
-        Directions (down, right).
-    distance : ndarray (K, H, W)
-        Output: number of steps; 0 at known pixels, -1 if there is none.
+    0 at known pixels, -1 if there is none.
     """
     height, width = inverse_depth.shape
     for k in range(steps.shape[0]):
@@ -295,27 +260,8 @@ def distances_to_known(inverse_depth: F32, steps: I32, distance: I16) -> None:
 
 
 @njit(cache=True, nogil=True)
-def fill_from_behind(
-    rgb: F32, inverse_depth: F32, steps: I32, distance: I16, limits: tuple[float, float], out: F32
-) -> None:
-    """Fill holes with the colours of the background around them.
-
-    Parameters
-    ----------
-    rgb : ndarray (H, W, C)
-        Levels.
-    inverse_depth : ndarray (H, W)
-        Inverse depth, NaN at holes.
-    steps : ndarray (K, 2)
-        Directions (down, right).
-    distance : ndarray (K, H, W)
-        Steps to the next known pixel, from :func:`distances_to_known`.
-    limits : tuple of float
-        Tolerance of inverse depth and search radius (px).
-    out : ndarray (H, W, C)
-        The result; weights are 1 / distance^2, NaN where no direction leads to a known pixel.
-    """
-    reach = np.empty(steps.shape[0])
+def _fill_from_behind(rgb: F32, inverse_depth: F32, steps: I32, distance: I16, step: float, out: F32) -> None:
+    """Fill holes with the background around, see :func:`fill_holes`."""
     colors = np.empty(rgb.shape[2])
     for y in range(rgb.shape[0]):
         for x in range(rgb.shape[1]):
@@ -325,19 +271,19 @@ def fill_from_behind(
             colors[:] = 0.0
             for k in range(steps.shape[0]):
                 n = distance[k, y, x]
-                reach[k] = n * np.hypot(steps[k, 0], steps[k, 1]) if n > 0 else np.nan
-                if reach[k] <= limits[1]:
+                if n > 0:
                     least = min(least, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
                     most = max(most, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
-            behind = least + max(limits[0], BACKGROUND_FRACTION * (most - least))
+            behind = least + max(step, BACKGROUND_FRACTION * (most - least))
             for k in range(steps.shape[0]):
-                if not reach[k] <= limits[1]:
-                    continue
                 n = distance[k, y, x]
+                if n <= 0:
+                    continue
                 v, u = y + n * steps[k, 0], x + n * steps[k, 1]
                 if inverse_depth[v, u] > behind:
                     continue
-                weight = 1.0 / (reach[k] * reach[k])
+                reach = n * np.hypot(steps[k, 0], steps[k, 1])
+                weight = 1.0 / (reach * reach)
                 total += weight
                 for c in range(colors.size):
                     colors[c] += weight * rgb[v, u, c]
@@ -351,8 +297,7 @@ DIRECTIONS = np.array(
 """Sixteen directions (down, right) in which known pixels around a hole are searched."""
 
 
-def forward_warp(
-    image: ArrayLike,
+def forward_map(
     target_xy: F64 | F32,
     inverse_depth: F64 | F32,
     *,
@@ -360,17 +305,14 @@ def forward_warp(
     step: float = np.inf,
     threads: int = 1,
 ) -> tuple[F32, F32]:
-    """Warp an image to another view with known pixel positions.
+    """Compute which position of an image each pixel of another view shows.
 
-    Pixels are corners of small triangles in which positions are interpolated and colours sampled by
-    cubic convolution. Neighbours belong to one surface if they come at most 3 px apart and their
-    inverse depth differs by at most ``step``; at discontinuities a pixel covers half a pixel to each
-    side. Back faces are not drawn.
+    Pixels are corners of small triangles in which positions are interpolated. Neighbours belong to one
+    surface if they come at most 3 px apart and their inverse depth differs by at most ``step``; at
+    discontinuities a pixel covers half a pixel to each side. Back faces are not drawn.
 
     Parameters
     ----------
-    image : array_like (h, w, C)
-        Levels.
     target_xy : ndarray (h, w, 2)
         Position of each pixel in the view, NaN for none.
     inverse_depth : ndarray (h, w)
@@ -384,80 +326,20 @@ def forward_warp(
 
     Returns
     -------
-    colors : ndarray (H, W, C) of float32
-        Levels, NaN where nothing lands.
-    front : ndarray (H, W) of float32
-        Inverse depth of the visible pixel, NaN where nothing lands.
-
-    Raises
-    ------
-    ValueError
-        For shapes that do not fit, a size below one pixel or a negative step.
-    """
-    levels = np.ascontiguousarray(image, dtype=np.float32)
-    if levels.ndim != 3 or levels.shape[:2] != np.shape(inverse_depth):
-        raise ValueError(
-            f"forward_warp takes an image (h, w, C) and its inverse_depth (h, w); got {levels.shape} and "
-            f"{np.shape(inverse_depth)}"
-        )
-    source, front = forward_map(target_xy, inverse_depth, size=size, step=step, threads=threads)
-    return sample(levels, source, threads=threads), front
-
-
-def forward_map(
-    target_xy: F64 | F32,
-    inverse_depth: F64 | F32,
-    *,
-    size: tuple[int, int],
-    step: float = np.inf,
-    threads: int = 1,
-) -> tuple[F32, F32]:
-    """Compute which position of an image each pixel of another view shows.
-
-    Parameters
-    ----------
-    target_xy : ndarray (h, w, 2)
-        Position of each pixel in the view, NaN for none.
-    inverse_depth : ndarray (h, w)
-        Larger values are in front; NaN for none.
-    size : tuple of int
-        Width and height of the view.
-    step : float
-        Largest difference of inverse depth of neighbours on one surface.
-    threads : int
-        Number of threads.
-
-    Returns
-    -------
-    source : ndarray (H, W, 2) of float32
-        Position in the image, NaN where nothing lands.
-    front : ndarray (H, W) of float32
-        Inverse depth, NaN where nothing lands.
-
-    Raises
-    ------
-    ValueError
-        For shapes that do not fit, a size below one pixel or a negative step.
+    source, front : ndarray (H, W, 2), (H, W) of float32
+        Position in the image and inverse depth, NaN where nothing lands.
     """
     target = np.ascontiguousarray(target_xy, dtype=np.float64)
     near = np.ascontiguousarray(inverse_depth, dtype=np.float32)
-    if near.ndim != 2 or target.shape != (*near.shape, 2):
-        raise ValueError(
-            f"target_xy must be (h, w, 2) and inverse_depth (h, w); got {target.shape} and {near.shape}"
-        )
-    if min(size) < 1 or not step >= 0.0:
-        raise ValueError(f"size must be at least 1 x 1 and step not negative; got {size} and {step}")
     source = np.full((size[1], size[0], 2), np.nan, dtype=np.float32)
     front = np.full((size[1], size[0]), np.nan, dtype=np.float32)
     limits = np.array([step, STRETCH])
-    run_in_strips(lambda rows: draw_surface(target, near, limits, rows, source, front), size[1], threads)
+    run_in_strips(lambda rows: _draw_surface(target, near, limits, rows, source, front), size[1], threads)
     return source, front
 
 
 def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
-    """Sample an image by cubic convolution.
-
-    Beside the border and beside NaN pixels the samples are bilinear.
+    """Sample an image by cubic convolution; bilinear beside the border and beside NaN pixels.
 
     Parameters
     ----------
@@ -475,44 +357,30 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
     """
     levels = np.ascontiguousarray(image, dtype=np.float32)
     out = np.empty((*source_xy.shape[:2], levels.shape[2]), dtype=np.float32)
-    run_in_strips(lambda rows: sample_at(levels, source_xy, rows, out), len(out), threads)
+    run_in_strips(lambda rows: _sample_at(levels, source_xy, rows, out), len(out), threads)
     return out
 
 
-def fill_holes(rgb: F32, inverse_depth: F32, *, step: float = 0.0, reach_px: float = np.inf) -> F32:
+def fill_holes(rgb: F32, inverse_depth: F32, *, step: float) -> F32:
     """Fill holes with the background around them, since what was occluded is background.
 
-    Of the nearest known pixels in sixteen directions those count whose inverse depth is at most
-    ``step``, or 0.4 of its range, above the smallest. Their colours are averaged with weights 1 /
-    distance^2.
+    Of the nearest known pixels in sixteen directions those count whose inverse depth is at most ``step``,
+    or 0.4 of its range, above the smallest. Their colours are averaged with weights 1 / distance^2.
 
     Parameters
     ----------
-    rgb : ndarray (H, W, C) of float32
-        Levels.
-    inverse_depth : ndarray (H, W) of float32
-        Inverse depth; NaN marks a hole.
+    rgb, inverse_depth : ndarray (H, W, C), (H, W) of float32
+        Levels and inverse depth; NaN of the latter marks a hole.
     step : float
         Tolerance of inverse depth.
-    reach_px : float
-        Search radius.
 
     Returns
     -------
     ndarray (H, W, C) of float32
-        The image; NaN where no known pixel is in reach.
-
-    Raises
-    ------
-    ValueError
-        For shapes that do not fit.
+        The image; NaN where no direction leads to a known pixel.
     """
-    if rgb.ndim != 3 or rgb.shape[:2] != inverse_depth.shape:
-        raise ValueError(
-            f"rgb must be (H, W, C) and inverse_depth (H, W); got {rgb.shape} and {inverse_depth.shape}"
-        )
     distance = np.empty((len(DIRECTIONS), *inverse_depth.shape), dtype=np.int16)
     distances_to_known(inverse_depth, DIRECTIONS, distance)
     filled = rgb.copy()
-    fill_from_behind(rgb, inverse_depth, DIRECTIONS, distance, (step, reach_px), filled)
+    _fill_from_behind(rgb, inverse_depth, DIRECTIONS, distance, step, filled)
     return filled

@@ -13,8 +13,8 @@ from PIL import Image
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
+from thesisrecon.views.trilinear import CalibratedPair, default_intrinsics
 from thesisrecon.views.trilinear_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
-from thesisrecon.views.virtual_camera import CalibratedPair, default_intrinsics
 from validation.scenes.real import data_root
 
 ENDS = (2, 6)

@@ -21,15 +21,15 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.view_synthesis import match_images
-from thesisrecon.views.trilinear import seed_of_two
-from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
-from thesisrecon.views.virtual_camera import (
+from thesisrecon.views.trilinear import (
     CalibratedPair,
     VirtualCamera,
     camera_at,
     default_intrinsics,
     pair_from_fundamental,
+    seed_of_two,
 )
+from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
 from validation.metrics.pictures import picture_metrics, psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.metrics.timing import time_of_a_frame

@@ -11,7 +11,7 @@ import PIL.Image
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.view_interpolation import prepare_rectified_pair
-from thesisrecon.views.virtual_camera import camera_at
+from thesisrecon.views.trilinear import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric

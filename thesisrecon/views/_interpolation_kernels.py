@@ -21,17 +21,7 @@ NEAR = 2
 
 @njit(cache=True, nogil=True)
 def mark_crossings(disparity: F32, slack: float, crossing: B8) -> None:
-    """Mark pixels whose correspondence x - d crosses that of another pixel of their row.
-
-    Parameters
-    ----------
-    disparity : ndarray (H, W)
-        Disparities; NaN takes no part.
-    slack : float
-        Tolerance in pixels.
-    crossing : ndarray (H, W) of bool
-        The result.
-    """
+    """Mark pixels whose correspondence x - d crosses that of another pixel of their row by ``slack`` px."""
     height, width = disparity.shape
     least = np.empty(width + 1)
     for y in range(height):
@@ -49,13 +39,7 @@ def mark_crossings(disparity: F32, slack: float, crossing: B8) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_empty_rows(disparity: F32) -> None:
-    """Copy the nearest other row into rows that are NaN throughout, in place.
-
-    Parameters
-    ----------
-    disparity : ndarray (H, W)
-        Disparities; of two equally near rows the upper one is taken.
-    """
+    """Copy the nearest other row (first the upper one) into rows that are NaN throughout, in place."""
     height = disparity.shape[0]
     known = np.empty(height, np.bool_)
     for y in range(height):
@@ -78,18 +62,9 @@ def disparity_from_rectified(
 ) -> None:
     """Transfer disparity and confidence from the rectified frame to the pixels of an image.
 
-    Parameters
-    ----------
-    maps : tuple of ndarray (H, W)
-        Disparities without holes and confidences, 0 if unknown.
-    H : ndarray (3, 3)
-        Homography from the image to the rectified frame.
-    rows : tuple of int
-        First and last row (exclusive).
-    places : ndarray (h, w, 2)
-        Output: positions in the frame, NaN beyond the line at infinity.
-    disparity, sure : ndarray (h, w)
-        Output: disparity, bilinear on one surface, otherwise nearest; confidence, 0 outside the frame.
+    ``maps``: disparities without holes, confidences (0 if unknown); H takes the image to the frame.
+    ``places`` (h, w, 2) receives positions in the frame, NaN beyond the line at infinity; ``disparity`` is
+    bilinear on one surface, otherwise nearest; ``sure`` receives the confidence, 0 outside the frame.
     """
     field, confidence = maps
     height, width = field.shape
@@ -122,20 +97,9 @@ def disparity_from_rectified(
 def filter_extrapolated_by_colour(
     levels: F32, disparity: F32, sure: F32, rows: tuple[int, int], limits: tuple[float, float], out: F32
 ) -> None:
-    """Replace guessed disparities by a colour-weighted median of their surroundings.
+    """Replace disparities of confidence 0 by a colour-weighted median of their surroundings.
 
-    Parameters
-    ----------
-    levels : ndarray (h, w, 3)
-        Colours.
-    disparity, sure : ndarray (h, w)
-        Disparities and confidences, 0 for guesses.
-    rows : tuple of int
-        First and last row (exclusive).
-    limits : tuple of float
-        Colour difference at which weights fall to 1 / e; weight of guesses relative to known values.
-    out : ndarray (h, w)
-        The result.
+    ``limits``: colour difference at which weights fall to 1 / e; weight of guesses relative to known values.
     """
     height, width = disparity.shape
     values, weights = np.empty(WINDOW * WINDOW, np.float32), np.empty(WINDOW * WINDOW)
@@ -168,17 +132,7 @@ def filter_extrapolated_by_colour(
 
 @njit(cache=True, nogil=True)
 def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
-    """Replace guessed disparities by the median of their neighbours, which removes isolated pixels.
-
-    Parameters
-    ----------
-    disparity, sure : ndarray (h, w)
-        Disparities and confidences, 0 for guesses.
-    rows : tuple of int
-        First and last row (exclusive).
-    out : ndarray (h, w)
-        The result.
-    """
+    """Replace disparities of confidence 0 by the median of their neighbours."""
     height, width = disparity.shape
     values = np.empty((2 * NEAR + 1) ** 2, np.float32)
     for y in range(rows[0], rows[1]):
@@ -200,23 +154,7 @@ def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, in
 def intermediate_positions(
     places: F64, disparity: F32, share: float, G: F64, rows: tuple[int, int], target: F64
 ) -> None:
-    """Compute the pixel positions in an intermediate view.
-
-    Parameters
-    ----------
-    places : ndarray (h, w, 2)
-        Positions in the rectified frame.
-    disparity : ndarray (h, w)
-        Disparities.
-    share : float
-        Share of the disparity by which pixels move left.
-    G : ndarray (3, 3)
-        Homography from the rectified frame to the view.
-    rows : tuple of int
-        First and last row (exclusive).
-    target : ndarray (h, w, 2)
-        Output: positions, NaN beyond the line at infinity.
-    """
+    """Move pixels at ``places`` left by a share of their disparity and map them by G to the view."""
     for y in range(rows[0], rows[1]):
         for x in range(disparity.shape[1]):
             u, v = places[y, x, 0] - share * disparity[y, x], places[y, x, 1]
@@ -245,25 +183,11 @@ def blend(
     limits: tuple[float, float, float],
     out: tuple[F32, F32],
 ) -> None:
-    """Blend two warped images.
+    """Blend two warped images of colours (H, W, 3), inverse depths ``fronts`` and positions ``sources``.
 
     Where both inverse depths agree, the weighted mean is taken. Otherwise known pixels win over guessed ones;
-    of two known pixels the nearer wins, of two guessed ones the farther.
-
-    Parameters
-    ----------
-    colors : tuple of ndarray (H, W, 3)
-        Warped colours.
-    fronts : tuple of ndarray (H, W)
-        Inverse depths, NaN if empty.
-    sources : tuple of ndarray (H, W, 2)
-        Source pixels.
-    weights : tuple of ndarray (h, w)
-        Weights of the source pixels.
-    limits : tuple of float
-        Tolerance of inverse depth, weight up to which a pixel counts as guessed, and s.
-    out : tuple of ndarray
-        Colours and inverse depth, NaN where both are empty.
+    of two known pixels the nearer wins, of two guessed ones the farther. ``weights`` (h, w) are of the source
+    pixels; ``limits``: tolerance of inverse depth, weight up to which a pixel counts as guessed, and s.
     """
     alike, guess, s = limits
     rgb, near = out
@@ -295,16 +219,10 @@ def blend(
 
 @njit(cache=True, nogil=True)
 def blending_weights(disparity: F32, sure: F32, floors: tuple[float, float, float], out: F32) -> None:
-    """Compute the blending weight of each pixel of an image.
+    """Compute the blending weight of each pixel from its confidence.
 
-    Parameters
-    ----------
-    disparity, sure : ndarray (h, w)
-        Disparities and confidences, 0 for guesses.
-    floors : tuple of float
-        Weight of guesses, minimum weight of other pixels, factor beside a depth discontinuity (mixed pixels).
-    out : ndarray (h, w)
-        The weights.
+    ``floors``: weight of guesses, minimum weight of other pixels, factor beside a depth discontinuity (mixed
+    pixels).
     """
     height, width = disparity.shape
     for y in range(height):
