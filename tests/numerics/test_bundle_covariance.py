@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics import covariance as bundle_covariance
-from thesisrecon.numerics import reduced_solvers as kernels
-from thesisrecon.numerics.covariance import gauge_directions, robust_sigma
+from thesisrecon.numerics import _covariance as bundle_covariance
+from thesisrecon.numerics import _reduced_solvers as kernels
+from thesisrecon.numerics._covariance import gauge_directions, robust_sigma
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations

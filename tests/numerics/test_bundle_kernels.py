@@ -8,28 +8,18 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics import schur
-from thesisrecon.numerics.block_scatter import block_scatter, point_blocks
-from thesisrecon.numerics.elimination import ReducedSums, sum_leverages
-from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
-from thesisrecon.numerics.losses import LOSS_CODES, LOSSES
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import (
-    MetricCameras,
-    MetricModel,
-    linearize_metric,
-    metric_cost,
-    move_poses,
-)
-from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
-from thesisrecon.numerics.projective_bundle import (
+from thesisrecon.numerics import _schur
+from thesisrecon.numerics._elimination import ReducedSums, sum_leverages
+from thesisrecon.numerics._metric_kernels import MetricModel, linearize_metric, metric_cost, move_poses
+from thesisrecon.numerics._observations import Jacobians, Weighting, sort_observations
+from thesisrecon.numerics._projective_kernels import (
     UnitState,
     linearize_projective,
     projective_cost,
     tangent_reflectors,
     tangent_step,
 )
-from thesisrecon.numerics.reduced_solvers import (
+from thesisrecon.numerics._reduced_solvers import (
     BandedCholesky,
     ConjugateGradients,
     DenseCholesky,
@@ -37,9 +27,14 @@ from thesisrecon.numerics.reduced_solvers import (
     add_diagonal,
     choose_solver,
     fill_band,
-    multiply,
 )
-from thesisrecon.numerics.schur import BundleSystem, CameraPrior, build_layout
+from thesisrecon.numerics._schur import BundleSystem, CameraPrior, build_layout
+from thesisrecon.numerics.block_scatter import _point_blocks, block_scatter
+from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
+from thesisrecon.numerics.losses import LOSS_CODES, LOSSES
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
 
 
 def _linearized_metric(block, xy, loss="squared", delta=1.0, sigma=1.0):
@@ -157,12 +152,13 @@ def _full_jacobian(J, layout):
     """All columns of one problem side by side: blocks of the views, border, points."""
     o, index, C = layout.observations, layout.index, layout.width
     edge = C * len(index.pair)
-    full = np.zeros((2 * len(o.xy), layout.size + 3 * (len(o.start) - 1)))
-    for k in range(len(o.xy)):
-        rows, v, j = slice(2 * k, 2 * k + 2), index.block[o.view_index[k]], o.point_index[k]
+    seen = o.seen
+    full = np.zeros((2 * len(seen.xy), layout.size + 3 * (len(o.start) - 1)))
+    for k in range(len(seen.xy)):
+        rows, v, j = slice(2 * k, 2 * k + 2), index.block[seen.view_index[k]], seen.point_index[k]
         if v >= 0:
             full[rows, C * v : C * v + C] = J.A[k]
-        for f, column in enumerate(index.common[o.view_index[k]]):
+        for f, column in enumerate(index.common[seen.view_index[k]]):
             if column >= 0:
                 full[rows, edge + column] += J.E[k, :, f]
         full[rows, layout.size + 3 * j : layout.size + 3 * j + 3] = J.B[k]
@@ -177,7 +173,8 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     view = block.view.copy()
     if twice:
         view[1] = view[0]
-    o = sort_observations(view, block.point, block.xy + rng.normal(size=block.xy.shape), 6, 30)
+    seen = Observations(view, block.point, block.xy + rng.normal(size=block.xy.shape))
+    o = sort_observations(seen, 6, 30)
     c = block.cameras
     # View 0 is fixed; focals are per view, the rest belongs to two groups, one without third coefficient.
     own, common = np.array([0]), np.arange(1, 6)
@@ -191,8 +188,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
         layout = replace(layout, solver=ConjugateGradients(1e-13))
     J = layout.jacobians()
     model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
-    seen = Observations(o.view_index, o.point_index, o.xy)
-    cost = linearize_metric(model, seen, Weighting(1.0, 0, 1.0), own, common, J)
+    cost = linearize_metric(model, o.seen, Weighting(1.0, 0, 1.0), own, common, J)
     gradient = np.zeros(layout.size)
     gradient[[6, 40]] = [3.0, -3.0]
     prior = CameraPrior(np.array([6, 40]), np.array([40, -1]), np.array([2e4, 5e3]), gradient)
@@ -215,7 +211,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
 
 def test_chunks_and_threads_do_not_change_a_byte(monkeypatch):
     block = make_block(views=6, points=200, groups=1)
-    monkeypatch.setattr(schur, "CHUNK", 100)
+    monkeypatch.setattr(_schur, "CHUNK", 100)
     cameras, X = perturbed(block)
     fits = [
         refine_metric_bundle(
@@ -229,7 +225,7 @@ def test_chunks_and_threads_do_not_change_a_byte(monkeypatch):
     ]
     assert fits[0].X.tobytes() == fits[1].X.tobytes()
     assert fits[0].cameras.R.tobytes() == fits[1].cameras.R.tobytes()
-    monkeypatch.setattr(schur, "CHUNK", 10**6)
+    monkeypatch.setattr(_schur, "CHUNK", 10**6)
     whole = refine_metric_bundle(
         cameras,
         X,
@@ -259,7 +255,7 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
     full += np.diag(more)
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
     x = rng.normal(size=11)
-    np.testing.assert_allclose(multiply(system, x), full @ x, rtol=1e-12)
+    np.testing.assert_allclose(system.multiply(x), full @ x, rtol=1e-12)
     place = np.array([1, 3, 0, 2])
     band = np.zeros((8, 6))
     fill_band(blocks, row, column, place, band)
@@ -281,7 +277,7 @@ def test_every_solver_detects_an_indefinite_system(solver, spoiled, value):
     blocks[row == column] = np.eye(2)
     sums = ReducedSums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
     system = ReducedSystem(row, column, sums)
-    np.testing.assert_allclose(multiply(system, solver.solve(system)), 1.0, atol=1e-2)
+    np.testing.assert_allclose(system.multiply(solver.solve(system)), 1.0, atol=1e-2)
     what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
     what *= value
     if spoiled != "rhs" or np.isnan(value):
@@ -424,11 +420,11 @@ def test_noise_that_neighbours_share_is_seen():
 def test_blocks_are_of_neighbours_and_of_equal_size():
     rng = np.random.default_rng(3)
     X, used = rng.normal(size=(500, 3)) * [5.0, 1.0, 1.0], rng.random(500) < 0.9
-    block = point_blocks(X, used)
+    block = _point_blocks(X, used)
     assert (block[~used] == -1).all()
     counts = np.bincount(block[used])
     assert len(counts) == 32
     assert counts.min() > 0.8 * counts.mean()
     within = np.mean([np.var(X[block == b], axis=0).sum() for b in range(32)])
     assert within < 0.3 * np.var(X, axis=0).sum()
-    assert point_blocks(X[:20], np.ones(20, bool)).max() == 0
+    assert _point_blocks(X[:20], np.ones(20, bool)).max() == 0

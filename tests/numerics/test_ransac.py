@@ -15,9 +15,9 @@ from thesisrecon.numerics.losses import LOSSES, loss_code
 from thesisrecon.numerics.noise import (
     TAIL,
     NoiseMixture,
+    _fit_mixture,
     best_huber_width,
     effective_noise,
-    fit_noise_mixture,
     noise_scale,
     noise_width,
     trimmed_noise_scale,
@@ -172,7 +172,7 @@ def test_one_round_is_the_textbook_step():
     posterior = p / p.sum(axis=1, keepdims=True)
     squares = posterior.T @ r**2
     counts = posterior.sum(axis=0)
-    likelihood = fit_noise_mixture(r, 7.0, 50.0, 1, mixture)
+    likelihood = _fit_mixture(r, 7.0, 50.0, 1, mixture)
     sigma = np.sqrt((squares[0] + squares[1] / TAIL**2) / (counts[0] + counts[1] - 7.0))
     assert mixture[0] == pytest.approx(sigma, rel=1e-9)
     assert mixture[1] == pytest.approx(np.sqrt((squares[2] + 50.0**2) / (counts[2] + 1.0)), rel=1e-9)
@@ -184,8 +184,8 @@ def test_one_round_is_the_textbook_step():
 def test_the_compiled_mixture_equals_the_plain_code():
     r, a = draw(200, 0.4, 0.1, 1), np.array([0.3, 100.0, 0.5, 0.1, 0.4])
     b = a.copy()
-    assert fit_noise_mixture(r, 7.0, 90.0, 5, a) == pytest.approx(
-        fit_noise_mixture.py_func(r, 7.0, 90.0, 5, b), rel=1e-12
+    assert _fit_mixture(r, 7.0, 90.0, 5, a) == pytest.approx(
+        _fit_mixture.py_func(r, 7.0, 90.0, 5, b), rel=1e-12
     )
     np.testing.assert_allclose(a, b, rtol=1e-12)
 

@@ -1,10 +1,8 @@
 """Contradictions between parts of the scene after bundle adjustment, compared with the expected noise.
 
-The covariance of a bundle adjustment is right for independent noise of one size and a correct camera model.
-Matches of images have correlated errors and heavy tails, and lenses have more coefficients than the model.
-These effects appear as disagreement between parts of the scene: gradients summed by parts are larger than
-independent noise allows (the sandwich covariance of Huber 1967 and White 1980, its terms summed by clusters;
-Liang and Zeger 1986).
+Correlated errors, heavy tails and lenses with more coefficients than the model make gradients summed by parts
+larger than independent noise allows (the sandwich covariance of Huber 1967 and White 1980, summed by
+clusters; Liang and Zeger 1986).
 """
 
 from __future__ import annotations
@@ -17,30 +15,36 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics.covariance import gauge_directions, invert_in_inner_gauge
-from thesisrecon.numerics.intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
+from thesisrecon.numerics._covariance import gauge_directions, invert_in_inner_gauge
+from thesisrecon.numerics._intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
+from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricModel, linearize_metric
+from thesisrecon.numerics._observations import Jacobians, Weighting
 from thesisrecon.numerics.losses import LOSS_CODES
-from thesisrecon.numerics.metric_cameras import POSE_DOF, MetricCameras, MetricModel, linearize_metric
-from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
 
 # Number of pose unknowns tested besides all intrinsics.
-MAX_POSES = 30
+_MAX_POSES = 30
+_MAX_BLOCKS, _MIN_BLOCK_POINTS = 32, 12
 
 
 @dataclass(frozen=True)
 class BlockScatter:
     """Variances of the intrinsics and their scatter between blocks of points.
 
-    Attributes
+    Parameters
     ----------
     variance : ndarray (G, C)
         Variances by the information matrix for the given noise, relative for the focal length.
-    shared_variance : ndarray (C,), variances if all views shared one camera, 0 for fixed intrinsics
-    ratio : ndarray (G, C), scatter between blocks of points over its expectation, NaN for fixed intrinsics
+    shared_variance : ndarray (C,)
+        Variances if all views shared one camera, 0 for fixed intrinsics.
+    ratio : ndarray (G, C)
+        Scatter between blocks of points over its expectation, NaN for fixed intrinsics.
     overdispersion : float
         Scatter between blocks over that between single points, for all unknowns: 1 if the noise of different
         points is independent, for any distribution.
-    blocks : int, number of blocks
+    blocks : int
+        Number of blocks.
     """
 
     variance: F64
@@ -56,23 +60,11 @@ class BlockScatter:
         return float(np.median(known)) if len(known) else 1.0
 
 
-def point_blocks(X: F64, used: B8, *, most: int = 32, least_points: int = 12) -> I64:
-    """Divide points into blocks of neighbours by median splits along the longest robust axis.
-
-    Parameters
-    ----------
-    X : ndarray (N, 3), points
-    used : ndarray (N,) of bool, points to divide
-    most : int, largest number of blocks, a power of two
-    least_points : int, least points in a block
-
-    Returns
-    -------
-    ndarray (N,) of int, block of each point, -1 if not used
-    """
+def _point_blocks(X: F64, used: B8) -> I64:
+    """Divide points into blocks of neighbours by median splits along the longest axis; -1 if not used."""
     block = np.where(used, 0, -1)
     count = 1
-    while 2 * count <= most and np.count_nonzero(used) >= 2 * count * least_points:
+    while 2 * count <= _MAX_BLOCKS and np.count_nonzero(used) >= 2 * count * _MIN_BLOCK_POINTS:
         for b in range(count):
             rows = np.flatnonzero(block == b)
             spread = np.subtract(*np.percentile(X[rows], [90, 10], axis=0))
@@ -85,10 +77,9 @@ def point_blocks(X: F64, used: B8, *, most: int = 32, least_points: int = 12) ->
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Linearised bundle with the points eliminated.
+    """Weighted residuals (2K,) at the optimal points, their Jacobian J (2K, D) by the cameras and points.
 
-    Weighted residuals (2K,) at the optimal points, sparse Jacobian by the cameras (2K, D), the part ``taken``
-    by the elimination of the points (3N, D), and the point of each residual.
+    ``taken`` (3N, D) is the part of J removed by the elimination of the points.
     """
 
     residual: F64
@@ -116,50 +107,50 @@ def block_scatter(
 
     Parameters
     ----------
-    cameras : MetricCameras, cameras after the adjustment
-    X : ndarray (N, 3), points after the adjustment
-    observations : Observations, observations
-    free : ndarray (C,) of bool, intrinsics that move
-    prior : IntrinsicsPrior, prior of the intrinsics
-    noise : tuple of float, sigma and the turning point of Huber's loss, px
+    cameras, X : MetricCameras, ndarray (N, 3)
+        Cameras and points after the adjustment.
+    observations : Observations
+        Observations.
+    free : ndarray (C,) of bool
+        Intrinsics that move.
+    prior : IntrinsicsPrior
+        Prior of the intrinsics.
+    noise : tuple of float
+        Sigma and the turning point of Huber's loss, px.
 
     Returns
     -------
-    BlockScatter, variances and their scatter
+    BlockScatter
+        Variances and their scatter.
     """
     o, group = observations, np.asarray(cameras.group)
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
     values = number_unknowns(cameras, used, np.asarray(free, dtype=bool), prior)[0]
     views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
-    frame = _centred(cameras, X, o)
-    system = _linearise(*frame, o, (values, np.where(observed, np.cumsum(observed) - 1, -1)), noise)
+    # Centred and scaled to size 1.
+    origin, scale = scene_frame(X[np.unique(o.point_index)])
+    frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
+    place = np.where(observed, np.cumsum(observed) - 1, -1)
+    system = _linearise(frame, scale * (X - origin), o, (values, place), noise)
     S = (system.J.T @ system.J).toarray() - (system.taken.T @ system.taken).toarray()
     S[first:, first:] += values.terms.information(values.size)
-    C = _covariance(S, frame[0], views)
-    poses = np.arange(0, first, max(first // MAX_POSES, 1))
+    C = _covariance(S, frame, views)
+    poses = np.arange(0, first, max(first // _MAX_POSES, 1))
     tested = np.concatenate([poses, np.arange(first, len(C))])
-    block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
+    block = _point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
     ratio = curvature * _block_ratio(system, C[tested], C, block)
     alone = curvature * _point_ratio(system, C[tested])
     valid = np.isfinite(ratio) & (alone > 0.0)
-    number = values.number
-    place = np.maximum(number, 0)
+    number, own = values.number, np.maximum(values.number, 0)
     return BlockScatter(
-        np.where(number >= 0, np.diag(C)[first + place], 0.0),
-        _shared_variances(S, values, frame[0], views),
-        np.where(number >= 0, ratio[len(poses) + place], np.nan),
+        np.where(number >= 0, np.diag(C)[first + own], 0.0),
+        _shared_variances(S, values, frame, views),
+        np.where(number >= 0, ratio[len(poses) + own], np.nan),
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )
-
-
-def _centred(cameras: MetricCameras, X: F64, o: Observations) -> tuple[MetricCameras, F64]:
-    """Return the scene centred and scaled to size 1."""
-    origin, scale = scene_frame(X[np.unique(o.point_index)])
-    t = scale * (cameras.t + cameras.R @ origin)
-    return replace(cameras, t=t), scale * (X - origin)
 
 
 def _linearise(
@@ -169,15 +160,11 @@ def _linearise(
     columns: tuple[IntrinsicUnknowns, I64],
     noise: tuple[float, float],
 ) -> _Linearised:
-    values, place = columns
-    K, width, (sigma, loss) = len(o.xy), cameras.intrinsics.shape[1], noise
+    (values, place), (sigma, loss), width = columns, noise, cameras.intrinsics.shape[1]
     model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
-    obs, weighting = (
-        Observations(o.view_index, o.point_index, o.xy),
-        Weighting(sigma, LOSS_CODES["huber"], loss / sigma),
-    )
-    weighted, none = Jacobians.empty(K, POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
-    linearize_metric(model, obs, weighting, np.arange(width), none, weighted)
+    weighting = Weighting(sigma, LOSS_CODES["huber"], loss / sigma)
+    weighted, none = Jacobians.empty(len(o.xy), POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
+    linearize_metric(model, o, weighting, np.arange(width), none, weighted)
     first = POSE_DOF * (int(place.max()) + 1)
     number = values.number[cameras.group[o.view_index]]
     column = np.concatenate(

@@ -1,10 +1,4 @@
-"""Levenberg-Marquardt: one damping loop for every problem, and a dense solver for small ones.
-
-A problem linearises itself at a state, its linear system is solved for a damping, and the problem moves the
-state; the dense problem below, the sparse bundle problems and the refinements of one camera differ only in
-these three. Damping follows Nielsen (IMM-REP-1999-05): it shrinks smoothly with the quality of the predicted
-gain and grows faster with each failed step.
-"""
+"""Levenberg-Marquardt: one damping loop for every problem, and dense solvers for small ones."""
 
 from __future__ import annotations
 
@@ -14,6 +8,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import scipy
+from numba import njit
 
 from thesisrecon.arrays import F64
 from thesisrecon.numerics.losses import LOSSES, loss_code
@@ -22,80 +17,46 @@ State = TypeVar("State")
 Step = TypeVar("Step")
 StepOut = TypeVar("StepOut", covariant=True)
 
-MIN_DAMPING, MAX_DAMPING = 1e-9, 1e12
+_MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
 
 
 class LinearSystem(Protocol[StepOut]):
-    """A problem linearised at one state."""
+    """A problem linearised at one state of the given cost, 1/2 sum rho."""
 
     @property
-    def cost(self) -> float:
-        """1/2 sum rho at the state."""
+    def cost(self) -> float: ...
 
     def solve(self, damping: float) -> tuple[StepOut, float] | None:
-        """Solve the damped system.
-
-        Parameters
-        ----------
-        damping : float, factor of the diagonal
-
-        Returns
-        -------
-        tuple or None, step and predicted gain of cost; None if the damped system is not positive
-        """
+        """Return the damped step and its predicted gain of cost; None if the system is not positive."""
 
 
 class Problem(Protocol[State, Step]):
     """A problem of the loop; states are never changed in place."""
 
     def linearize(self, state: State) -> LinearSystem[Step]:
-        """Return the normal equations.
-
-        Parameters
-        ----------
-        state : State, point of linearisation
-
-        Returns
-        -------
-        LinearSystem, normal equations
-        """
+        """Return the normal equations at a state."""
 
     def retract(self, state: State, step: Step) -> State:
-        """Move a state.
-
-        Parameters
-        ----------
-        state : State, start
-        step : Step, solution of the linear system
-
-        Returns
-        -------
-        State, moved state
-        """
+        """Return the state moved by a step."""
 
     def cost(self, state: State) -> float:
-        """Evaluate 1/2 sum rho.
-
-        Parameters
-        ----------
-        state : State, point of evaluation
-
-        Returns
-        -------
-        float, cost; inf or NaN rejects the state
-        """
+        """Return 1/2 sum rho; inf or NaN rejects the state."""
 
 
 @dataclass(frozen=True)
 class Solution(Generic[State]):
     """End of the loop.
 
-    Attributes
+    Parameters
     ----------
-    state : State, final state
-    cost, initial_cost : float, 1/2 sum rho at the end and the start, cost <= initial_cost
-    iterations : int, linear solves
-    converged : bool, whether a tolerance or the numerical floor was reached
+    state : State
+        Final state.
+    cost, initial_cost : float
+        1/2 sum rho at the end and the start, cost <= initial_cost.
+    iterations : int
+        Linear solves.
+    converged : bool
+        Whether a tolerance or the numerical floor was reached.
     """
 
     state: State
@@ -116,20 +77,26 @@ def run_levenberg_marquardt(
     """Minimise a problem by Levenberg-Marquardt; the cost never rises and singular systems raise nothing.
 
     Converged if the predicted or the actual gain is below ``tolerance`` times the cost, or no damping gives a
-    better state (the numerical floor). The damping multiplies the diagonal (Marquardt 1963), so that the
-    result does not depend on the units of the parameters and gauge freedoms need no other treatment.
+    better state. The damping multiplies the diagonal (Marquardt 1963), so that units do not matter and gauge
+    freedoms need no other treatment; it follows Nielsen (IMM-REP-1999-05).
 
     Parameters
     ----------
-    problem : Problem, problem to minimise
-    state : State, initial state
-    max_iterations : int, maximum number of linear solves
-    tolerance : float, relative gain of cost at convergence
-    initial_damping : float, first damping
+    problem : Problem
+        Problem to minimise.
+    state : State
+        Initial state.
+    max_iterations : int
+        Maximum number of linear solves.
+    tolerance : float
+        Relative gain of cost at convergence.
+    initial_damping : float
+        First damping.
 
     Returns
     -------
-    Solution, final state and cost
+    Solution
+        Final state and cost.
     """
     system = problem.linearize(state)
     cost = initial_cost = system.cost
@@ -145,7 +112,7 @@ def run_levenberg_marquardt(
             gain = cost - problem.cost(candidate)
         if gain > 0.0 and np.isfinite(gain):
             state, previous = candidate, cost
-            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / promised - 1.0) ** 3), MIN_DAMPING)
+            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / promised - 1.0) ** 3), _MIN_DAMPING)
             growth = 2.0
             if gain <= tolerance * previous:
                 return Solution(state, cost - gain, initial_cost, iteration, True)
@@ -155,7 +122,7 @@ def run_levenberg_marquardt(
                 cost = system.cost
         else:
             damping, growth = damping * growth, growth * 2.0
-            if damping > MAX_DAMPING:
+            if damping > _MAX_DAMPING:
                 return Solution(state, cost, initial_cost, iteration, True)
     return Solution(state, cost, initial_cost, max_iterations, False)
 
@@ -164,11 +131,12 @@ def run_levenberg_marquardt(
 class DenseSystem:
     """Normal equations of a small problem, weighted by sqrt(rho').
 
-    Attributes
+    Parameters
     ----------
-    cost : float, 1/2 sum rho
-    hessian : ndarray (D, D), J'J
-    gradient : ndarray (D,), J'r
+    cost : float
+        1/2 sum rho.
+    hessian, gradient : ndarray (D, D), (D,)
+        J'J and J'r.
     """
 
     cost: float
@@ -180,11 +148,13 @@ class DenseSystem:
 
         Parameters
         ----------
-        damping : float, factor of the diagonal
+        damping : float
+            Factor of the diagonal.
 
         Returns
         -------
-        tuple or None, step (D,) and predicted gain of cost; None if the damped system is not positive
+        tuple or None
+            Step (D,) and predicted gain of cost; None if the damped system is not positive.
         """
         diagonal = damping * floored_diagonal(np.diag(self.hessian))
         step = solve_positive(self.hessian + np.diag(diagonal), -self.gradient)
@@ -198,11 +168,13 @@ def floored_diagonal(diagonal: F64) -> F64:
 
     Parameters
     ----------
-    diagonal : ndarray (D,), diagonal of J'J
+    diagonal : ndarray (D,)
+        Diagonal of J'J.
 
     Returns
     -------
-    ndarray (D,), floored diagonal
+    ndarray (D,)
+        Floored diagonal.
     """
     largest = float(diagonal.max(initial=0.0))
     return np.maximum(diagonal, 1e-12 * largest if largest > 0.0 else 1.0)
@@ -213,12 +185,13 @@ def solve_positive(A: F64, b: F64) -> F64 | None:
 
     Parameters
     ----------
-    A : ndarray (D, D), matrix
-    b : ndarray (D,) or (D, M), right-hand side
+    A, b : ndarray (D, D), (D,) or (D, M)
+        Matrix and right-hand side.
 
     Returns
     -------
-    ndarray or None, x, of the shape of ``b``; None if a pivot of the Cholesky factorisation is not positive
+    ndarray or None
+        x, of the shape of ``b``; None if a pivot of the Cholesky factorisation is not positive.
     """
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
         return None
@@ -228,7 +201,57 @@ def solve_positive(A: F64, b: F64) -> F64 | None:
     return None if info != 0 or not np.isfinite(x).all() else np.asarray(x).reshape(b.shape)
 
 
-def invert_information(information: F64, *, floor: float = 1e-14) -> F64:
+@njit(cache=True, nogil=True)
+def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
+    """Solve (H + damping diag H) step = -g by Cholesky factorisation, inside kernels.
+
+    Parameters
+    ----------
+    H, g : ndarray (n, n), (n,)
+        J'J and J'r.
+    damping : float
+        Levenberg-Marquardt damping.
+    step : ndarray (n,)
+        Output.
+
+    Returns
+    -------
+    bool
+        False if the damped matrix is not positive definite.
+    """
+    n = len(g)
+    L = np.zeros((n, n))
+    floor = 0.0
+    for i in range(n):
+        floor = max(floor, H[i, i])
+    floor = 1e-14 * floor + 1e-300
+    for i in range(n):
+        for j in range(i + 1):
+            total = H[i, j]
+            if i == j:
+                total += damping * max(H[i, i], floor)
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 1e-3 * damping * floor:
+                    return False
+                L[i, i] = np.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    for i in range(n):
+        total = -g[i]
+        for k in range(i):
+            total -= L[i, k] * step[k]
+        step[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, n):
+            total -= L[k, i] * step[k]
+        step[i] = total / L[i, i]
+    return True
+
+
+def invert_information(information: F64) -> F64:
     """Invert an information matrix, eigenvalues floored relative to the largest.
 
     Directions that the data do not determine get a huge variance instead of a failure. The matrix is first
@@ -236,12 +259,13 @@ def invert_information(information: F64, *, floor: float = 1e-14) -> F64:
 
     Parameters
     ----------
-    information : ndarray (D, D), information matrix
-    floor : float, relative floor of the eigenvalues
+    information : ndarray (D, D)
+        Information matrix.
 
     Returns
     -------
-    ndarray (D, D), covariance; inf if an entry is not finite
+    ndarray (D, D)
+        Covariance; inf if an entry is not finite.
     """
     if len(information) == 0:
         return np.zeros_like(information)
@@ -249,7 +273,7 @@ def invert_information(information: F64, *, floor: float = 1e-14) -> F64:
         return np.full_like(information, np.inf)
     scale = 1.0 / np.sqrt(floored_diagonal(np.diag(information)))
     values, vectors = np.linalg.eigh(information * scale * scale[:, None])
-    inverse = (vectors / np.maximum(values, floor * max(float(values[-1]), 1e-300))) @ vectors.T
+    inverse = (vectors / np.maximum(values, 1e-14 * max(float(values[-1]), 1e-300))) @ vectors.T
     return np.asarray(inverse * scale * scale[:, None])
 
 
@@ -257,22 +281,24 @@ def invert_information(information: F64, *, floor: float = 1e-14) -> F64:
 class ResidualMinimum:
     """Result of :func:`minimize_residuals`.
 
-    Attributes
+    Parameters
     ----------
-    x : ndarray (D,), minimum
-    cost, initial_cost : float, 1/2 sum rho at the end and the start
-    covariance : ndarray (D, D), sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D)
-    residual : ndarray (M,), residuals at the minimum
-    iterations : int, linear solves
-    converged : bool, whether the loop converged
+    x : ndarray (D,)
+        Minimum.
+    cost : float
+        1/2 sum rho.
+    covariance : ndarray (D, D)
+        sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D).
+    residual : ndarray (M,)
+        Residuals.
+    converged : bool
+        Whether the loop converged.
     """
 
     x: F64
     cost: float
-    initial_cost: float
     covariance: F64
     residual: F64
-    iterations: int
     converged: bool
 
 
@@ -325,22 +351,26 @@ def minimize_residuals(
 
     Parameters
     ----------
-    residual_fn : callable, (D,) -> (M,); states with residuals that are not finite are rejected
-    x0 : ndarray (D,), start
-    jacobian : callable, optional, (D,) -> (M, D); forward differences by default
-    loss : str, name in :data:`~thesisrecon.numerics.losses.LOSSES`
-    loss_scale : float, turning point of the loss, in units of the residuals
-    max_iterations : int, maximum number of linear solves
-    tolerance : float, relative gain of cost at convergence
+    residual_fn : callable
+        (D,) -> (M,); states with residuals that are not finite are rejected.
+    x0 : ndarray (D,)
+        Start.
+    jacobian : callable, optional
+        (D,) -> (M, D); forward differences by default.
+    loss, loss_scale : str, float
+        Name in :data:`~thesisrecon.numerics.losses.LOSSES`, and turning point in units of the residuals.
+    max_iterations, tolerance : int, float
+        As in :func:`run_levenberg_marquardt`.
 
     Returns
     -------
-    ResidualMinimum, minimum with its covariance
+    ResidualMinimum
+        Minimum with its covariance.
 
     Raises
     ------
     ValueError
-        x0 or its residuals are not finite.
+        If x0 or its residuals are not finite.
 
     Examples
     --------
@@ -355,18 +385,10 @@ def minimize_residuals(
             f"minimize_residuals needs a finite vector with finite residuals; got shape {x0.shape}"
         )
     problem = _VectorProblem(residual_fn, jacobian, loss, loss_scale)
-    solution = run_levenberg_marquardt(
+    end = run_levenberg_marquardt(
         problem, x0, max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3
     )
-    residual = residual_fn(solution.state)
-    variance = 2.0 * solution.cost / max(len(residual) - len(x0), 1)
-    covariance = variance * invert_information(problem.linearize(solution.state).hessian)
-    return ResidualMinimum(
-        solution.state,
-        solution.cost,
-        solution.initial_cost,
-        covariance,
-        residual,
-        solution.iterations,
-        solution.converged,
-    )
+    residual = residual_fn(end.state)
+    variance = 2.0 * end.cost / max(len(residual) - len(x0), 1)
+    covariance = variance * invert_information(problem.linearize(end.state).hessian)
+    return ResidualMinimum(end.state, end.cost, covariance, residual, end.converged)

@@ -7,69 +7,60 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry.homogeneous import scene_frame
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes, scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics.covariance import (
+from thesisrecon.numerics._covariance import (
     SIMILARITY_DOF,
     CovarianceInput,
     bundle_covariances,
     robust_sigma,
 )
-from thesisrecon.numerics.elimination import sum_leverages
-from thesisrecon.numerics.intrinsic_unknowns import (
+from thesisrecon.numerics._elimination import sum_leverages
+from thesisrecon.numerics._intrinsic_unknowns import (
     IntrinsicColumns,
     IntrinsicUnknowns,
     assign_columns,
     number_unknowns,
 )
-from thesisrecon.numerics.levenberg_marquardt import Solution, run_levenberg_marquardt
-from thesisrecon.numerics.losses import LossName, loss_code
-from thesisrecon.numerics.metric_cameras import (
+from thesisrecon.numerics._metric_kernels import (
+    FOCAL,
     POSE_DOF,
-    MetricCameras,
     MetricModel,
-    check_cameras,
-    check_prior,
     linearize_metric,
     metric_cost,
     move_poses,
     project_metric,
 )
-from thesisrecon.numerics.observations import (
-    Jacobians,
-    Observations,
-    SortedObservations,
-    Weighting,
-    sort_observations,
-)
-from thesisrecon.numerics.schur import (
-    BundleLayout,
-    BundleStep,
-    BundleSystem,
-    CameraPrior,
-    build_layout,
-)
+from thesisrecon.numerics._observations import Jacobians, SortedObservations, Weighting, sort_observations
+from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
+from thesisrecon.numerics.levenberg_marquardt import Solution, run_levenberg_marquardt
+from thesisrecon.numerics.losses import LossName, loss_code
+from thesisrecon.numerics.metric_cameras import MetricCameras
+from thesisrecon.numerics.observations import Observations
 
 # Below a relative gain of NEWTON_GAIN, MIN_CURVATURE of the curvature along a residual is kept if its loss
 # bends: reweighting is safe far from the minimum, Newton's method is faster near it.
-MIN_CURVATURE, NEWTON_GAIN = 0.3, 1e-3
-CURVED_LOSSES = ("huber", "soft_l1", "cauchy")
+_MIN_CURVATURE, _NEWTON_GAIN = 0.3, 1e-3
 
 
 @dataclass(frozen=True)
 class BundleOptions:
     """Weighting and end of a metric bundle adjustment.
 
-    Attributes
+    Parameters
     ----------
-    sigma_px : float, standard deviation of one image coordinate, the weight of the data against the priors
-    loss : str, robust loss
-    loss_px : float, turning point of the loss, px
-    max_iterations : int, maximum number of linear solves
-    fixed_views : ndarray (V,) of bool, optional, poses that must not move
-    covariance : bool, whether to compute covariances (one more linear system)
-    noise_floor_px : float, least noise assumed for the covariances, px
-    threads : int, worker threads; the result does not depend on them
+    sigma_px : float
+        Standard deviation of one image coordinate, the weight of the data against the priors.
+    loss, loss_px : str, float
+        Robust loss and its turning point (px).
+    max_iterations : int
+        Maximum number of linear solves.
+    fixed_views : ndarray (V,) of bool, optional
+        Poses that must not move.
+    covariance, noise_floor_px : bool, float
+        Whether to compute covariances (one more linear system), and the least noise assumed for them.
+    threads : int
+        Worker threads; the result does not depend on them.
     """
 
     sigma_px: float = 1.0
@@ -95,19 +86,23 @@ class BundleOptions:
 class MetricBundleResult:
     """Refined cameras and points with their uncertainty.
 
-    Attributes
+    Parameters
     ----------
-    cameras : MetricCameras, refined cameras
-    X : ndarray (N, 3), refined points
-    residual_px : ndarray (K, 2), projection minus observation in the caller's order
-    cost, initial_cost : float, 1/2 sum rho in units of the given sigma, priors included
-    iterations : int, linear solves
-    converged : bool, whether the loop converged
-    intrinsics_covariance : ndarray (G, C, C), zero for entries that do not move, and without ``covariance``
-    pose_covariance : ndarray (V, 6, 6) or None
-        Of (rotation vector in rad, translation) of x -> exp(w) x + d in each camera frame, with respect to
-        the centre of all poses (the inner gauge: no camera is taken as exact).
-    sigma_px : float, standard deviation of one image coordinate, estimated from the residuals
+    cameras, X : MetricCameras, ndarray (N, 3)
+        Refined cameras and points.
+    residual_px : ndarray (K, 2)
+        Projection minus observation in the caller's order.
+    cost, initial_cost : float
+        1/2 sum rho in units of the given sigma, priors included.
+    iterations, converged : int, bool
+        Linear solves, and whether the loop converged.
+    intrinsics_covariance : ndarray (G, C, C)
+        Zero for entries that do not move, and without ``covariance``.
+    pose_covariance : ndarray (V, 6, 6), optional
+        Of (rotation vector in rad, translation) of x -> exp(w) x + d in each camera frame, in the inner gauge
+        (no camera is taken as exact).
+    sigma_px : float
+        Standard deviation of one image coordinate, estimated from the residuals.
     """
 
     cameras: MetricCameras
@@ -143,38 +138,36 @@ class _MetricProblem:
     weighting: Weighting
     jacobians: Jacobians
 
+    @property
+    def fixed_frame(self) -> bool:
+        """Whether an observed view is fixed."""
+        return not self.free_views[self.layout.observations.seen.view_index].all()
+
     def linearize(self, state: _State) -> BundleSystem:
         J, c = self.jacobians, self.columns
 
-        def work(which: slice, obs: Observations) -> float:
-            part = J.part(which.start, which.stop)
-            return float(linearize_metric(state.model, obs, self.weighting, c.own, c.common, part))
+        def work(rows: slice, obs: Observations) -> float:
+            part = Jacobians(*(a[rows] for a in J))
+            return linearize_metric(state.model, obs, self.weighting, c.own, c.common, part)
 
-        cost = sum(self.layout.over_observations(work)) + self.values.terms.cost(state.values)
+        cost = self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
         if c.pinned.any():
-            J.A[:] = np.where(c.pinned[self.layout.observations.view_index][:, None], 0.0, J.A)
+            J.A[:] = np.where(c.pinned[self.layout.observations.seen.view_index][:, None], 0.0, J.A)
         return BundleSystem(cost, self.layout, J, self._prior(state))
 
     def _prior(self, state: _State) -> CameraPrior | None:
-        terms, place = self.values.terms, self.columns.place
+        terms, c = self.values.terms, self.columns
         if not len(terms.first):
             return None
         gradient = np.zeros(self.layout.size)
-        gradient[place] = terms.gradient(state.values)
-        return CameraPrior(
-            self.columns.columns_of(terms.first),
-            self.columns.columns_of(terms.second),
-            terms.weight,
-            gradient,
-        )
+        gradient[c.place] = terms.gradient(state.values)
+        return CameraPrior(c.columns_of(terms.first), c.columns_of(terms.second), terms.weight, gradient)
 
     def retract(self, state: _State, step: BundleStep) -> _State:
-        m, layout = state.model, self.layout
-        n_own = layout.size - layout.border
+        m, layout, free = state.model, self.layout, self.free_views
+        own = step.cameras[: layout.size - layout.border].reshape(-1, layout.width)
         poses = np.zeros((len(m.t), POSE_DOF))
-        poses[self.free_views] = step.cameras[:n_own].reshape(-1, layout.width)[
-            layout.index.block[self.free_views], :POSE_DOF
-        ]
+        poses[free] = own[layout.index.block[free], :POSE_DOF]
         R, t = np.empty_like(m.R), np.empty_like(m.t)
         move_poses(m.R, m.t, poses, R, t)
         values = self.values.step(state.values, step.cameras[self.columns.place])
@@ -183,33 +176,19 @@ class _MetricProblem:
         layout.revert_cheirality_violations(before, after, m.X, X)
         return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
 
-    def residual(self, state: _State) -> F64:
-        """Return residuals (K, 2), px."""
-        K = len(self.layout.observations.xy)
-        residual, depth = np.empty((K, 2)), np.empty(K)
+    def cost(self, state: _State) -> float:
+        def work(_: slice, obs: Observations) -> float:
+            return metric_cost(state.model, obs, self.weighting)
 
-        def work(which: slice, obs: Observations) -> None:
-            project_metric(state.model, obs, residual[which], depth[which])
-
-        self.layout.over_observations(work)
-        return residual
+        return self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
 
     def sigma(self, state: _State, residual: F64) -> float:
         """Return the noise of one coordinate, px, from the residuals at the minimum."""
         leverage = np.empty_like(residual)
         self.linearize(state)
         sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
-        fixed_frame = not self.free_views[self.layout.observations.view_index].all()
-        poses = POSE_DOF * int(self.free_views.sum())
-        return robust_sigma(
-            residual, leverage, poses + self.values.size - (0 if fixed_frame else SIMILARITY_DOF)
-        )
-
-    def cost(self, state: _State) -> float:
-        def work(_: slice, obs: Observations) -> float:
-            return float(metric_cost(state.model, obs, self.weighting))
-
-        return sum(self.layout.over_observations(work)) + self.values.terms.cost(state.values)
+        dof = POSE_DOF * int(self.free_views.sum()) + self.values.size
+        return robust_sigma(residual, leverage, dof - (0 if self.fixed_frame else SIMILARITY_DOF))
 
 
 def refine_metric_bundle(
@@ -230,12 +209,16 @@ def refine_metric_bundle(
 
     Parameters
     ----------
-    cameras : MetricCameras, start, and which intrinsics are shared
-    X : ndarray (N, 3), points
-    observations : Observations, observations in any order
-    free : ndarray (C,) of bool, intrinsics that move
-    prior : IntrinsicsPrior, optional, prior of the intrinsics, which may fix single values
-    options : BundleOptions, optional, weighting and end
+    cameras, X : MetricCameras, ndarray (N, 3)
+        Start, and which intrinsics are shared.
+    observations : Observations
+        Observations in any order.
+    free : ndarray (C,) of bool
+        Intrinsics that move.
+    prior : IntrinsicsPrior, optional
+        Prior of the intrinsics, which may fix single values.
+    options : BundleOptions, optional
+        Weighting and end.
 
     Returns
     -------
@@ -245,16 +228,12 @@ def refine_metric_bundle(
     Raises
     ------
     ValueError
-        Wrong shapes, values that are not finite, or focal lengths that are not positive.
+        For wrong shapes, values that are not finite, or focal lengths that are not positive.
     """
     options = options or BundleOptions()
     X = np.array(X, dtype=np.float64)
-    check_cameras(cameras, X, free)
-    if prior is not None:
-        check_prior(prior, cameras.intrinsics.shape)
-    o = sort_observations(
-        observations.view_index, observations.point_index, observations.xy, len(cameras.R), len(X)
-    )
+    _check_cameras(cameras, X, free)
+    o = sort_observations(observations, len(cameras.R), len(X))
     seen_points = np.diff(o.start) > 0
     origin, scale = scene_frame(X[seen_points])
     problem, values, table = _metric_problem(cameras, o, np.asarray(free, dtype=bool), prior, options)
@@ -266,48 +245,54 @@ def refine_metric_bundle(
         np.ascontiguousarray(scale * (X - origin)),
     )
     solution = _minimize(problem, _State(start, values), options)
-    refined = _refined(cameras, problem.free_views, solution.state.model, origin, scale)
-    residual = problem.residual(solution.state)
-    sigma = problem.sigma(solution.state, residual)
-    intrinsics_covariance, pose_covariance = np.zeros((*table.shape, table.shape[1])), None
-    if options.covariance:
-        noise = max(sigma or options.sigma_px, options.noise_floor_px)
-        intrinsics_covariance, pose_covariance = _covariances(problem, solution.state, noise, scale)
-    return MetricBundleResult(
-        refined,
-        np.where(seen_points[:, None], solution.state.model.X / scale + origin, X),
-        o.unsort(residual),
-        solution.cost,
-        solution.initial_cost,
-        solution.iterations,
-        solution.converged,
-        intrinsics_covariance,
-        pose_covariance,
-        sigma,
-    )
-
-
-def _refined(cameras: MetricCameras, moved: B8, end: MetricModel, origin: F64, scale: float) -> MetricCameras:
-    """Return the final cameras in the caller's frame; cameras that did not move are unchanged."""
-    return replace(
+    end, moved = solution.state.model, problem.free_views
+    refined = replace(
         cameras,
         R=np.where(moved[:, None, None], end.R, cameras.R),
         t=np.where(moved[:, None], end.t / scale - end.R @ origin, cameras.t),
         intrinsics=end.intrinsics,
     )
+    residual = project_metric(end, o.seen)
+    sigma = problem.sigma(solution.state, residual)
+    covariances: tuple[F64, F64 | None] = (np.zeros((*table.shape, table.shape[1])), None)
+    if options.covariance:
+        noise = max(sigma or options.sigma_px, options.noise_floor_px)
+        covariances = _covariances(problem, solution.state, noise, scale)
+    return MetricBundleResult(
+        refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), solution.cost,
+        solution.initial_cost, solution.iterations, solution.converged, *covariances, sigma,
+    )  # fmt: skip
+
+
+def _check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
+    """Raise ``ValueError`` for wrong shapes and values of cameras and points."""
+    require_shapes(
+        "a metric bundle", R=(cameras.R, ("V", 3, 3)), t=(cameras.t, ("V", 3)), group=(cameras.group, ("V",)),
+        intrinsics=(cameras.intrinsics, ("G", "C")), free=(free, ("C",)), X=(X, ("N", 3)),
+    )  # fmt: skip
+    n_rows, width = cameras.intrinsics.shape
+    if width not in (6, 8):
+        raise ValueError(f"a metric bundle needs 6 or 8 intrinsics; got {width}")
+    if cameras.shared is not None:
+        require_shapes("a metric bundle", shared=(cameras.shared, (n_rows, width)))
+    require_finite("a metric bundle", cameras.R, cameras.t, cameras.intrinsics, X)
+    if not (cameras.intrinsics[:, FOCAL] > 0.0).all():
+        raise ValueError("a metric bundle needs positive focal lengths")
+    if len(cameras.group) and (cameras.group.min() < 0 or cameras.group.max() >= n_rows):
+        raise ValueError(f"groups must lie in 0..{n_rows - 1}")
 
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Solution[_State]:
-    """Minimise, by reweighting first and nearly Newton's steps at the end."""
-    if options.loss not in CURVED_LOSSES:
+    """Minimise, by reweighting first and nearly Newton's steps at the end if the loss bends."""
+    if options.loss == "squared":
         return run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations)
     far = run_levenberg_marquardt(
-        problem, state, max_iterations=options.max_iterations, tolerance=NEWTON_GAIN
+        problem, state, max_iterations=options.max_iterations, tolerance=_NEWTON_GAIN
     )
     left = options.max_iterations - far.iterations
     if left < 1:
         return far
-    near = replace(problem, weighting=problem.weighting._replace(min_curvature=MIN_CURVATURE))
+    near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
     end = run_levenberg_marquardt(near, far.state, max_iterations=left)
     return replace(end, initial_cost=far.initial_cost, iterations=far.iterations + end.iterations)
 
@@ -321,7 +306,7 @@ def _metric_problem(
 ) -> tuple[_MetricProblem, F64, F64]:
     """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics."""
     group = np.asarray(cameras.group, dtype=np.int64)
-    observed = np.bincount(o.view_index, minlength=len(group)) > 0
+    observed = np.bincount(o.seen.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
     values, start, table = number_unknowns(cameras, used, free, prior)
     fixed = np.zeros(len(group), bool) if options.fixed_views is None else np.asarray(options.fixed_views)
@@ -330,18 +315,12 @@ def _metric_problem(
     free_views = observed & ~fixed.astype(bool)
     columns = assign_columns(values, group, np.flatnonzero(free), observed, free_views)
     layout = build_layout(
-        o,
-        columns.block,
-        width=POSE_DOF + len(columns.own),
-        common=columns.border,
-        border=columns.n_border,
+        o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border,
         threads=options.threads,
-    )
-    weighting = Weighting(
-        options.sigma_px, loss_code(options.loss, options.loss_px), options.loss_px / options.sigma_px
-    )
-    problem = _MetricProblem(layout, columns, free_views, values, weighting, layout.jacobians())
-    return problem, start, table
+    )  # fmt: skip
+    code, delta = loss_code(options.loss, options.loss_px), options.loss_px / options.sigma_px
+    weighting = Weighting(options.sigma_px, code, delta)
+    return _MetricProblem(layout, columns, free_views, values, weighting, layout.jacobians()), start, table
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
@@ -349,9 +328,7 @@ def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale:
     w = problem.weighting
     problem = replace(problem, weighting=Weighting(sigma_px, w.code, w.delta))
     reduced, _, _ = problem.linearize(state).reduce(1e-10)
-    layout, m = problem.layout, state.model
-    fixed_frame = not problem.free_views[layout.observations.view_index].all()
-    block = np.where(problem.free_views, layout.index.block, -1)
-    found = CovarianceInput(reduced, block, m.R, m.t, fixed_frame)
+    m, block = state.model, np.where(problem.free_views, problem.layout.index.block, -1)
+    found = CovarianceInput(reduced, block, m.R, m.t, problem.fixed_frame)
     number = problem.columns.columns_of(problem.values.number)
     return bundle_covariances(found, number, m.intrinsics[:, 0], scale)

@@ -9,39 +9,28 @@ from numba import njit
 
 from thesisrecon.arrays import F64
 
-TAIL, SEPARATION = 4.0, 12.0
-"""Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise."""
-CORE_COUNT, TAIL_COUNT, WRONG_COUNT = 1.0, 0.5, 1.0
-"""Prior counts of each component."""
+# Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise.
+TAIL, _SEPARATION = 4.0, 12.0
+# Prior counts of each component.
+_CORE_COUNT, _TAIL_COUNT, _WRONG_COUNT = 1.0, 0.5, 1.0
+# 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75), which is not consistent.
 MAD_FACTOR = 1.4826022185056018
-"""1 / Phi^-1(0.75): the thesis' text divides by Phi(0.75), which is not consistent."""
-MEDIAN_RATIO, MAX_WIDENINGS = 0.22, 6
-RAYLEIGH_MEDIAN = 1.1774
-TRIM, TRIMMED_VARIANCE, TRIM_ROUNDS = 2.5, 0.91125, 5
-"""Trimming point in standard deviations, variance of a standard normal variable trimmed there, and rounds."""
-EM_ROUNDS, QUANTILES = 6, 300
-"""EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more."""
-BISECTIONS = 20
-HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
+_MEDIAN_RATIO, _MAX_WIDENINGS = 0.22, 6
+_RAYLEIGH_MEDIAN = 1.1774
+# Trimming point in standard deviations, variance of a standard normal variable trimmed there, and rounds.
+_TRIM, _TRIMMED_VARIANCE, _TRIM_ROUNDS = 2.5, 0.91125, 5
+# EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more.
+_EM_ROUNDS, _QUANTILES = 6, 300
+_BISECTIONS = 20
+_HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_noise_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
-    """Fit three zero-mean normals to residuals by expectation-maximisation.
+def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
+    """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood.
 
-    Parameters
-    ----------
-    residuals : ndarray (N,), residuals >= 0
-    parameters : float, parameters fitted to the residuals
-    spread : float, prior standard deviation of wrong residuals
-    rounds : int, EM rounds
-    mixture : ndarray (5,)
-        Sigma, standard deviation of wrong residuals, fractions of noise, its tail (TAIL times as wide) and
-        wrong residuals; updated.
-
-    Returns
-    -------
-    float, mean log-likelihood
+    ``mixture`` (5,), updated: sigma, standard deviation of wrong residuals (prior ``spread``), fractions of
+    noise, its tail and wrong residuals.
     """
     n = len(residuals)
     likelihood = 0.0
@@ -69,47 +58,39 @@ def fit_noise_mixture(residuals: F64, parameters: float, spread: float, rounds: 
             n2 += p2 * p
             s01 += (p0 + p1 / (TAIL * TAIL)) * p * q
             s2 += p2 * p * q
-        total = n + CORE_COUNT + TAIL_COUNT + WRONG_COUNT
+        total = n + _CORE_COUNT + _TAIL_COUNT + _WRONG_COUNT
         mixture[0] = np.sqrt(s01 / max(n0 + n1 - parameters, 1.0)) + 1e-12 * spread
-        wide = np.sqrt((s2 + WRONG_COUNT * spread * spread) / (n2 + WRONG_COUNT))
-        mixture[1] = max(wide, SEPARATION * mixture[0])
-        mixture[2] = (n0 + CORE_COUNT) / total
-        mixture[3] = (n1 + TAIL_COUNT) / total
-        mixture[4] = (n2 + WRONG_COUNT) / total
+        wide = np.sqrt((s2 + _WRONG_COUNT * spread * spread) / (n2 + _WRONG_COUNT))
+        mixture[1] = max(wide, _SEPARATION * mixture[0])
+        mixture[2] = (n0 + _CORE_COUNT) / total
+        mixture[3] = (n1 + _TAIL_COUNT) / total
+        mixture[4] = (n2 + _WRONG_COUNT) / total
     return likelihood / n
 
 
 def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
     """Estimate the standard deviation by 1.4826 (1 + 5 / (n - p)) median |r|.
 
-    Breaks down if half of the residuals are wrong.
-
     Parameters
     ----------
-    residuals : ndarray (N,), residuals of mean 0, any sign
-    parameters : int, degrees of freedom p fitted to them
+    residuals : ndarray (N,)
+        Residuals of mean 0, any sign, less than half of them wrong.
+    parameters : int
+        Degrees of freedom p fitted to them.
 
     Returns
     -------
-    float, standard deviation, in units of the residuals
+    float
+        Standard deviation.
 
     Raises
     ------
     ValueError
-        N <= p, or a residual is not finite.
-
-    Notes
-    -----
-    The factor is 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75).
+        If N <= p, or a residual is not finite.
 
     References
     ----------
     Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987; Torr and Murray, IJCV 24(3), 1997.
-
-    Examples
-    --------
-    >>> round(noise_scale(np.array([-1.0, 1.0] * 500)), 2)
-    1.49
     """
     n = len(residuals)
     if n <= parameters:
@@ -122,55 +103,59 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
     """Return the width that contains the noise: ``threshold``, or more if the residuals continue.
 
-    Normal noise has its median at no more than 0.22 of a width of 3 standard deviations or more (the fitted
-    ``parameters`` allowed for); a higher median shows that the width cuts the noise off, or that the
-    residuals are of wrong matches and spread evenly. The width grows by steps of 1.5 until the noise ends; if
-    it does not end within 11 thresholds, the residuals are wrong matches and the threshold is kept.
+    Normal noise has its median at no more than 0.22 of a width of 3 standard deviations. The width grows by
+    steps of 1.5 until its median is; if that does not happen within 11 thresholds, the residuals are of wrong
+    matches and the threshold is kept.
 
     Parameters
     ----------
-    residuals : ndarray (N,), residuals >= 0
-    threshold : float, least width
-    parameters : int, degrees of freedom fitted to the residuals
+    residuals : ndarray (N,)
+        Residuals >= 0.
+    threshold : float
+        Least width.
+    parameters : int
+        Degrees of freedom fitted to the residuals.
 
     Returns
     -------
-    float, width, in units of the residuals
+    float
+        Width.
     """
     width, ordered = threshold, np.sort(residuals)
-    for _ in range(MAX_WIDENINGS + 1):
+    for _ in range(_MAX_WIDENINGS + 1):
         n = int(np.searchsorted(ordered, width))
         if n <= parameters:
             return threshold
         median = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
-        if median <= MEDIAN_RATIO * width * np.sqrt(1.0 - parameters / n):
+        if median <= _MEDIAN_RATIO * width * np.sqrt(1.0 - parameters / n):
             return width
         width *= 1.5
     return threshold
 
 
 def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
-    """Estimate the standard deviation from the residuals within 2.5 of it.
-
-    The root mean square, corrected for the trimming and the fitted ``parameters``, repeated from ``start``:
-    half the variance of the median's estimate.
+    """Estimate the standard deviation by the root mean square of the residuals within 2.5 of it.
 
     Parameters
     ----------
-    residuals : ndarray (N,), residuals >= 0
-    start : float, initial standard deviation
-    parameters : int, degrees of freedom fitted to the residuals
+    residuals : ndarray (N,)
+        Residuals >= 0.
+    start : float
+        Initial standard deviation.
+    parameters : int
+        Degrees of freedom fitted to the residuals.
 
     Returns
     -------
-    float, standard deviation; ``start`` if too few residuals are left
+    float
+        Standard deviation; ``start`` if too few residuals are left.
     """
     sigma = start
-    for _ in range(TRIM_ROUNDS):
-        kept = residuals[residuals <= TRIM * sigma]
+    for _ in range(_TRIM_ROUNDS):
+        kept = residuals[residuals <= _TRIM * sigma]
         if len(kept) <= 2 * parameters:
             return start
-        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / TRIMMED_VARIANCE))
+        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / _TRIMMED_VARIANCE))
     return sigma
 
 
@@ -179,24 +164,27 @@ def noise_from_distances(distances: F64) -> float:
 
     Parameters
     ----------
-    distances : ndarray (N,), lengths, N > 0
+    distances : ndarray (N,)
+        Lengths, N > 0.
 
     Returns
     -------
-    float, median / 1.1774, the median of a Rayleigh variable
+    float
+        Median / 1.1774, the median of a Rayleigh variable.
     """
-    return float(np.median(distances)) / RAYLEIGH_MEDIAN
+    return float(np.median(distances)) / _RAYLEIGH_MEDIAN
 
 
 @dataclass(frozen=True)
 class NoiseMixture:
     """Residuals as normal noise, its tail four times as wide, and wrong matches.
 
-    Attributes
+    Parameters
     ----------
-    sigma : float, standard deviation of the noise
-    spread : float, standard deviation of wrong residuals
-    core, tail, wrong : float, fractions of the components
+    sigma, spread : float
+        Standard deviations of the noise and of wrong residuals.
+    core, tail, wrong : float
+        Fractions of the components.
     log_likelihood : float
         Mean over the residuals: of two models of the same data the higher one explains them better.
     """
@@ -206,7 +194,7 @@ class NoiseMixture:
     core: float
     tail: float
     wrong: float
-    log_likelihood: float = -np.inf
+    log_likelihood: float
 
     @classmethod
     def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> NoiseMixture:
@@ -214,20 +202,23 @@ class NoiseMixture:
 
         Parameters
         ----------
-        residuals : ndarray (N,), residuals >= 0 in ascending order, N > 0
-        sigma : float, initial standard deviation of the noise, > 0
-        spread : float, prior standard deviation of wrong residuals
-        parameters : int, degrees of freedom fitted to the residuals
+        residuals : ndarray (N,)
+            Residuals >= 0 in ascending order, N > 0.
+        sigma, spread : float
+            Initial standard deviation of the noise, and a prior one of wrong residuals, > 0.
+        parameters : int
+            Degrees of freedom fitted to the residuals.
 
         Returns
         -------
-        NoiseMixture, fitted mixture
+        NoiseMixture
+            Fitted mixture.
         """
-        step = max(len(residuals) // QUANTILES, 1)
+        step = max(len(residuals) // _QUANTILES, 1)
         some = residuals[step // 2 :: step]
         share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
         mixture = np.array([sigma, spread, 0.9 * share, 0.1 * share, 1.0 - share])
-        likelihood = fit_noise_mixture(some, parameters / step, spread, EM_ROUNDS, mixture)
+        likelihood = _fit_mixture(some, parameters / step, spread, _EM_ROUNDS, mixture)
         sigma, spread, core, tail, wrong = mixture.tolist()
         return cls(sigma, spread, core, tail, wrong, float(likelihood))
 
@@ -235,7 +226,7 @@ class NoiseMixture:
     def limit(self) -> float:
         """Residual at which noise, with its tail, and wrong matches are equally likely."""
         low, high = self.sigma, self.spread
-        for _ in range(BISECTIONS):
+        for _ in range(_BISECTIONS):
             middle = float(np.sqrt(low * high))
             core = self.core * np.exp(-0.5 * (middle / self.sigma) ** 2)
             tail = self.tail / TAIL * np.exp(-0.5 * (middle / (TAIL * self.sigma)) ** 2)
@@ -251,28 +242,32 @@ class NoiseMixture:
 
 
 def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> float:
-    """Return the width of Huber's loss with the least expected variance.
+    """Return the width of Huber's loss with the least expected variance, infinite for least squares.
 
-    The asymptotic variance of an M-estimator is mean(psi^2) / mean(psi')^2 (Huber, 1964), estimated from the
-    residuals (Jaeckel, 1971). Least squares (infinite width) is abandoned only for a gain of more than twice
-    the chance of N residuals to which ``parameters`` were fitted: few residuals look heavy-tailed too easily.
+    The asymptotic variance mean(psi^2) / mean(psi')^2 (Huber, 1964) is estimated from the residuals (Jaeckel,
+    1971). Least squares is abandoned only for a gain of more than twice the chance: few residuals look
+    heavy-tailed easily.
 
     Parameters
     ----------
-    residuals : ndarray (N,), residuals >= 0
-    sigma : float, standard deviation of the noise
-    parameters : int, degrees of freedom fitted to the residuals
+    residuals : ndarray (N,)
+        Residuals >= 0.
+    sigma : float
+        Standard deviation of the noise.
+    parameters : int
+        Degrees of freedom fitted to the residuals.
 
     Returns
     -------
-    float, width, in units of the residuals; inf for least squares
+    float
+        Width.
     """
     n = len(residuals)
     if n <= 2 * parameters:
         return np.inf
     needed = (1.0 + 2.0 / np.sqrt(n)) * n / (n - 2 * parameters)
     width, least = np.inf, effective_noise(residuals, np.inf) ** 2
-    for k in HUBER_SIGMAS:
+    for k in _HUBER_SIGMAS:
         variance = effective_noise(residuals, k * sigma) ** 2 * needed
         if variance < least:
             width, least = k * sigma, variance
@@ -286,13 +281,17 @@ def effective_noise(residuals: F64, width: float, *, parameters: int = 0) -> flo
 
     Parameters
     ----------
-    residuals : ndarray (N,), residuals >= 0, N > 0
-    width : float, width of Huber's loss
-    parameters : int, degrees of freedom p fitted to the residuals
+    residuals : ndarray (N,)
+        Residuals >= 0, N > 0.
+    width : float
+        Width of Huber's loss.
+    parameters : int
+        Degrees of freedom p fitted to the residuals.
 
     Returns
     -------
-    float, standard deviation
+    float
+        Standard deviation.
     """
     n = len(residuals)
     psi = np.minimum(residuals, width)

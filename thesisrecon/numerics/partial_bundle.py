@@ -15,40 +15,33 @@ from thesisrecon.geometry.homogeneous import (
     require_shapes,
     whitening_transform,
 )
-from thesisrecon.numerics.levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
-from thesisrecon.numerics.losses import loss_code, loss_value, loss_weight
-from thesisrecon.numerics.metric_cameras import (
+from thesisrecon.numerics._kernels import away_from_zero, invert_positive_3x3, loss_value, loss_weight
+from thesisrecon.numerics._metric_kernels import (
     MetricModel,
     linearize_metric,
     metric_cost,
     move_poses,
     project_metric,
 )
-from thesisrecon.numerics.observations import (
-    Jacobians,
-    Observations,
-    SortedObservations,
-    Weighting,
-    sort_observations,
-)
-from thesisrecon.numerics.projective_bundle import (
+from thesisrecon.numerics._observations import Jacobians, SortedObservations, Weighting, sort_observations
+from thesisrecon.numerics._projective_kernels import (
     UnitState,
     linearize_projective,
-    project_projective,
     projective_cost,
     tangent_reflectors,
     tangent_step,
 )
-from thesisrecon.numerics.small_solvers import away_from_zero, invert_positive_3x3
+from thesisrecon.numerics.levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
+from thesisrecon.numerics.losses import loss_code
+from thesisrecon.numerics.observations import Observations
 
-MAX_ITERATIONS = 200
-"""Iterations of :func:`minimize_reprojection`; the median point takes three or four."""
+# Iterations of minimize_reprojection; the median point takes three or four.
+_MAX_ITERATIONS = 200
 
 
-class PointOptions(NamedTuple):
-    """Loss and end of a refinement of points.
+class _PointOptions(NamedTuple):
+    """``patience`` consecutive relative gains below ``tolerance`` end the refinement.
 
-    ``patience`` is the number of consecutive relative gains below ``tolerance`` that end it;
     ``keep_cheirality`` rejects steps that change the number of views a point lies behind.
     """
 
@@ -60,7 +53,7 @@ class PointOptions(NamedTuple):
     keep_cheirality: bool
 
 
-class PointObservations(NamedTuple):
+class _PointRows(NamedTuple):
     """Observations ``first`` to ``last`` of one point among all, sorted by point."""
 
     first: int
@@ -70,7 +63,7 @@ class PointObservations(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _point_cost(P: F64, x: F64, obs: PointObservations, options: PointOptions) -> tuple[float, int]:
+def _point_cost(P: F64, x: F64, obs: _PointRows, options: _PointOptions) -> tuple[float, int]:
     """Return 1/2 sum rho of one point's observations and the number of cameras it lies behind."""
     first, last, view_index, xy = obs
     code, delta = options.loss_code, options.delta
@@ -90,7 +83,7 @@ def _point_cost(P: F64, x: F64, obs: PointObservations, options: PointOptions) -
 
 @njit(cache=True, nogil=True)
 def _linearize_point(
-    P: F64, x: F64, tangent: tuple[F64, float], obs: PointObservations, options: PointOptions, H: F64, g: F64
+    P: F64, x: F64, tangent: tuple[F64, float], obs: _PointRows, options: _PointOptions, H: F64, g: F64
 ) -> None:
     """Fill J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space (Householder vector, factor)."""
     v, beta = tangent
@@ -124,7 +117,7 @@ def _linearize_point(
 
 
 @njit(cache=True, nogil=True)
-def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, options: PointOptions) -> None:
+def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, options: _PointOptions) -> None:
     """Refine every unit point of X (N, 4) in place by Levenberg-Marquardt in its tangent space."""
     H, M, Mi, root = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     g, step = np.empty(3), np.empty((1, 3))
@@ -136,7 +129,7 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
         x = X[j : j + 1]
         if x[0, 0] == 0.0 and x[0, 1] == 0.0 and x[0, 2] == 0.0 and x[0, 3] == 0.0:
             continue
-        obs = PointObservations(first, last, view_index, xy)
+        obs = _PointRows(first, last, view_index, xy)
         cost, behind = _point_cost(P, x[0], obs, options)
         damping, small_gains, accepted = 1e-4, 0, True
         for _ in range(options.iterations):
@@ -172,39 +165,34 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
 class CameraRefinement:
     """Refined projective camera.
 
-    Attributes
+    Parameters
     ----------
-    P : ndarray (3, 4), camera at the norm and sign of its start
+    P : ndarray (3, 4)
+        Camera at the norm and sign of its start.
     covariance : ndarray (12, 12)
         Of P's row-major entries for image noise of 1 px; multiply by sigma^2. No part along P itself (the
         scale); huge variances in undetermined directions.
-    residual_px : ndarray (M, 2), projection minus observation
-    cost : float, 1/2 sum rho, px^2
-    iterations : int, linear solves
     """
 
     P: F64
     covariance: F64
-    residual_px: F64
-    cost: float
-    iterations: int
 
 
 @dataclass(frozen=True)
 class PoseRefinement:
     """Refined calibrated camera.
 
-    Attributes
+    Parameters
     ----------
-    R : ndarray (3, 3), rotation world-to-camera
-    t : ndarray (3,), translation
-    intrinsics : ndarray (6,) or (8,), row of ``MetricCameras.intrinsics``
+    R, t : ndarray (3, 3), (3,)
+        Pose, world-to-camera.
+    intrinsics : ndarray (6,) or (8,)
+        Row of ``MetricCameras.intrinsics``.
     covariance : ndarray (6 + F, 6 + F)
-        For noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x + d in the camera frame,
-        then the F free intrinsics, the focal length as log f.
-    residual_px : ndarray (M, 2), projection minus observation
-    cost : float, 1/2 sum rho, px^2
-    iterations : int, linear solves
+        For noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x + d of the camera frame;
+        F free intrinsics, the focal length as log f.
+    residual_px : ndarray (M, 2)
+        Projection minus observation.
     """
 
     R: F64
@@ -212,8 +200,6 @@ class PoseRefinement:
     intrinsics: F64
     covariance: F64
     residual_px: F64
-    cost: float
-    iterations: int
 
 
 def refine_points(
@@ -233,29 +219,31 @@ def refine_points(
 
     Parameters
     ----------
-    P : ndarray (V, 3, 4), cameras
-    X : ndarray (N, 4), homogeneous starting points
-    view_index, point_index : ndarray (K,) of int, view and point of each observation
-    xy : ndarray (K, 2), pixels
-    loss_px : float, turning point of Huber's loss, px
-    iterations : int, steps per point
+    P, X : ndarray (V, 3, 4), (N, 4)
+        Cameras and starting points.
+    view_index, point_index : ndarray (K,) of int
+        View and point of each observation.
+    xy : ndarray (K, 2)
+        Pixels.
+    loss_px : float
+        Turning point of Huber's loss, px.
+    iterations : int
+        Steps per point.
 
     Returns
     -------
     ndarray (N, 4)
-        Points with the norms and signs of the starts; unchanged if zero, not finite or observed less than
-        twice.
+        Points of unchanged norms and signs; unchanged if zero, not finite or observed less than twice.
 
     Raises
     ------
     ValueError
-        Wrong shapes.
+        For wrong shapes.
     """
-    P, X, o = _checked_points("refine_points", P, X, (view_index, point_index, xy))
-    used = _observed_twice(X, o)
+    P, X, o, used = _checked_points("refine_points", P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
-    options = PointOptions(loss_code("huber", loss_px), loss_px, iterations, 1e-9, 1, True)
+    options = _PointOptions(loss_code("huber", loss_px), loss_px, iterations, 1e-9, 1, True)
     return _refine_in_frame(P, X, o, used, whitening_transform(X[used]), options)
 
 
@@ -267,63 +255,57 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
 
     Parameters
     ----------
-    P : ndarray (V, 3, 4), cameras
-    X : ndarray (N, 4), homogeneous starting points
-    view_index, point_index : ndarray (K,) of int, view and point of each observation
-    xy : ndarray (K, 2), pixels
+    P, X, view_index, point_index, xy
+        As in :func:`refine_points`.
 
     Returns
     -------
     ndarray (N, 4)
-        Points with the norms and signs of the starts; unchanged if zero, not finite or observed less than
-        twice.
+        Points as in :func:`refine_points`.
 
     Raises
     ------
     ValueError
-        Wrong shapes.
+        For wrong shapes.
     """
-    P, X, o = _checked_points("minimize_reprojection", P, X, (view_index, point_index, xy))
-    used = _observed_twice(X, o)
+    P, X, o, used = _checked_points("minimize_reprojection", P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
-    cameras = pixel_conditioning(o.xy) @ P
-    norms = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
-    M = np.asarray(np.linalg.qr((cameras / np.where(norms > 0.0, norms, 1.0)).reshape(-1, 4))[1])
+    cameras = _unit_cameras(pixel_conditioning(o.seen.xy) @ P)
+    M = np.asarray(np.linalg.qr(cameras.reshape(-1, 4))[1])
     # Cameras with one centre leave a direction of space undetermined.
     if len(M) < 4 or not np.abs(np.diag(M)).min() > 1e-13 * np.abs(M).max():
         M = np.eye(4)
-    options = PointOptions(loss_code("squared", 1.0), 1.0, MAX_ITERATIONS, 1e-14, 2, False)
+    options = _PointOptions(loss_code("squared", 1.0), 1.0, _MAX_ITERATIONS, 1e-14, 2, False)
     return _refine_in_frame(P, X, o, used, M, options)
 
 
 def _checked_points(
-    caller: str, P: F64, X: F64, observations: tuple[I64, I64, F64]
-) -> tuple[F64, F64, SortedObservations]:
-    """Check cameras, points and observations."""
+    caller: str, P: F64, X: F64, observations: Observations
+) -> tuple[F64, F64, SortedObservations, B8]:
+    """Return copies, sorted observations, and the finite non-zero points with two observations or more."""
     P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
     require_shapes(caller, P=(P, ("V", 3, 4)), X=(X, ("N", 4)))
-    return P, X, sort_observations(*observations, len(P), len(X))
+    o, norms = sort_observations(observations, len(P), len(X)), np.linalg.norm(X, axis=1)
+    return P, X, o, np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2)
 
 
-def _observed_twice(X: F64, o: SortedObservations) -> B8:
-    """Return the finite non-zero points with two observations or more."""
-    norms = np.linalg.norm(X, axis=1)
-    return np.asarray(np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2))
+def _unit_cameras(P: F64) -> F64:
+    """Return cameras (V, 3, 4) of unit norm; zeros stay."""
+    norms = np.linalg.norm(P, axis=(1, 2), keepdims=True)
+    return np.asarray(P / np.where(norms > 0.0, norms, 1.0))
 
 
-def _refine_in_frame(P: F64, X: F64, o: SortedObservations, used: B8, M: F64, options: PointOptions) -> F64:
+def _refine_in_frame(P: F64, X: F64, o: SortedObservations, used: B8, M: F64, options: _PointOptions) -> F64:
     """Refine the ``used`` points in conditioned pixels and the space M X; norms and signs are kept."""
-    norms, T = np.linalg.norm(X, axis=1), pixel_conditioning(o.xy)
+    norms, T = np.linalg.norm(X, axis=1), pixel_conditioning(o.seen.xy)
     # The scale of a camera has no effect on its projections, but must not push depths below rounding.
-    cameras = T @ P @ np.linalg.inv(M)
-    sizes = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
-    cameras = np.ascontiguousarray(cameras / np.where(sizes > 0.0, sizes, 1.0))
+    cameras = np.ascontiguousarray(_unit_cameras(T @ P @ np.linalg.inv(M)))
     moved = np.where(used[:, None], X, 0.0) @ M.T
     moved[used] /= np.linalg.norm(moved[used], axis=1, keepdims=True)
-    xy = o.xy * T[0, 0] + T[:2, 2]
+    xy = o.seen.xy * T[0, 0] + T[:2, 2]
     options = options._replace(delta=options.delta * float(T[0, 0]))
-    _refine_each_point(cameras, moved, o.start, o.view_index, xy, options)
+    _refine_each_point(cameras, moved, o.start, o.seen.view_index, xy, options)
     back = moved @ np.linalg.inv(M).T
     lengths = np.linalg.norm(back, axis=1, keepdims=True)
     back *= norms[:, None] / np.where(lengths > 0.0, lengths, 1.0)
@@ -348,11 +330,6 @@ class _CameraProblem:
         tangent_step(state, s.vP, s.bP, step[None], moved)
         return moved
 
-    def residual(self, state: F64) -> F64:
-        residual, depth = np.empty((len(self.X), 2)), np.empty(len(self.X))
-        project_projective(state.reshape(1, 3, 4), self.X, self.obs, residual, depth)
-        return residual
-
     def cost(self, state: F64) -> float:
         return float(projective_cost(UnitState.at(state, self.X), self.obs, self.weighting))
 
@@ -371,25 +348,28 @@ def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
 def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> CameraRefinement:
     """Refine one projective camera with the points fixed: resection (section 6.4), 11 unknowns, Huber's loss.
 
-    Conditioned and whitened inside. Too few points or points on one plane raise nothing: the covariance shows
-    them.
+    Too few points or points on one plane raise nothing: the covariance shows them.
 
     Parameters
     ----------
-    P : ndarray (3, 4), start
-    X : ndarray (M, 4), homogeneous points
-    xy : ndarray (M, 2), pixels
-    loss_px : float, turning point of Huber's loss, px
-    iterations : int, maximum number of linear solves
+    P : ndarray (3, 4)
+        Start.
+    X, xy : ndarray (M, 4), (M, 2)
+        Homogeneous points and their pixels.
+    loss_px : float
+        Turning point of Huber's loss, px.
+    iterations : int
+        Maximum number of linear solves.
 
     Returns
     -------
-    CameraRefinement, camera with covariance
+    CameraRefinement
+        Camera with its covariance.
 
     Raises
     ------
     ValueError
-        Wrong shapes, or values that are zero or not finite.
+        For wrong shapes, or values that are zero or not finite.
     """
     P, X, xy = (np.array(a, dtype=np.float64) for a in (P, X, xy))
     require_shapes("refine_camera", P=(P, (3, 4)), X=(X, ("M", 4)), xy=(xy, ("M", 2)))
@@ -404,22 +384,16 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     scale = float(T[0, 0])
     weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px * scale)
     problem = _CameraProblem(points, _one_view_observations(xy * scale + T[:2, 2]), weighting)
-    solution = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
+    end = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations).state
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), M.T)
-    raw = back @ solution.state[0]
+    raw = back @ end[0]
     back *= size / np.linalg.norm(raw)
     raw *= size / np.linalg.norm(raw)
     # The norm is fixed, so the part of an error along P is only a change of scale.
     back -= np.outer(raw, raw @ back) / size**2
-    covariance = back @ _camera_covariance(problem, solution.state) @ back.T * scale**2
-    return CameraRefinement(
-        raw.reshape(3, 4),
-        covariance,
-        problem.residual(solution.state) / scale,
-        solution.cost / scale**2,
-        solution.iterations,
-    )
+    covariance = back @ _camera_covariance(problem, end) @ back.T * scale**2
+    return CameraRefinement(raw.reshape(3, 4), covariance)
 
 
 def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
@@ -452,11 +426,6 @@ class _PoseProblem:
         intrinsics[0, 0] = state.intrinsics[0, 0] * np.exp(np.clip(moves[0], -3.0, 3.0))
         return state._replace(R=R, t=t, intrinsics=intrinsics)
 
-    def residual(self, state: MetricModel) -> F64:
-        residual, depth = np.empty_like(self.obs.xy), np.empty(len(self.obs.xy))
-        project_metric(state, self.obs, residual, depth)
-        return residual
-
     def cost(self, state: MetricModel) -> float:
         return float(metric_cost(state, self.obs, self.weighting))
 
@@ -476,34 +445,32 @@ def refine_pose(
 
     Parameters
     ----------
-    R : ndarray (3, 3), rotation world-to-camera
-    t : ndarray (3,), translation
-    intrinsics : ndarray (6,) or (8,), row of ``MetricCameras.intrinsics``
-    X : ndarray (M, 3), points
-    xy : ndarray (M, 2), pixels
-    free : ndarray (6,) or (8,) of bool, optional, intrinsics that move; none by default
-    loss_px : float, turning point of Huber's loss, px
-    iterations : int, maximum number of linear solves
+    R, t, intrinsics : ndarray (3, 3), (3,), (6,) or (8,)
+        Start: pose world-to-camera, and a row of ``MetricCameras.intrinsics``.
+    X, xy : ndarray (M, 3), (M, 2)
+        Points and their pixels.
+    free : ndarray (6,) or (8,) of bool, optional
+        Intrinsics that move; none by default.
+    loss_px : float
+        Turning point of Huber's loss, px.
+    iterations : int
+        Maximum number of linear solves.
 
     Returns
     -------
-    PoseRefinement, pose with covariance
+    PoseRefinement
+        Pose with its covariance.
 
     Raises
     ------
     ValueError
-        Wrong shapes, values that are not finite, or a focal length that is not positive.
+        For wrong shapes, values that are not finite, or a focal length that is not positive.
     """
     R, t, q, X, xy = (np.array(a, dtype=np.float64) for a in (R, t, intrinsics, X, xy))
-    width = 8 if q.shape == (8,) else 6
     require_shapes(
-        "refine_pose",
-        R=(R, (3, 3)),
-        t=(t, (3,)),
-        intrinsics=(q, (width,)),
-        X=(X, ("M", 3)),
-        xy=(xy, ("M", 2)),
-    )
+        "refine_pose", R=(R, (3, 3)), t=(t, (3,)), X=(X, ("M", 3)), xy=(xy, ("M", 2)),
+        intrinsics=(q, (8 if q.shape == (8,) else 6,)),
+    )  # fmt: skip
     require_finite("refine_pose", R, t, q, X, xy)
     if not len(X) or not q[0] > 0.0:
         raise ValueError(f"refine_pose needs points and a positive focal length; got {len(X)} and {q[0]}")
@@ -514,20 +481,11 @@ def refine_pose(
     scale = 1.0 / size if size > 0.0 else 1.0
     weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px)
     problem = _PoseProblem(_one_view_observations(xy), columns, weighting)
-    moved = scale * (t + R @ origin)
-    group = np.zeros(1, dtype=np.int64)
-    start = MetricModel(R[None], moved[None], q[None], group, np.ascontiguousarray(scale * (X - origin)))
-    solution = run_levenberg_marquardt(problem, start, max_iterations=iterations)
-    end = solution.state
+    moved, points = scale * (t + R @ origin), np.ascontiguousarray(scale * (X - origin))
+    start = MetricModel(R[None], moved[None], q[None], np.zeros(1, dtype=np.int64), points)
+    end = run_levenberg_marquardt(problem, start, max_iterations=iterations).state
     units = np.ones(6 + len(columns))
     units[3:6] = 1.0 / scale
     covariance = invert_information(problem.linearize(end).hessian) * units * units[:, None]
-    return PoseRefinement(
-        end.R[0],
-        end.t[0] / scale - end.R[0] @ origin,
-        end.intrinsics[0],
-        covariance,
-        problem.residual(end),
-        solution.cost,
-        solution.iterations,
-    )
+    t = end.t[0] / scale - end.R[0] @ origin
+    return PoseRefinement(end.R[0], t, end.intrinsics[0], covariance, project_metric(end, problem.obs))

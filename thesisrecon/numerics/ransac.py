@@ -7,22 +7,22 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numba import njit
-from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 
 
 @njit(cache=True, nogil=True)
 def draw_sample(uniforms: F64, n: int, out: I64) -> None:
-    """Turn uniform random numbers into distinct sorted indices.
-
-    The k-th number picks one of the n - k indices left, so that every subset is equally likely.
+    """Turn uniform random numbers into distinct sorted indices; every subset is equally likely.
 
     Parameters
     ----------
-    uniforms : ndarray (s,), numbers in [0, 1)
-    n : int, number of data
-    out : ndarray (s,) of int, output, indices below n
+    uniforms : ndarray (s,)
+        Numbers in [0, 1).
+    n : int
+        Number of data.
+    out : ndarray (s,) of int
+        Output, indices below n.
     """
     for k in range(len(out)):
         index = min(int(uniforms[k] * (n - k)), n - k - 1)
@@ -43,14 +43,15 @@ def required_samples(inlier_ratio: float, sample_size: int, confidence: float, l
 
     Parameters
     ----------
-    inlier_ratio : float, fraction of inliers
-    sample_size : int, data in a minimal sample
-    confidence : float, required probability
-    largest : int, upper bound
+    inlier_ratio, sample_size, confidence : float, int, float
+        Fraction of inliers, data in a minimal sample, and required probability.
+    largest : int
+        Upper bound.
 
     Returns
     -------
-    int, number of samples
+    int
+        Number of samples.
     """
     good = inlier_ratio**sample_size
     if good <= 1e-12:
@@ -72,39 +73,22 @@ class SampledProblem(Protocol[Model]):
         """Data in a minimal sample."""
 
     def solve(self, sample: I64) -> list[Model]:
-        """Solve for the model of a minimal sample.
-
-        Parameters
-        ----------
-        sample : ndarray (sample_size,) of int, indices of the data
-
-        Returns
-        -------
-        list, models, possibly none
-        """
+        """Return the models of the data with indices ``sample`` (sample_size,), possibly none."""
 
     def residuals(self, model: Model) -> F64:
-        """Evaluate a model.
-
-        Parameters
-        ----------
-        model : Model, model
-
-        Returns
-        -------
-        ndarray (N,), distance of every datum
-        """
+        """Return the distance (N,) of every datum."""
 
 
 @dataclass(frozen=True)
 class Consensus(Generic[Model]):
     """Best model of a search.
 
-    Attributes
+    Parameters
     ----------
-    model : Model, model with the most data within the threshold
-    inliers : ndarray (N,) of bool, data within the threshold
-    samples : int, samples drawn
+    model, inliers : Model, ndarray (N,) of bool
+        Model with the most data within the threshold, and these data.
+    samples : int
+        Samples drawn.
     """
 
     model: Model
@@ -119,6 +103,17 @@ class SampleConsensus:
     Of two models with equally many inliers the one with the lower standard deviation wins (Fischler and
     Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
     n! / s!).
+
+    Parameters
+    ----------
+    threshold : float
+        Largest residual of an inlier.
+    max_samples : int
+        Number of samples.
+    stop_inlier_ratio : float
+        The search ends if a model has more inliers than this share of the data.
+    least_median : bool
+        Rank models by the median of their residuals instead (Rousseeuw, 1984).
     """
 
     threshold: float
@@ -126,23 +121,29 @@ class SampleConsensus:
     stop_inlier_ratio: float = 1.0
     least_median: bool = False
 
-    def search(self, problem: SampledProblem[Model], n: int, rng: Generator) -> Consensus[Model] | None:
+    def search(
+        self, problem: SampledProblem[Model], n: int, rng: np.random.Generator
+    ) -> Consensus[Model] | None:
         """Search the best model.
 
         Parameters
         ----------
-        problem : SampledProblem, minimal solver and residuals
-        n : int, number of data
-        rng : numpy.random.Generator, source of randomness
+        problem : SampledProblem
+            Minimal solver and residuals.
+        n : int
+            Number of data.
+        rng : numpy.random.Generator
+            Source of randomness.
 
         Returns
         -------
-        Consensus or None, best model; None if no sample gave one
+        Consensus or None
+            Best model; None if no sample gave one.
 
         Raises
         ------
         ValueError
-            There are fewer data than in a sample.
+            If there are fewer data than in a sample.
         """
         if n < problem.sample_size:
             raise ValueError(f"sampling needs at least {problem.sample_size} data; got {n}")

@@ -8,9 +8,9 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.numerics._metric_kernels import FOCAL, POSE_DOF
+from thesisrecon.numerics._reduced_solvers import ReducedSystem, order_views
 from thesisrecon.numerics.levenberg_marquardt import invert_information
-from thesisrecon.numerics.metric_cameras import FOCAL, POSE_DOF
-from thesisrecon.numerics.reduced_solvers import ReducedSystem, order_views
 
 SIMILARITY_DOF = 7
 # Largest number of unknowns for dense inversion.
@@ -23,20 +23,10 @@ MIN_KEPT = 0.1
 
 
 def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
-    """Estimate the standard deviation of one image coordinate from residuals after a fit.
+    """Estimate the standard deviation of one image coordinate from residuals (K, 2); 0 if unknown.
 
-    The root mean square within 2.5 sigma of the residuals scaled up by their remaining variance, from a start
-    at the median, corrected for the trimming of a normal distribution.
-
-    Parameters
-    ----------
-    residual : ndarray (K, 2), residuals, px
-    leverage : ndarray (K, 2), fraction of a coordinate's variance absorbed by its point
-    dof : int, camera unknowns, which absorb variance of all coordinates equally
-
-    Returns
-    -------
-    float, standard deviation, px; 0 if no variance is left
+    The root mean square within 2.5 sigma, corrected for the trimming, of the residuals scaled up by their
+    remaining variance: points absorb ``leverage`` (K, 2) of it, ``dof`` camera unknowns the same of all.
     """
     if not len(residual):
         return 0.0
@@ -55,15 +45,9 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
 
 @dataclass(frozen=True)
 class CovarianceInput:
-    """Information matrix and poses of a bundle adjustment.
+    """Information of the cameras, and poses; ``block`` (V,) is -1 for views whose pose does not move.
 
-    Attributes
-    ----------
-    reduced : ReducedSystem, information of the cameras
-    block : ndarray (V,) of int, block of each view whose pose moves, -1 for others
-    R : ndarray (V, 3, 3), rotations
-    t : ndarray (V, 3), translations
-    fixed_frame : bool, whether observed views are fixed, and the frame with them
+    ``fixed_frame``: observed views are fixed, and the frame with them.
     """
 
     reduced: ReducedSystem
@@ -74,22 +58,10 @@ class CovarianceInput:
 
 
 def bundle_covariances(inputs: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
-    """Return covariances of intrinsics and poses.
+    """Return covariances of intrinsics (G, C, C) and poses (V, 6, 6), with unit of length 1 / ``scale``.
 
     Poses refer to the inner gauge: of all solutions that differ by a similarity, the one that moved the
-    cameras least. The intrinsics do not depend on the frame.
-
-    Parameters
-    ----------
-    inputs : CovarianceInput, information and poses
-    number : ndarray (G, C) of int, column of each intrinsic, -1 if fixed
-    focal : ndarray (G,), focal lengths, which convert log f to f
-    scale : float, unit of length
-
-    Returns
-    -------
-    intrinsics : ndarray (G, C, C), covariances of the intrinsics
-    poses : ndarray (V, 6, 6), covariances of the poses
+    cameras least. ``number`` (G, C) is the column of each intrinsic; ``focal`` (G,) converts log f to f.
     """
     b, C, e = inputs.reduced.sums.border.shape
     width, edge = (C if b else 0), b * C
@@ -127,19 +99,9 @@ def _dense_blocks(inputs: CovarianceInput, views: I64) -> F64:
 
 
 def invert_in_inner_gauge(information: F64, N: F64) -> F64:
-    """Invert an information matrix that is singular along the gauge freedoms.
+    """Invert an information matrix that is singular along the orthonormal gauge directions N (D, 7).
 
-    (S + w N N')^-1 is the generalised inverse of S with variance 1 / w along the gauge freedoms, which are
-    then removed.
-
-    Parameters
-    ----------
-    information : ndarray (D, D), information matrix S
-    N : ndarray (D, 7), orthonormal gauge directions
-
-    Returns
-    -------
-    ndarray (D, D), covariance
+    (S + w N N')^-1 is the generalised inverse of S with variance 1 / w along N, which is then removed.
     """
     weight = float(np.median(np.diag(information)))
     C = invert_information(information + weight * N @ N.T)
@@ -149,8 +111,8 @@ def invert_in_inner_gauge(information: F64, N: F64) -> F64:
 def _band_blocks(inputs: CovarianceInput, views: I64) -> F64:
     """Return the covariance blocks from a banded factor.
 
-    Any seven coordinates fix the frame; Baarda's S-transformation (I - N N') Q (I - N N') then takes the
-    covariance Q to the inner gauge.
+    Seven coordinates fix the frame; Baarda's S-transformation (I - N N') Q (I - N N') changes to the inner
+    gauge.
     """
     reduced = inputs.reduced
     b, C, e = reduced.sums.border.shape
@@ -199,17 +161,7 @@ def _gauge_basis(inputs: CovarianceInput, views: I64) -> F64:
 
 
 def gauge_directions(R: F64, t: F64) -> F64:
-    """Return the orthonormal motion of poses under translations, rotations and scalings of the world.
-
-    Parameters
-    ----------
-    R : ndarray (V, 3, 3), rotations
-    t : ndarray (V, 3), translations
-
-    Returns
-    -------
-    ndarray (6 V, 7), orthonormal columns
-    """
+    """Return the orthonormal motion (6 V, 7) of poses under similarities of the world."""
     directions = np.zeros((len(t), POSE_DOF, SIMILARITY_DOF))
     directions[:, 3:, 0:3] = -R
     directions[:, :3, 3:6] = -R

@@ -1,21 +1,20 @@
 """Solvers of the reduced camera system, and the choice between them by size and sparsity.
 
-Dense Cholesky serves up to some hundred views. Beyond, views share points with their neighbours only: if an
-order of the views keeps these near the diagonal (corridors, loops, streets), a banded Cholesky factor is
-exact at a cost linear in the views; otherwise conjugate gradients work on the blocks as they are.
+Dense Cholesky serves up to some hundred views. Beyond, a banded Cholesky factor is linear in the views if an
+order keeps neighbours together (corridors, loops, streets); otherwise conjugate gradients are used.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 import scipy
 from numba import njit
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.numerics.elimination import ReducedSums
+from thesisrecon.numerics._elimination import ReducedSums
 from thesisrecon.numerics.levenberg_marquardt import solve_positive
 
 # Cost of an operation relative to dense Cholesky: narrow bands compute slower, products read from memory.
@@ -37,15 +36,7 @@ def _fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
-    """Add values to the diagonal of the reduced matrix.
-
-    Parameters
-    ----------
-    blocks : ndarray (n, C, C), blocks of view pairs, updated
-    pair : ndarray (b, b) of int, number of the block of two views
-    corner : ndarray (e, e), corner, updated
-    values : ndarray (D,), values to add
-    """
+    """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) is the block of two views."""
     C, b = blocks.shape[1], len(pair)
     for v in range(b):
         for a in range(C):
@@ -56,15 +47,7 @@ def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None:
-    """Copy blocks to LAPACK's lower band, band[j, i - j] = S[i, j].
-
-    Parameters
-    ----------
-    blocks : ndarray (n, C, C), blocks of view pairs
-    row, column : ndarray (n,) of int, views of each block
-    place : ndarray (b,) of int, position of each view in the band
-    band : ndarray (D, width + 1), output, row-major: the transpose of LAPACK's column-major array
-    """
+    """Copy blocks to band[j, i - j] = S[i, j] (D, width + 1), views in the order ``place`` (b,)."""
     C = blocks.shape[1]
     for i in range(len(blocks)):
         r, c = place[row[i]] * C, place[column[i]] * C
@@ -95,13 +78,7 @@ def _multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None
 
 @njit(cache=True, nogil=True)
 def invert_band(L: F64, Z: F64) -> None:
-    """Compute the entries inside the band of (L L')^-1 by the recursion of Takahashi (1973).
-
-    Parameters
-    ----------
-    L : ndarray (D, width), factor, column j from the diagonal down: L[j, i - j]
-    Z : ndarray (D, width), output in the same layout
-    """
+    """Fill the entries inside the band of (L L')^-1 by the recursion of Takahashi (1973); L[j, i - j]."""
     D, width = L.shape
     for j in range(D - 1, -1, -1):
         last = min(D - 1, j + width - 1)
@@ -121,25 +98,14 @@ def invert_band(L: F64, Z: F64) -> None:
 
 @dataclass(frozen=True)
 class ReducedSystem:
-    """Symmetric positive system in blocks.
-
-    Attributes
-    ----------
-    row, column : ndarray (n,) of int, views of each block, row <= column
-    sums : ReducedSums, blocks, border, corner and right-hand side
-    """
+    """Symmetric positive system in blocks of views ``row`` <= ``column`` (n,)."""
 
     row: I64
     column: I64
     sums: ReducedSums
 
     def dense(self) -> F64:
-        """Assemble the matrix.
-
-        Returns
-        -------
-        ndarray (D, D), matrix, upper triangle
-        """
+        """Return the upper triangle of the matrix; (D, D)."""
         edge, D = self.sums.border.shape[0] * self.sums.border.shape[1], len(self.sums.rhs)
         S = np.zeros((D, D))
         _fill_dense(self.sums.blocks, self.row, self.column, S)
@@ -147,12 +113,14 @@ class ReducedSystem:
         S[edge:, edge:] = self.sums.corner
         return S
 
-
-class ReducedSolver(Protocol):
-    """Solver of a reduced system."""
-
-    def solve(self, system: ReducedSystem) -> F64 | None:
-        """Return x (D,), or None if the system is not positive."""
+    def multiply(self, x: F64) -> F64:
+        """Return S x for x (D,)."""
+        s, (b, C, e) = self.sums, self.sums.border.shape
+        border, y = s.border.reshape(b * C, e), np.empty((b, C))
+        _multiply_blocks(s.blocks, self.row, self.column, x[: b * C].reshape(b, C), y)
+        return np.concatenate(
+            [y.ravel() + border @ x[b * C :], border.T @ x[: b * C] + s.corner @ x[b * C :]]
+        )
 
 
 @dataclass(frozen=True)
@@ -160,26 +128,16 @@ class DenseCholesky:
     """Dense factorisation by LAPACK: D^3 / 3 operations."""
 
     def solve(self, system: ReducedSystem) -> F64 | None:
-        """Solve the system.
-
-        Parameters
-        ----------
-        system : ReducedSystem, system
-
-        Returns
-        -------
-        ndarray (D,) or None, solution; None if the system is not positive
-        """
+        """Return x (D,), or None if the system is not positive."""
         # Row-major upper is column-major lower: LAPACK reads the transpose without a copy.
         return solve_positive(system.dense().T, system.sums.rhs)
 
 
 @dataclass(frozen=True)
 class _BandedFactor:
-    """Factored reduced system.
+    """LAPACK's lower banded ``factor`` (width, b C) of the views, in the order ``place`` (b,).
 
-    LAPACK's lower banded ``factor`` (width, b C) of the views, in the order ``place`` (b,); ``border`` (b, C,
-    e); ``moved`` (b C, e) = views^-1 border; ``complement`` (e, e) = corner - border' moved.
+    ``border`` (b, C, e), ``moved`` (b C, e) = views^-1 border, ``complement`` = corner - border' moved.
     """
 
     place: I64
@@ -226,41 +184,20 @@ class _BandedFactor:
 class BandedCholesky:
     """Banded factorisation by LAPACK, the border by its Schur complement.
 
-    Attributes
-    ----------
-    place : ndarray (b,) of int, position of each view
-    reach : int, largest distance of neighbours
+    Views have positions ``place`` (b,), neighbours at most ``reach`` apart.
     """
 
     place: I64
     reach: int
 
     def solve(self, system: ReducedSystem) -> F64 | None:
-        """Solve the system.
-
-        Parameters
-        ----------
-        system : ReducedSystem, system
-
-        Returns
-        -------
-        ndarray (D,) or None, solution; None if the system is not positive
-        """
+        """Return x (D,), or None if the system is not positive."""
         factored = self.factor(system)
         found = None if factored is None else factored.solve(system.sums.rhs[:, None])
         return None if found is None else found[:, 0]
 
     def factor(self, system: ReducedSystem) -> _BandedFactor | None:
-        """Factor the system.
-
-        Parameters
-        ----------
-        system : ReducedSystem, system
-
-        Returns
-        -------
-        _BandedFactor or None, factors; None if the system is not positive
-        """
+        """Return the factors, or None if the system is not positive."""
         s, (b, C, e) = system.sums, system.sums.border.shape
         band = np.zeros((b * C, (self.reach + 1) * C))
         fill_band(s.blocks, system.row, system.column, self.place, band)
@@ -279,26 +216,14 @@ class BandedCholesky:
 class ConjugateGradients:
     """Conjugate gradients with a block Jacobi preconditioner (views' blocks and the corner), from zero.
 
-    Attributes
-    ----------
-    tolerance : float, decrease of the residual in the preconditioner's norm
-    max_products : int, maximum number of matrix products
+    Ends after ``max_products`` or a decrease of the residual in the preconditioner's norm by ``tolerance``.
     """
 
     tolerance: float = 1e-3
     max_products: int = 1000
 
     def solve(self, system: ReducedSystem) -> F64 | None:
-        """Solve the system.
-
-        Parameters
-        ----------
-        system : ReducedSystem, system
-
-        Returns
-        -------
-        ndarray (D,) or None, solution; None if the system is not positive
-        """
+        """Return x (D,), or None if the system is not positive."""
         s, (b, C, _) = system.sums, system.sums.border.shape
         own = s.blocks[system.row == system.column]
         try:
@@ -321,7 +246,7 @@ class ConjugateGradients:
         for _ in range(self.max_products):
             if not energy > enough:
                 break
-            product = multiply(system, p)
+            product = system.multiply(p)
             curvature = float(p @ product)
             if not curvature > 0.0:
                 return None
@@ -332,37 +257,11 @@ class ConjugateGradients:
         return x if np.isfinite(x).all() else None
 
 
-def multiply(system: ReducedSystem, x: F64) -> F64:
-    """Return S x.
-
-    Parameters
-    ----------
-    system : ReducedSystem, system
-    x : ndarray (D,), vector
-
-    Returns
-    -------
-    ndarray (D,), product
-    """
-    s, (b, C, e) = system.sums, system.sums.border.shape
-    border, y = s.border.reshape(b * C, e), np.empty((b, C))
-    _multiply_blocks(s.blocks, system.row, system.column, x[: b * C].reshape(b, C), y)
-    return np.concatenate([y.ravel() + border @ x[b * C :], border.T @ x[: b * C] + s.corner @ x[b * C :]])
+ReducedSolver: TypeAlias = DenseCholesky | BandedCholesky | ConjugateGradients
 
 
 def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) -> ReducedSolver:
-    """Choose the solver with the least work for a pattern of blocks; dense for all small systems.
-
-    Parameters
-    ----------
-    row, column : ndarray (n,) of int, views of each block
-    n_views : int, number of views
-    width, border : int, columns of a view and of the border
-
-    Returns
-    -------
-    ReducedSolver, solver
-    """
+    """Choose the solver with the least work for blocks of ``width`` and a border; dense for small systems."""
     D = float(n_views * width + border)
     if D <= SMALL:
         return DenseCholesky()
@@ -377,17 +276,7 @@ def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) 
 
 
 def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
-    """Order the views such that neighbours stand close (reverse Cuthill-McKee).
-
-    Parameters
-    ----------
-    row, column : ndarray (n,) of int, views of each block
-    n_views : int, number of views
-
-    Returns
-    -------
-    BandedCholesky, solver with this order
-    """
+    """Order the views such that neighbours stand close (reverse Cuthill-McKee)."""
     graph = scipy.sparse.coo_array((np.ones(len(row)), (row, column)), shape=(n_views, n_views)).tocsr()
     order = scipy.sparse.csgraph.reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
     place = np.empty(n_views, dtype=np.int64)

@@ -1,12 +1,9 @@
 """Elimination of the points from the normal equations, and their steps for given camera steps.
 
-A residual's Jacobian has three parts: ``A`` (K, 2, C), columns of its view's block; ``E`` (K, 2, F), columns
-that views have in common, F may be 0; and ``B`` (K, 2, 3) of its point. The reduced system has three parts
-accordingly: C x C blocks for pairs of views with a common point, a border between views and common columns,
-and a corner. Residuals and Jacobians are multiplied by sqrt(rho').
-
-With V = sum B'B + damping = L L' of one point, B~ = B L^-T and Q_kl = delta_kl I - B~_k B~_l' (2 x 2), the
-reduced system is S_kl = A_k' Q_kl A_l: rank-two updates instead of the rank-three ones of W V^-1 W'.
+A Jacobian has columns A of its view, E that views have in common, and B of its point. The reduced system has
+blocks for pairs of views with a common point, a border between views and common columns, and a corner. With
+V = sum B'B + damping = L L' of one point, B~ = B L^-T and Q_kl = delta_kl I - B~_k B~_l' (2 x 2), it is
+S_kl = A_k' Q_kl A_l: rank-two updates instead of the rank-three ones of W V^-1 W'.
 """
 
 from __future__ import annotations
@@ -15,19 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from thesisrecon.arrays import F64, I64
-from thesisrecon.numerics.observations import Jacobians
-from thesisrecon.numerics.small_solvers import invert_cholesky_3x3, multiply_transposed_3x3
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.numerics._kernels import invert_cholesky_3x3, multiply_transposed_3x3
+from thesisrecon.numerics._observations import Jacobians
 
 
 class BlockIndex(NamedTuple):
-    """Blocks of observations sorted by point.
+    """``start`` (N + 1,) of each point, ``block`` (V,) and border columns ``common`` (V, F) of each view.
 
-    ``start`` (N + 1,) first observation of each point; ``view_index`` (K,); ``block`` (V,) block of each
-    view, -1 if fixed; ``pair`` (b, b) block of two views, upper triangle; ``common`` (V, F) border columns,
-    -1 if fixed.
+    Both are -1 if fixed; ``pair`` (b, b) is the block of two views, upper triangle.
     """
 
     start: I64
@@ -38,10 +32,9 @@ class BlockIndex(NamedTuple):
 
 
 class ReducedSums(NamedTuple):
-    """The reduced system, summed over points.
+    """The reduced system: ``blocks`` (n, C, C), ``border`` (b, C, e), ``corner`` (e, e), ``rhs`` (D,).
 
-    ``blocks`` (n, C, C), ``border`` (b, C, e), ``corner`` (e, e), ``rhs`` (D,) with D = b C + e; and, before
-    elimination, ``diagonal`` (D,) of J'J and ``gradient`` (D,).
+    D = b C + e; ``diagonal`` (D,) of J'J and ``gradient`` (D,) are those before elimination.
     """
 
     blocks: F64
@@ -53,11 +46,7 @@ class ReducedSums(NamedTuple):
 
 
 class PointSums(NamedTuple):
-    """Sums of each point.
-
-    ``inverse`` (N, 3, 3) of its damped J'J, zeros if undetermined; ``gradient`` and ``diagonal`` (N, 3) of
-    J'J.
-    """
+    """Inverse (N, 3, 3) of each point's damped J'J, zeros if undetermined; gradient and diagonal (N, 3)."""
 
     inverse: F64
     gradient: F64
@@ -65,11 +54,7 @@ class PointSums(NamedTuple):
 
 
 class _Elimination(NamedTuple):
-    """Residuals after the points' own steps.
-
-    ``Bt`` (k, 2, 3) = B~ and ``residual`` (k, 2) of the observations from ``first`` on, ``g`` (n, 3) = L^-1
-    h.
-    """
+    """B~ (k, 2, 3) and residuals (k, 2) after the points' own steps, from ``first`` on; g = L^-1 h (n, 3)."""
 
     first: int
     Bt: F64
@@ -87,20 +72,7 @@ def eliminate_points(
     sums: ReducedSums,
     points: PointSums,
 ) -> None:
-    """Add the eliminated points ``first`` to ``last`` to the reduced system.
-
-    The diagonal of a point's J'J is multiplied by 1 + damping; a point whose block is not positive does not
-    move.
-
-    Parameters
-    ----------
-    first, last : int, range of points
-    damping : float, Levenberg-Marquardt damping
-    J : Jacobians, residuals and Jacobians
-    index : BlockIndex, blocks
-    sums : ReducedSums, reduced system, updated
-    points : PointSums, output for the points of the range
-    """
+    """Add the eliminated points to the sums; a point whose block is not positive does not move."""
     k = index.start[first]
     n = index.start[last] - k
     left = _Elimination(k, np.empty((n, 2, 3)), np.empty((n, 2)), np.empty((last - first, 3)))
@@ -295,17 +267,7 @@ def _add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[
 def substitute_points(
     first: int, last: int, camera_step: F64, J: Jacobians, index: BlockIndex, points: PointSums, step: F64
 ) -> None:
-    """Compute the steps -V^-1 (h + B' J step) of points for a camera step.
-
-    Parameters
-    ----------
-    first, last : int, range of points
-    camera_step : ndarray (D,), step of the camera unknowns
-    J : Jacobians, residuals and Jacobians
-    index : BlockIndex, blocks
-    points : PointSums, inverses and gradients of the points
-    step : ndarray (N, 3), output
-    """
+    """Compute the steps -V^-1 (h + B' J step) of points for a camera step."""
     C, F = J.A.shape[2], index.common.shape[1]
     border = len(index.pair) * C
     for j in range(first, last):
@@ -334,14 +296,7 @@ def substitute_points(
 
 @njit(cache=True, nogil=True)
 def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
-    """Compute the fraction of each coordinate's variance that its point's three unknowns absorb, B V^-1 B'.
-
-    Parameters
-    ----------
-    start : ndarray (N + 1,) of int, first observation of each point
-    B : ndarray (K, 2, 3), Jacobians by the points
-    leverage : ndarray (K, 2), output
-    """
+    """Fill the share (K, 2) of each coordinate's variance that its point's unknowns absorb, B V^-1 B'."""
     M = np.empty((3, 3))
     for j in range(len(start) - 1):
         v00 = v01 = v02 = v11 = v12 = v22 = 0.0
@@ -360,16 +315,8 @@ def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> None:
-    """Mark the pairs of blocks whose views observe a common point.
-
-    Parameters
-    ----------
-    start : ndarray (N + 1,) of int, first observation of each point
-    view : ndarray (K,) of int, view of each observation
-    block : ndarray (V,) of int, block of each view, -1 if fixed
-    seen : ndarray (b, b) of bool, output, upper triangle
-    """
+def mark_pairs(start: I64, view: I64, block: I64, seen: B8) -> None:
+    """Mark the pairs of blocks whose views observe a common point."""
     for j in range(len(start) - 1):
         for k in range(start[j], start[j + 1]):
             v = block[view[k]]
@@ -383,16 +330,7 @@ def mark_pairs(start: I64, view: I64, block: I64, seen: NDArray[np.bool_]) -> No
 def revert_crossing_points(
     start: I64, view_index: I64, row_before: F64, row_after: F64, X_before: F64, X_after: F64
 ) -> None:
-    """Undo the steps of points that cross the focal plane of a view that observes them.
-
-    Parameters
-    ----------
-    start : ndarray (N + 1,) of int, first observation of each point
-    view_index : ndarray (K,) of int, view of each observation
-    row_before, row_after : ndarray (V, 4), third rows of the cameras
-    X_before : ndarray (N, 4) or (N, 3), points before the step; (N, 3) have a fourth coordinate 1
-    X_after : ndarray (N, 4) or (N, 3), points after the step, changed in place
-    """
+    """Undo the steps of points (N, 3) or (N, 4) that cross the focal plane of a view that observes them."""
     d = X_before.shape[1]
     for j in range(len(start) - 1):
         for k in range(start[j], start[j + 1]):

@@ -1,9 +1,7 @@
 """The distinct unknowns behind a table of intrinsics, their Gaussian prior and their columns in the bundle.
 
-Unknowns are numbered so that rows of the table that share a value have the same number; the focal length is
-unknown as log f. The prior is a list of terms w (x_a - x_b - c)^2 / 2, either of which may be missing. The
-common mean of a hierarchical prior is an unknown of its own, seen by no image: the prior stays sparse, and
-marginalising it is left to the linear algebra.
+Rows of the table that share a value have the same unknown; the focal length is unknown as log f. The common
+mean of a hierarchical prior is an unknown of its own, seen by no image: the prior stays sparse.
 """
 
 from __future__ import annotations
@@ -14,7 +12,8 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics.metric_cameras import FOCAL, POSE_DOF, MetricCameras
+from thesisrecon.numerics._metric_kernels import FOCAL, POSE_DOF
+from thesisrecon.numerics.metric_cameras import MetricCameras
 
 NONE = -1
 # Larger steps of log f are rejected anyway; the bound avoids overflow.
@@ -23,7 +22,7 @@ MAX_LOG_STEP = 3.0
 
 @dataclass(frozen=True)
 class _PriorTerms:
-    """Terms w (x_first - x_second - offset)^2 / 2; ``second`` is -1 if a term binds one value to a number."""
+    """Terms w (x_first - x_second - offset)^2 / 2; ``second`` is -1 if a term binds one value."""
 
     first: I64
     second: I64
@@ -59,14 +58,9 @@ class _PriorTerms:
 
 @dataclass(frozen=True)
 class IntrinsicUnknowns:
-    """The unknowns of a table of intrinsics.
+    """``number`` (G, C) is the unknown of every entry, -1 if it does not move; ``column`` (n,) its intrinsic.
 
-    Attributes
-    ----------
-    number : ndarray (G, C) of int, unknown of every entry, -1 if it does not move
-    column : ndarray (n,) of int, intrinsic of every unknown
-    n_table : int, unknowns in the table; the rest are means of a hierarchical prior
-    terms : _PriorTerms, Gaussian prior
+    The first ``n_table`` unknowns are in the table, the rest are means of a hierarchical prior.
     """
 
     number: I64
@@ -80,17 +74,7 @@ class IntrinsicUnknowns:
         return len(self.column)
 
     def write(self, intrinsics: F64, x: F64) -> F64:
-        """Return the table with the unknowns put in.
-
-        Parameters
-        ----------
-        intrinsics : ndarray (G, C), table
-        x : ndarray (n,), unknowns
-
-        Returns
-        -------
-        ndarray (G, C), new table
-        """
+        """Return the table with the unknowns put in."""
         table = intrinsics.copy()
         moves = self.number >= 0
         table[moves] = x[self.number[moves]]
@@ -98,17 +82,7 @@ class IntrinsicUnknowns:
         return table
 
     def step(self, x: F64, step: F64) -> F64:
-        """Return the unknowns after a step; a log focal length moves by ``MAX_LOG_STEP`` at most.
-
-        Parameters
-        ----------
-        x : ndarray (n,), unknowns
-        step : ndarray (n,), step
-
-        Returns
-        -------
-        ndarray (n,), moved unknowns
-        """
+        """Return the moved unknowns; a log focal length moves by ``MAX_LOG_STEP`` at most."""
         limit = np.where(self.column == FOCAL, MAX_LOG_STEP, np.inf)
         return np.asarray(x + np.clip(step, -limit, limit))
 
@@ -116,27 +90,13 @@ class IntrinsicUnknowns:
 def number_unknowns(
     cameras: MetricCameras, used: B8, free: B8, prior: IntrinsicsPrior | None
 ) -> tuple[IntrinsicUnknowns, F64, F64]:
-    """Number the unknowns of a problem and choose their starting values.
+    """Return the unknowns, their start (n,), and the table (G, C) with known values put in.
 
-    A value starts at the mean of the used rows that share it; a value that no image observes is not an
-    unknown.
-
-    Parameters
-    ----------
-    cameras : MetricCameras, cameras
-    used : ndarray (G,) of bool, rows with observations
-    free : ndarray (C,) of bool, intrinsics that move
-    prior : IntrinsicsPrior or None, prior
-
-    Returns
-    -------
-    unknowns : IntrinsicUnknowns, numbering and prior
-    start : ndarray (n,), starting values
-    table : ndarray (G, C), table of intrinsics with known values put in
+    A value starts at the mean of the ``used`` rows (G,) that share it; one that no image observes is not an
+    unknown. ``free`` (C,) are the intrinsics that move.
     """
     table = _log_focal(cameras.intrinsics)
-    nothing = IntrinsicsPrior.unshared(cameras.intrinsics, np.full_like(table, np.inf))
-    prior = prior or nothing
+    prior = prior or IntrinsicsPrior.unshared(cameras.intrinsics, np.full_like(table, np.inf))
     number = np.full(table.shape, NONE, dtype=np.int64)
     parts = _Parts([], [], [])
     names = np.arange(len(table))
@@ -225,15 +185,9 @@ def _log_focal(intrinsics: F64) -> F64:
 class IntrinsicColumns:
     """Columns of the unknowns in the reduced system.
 
-    Attributes
-    ----------
-    own : ndarray of int, intrinsics that no two views share; they join the pose in the block of their view
-    common : ndarray (F,) of int, the other intrinsics
-    block : ndarray (V,) of int, block of each view, -1 if nothing moves
-    border : ndarray (V, F) of int, border columns of the common intrinsics, -1 if fixed
-    n_border : int, number of border columns
-    pinned : ndarray (V, C) of bool, columns of a block that do not move
-    place : ndarray (n,) of int, column of every unknown
+    ``own`` intrinsics, which no two views share, join the pose in the ``block`` (V,) of a view, others
+    (F,) have the columns ``border`` (V, F); both are -1 if fixed. ``pinned`` (V, C) columns do not move;
+    ``place`` (n,) is the column of every unknown.
     """
 
     own: I64
@@ -245,35 +199,14 @@ class IntrinsicColumns:
     place: I64
 
     def columns_of(self, number: I64) -> I64:
-        """Return the columns of unknowns.
-
-        Parameters
-        ----------
-        number : ndarray of int, unknowns, -1 for none
-
-        Returns
-        -------
-        ndarray of int, columns, -1 for none
-        """
+        """Return the columns of unknowns, -1 for none."""
         return np.append(self.place, NONE)[number]
 
 
 def assign_columns(
     values: IntrinsicUnknowns, group: I64, free: I64, observed: B8, free_views: B8
 ) -> IntrinsicColumns:
-    """Distribute the unknowns of the views over blocks and border.
-
-    Parameters
-    ----------
-    values : IntrinsicUnknowns, unknowns
-    group : ndarray (V,) of int, row of each view
-    free : ndarray of int, intrinsics that move in some view
-    observed, free_views : ndarray (V,) of bool, views with observations, and views whose pose moves
-
-    Returns
-    -------
-    IntrinsicColumns, columns
-    """
+    """Distribute the unknowns over blocks and border; ``free`` are the intrinsics that move in some view."""
     number = np.where(observed[:, None], values.number[group], NONE)
     repeated = [len(np.unique(m)) < len(m) for m in (number[number[:, c] >= 0, c] for c in free)]
     own, common = free[np.logical_not(repeated)], free[np.array(repeated, dtype=bool)]
