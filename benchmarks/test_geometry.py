@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
-from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_optimal
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from validation.references.ceres_bundle import CeresOptions, bundle_adjuster
 from validation.references.colmap_model import colmap_model
@@ -37,11 +39,11 @@ def test_fundamental(bench: Bench, method: str, outliers: float) -> None:
 @pytest.mark.parametrize(
     ("group", "method", "solve"),
     [
-        ("linear triangulation, two views", "ours", triangulate_linear),
+        ("linear triangulation, two views", "ours", partial(triangulate, method="linear")),
         ("linear triangulation, two views", "OpenCV", opencv_linear),
         ("linear triangulation, two views", "COLMAP", colmap_points),
         ("optimal triangulation, two views", "ours", triangulate_polynomial),
-        ("optimal triangulation, two views", "ours (iterative)", triangulate_optimal),
+        ("optimal triangulation, two views", "ours (iterative)", partial(triangulate, method="optimal")),
         ("optimal triangulation, two views", "OpenCV", opencv_polynomial),
     ],
 )

@@ -25,11 +25,10 @@ from thesisrecon.geometry.camera_matrix import (
     project,
 )
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
+from thesisrecon.geometry.lines_and_planes import join, unit_normals
 from thesisrecon.geometry.three_view import (
     TensorEquations,
     cameras_from_tensor,
-    estimate_tensor_linear,
     tensor_equations,
     tensor_from_cameras,
     transfer_lines,
@@ -66,7 +65,7 @@ def point_transfer_px(T, points):
 def line_transfer_px(T, segments):
     """RMS distance of the third segment's ends to the transferred line; (M,)."""
     ends = homogenize(segments)
-    l1, l2 = line_through(ends[:2, :, 0], ends[:2, :, 1])
+    l1, l2 = join(ends[:2, :, 0], ends[:2, :, 1])
     found = unit_normals(transfer_lines(T, l1, l2))
     return np.sqrt(np.mean(np.einsum("na,nea->ne", found, ends[2]) ** 2, axis=1))
 
@@ -124,13 +123,14 @@ def test_each_step_approaches_the_truth_and_reports_the_noise(n, m):
         points, segments = matches(P, rng, n, m, 0.5)
         exact, _ = matches(P, rng, 100, 0, 0.0)
         equations = tensor_equations(points, segments)
-        algebraic = _minimize_algebraic_error(equations, equations.solve())
+        linear = equations.solve()
+        algebraic = _minimize_algebraic_error(equations, linear)
         np.testing.assert_allclose(
             abs(np.sum(algebraic * tensor_from_cameras(*cameras_from_tensor(algebraic)))), 1.0, atol=1e-9
         )
         fit = estimate_trifocal(points, segments, loss_px=5.0)
         sigmas.append(fit.sigma_px)
-        steps = (estimate_tensor_linear(points, segments), equations.in_pixels(algebraic), fit.T)
+        steps = (equations.in_pixels(linear), equations.in_pixels(algebraic), fit.T)
         errors.append([np.median(point_transfer_px(T, exact)) for T in steps])
     linear, constrained, refined = np.median(errors, axis=0)
     assert refined < 1.05 * constrained < 0.6 * linear

@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre
+from thesisrecon.geometry.conics import bilinear_form
 
 
 def holds_for_every(*more, examples=30):
@@ -40,6 +41,17 @@ def gap(a, b):
     """Distance of two arrays of any scale and sign: the sine of their angle."""
     a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
     return float(min(np.linalg.norm(a - b), np.linalg.norm(a + b)))
+
+
+def incidence_sine(dual, point):
+    """|dual . point| / (|dual| |point|), 0 if the line or plane (..., d) contains the point."""
+    size = np.linalg.norm(dual, axis=-1) * np.linalg.norm(point, axis=-1)
+    return np.abs(np.sum(dual * point, axis=-1)) / np.maximum(size, 1e-300)
+
+
+def incidence_residual(C, x):
+    """|x'C x| / (|C| |x|^2), 0 on the conic or quadric C (d, d)."""
+    return np.abs(bilinear_form(C, x, x)) / (np.linalg.norm(C) * np.sum(x**2, axis=-1))
 
 
 def reprojection_costs(P, X, xy):

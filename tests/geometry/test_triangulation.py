@@ -22,20 +22,12 @@ from thesisrecon.geometry.camera_matrix import (
     undistort,
 )
 from thesisrecon.geometry.optimal_triangulation import (
+    _roots_in_unit_interval,
     correct_matches,
-    roots_in_unit_interval,
     triangulate_polynomial,
 )
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
-from thesisrecon.geometry.triangulation import (
-    jacobi_least,
-    triangulate,
-    triangulate_iterated,
-    triangulate_linear,
-    triangulate_midpoint,
-    triangulate_observations,
-    triangulate_optimal,
-)
+from thesisrecon.geometry.triangulation import _jacobi_least, triangulate, triangulate_observations
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
@@ -121,7 +113,7 @@ def test_6_3_3_polynomial_cost_is_the_optimum_in_every_geometry(rng, kind, sigma
     cost = twins.reprojection_costs(P, found, xy)
     # No descent gets lower from there, and none from the linear answer gets below.
     assert excess(cost, twins.reprojection_costs(P, polished(P, found, xy), xy)) < RELATIVE
-    many = twins.reprojection_costs(P, triangulate_optimal(P, xy), xy)
+    many = twins.reprojection_costs(P, triangulate(P, xy, method="optimal"), xy)
     assert excess(cost, many) < RELATIVE
     # Nor does any of many epipolar planes, each with the two lines' distances.
     assert np.all(cost <= cost_of_planes(P, xy) * (1.0 + RELATIVE) + ROUNDING_PX)
@@ -162,8 +154,8 @@ def test_the_compiled_polynomial_method_is_its_plain_twin(rng, kind, sigma_px):
 def test_6_3_3_exact_matches_are_left_where_they_are_and_points_found(rng, kind):
     P, X = two_views(kind, rng)
     xy = images(P, X)
-    for method in (triangulate_polynomial, triangulate_optimal):
-        assert np.abs(images(P, method(P, xy)) - xy).max() < 1e-7
+    for method in ("polynomial", "optimal"):
+        assert np.abs(images(P, triangulate(P, xy, method=method)) - xy).max() < 1e-7
     corrected = np.stack(correct_matches(fundamental_from_cameras(*P), *xy))
     assert np.abs(corrected - xy).max() < 1e-6
 
@@ -216,13 +208,13 @@ def test_the_compiled_methods_are_their_plain_twins(rng, sigma_px):
     P, xy = several_views(rng, sigma_px)
     scale = twins.view_scales(P, xy)
     answers = [
-        (triangulate_linear(P, xy), twins.linear_point),
-        (triangulate_iterated(P, xy), twins.iterated_point),
+        (triangulate(P, xy, method="linear"), twins.linear_point),
+        (triangulate(P, xy, method="iterated"), twins.iterated_point),
     ]
     for found, twin in answers:
         expected = np.stack([twin(P, scale, xy[:, n]) for n in range(xy.shape[1])])
         np.testing.assert_allclose(np.abs(np.sum(found * expected, axis=1)), 1.0, atol=1e-10)
-    found = triangulate_midpoint(P, xy)
+    found = triangulate(P, xy, method="midpoint")
     np.testing.assert_allclose(
         found[:, :3], [twins.midpoint(P, xy[:, n]) for n in range(xy.shape[1])], atol=1e-7
     )
@@ -231,7 +223,7 @@ def test_the_compiled_methods_are_their_plain_twins(rng, sigma_px):
 @holds_for_every(st.sampled_from([1.0, 10.0]), examples=10)
 def test_6_3_n_view_method_reaches_the_least_squares_optimum(rng, sigma_px):
     P, xy = several_views(rng, sigma_px)
-    found = triangulate_optimal(P, xy)
+    found = triangulate(P, xy, method="optimal")
     cost = twins.reprojection_costs(P, found, xy)
     for n in range(xy.shape[1]):
         seen = np.isfinite(xy[:, n, 0])
@@ -244,7 +236,7 @@ def test_6_3_1_near_least_singular_values_go_to_jacobis_rotations():
         U, V = (np.linalg.qr(rng.normal(size=(4, 4)))[0] for _ in range(2))
         R = np.linalg.qr((U * [3.0, 2.0, 1.0, ratio]) @ V.T)[1]
         x = np.empty(4)
-        jacobi_least(np.ascontiguousarray(R), x)
+        _jacobi_least(np.ascontiguousarray(R), x)
         assert np.linalg.norm(R @ x) == pytest.approx(ratio, abs=1e-14)
         assert np.linalg.norm(x) == pytest.approx(1.0)
 
@@ -258,7 +250,7 @@ def test_real_roots_of_a_polynomial_in_the_unit_interval(rng):
     coefficients = np.polynomial.polynomial.polyfromroots([*inside, *outside]) * rng.choice([-2.0, 5.0])
     c[: len(coefficients)] = coefficients
     roots = np.empty(8)
-    count = roots_in_unit_interval(c, roots)
+    count = _roots_in_unit_interval(c, roots)
     np.testing.assert_allclose(roots[:count], inside, atol=1e-5)
 
 
@@ -303,7 +295,7 @@ def test_observations_in_any_order_give_the_same_points():
     shuffled = rng.permutation(len(view))
     view, point = view[shuffled], point[shuffled]
     found = triangulate_observations(P, view, point, xy[view, point], 14)
-    np.testing.assert_allclose(found[:12], triangulate_linear(P, xy), atol=1e-12)
+    np.testing.assert_allclose(found[:12], triangulate(P, xy, method="linear"), atol=1e-12)
     assert not found[12:].any()
 
 
@@ -335,7 +327,9 @@ def test_single_methods_reject_their_own_failures():
     with pytest.raises(ValueError, match="exactly two"):
         triangulate(np.concatenate([P, P]), np.concatenate([xy, xy]))
     with pytest.raises(ValueError, match="finite cameras"):
-        triangulate_midpoint(np.stack([P[0], np.eye(3, 4) * [[1.0], [1.0], [0.0]] + [0, 0, 0, 1.0]]), xy)
+        triangulate(
+            np.stack([P[0], np.eye(3, 4) * [[1.0], [1.0], [0.0]] + [0, 0, 0, 1.0]]), xy, method="midpoint"
+        )
     with pytest.raises(ValueError, match="polynomial, linear, midpoint, iterated, optimal"):
         triangulate(P, xy, method="guess")
     with pytest.raises(ValueError, match="rank 2"):
@@ -356,7 +350,7 @@ def test_triangulation_leaves_points_seen_once_at_zero():
     xy = np.full((8, 20, 2), np.nan)
     xy[scene.tracks.view_index, scene.tracks.point_index] = scene.tracks.xy
     xy[1:, 3] = np.nan
-    X = triangulate_linear(scene.P, xy)
+    X = triangulate(scene.P, xy, method="linear")
     assert not X[3].any()
     keep = np.arange(20) != 3
     np.testing.assert_allclose(X[keep, :3] / X[keep, 3:], scene.X[keep], atol=1e-6)
@@ -364,7 +358,7 @@ def test_triangulation_leaves_points_seen_once_at_zero():
 
 def test_triangulation_refuses_wrong_shapes():
     with pytest.raises(ValueError, match="triangulate needs"):
-        triangulate_linear(np.zeros((2, 3, 4)), np.zeros((3, 5, 2)))
+        triangulate(np.zeros((2, 3, 4)), np.zeros((3, 5, 2)), method="linear")
 
 
 def test_linear_resection_recovers_the_camera():

@@ -10,7 +10,7 @@ from tests.synthetic import make_scene, true_pairs
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project, project_camera
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.projective.factorization import Factorization
 from thesisrecon.projective.incremental import (
     IncrementalProjective,
@@ -119,7 +119,7 @@ def test_initial_cameras_have_the_fundamental_matrix_they_came_from():
     pair = true_pairs(scene)[0]
     for sign in (1.0, -1.0):
         P = np.stack(initial_cameras(replace(pair, F=sign * pair.F), scene.sizes[:2]))
-        X = triangulate_linear(P, np.stack([pair.xy1, pair.xy2]))
+        X = triangulate(P, np.stack([pair.xy1, pair.xy2]), method="linear")
         assert (np.sign(X @ P[0, 2]) == np.sign(X @ P[1, 2])).all()
     P1, P2 = initial_cameras(pair, scene.sizes[:2])
     M = P2[:, :3] @ np.linalg.inv(P1[:, :3])
@@ -145,7 +145,7 @@ def test_initial_cameras_put_infinity_beyond_the_scene_however_the_camera_is_hel
     turn[:2, :2], turn[:2, 2] = roll[:2, :2], middle - roll[:2, :2] @ middle
     held = replace(pair, xy2=pair.xy2 @ turn[:2, :2].T + turn[:2, 2], F=np.linalg.inv(turn).T @ pair.F)
     P = np.stack(initial_cameras(held, scene.sizes[:2]))
-    X = triangulate_linear(P, np.stack([held.xy1, held.xy2]))
+    X = triangulate(P, np.stack([held.xy1, held.xy2]), method="linear")
     beyond = np.sign(X[:, 3] * (X @ P[0, 2]))
     assert abs(beyond.mean()) > 0.97
     T1, T2 = pixel_from_unit(scene.sizes[:2])

@@ -12,18 +12,18 @@ from tests.selfcalibration.stratified_scenes import (
 )
 from tests.synthetic import make_scene
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conics import calibration_from_dual_image
+from thesisrecon.geometry.conics import calibration_from_image
 from thesisrecon.intrinsics import IntrinsicsOptions
+from thesisrecon.selfcalibration._frame import square_pixel_constraints
 from thesisrecon.selfcalibration.absolute_conic import (
     FixedPlaneQuadric,
     LinearAbsoluteConic,
+    _largest_rotation,
     dual_conic_of_constant_camera,
     infinite_homographies,
-    largest_rotation,
     solve_conic,
     solve_conic_batch,
 )
-from thesisrecon.selfcalibration.unknowns import square_pixel_constraints
 
 WAYS = [LinearAbsoluteConic(), FixedPlaneQuadric()]
 
@@ -35,12 +35,12 @@ def pixels(found, K):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_dual_image_is_carried_exactly_by_homographies_of_determinant_one(seed):
     scene = make_scene(seed=seed, principal_shift=(60.0, -45.0))
-    found, plane, _ = setup(scene, NOTHING_BUT_CONSTANT, seed=seed)
+    found, plane = setup(scene, NOTHING_BUT_CONSTANT, seed=seed)
     H = infinite_homographies(found.frame, plane[None])[0]
     np.testing.assert_allclose(np.linalg.det(H), 1.0, atol=1e-12)
     dual, s = dual_conic_of_constant_camera(H)
     np.testing.assert_allclose(H @ dual @ H.swapaxes(1, 2), np.tile(dual, (len(H), 1, 1)), atol=1e-9)
-    K = pixels(found, calibration_from_dual_image(dual)[None])[0]
+    K = pixels(found, calibration_from_image(dual, is_dual=True)[None])[0]
     np.testing.assert_allclose(K, scene.K[0], rtol=1e-8, atol=1e-5)
     assert s[5] < 1e-10 < 1e-4 * s[4]
 
@@ -53,16 +53,16 @@ def test_the_dual_image_is_carried_exactly_by_homographies_of_determinant_one(se
 def test_the_true_plane_gives_the_true_calibrations(way, options, zoom, seed):
     shift = (60.0, -45.0) if options is NOTHING_BUT_CONSTANT else (0.0, 0.0)
     scene = make_scene(zoom=zoom, seed=seed, principal_shift=shift)
-    found, plane, problem = setup(scene, options, seed=seed)
-    K = pixels(found, way.calibrations(problem, plane))
+    found, plane = setup(scene, options, seed=seed)
+    K = pixels(found, way.calibrations(found, plane))
     np.testing.assert_allclose(K[:, 0, 0], scene.K[:, 0, 0], rtol=1e-8)
     np.testing.assert_allclose(K, scene.K, atol=2e-5)
 
 
 def test_roughly_known_principal_points_move_towards_the_truth():
     scene = make_scene(seed=3, principal_shift=(12.0, -9.0))
-    found, plane, problem = setup(scene, IntrinsicsOptions(), seed=3)
-    K = pixels(found, LinearAbsoluteConic().calibrations(problem, plane))
+    found, plane = setup(scene, IntrinsicsOptions(), seed=3)
+    K = pixels(found, LinearAbsoluteConic().calibrations(found, plane))
     np.testing.assert_allclose(K[:, 0, 0], scene.K[:, 0, 0], rtol=2e-3)
     assert np.linalg.norm(K[0, :2, 2] - scene.K[0, :2, 2]) < 5.0
 
@@ -70,15 +70,15 @@ def test_roughly_known_principal_points_move_towards_the_truth():
 @pytest.mark.parametrize("focal", [500.0, 6000.0])
 def test_short_and_long_lenses_need_no_guess(focal):
     scene = make_scene(seed=2, focal=focal)
-    found, plane, problem = setup(scene, CENTRED, seed=2)
+    found, plane = setup(scene, CENTRED, seed=2)
     for way in WAYS:
-        K = pixels(found, way.calibrations(problem, plane))
+        K = pixels(found, way.calibrations(found, plane))
         np.testing.assert_allclose(K[:, 0, 0], focal, rtol=1e-7)
 
 
 def test_the_score_of_the_right_plane_is_zero_and_grows_away_from_it():
     scene = make_scene(seed=1)
-    found, plane, _ = setup(scene, seed=1)
+    found, plane = setup(scene, seed=1)
     planes = plane + np.array([0.0, 0.01, 0.05])[:, None] * [1.0, -0.5, 0.3]
     scan = solve_conic_batch(
         infinite_homographies(found.frame, planes), square_pixel_constraints(found.frame)
@@ -92,7 +92,7 @@ def test_the_score_of_the_right_plane_is_zero_and_grows_away_from_it():
 def test_right_angles_determine_the_calibration_of_cameras_that_do_not_turn():
     """With square pixels, three vanishing points at right angles give all of K."""
     scene = make_scene(seed=5, principal_shift=(40.0, 25.0))
-    found, _, _ = setup(scene, NOTHING_BUT_CONSTANT, seed=5)
+    found, _ = setup(scene, NOTHING_BUT_CONSTANT, seed=5)
     reference = found.frame.reference
     H = np.tile(np.eye(3), (len(scene.K), 1, 1))
     v = (np.linalg.inv(found.frame.pixel_from_unit[reference]) @ scene.K[reference] @ scene.R[reference]).T
@@ -101,7 +101,7 @@ def test_right_angles_determine_the_calibration_of_cameras_that_do_not_turn():
     constraints.std[:, 1:3] = np.inf
     conic = solve_conic(H, constraints, orthogonal=orthogonal)
     dual = np.linalg.inv(conic.w)
-    K = found.frame.pixel_from_unit[reference] @ calibration_from_dual_image(dual)
+    K = found.frame.pixel_from_unit[reference] @ calibration_from_image(dual, is_dual=True)
     np.testing.assert_allclose(K, scene.K[reference], rtol=1e-8, atol=1e-5)
     assert conic.determined
 
@@ -110,7 +110,7 @@ def test_turns_measures_the_rotation_and_its_axis():
     scene = turned_about_one_axis(make_scene(seed=0), np.linspace(-20.0, 20.0, 8))
     K, R = scene.K[0], scene.R
     H = K @ R @ R[0].T @ np.linalg.inv(K)
-    angle, axis = largest_rotation(H)
+    angle, axis = _largest_rotation(H)
     assert angle == pytest.approx(40.0)
     seen = K @ R[0] @ [0.0, 1.0, 0.0]
     assert np.linalg.norm(np.cross(axis, seen / np.linalg.norm(seen))) < 1e-9
@@ -119,27 +119,27 @@ def test_turns_measures_the_rotation_and_its_axis():
 def test_one_axis_of_rotation_is_named():
     scene = make_scene(seed=0)
     turned = turned_about_one_axis(scene, np.linspace(-20.0, 20.0, 8))
-    _, plane, problem = setup(turned, NOTHING_BUT_CONSTANT)
+    found, plane = setup(turned, NOTHING_BUT_CONSTANT)
     with pytest.raises(StageFailure, match=r"one axis.*one-parameter|one-parameter.*one axis"):
-        LinearAbsoluteConic().calibrations(problem, plane)
+        LinearAbsoluteConic().calibrations(found, plane)
     with pytest.raises(StageFailure, match="one-parameter"):
-        FixedPlaneQuadric().calibrations(problem, plane)
+        FixedPlaneQuadric().calibrations(found, plane)
 
 
 def test_cameras_that_do_not_turn_are_named():
     turned = turned_about_one_axis(make_scene(seed=0), np.zeros(8))
-    _, plane, problem = setup(turned, NOTHING_BUT_CONSTANT)
+    found, plane = setup(turned, NOTHING_BUT_CONSTANT)
     with pytest.raises(StageFailure, match="do not rotate"):
-        LinearAbsoluteConic().calibrations(problem, plane)
+        LinearAbsoluteConic().calibrations(found, plane)
 
 
 def test_a_wrong_plane_without_a_real_camera_is_refused_with_its_eigenvalues():
     scene = make_scene(seed=1)
-    _, plane, problem = setup(scene, NOTHING_BUT_CONSTANT, seed=1)
+    found, plane = setup(scene, NOTHING_BUT_CONSTANT, seed=1)
     refused = 0
     for shift in np.random.default_rng(0).normal(0.0, 2.0, (20, 3)):
         try:
-            LinearAbsoluteConic().calibrations(problem, plane + shift)
+            LinearAbsoluteConic().calibrations(found, plane + shift)
         except StageFailure as failure:
             refused += "eigenvalues" in str(failure)
     assert refused > 0
@@ -147,9 +147,9 @@ def test_a_wrong_plane_without_a_real_camera_is_refused_with_its_eigenvalues():
 
 def test_a_plane_through_a_camera_is_refused():
     scene = make_scene(seed=1)
-    found, plane, problem = setup(scene, seed=1)
+    found, plane = setup(scene, seed=1)
     other = 0 if found.frame.reference else 1
     centre = -np.linalg.solve(found.frame.A[other], found.frame.a[other])
     through = plane - (plane @ centre + 1.0) / (centre @ centre) * centre
     with pytest.raises(StageFailure, match="passes through a camera"):
-        LinearAbsoluteConic().calibrations(problem, through)
+        LinearAbsoluteConic().calibrations(found, through)

@@ -17,7 +17,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.lines_and_planes import line_through, unit_normals
+from thesisrecon.geometry.lines_and_planes import join, unit_normals
 from thesisrecon.geometry.three_view import (
     NEEDED_EQUATIONS,
     TensorEquations,
@@ -28,7 +28,7 @@ from thesisrecon.geometry.three_view import (
     transform_tensor,
     unit_tensor,
 )
-from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.levenberg_marquardt import (
     floored_diagonal,
     minimize_residuals,
@@ -140,8 +140,8 @@ class _ReprojectionProblem:
         """Cameras of a conditioned tensor, triangulated points, lines as intersections of planes."""
         P = np.stack(cameras_from_tensor(T))
         P[1:] /= np.linalg.norm(P[1:], axis=(1, 2), keepdims=True)
-        X = _off_principal_planes(triangulate_linear(P, self.points.swapaxes(0, 1)), P)
-        seen = unit_normals(line_through(self.ends[:, :, 0], self.ends[:, :, 1]))
+        X = _off_principal_planes(triangulate(P, self.points.swapaxes(0, 1), method="linear"), P)
+        seen = unit_normals(join(self.ends[:, :, 0], self.ends[:, :, 1]))
         planes = np.einsum("mva,vab->mvb", seen, P)
         return _State(P, X, np.linalg.svd(planes)[2][:, 2:])
 
@@ -195,7 +195,7 @@ class _ReprojectionProblem:
 
     def _line_distances(self, p: F64, q: F64) -> F64:
         """Signed distances (M, 3, 2) of the segment ends to the lines through p and q, conditioned."""
-        return np.asarray(np.einsum("mvea,mva->mve", self.ends, unit_normals(line_through(p, q))))
+        return np.asarray(np.einsum("mvea,mva->mve", self.ends, unit_normals(join(p, q))))
 
     def _point_jacobian(self, state: _State) -> tuple[F64, F64]:
         """Derivatives by the cameras (N, 3, 2, 24) and the points (N, 3, 2, 3), px."""
@@ -210,7 +210,7 @@ class _ReprojectionProblem:
     def _line_jacobian(self, state: _State) -> tuple[F64, F64]:
         """Derivatives by cameras (M, 3, 2, 24) and lines (M, 3, 2, 4): d = l.y / |(l_1, l_2)|, l = p x q."""
         p, q = self._line_images(state)
-        l = line_through(p, q)
+        l = join(p, q)
         size = np.linalg.norm(l[:, :, :2], axis=2)[:, :, None]
         unit = l / size
         distance = self._line_distances(p, q)

@@ -1,8 +1,6 @@
 """Section 3.5: the projective camera P = K [R t], its parts, projection, lens distortion and cheirality.
 
-The thesis writes R for camera-to-world (3.21); here R is world-to-camera, its transpose. Cheirality (3.5.2)
-says on which side of a camera a point is: Hartley, "Chirality", IJCV 26(1), 1998. The thesis' (3.27) is his
-chi; its magnitude is an inverse depth.
+The thesis writes R for camera-to-world (3.21); here R is world-to-camera, its transpose.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
-SETTLED = 1e-9
+_CONVERGED = 1e-9
 """Relative step at which Newton's method has converged to rounding: the next error is its square."""
 
 
@@ -21,12 +19,12 @@ def compose_camera(K: F64, R: F64, t: F64) -> F64:
 
     Parameters
     ----------
-    K, R : ndarray (..., 3, 3), calibration matrix and rotation world-to-camera
-    t : ndarray (..., 3), translation
+    K, R, t : ndarray (..., 3, 3), (..., 3, 3) and (..., 3)
+        Calibration matrix, rotation world-to-camera and translation.
 
     Returns
     -------
-    ndarray (..., 3, 4), camera matrices
+    ndarray (..., 3, 4)
 
     Examples
     --------
@@ -36,23 +34,33 @@ def compose_camera(K: F64, R: F64, t: F64) -> F64:
     return np.asarray(K @ np.concatenate([R, t[..., None]], axis=-1))
 
 
+def camera_from_centre(K: F64, R: F64, centre: F64) -> F64:
+    """Return P = K [R, -R C] (3.21), the thesis' K [R' | -R' C].
+
+    Parameters
+    ----------
+    K, R, centre : ndarray (..., 3, 3), (..., 3, 3) and (..., 3)
+        Calibration matrix, rotation world-to-camera and camera centre C.
+
+    Returns
+    -------
+    ndarray (..., 3, 4)
+    """
+    return compose_camera(K, R, -np.einsum("...ij,...j->...i", R, centre))
+
+
 def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
     """Decompose P of any scale and sign into K, R and t (3.21).
 
     Parameters
     ----------
-    P : ndarray (3, 4), camera matrix
+    P : ndarray (3, 4)
+        Finite camera; a singular left 3x3 part is a ``ValueError``.
 
     Returns
     -------
-    K : ndarray (3, 3), calibration matrix with K33 = 1 and positive focal lengths
-    R : ndarray (3, 3), rotation world-to-camera, det R = 1
-    t : ndarray (3,), translation
-
-    Raises
-    ------
-    ValueError
-        The left 3x3 part of P is singular: a camera at infinity has no K.
+    K, R, t : ndarray (3, 3), (3, 3) and (3,)
+        K33 = 1, positive focal lengths, det R = 1.
 
     Examples
     --------
@@ -71,18 +79,16 @@ def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: 
 
     Parameters
     ----------
-    f_u, f_v : float, focal length over the width and the height of a pixel, px
-    u_0, v_0 : float, principal point, px
-    skew : float, f_v tan(alpha), px, for pixel sides that deviate from a right angle by alpha (table 3.1)
+    f_u, f_v : float
+        Focal length over the width and the height of a pixel, px; positive.
+    u_0, v_0 : float
+        Principal point, px.
+    skew : float
+        f_v tan(alpha), px, for pixel sides that deviate from a right angle by alpha (table 3.1).
 
     Returns
     -------
-    ndarray (3, 3), calibration matrix
-
-    Raises
-    ------
-    ValueError
-        A focal length is not positive.
+    ndarray (3, 3)
 
     Examples
     --------
@@ -94,38 +100,19 @@ def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: 
     return np.array([[f_u, skew, u_0], [0.0, f_v, v_0], [0.0, 0.0, 1.0]])
 
 
-def camera_from_centre(K: F64, R: F64, centre: F64) -> F64:
-    """Return P = K [R, -R centre] (3.21), the thesis' K [R' | -R' C].
-
-    Parameters
-    ----------
-    K, R : ndarray (..., 3, 3), calibration matrix and rotation world-to-camera
-    centre : ndarray (..., 3), camera centre
-
-    Returns
-    -------
-    ndarray (..., 3, 4), camera matrices
-    """
-    return compose_camera(K, R, -np.einsum("...ij,...j->...i", R, centre))
-
-
 def normalize_camera(P: F64) -> F64:
-    """Scale P such that det M = 1 (definition 3.5.1).
+    """Scale P such that det M = 1 (definition 3.5.1): P / det(M)^(1/3), which also corrects the sign.
 
     The centre of (3.24) then has the last entry 1, and points in front have t > 0 in P X (proposition 3.5.1).
 
     Parameters
     ----------
-    P : ndarray (..., 3, 4), camera matrices of any scale and sign
+    P : ndarray (..., 3, 4)
+        Finite cameras [M m]; a singular M is a ``ValueError``.
 
     Returns
     -------
-    ndarray (..., 3, 4), P / det(M)^(1/3), whose real value also corrects the sign
-
-    Raises
-    ------
-    ValueError
-        A camera is at infinity (det M = 0) or not finite.
+    ndarray (..., 3, 4)
     """
     det = _left_determinant(P, "normalize_camera")
     return np.asarray(P / np.cbrt(det)[..., None, None])
@@ -141,95 +128,37 @@ def _left_determinant(P: F64, caller: str) -> F64:
     return np.asarray(det)
 
 
-def principal_plane(P: F64) -> F64:
-    """Return the last row of P: the plane of the centre parallel to the image (3.23).
-
-    Parameters
-    ----------
-    P : ndarray (..., 3, 4), camera matrices
-
-    Returns
-    -------
-    ndarray (..., 4), planes; their points project to (u, v, 0) (3.22)
-    """
-    return P[..., 2, :]
-
-
 def principal_ray(P: F64) -> F64:
     """Return the direction of the optical axis towards the front: det(M) m_3, normalised (3.23).
 
+    The last row (m_3, p_34) of P is the principal plane, whose points project to (u, v, 0) (3.22). The
+    principal point is M m_3 (HZ 6.2).
+
     Parameters
     ----------
-    P : ndarray (..., 3, 4), camera matrices of a metric frame, of any sign
+    P : ndarray (..., 3, 4)
+        Cameras of a metric frame, of any sign.
 
     Returns
     -------
-    ndarray (..., 3), unit vectors
+    ndarray (..., 3)
     """
     axis = np.linalg.det(P[..., :3])[..., None] * P[..., 2, :3]
     return np.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True))
 
 
-def principal_point(P: F64) -> F64:
-    """Return the pixel of the principal ray, M m_3 in a metric frame (HZ 6.2).
-
-    Parameters
-    ----------
-    P : ndarray (..., 3, 4), camera matrices
-
-    Returns
-    -------
-    ndarray (..., 2), principal points, px
-
-    Examples
-    --------
-    >>> principal_point(calibration_matrix(800.0, 820.0, 320.0, 240.0) @ np.eye(3, 4)).tolist()
-    [320.0, 240.0]
-    """
-    return dehomogenize(np.einsum("...ij,...j->...i", P[..., :3], P[..., 2, :3]))
-
-
-def back_project(P: F64, xy: F64) -> F64:
-    """Return the points at infinity (M^-1 (u, v, 1), 0) of the rays of pixels.
-
-    With the centre they span the ray. In a projective frame they lie on the plane W = 0, which has no special
-    meaning there.
-
-    Parameters
-    ----------
-    P : ndarray (3, 4), camera matrix
-    xy : ndarray (..., 2), pixels
-
-    Returns
-    -------
-    ndarray (..., 4), homogeneous points: the directions of the rays
-
-    Raises
-    ------
-    ValueError
-        The camera is at infinity.
-
-    Examples
-    --------
-    >>> back_project(np.eye(3, 4), np.array([0.5, 0.25])).tolist()
-    [0.5, 0.25, 1.0, 0.0]
-    """
-    _left_determinant(P, "back_project")
-    direction = np.linalg.solve(P[:, :3], homogenize(xy)[..., None])[..., 0]
-    return np.concatenate([direction, np.zeros((*direction.shape[:-1], 1))], axis=-1)
-
-
 def rq(M: F64) -> tuple[F64, F64]:
-    """Factor M = K R with K upper triangular and R orthogonal.
+    """Factor M = K R with K upper triangular, of positive diagonal, and R orthogonal.
 
     Parameters
     ----------
-    M : ndarray (3, 3), matrix
+    M : ndarray (3, 3)
+        Matrix.
 
     Returns
     -------
-    K : ndarray (3, 3), upper triangular, positive diagonal
-    R : ndarray (3, 3), orthogonal, a rotation if det M > 0
+    K, R : ndarray (3, 3)
+        R is a rotation if det M > 0.
     """
     Q, U = np.linalg.qr(M[::-1].T)
     K = U.T[::-1, ::-1]
@@ -244,11 +173,13 @@ def camera_centre(P: F64) -> F64:
 
     Parameters
     ----------
-    P : ndarray (..., 3, 4), camera matrices
+    P : ndarray (..., 3, 4)
+        Cameras.
 
     Returns
     -------
-    ndarray (..., 4), homogeneous centres with the sign of the minors
+    ndarray (..., 4)
+        Homogeneous centres with the sign of the minors.
 
     Examples
     --------
@@ -266,12 +197,15 @@ def project(P: F64, X: F64) -> F64:
 
     Parameters
     ----------
-    P : ndarray (3, 4), camera matrix
-    X : ndarray (N, 3) or (N, 4), points, Euclidean or homogeneous
+    P : ndarray (3, 4)
+        Camera.
+    X : ndarray (N, 3) or (N, 4)
+        Points, Euclidean or homogeneous.
 
     Returns
     -------
-    ndarray (N, 2), pixels; inf or NaN for points of the principal plane
+    ndarray (N, 2)
+        Inf or NaN for points of the principal plane.
 
     Examples
     --------
@@ -287,12 +221,14 @@ def distort(xy_normalized: F64, distortion: float | F64) -> F64:
 
     Parameters
     ----------
-    xy_normalized : ndarray (N, 2), normalised image points
-    distortion : float or ndarray (C,) or (N, C), k1, or the coefficients k1, k2, ..
+    xy_normalized : ndarray (N, 2)
+        Normalised image points.
+    distortion : float or ndarray (C,) or (N, C)
+        k1, or the coefficients k1, k2, ...
 
     Returns
     -------
-    ndarray (N, 2), distorted normalised points
+    ndarray (N, 2)
 
     Examples
     --------
@@ -303,20 +239,20 @@ def distort(xy_normalized: F64, distortion: float | F64) -> F64:
     return np.asarray(xy_normalized * _radial_factor(distortion, r2))
 
 
-def undistort(xy_normalized: F64, distortion: float | F64, *, iterations: int = 20) -> F64:
+def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
     """Invert :func:`distort` by Newton's method on r^2 (1 + k1 r^2 + ...)^2 = r_d^2.
 
     Parameters
     ----------
-    xy_normalized : ndarray (N, 2), distorted normalised points
-    distortion : float or ndarray (C,) or (N, C), k1, or the coefficients k1, k2, ..
-    iterations : int, maximum number of Newton steps
+    xy_normalized : ndarray (N, 2)
+        Distorted normalised points.
+    distortion : float or ndarray (C,) or (N, C)
+        k1, or the coefficients k1, k2, ...
 
     Returns
     -------
     ndarray (N, 2)
-        Points exact to rounding where the distortion grows with the radius. Points beyond the largest radius
-        that the distortion reaches have no inverse and are returned unchanged.
+        Points beyond the largest radius that the distortion reaches have no inverse and are not changed.
 
     Examples
     --------
@@ -328,12 +264,12 @@ def undistort(xy_normalized: F64, distortion: float | F64, *, iterations: int = 
     slopes = k * np.arange(1, k.shape[-1] + 1)
     r2 = distorted
     with np.errstate(all="ignore"):
-        for _ in range(iterations):
+        for _ in range(20):
             factor = _radial_factor(k, r2)
             slope = factor * (factor + 2.0 * (_radial_factor(slopes, r2) - 1.0))
             step = (r2 * factor**2 - distorted) / slope
             r2 = r2 - step
-            if np.all(np.abs(step) <= SETTLED * np.abs(r2)):
+            if np.all(np.abs(step) <= _CONVERGED * np.abs(r2)):
                 break
         factor = _radial_factor(k, r2)
         reached = np.abs(r2 * factor**2 - distorted) <= 1e-9 * distorted
@@ -353,14 +289,16 @@ def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 
 
     Parameters
     ----------
-    K, R : ndarray (3, 3), calibration matrix and rotation world-to-camera
-    t : ndarray (3,), translation
-    X : ndarray (N, 3), points
-    distortion : float or ndarray (C,) or (N, C), coefficients of :func:`distort`
+    K, R, t : ndarray (3, 3), (3, 3) and (3,)
+        Calibration matrix, rotation world-to-camera and translation.
+    X : ndarray (N, 3)
+        Points.
+    distortion : float or ndarray (C,) or (N, C)
+        Coefficients of :func:`distort`.
 
     Returns
     -------
-    ndarray (N, 2), pixels
+    ndarray (N, 2)
 
     Examples
     --------
@@ -373,18 +311,25 @@ def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 
 
 
 def cheirality(P: F64, X: F64) -> F64:
-    """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera.
+    """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera, 0 at infinity.
+
+    The value does not depend on the scales of X and P, negative ones included. Its magnitude is an inverse
+    depth (the thesis takes it for a depth), without a unit if P is not normalised; :func:`depth` measures.
 
     Parameters
     ----------
-    P : ndarray (3, 4), camera matrix
-    X : ndarray (N, 4), homogeneous points
+    P : ndarray (3, 4)
+        Camera.
+    X : ndarray (N, 4)
+        Homogeneous points.
 
     Returns
     -------
     ndarray (N,)
-        chi, 0 on the plane at infinity. It does not change if X or P is scaled, also by a negative factor.
-        Its magnitude is an inverse depth, without a unit if P is not normalised; :func:`depth` measures.
+
+    References
+    ----------
+    Hartley, "Chirality", IJCV 26(1), 1998.
 
     Examples
     --------
@@ -401,40 +346,38 @@ def depth(P: F64, X: F64) -> F64:
 
     Parameters
     ----------
-    P : ndarray (3, 4), camera matrix of any scale and sign
-    X : ndarray (N, 4), homogeneous points
+    P : ndarray (3, 4)
+        Camera of any scale and sign.
+    X : ndarray (N, 4)
+        Homogeneous points.
 
     Returns
     -------
-    ndarray (N,), depth, in units of space
-
-    Examples
-    --------
-    >>> depth(-2.0 * np.eye(3, 4), np.array([[0.0, 0.0, 2.0, 1.0]])).round(9).tolist()
-    [2.0]
+    ndarray (N,)
+        Depths, in units of space.
     """
     M = P[:, :3]
     return np.asarray(np.sign(np.linalg.det(M)) * (X @ P[2]) / (X[:, 3] * np.linalg.norm(M[2])))
 
 
-def orient_signs(P: F64, X: F64, view: I64, point: I64, *, sweeps: int = 20) -> tuple[F64, F64, float]:
-    """Choose signs of cameras and points that make the projective depths positive.
+def orient_signs(P: F64, X: F64, view: I64, point: I64) -> tuple[F64, F64, float]:
+    """Choose signs of cameras and points that make the projective depths w of P X = w (u, v, 1) positive.
 
-    The depths w are those of P_i X_j = w (u, v, 1). Votes of the neighbours decide, so that a few wrong
-    matches do not spread.
+    Votes of the neighbours decide, so that a few wrong matches do not spread.
 
     Parameters
     ----------
-    P : ndarray (V, 3, 4), cameras
-    X : ndarray (N, 4), homogeneous points
-    view, point : ndarray (K,) of int, view and point of each observation
-    sweeps : int, maximum number of passes
+    P, X : ndarray (V, 3, 4) and (N, 4)
+        Cameras and homogeneous points.
+    view, point : ndarray (K,) of int
+        View and point of each observation.
 
     Returns
     -------
-    views : ndarray (V,), signs +-1 of the cameras
-    points : ndarray (N,), signs +-1 of the points
-    ratio : float, fraction of the observations with positive depth: 1 up to wrong matches for real points
+    views, points : ndarray (V,) and (N,)
+        Signs +-1 of cameras and points.
+    ratio : float
+        Fraction of the observations with positive depth: 1 up to wrong matches for real points.
 
     References
     ----------
@@ -446,7 +389,7 @@ def orient_signs(P: F64, X: F64, view: I64, point: I64, *, sweeps: int = 20) -> 
     if len(view) == 0:
         return np.ones(len(P)), np.ones(len(X)), 1.0
     views[np.bincount(view, minlength=len(P)).argmax()] = 1.0
-    for _ in range(sweeps):
+    for _ in range(20):
         points = np.sign(np.bincount(point, w * views[view], minlength=len(X)))
         votes = np.sign(np.bincount(view, w * points[point], minlength=len(P)))
         if np.array_equal(votes, views):

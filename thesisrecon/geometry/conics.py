@@ -2,11 +2,11 @@
 
 One algebra serves both dimensions: C is a conic (3, 3) of the points x'C x = 0 (3.1) or a quadric (4, 4) with
 X'Q X = 0 (3.8); its dual has l'C* l = 0 (3.3) or Pi'Q* Pi = 0 (3.9). All are symmetric and of any scale. How
-they transform: :mod:`~thesisrecon.geometry.strata`.
+they transform: :func:`thesisrecon.geometry.strata.transform`.
 
 The absolute conic Omega is x'x = 0 on the plane at infinity (3.2); its tangent planes form the absolute dual
-quadric. The image of Omega depends on K alone, not on the pose (3.11-3.13): it calibrates and measures
-angles.
+quadric. A camera [M m] maps the point (x, 0) of that plane to M x (3.11), so that the image of Omega depends
+on K alone (3.11-3.13): it calibrates the camera and measures angles.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import checked_inverse, checked_unit, require_finite
+from thesisrecon.geometry._checks import checked_inverse, checked_unit
+from thesisrecon.geometry.homogeneous import require_finite
 
 ABSOLUTE_CONIC = np.eye(3)
 """Omega on the plane at infinity of a metric frame (3.2)."""
@@ -23,60 +24,36 @@ ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
 
 
 def bilinear_form(C: F64, x: F64, y: F64) -> F64:
-    """Return S(x, y) = x'C y (3.5).
+    """Return S(x, y) = x'C y (3.5); S(x, x) is 0 on the conic or quadric (3.1, 3.8).
 
     Parameters
     ----------
-    C : ndarray (..., d, d), conics or quadrics
-    x, y : ndarray (..., d), homogeneous points
+    C : ndarray (..., d, d)
+        Conics or quadrics, or their duals.
+    x, y : ndarray (..., d)
+        Homogeneous points, or lines or planes for duals (3.3, 3.9).
 
     Returns
     -------
-    ndarray (...), values of the form
+    ndarray (...)
     """
     return np.asarray(np.einsum("...i,...ij,...j->...", x, C, y))
-
-
-def incidence_residual(C: F64, x: F64) -> F64:
-    """Return |x'C x| / (|C| |x|^2), 0 on the conic or quadric (3.1, 3.8).
-
-    Parameters
-    ----------
-    C : ndarray (..., d, d), conics or quadrics, or their duals (3.3, 3.9)
-    x : ndarray (..., d), points, or lines or planes for duals
-
-    Returns
-    -------
-    ndarray (...), residuals in [0, 1]
-
-    Examples
-    --------
-    >>> circle = np.diag([1.0, 1.0, -1.0])
-    >>> float(incidence_residual(circle, np.array([1.0, 0.0, 1.0])))
-    0.0
-    """
-    size = np.linalg.norm(C, axis=(-2, -1)) * np.sum(x**2, axis=-1)
-    return np.asarray(np.abs(bilinear_form(C, x, x)) / np.maximum(size, 1e-300))
 
 
 def dual(C: F64) -> F64:
     """Return the dual C* ~ C^-1 (3.4) or Q* ~ Q^-1 (3.10): tangent lines or tangent planes.
 
     It is the adjugate, by singular values, so that a conic of rank 2 (two lines) has a dual too: their common
-    point, twice. Lower ranks give zero. The dual of the dual is the conic if that has full rank.
+    point, twice. Lower ranks give zero.
 
     Parameters
     ----------
-    C : ndarray (3, 3) or (4, 4), conic or quadric
+    C : ndarray (3, 3) or (4, 4)
+        Conic or quadric.
 
     Returns
     -------
-    ndarray, dual conic or quadric, of the shape of ``C``
-
-    Raises
-    ------
-    ValueError
-        An entry is not finite.
+    ndarray (3, 3) or (4, 4)
 
     Examples
     --------
@@ -92,18 +69,18 @@ def dual(C: F64) -> F64:
 
 
 def tangent(C: F64, x: F64) -> F64:
-    """Return the tangent line C x (3.7) or tangent plane Q X.
-
-    For points off the conic or quadric it is their polar: the line or plane through the points of tangency.
+    """Return the tangent line C x (3.7) or tangent plane Q X; the polar for points off the conic or quadric.
 
     Parameters
     ----------
-    C : ndarray (d, d), conic or quadric
-    x : ndarray (..., d), homogeneous points
+    C : ndarray (d, d)
+        Conic or quadric.
+    x : ndarray (..., d)
+        Homogeneous points.
 
     Returns
     -------
-    ndarray (..., d), lines or planes
+    ndarray (..., d)
 
     Examples
     --------
@@ -118,12 +95,14 @@ def tangency_discriminant(C: F64, x: F64, y: F64) -> F64:
 
     Parameters
     ----------
-    C : ndarray (d, d), conic or quadric
-    x, y : ndarray (..., d), two homogeneous points of the line
+    C : ndarray (d, d)
+        Conic or quadric.
+    x, y : ndarray (..., d)
+        Two homogeneous points of the line.
 
     Returns
     -------
-    ndarray (...), discriminants
+    ndarray (...)
 
     Notes
     -----
@@ -135,23 +114,19 @@ def tangency_discriminant(C: F64, x: F64, y: F64) -> F64:
 def intersect_line(C: F64, x: F64, y: F64) -> F64:
     """Intersect a conic or quadric with the line of two points (3.5).
 
-    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y, in homogeneous form, so that x
-    and y themselves can be solutions.
+    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y.
 
     Parameters
     ----------
-    C : ndarray (d, d), conic or quadric
-    x, y : ndarray (d,), homogeneous points
+    C : ndarray (d, d)
+        Conic or quadric.
+    x, y : ndarray (d,)
+        Homogeneous points.
 
     Returns
     -------
     ndarray (0, d), (1, d) or (2, d)
         Real points; one for a tangent (discriminant 0 to rounding), none for a line that lies on the quadric.
-
-    Raises
-    ------
-    ValueError
-        A point or the conic is zero or not finite.
 
     Examples
     --------
@@ -161,11 +136,7 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     [-1.0, 1.0]
     """
     x, y, C = (checked_unit(array, "intersect_line") for array in (x, y, C))
-    sxx, sxy, syy = (
-        float(bilinear_form(C, x, x)),
-        float(bilinear_form(C, x, y)),
-        float(bilinear_form(C, y, y)),
-    )
+    sxx, sxy, syy = (float(bilinear_form(C, a, b)) for a, b in ((x, x), (x, y), (y, y)))
     size = max(abs(sxx), abs(sxy), abs(syy))
     # The forms of unit vectors have rounding errors of about 1e-15.
     discriminant, rounding = sxy**2 - sxx * syy, 1e-14 * size
@@ -179,50 +150,21 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     return first[None] if touches else np.stack([first, second])
 
 
-def tangents_from(C: F64, x: F64) -> F64:
-    """Return the real tangents of a conic through an image point.
-
-    They touch where the polar of x meets the conic.
-
-    Parameters
-    ----------
-    C : ndarray (3, 3), conic of full rank
-    x : ndarray (3,), homogeneous image point
-
-    Returns
-    -------
-    ndarray (0, 3), (1, 3) or (2, 3), lines; one for a point of the conic
-
-    Raises
-    ------
-    ValueError
-        The point or the conic is zero or not finite.
-    """
-    require_finite("tangents_from", C, x)
-    basis = np.linalg.svd(tangent(C, x)[None])[2][1:]
-    return tangent(C, intersect_line(C, basis[0], basis[1]))
-
-
 def conic_through(x: F64) -> F64:
-    """Fit the conic with the least sum of squared x'C x to points.
+    """Fit the conic of unit norm with the least sum of squared x'C x to points.
 
     Parameters
     ----------
-    x : ndarray (N, 3), N >= 5 homogeneous points; exact for 5
+    x : ndarray (N, 3)
+        N >= 5 homogeneous points that determine one conic; exact for 5.
 
     Returns
     -------
-    ndarray (3, 3), conic of unit norm
-
-    Raises
-    ------
-    ValueError
-        There are fewer points, or they leave more than one conic (four on a line, or equal points).
+    ndarray (3, 3)
 
     Examples
     --------
-    >>> x = np.array([[1.0, 0, 1], [-1.0, 0, 1], [0, 1.0, 1], [0, -1.0, 1], [0.6, 0.8, 1]])
-    >>> C = conic_through(x)
+    >>> C = conic_through(np.array([[1.0, 0, 1], [-1.0, 0, 1], [0, 1.0, 1], [0, -1.0, 1], [0.6, 0.8, 1]]))
     >>> np.allclose(C / C[0, 0], np.diag([1.0, 1.0, -1.0]))
     True
     """
@@ -241,44 +183,39 @@ def conic_through(x: F64) -> F64:
 
 
 def curvature_sign(Q: F64) -> int:
-    """Return the sign of the Gaussian curvature of a quadric's real points, a projective invariant.
+    """Return the sign of the Gaussian curvature of a quadric's real points, a projective invariant (3.4.2).
 
     K = -det Q / |grad|^4 up to a positive factor, and det(G^-T Q G^-1) has the sign of det Q.
 
     Parameters
     ----------
-    Q : ndarray (4, 4), quadric
+    Q : ndarray (4, 4)
+        Quadric.
 
     Returns
     -------
     int
         1 for ellipsoids, elliptic paraboloids and hyperboloids of two sheets, -1 for saddles, 0 for cones,
         cylinders and planes.
-
-    Raises
-    ------
-    ValueError
-        The quadric is zero or not finite.
     """
-    scaled = checked_unit(Q, "curvature_sign")
-    det = float(np.linalg.det(scaled))
+    det = float(np.linalg.det(checked_unit(Q, "curvature_sign")))
     return 0 if abs(det) < 1e-14 else -int(np.sign(det))
 
 
 def project_dual_quadric(P: F64, dual_quadric: F64) -> F64:
     """Project a dual quadric to the dual conic of its outline: C* = P Q* P' (HZ 8.5).
 
-    A line is tangent to the outline if its plane P'l is tangent to the quadric. (3.14) is the case of the
-    absolute dual quadric.
+    A line is tangent to the outline if its plane P'l is tangent to the quadric. The absolute dual quadric
+    gives omega* = K K' (3.14), the inverse of omega (3.15).
 
     Parameters
     ----------
-    P : ndarray (..., 3, 4), cameras
-    dual_quadric : ndarray (4, 4), dual quadric
+    P, dual_quadric : ndarray (..., 3, 4) and (4, 4)
+        Cameras and dual quadric.
 
     Returns
     -------
-    ndarray (..., 3, 3), dual conics
+    ndarray (..., 3, 3)
 
     Examples
     --------
@@ -294,16 +231,12 @@ def image_of_absolute_conic(K: F64) -> F64:
 
     Parameters
     ----------
-    K : ndarray (..., 3, 3), calibration matrices
+    K : ndarray (..., 3, 3)
+        Calibration matrices.
 
     Returns
     -------
-    ndarray (..., 3, 3), images of the absolute conic
-
-    Raises
-    ------
-    ValueError
-        A matrix is singular or not finite.
+    ndarray (..., 3, 3)
 
     Examples
     --------
@@ -314,122 +247,56 @@ def image_of_absolute_conic(K: F64) -> F64:
     return np.asarray(np.swapaxes(inverse, -1, -2) @ inverse)
 
 
-def dual_image_of_absolute_conic(K: F64) -> F64:
-    """Return omega* = K K' (3.14), the inverse of omega (3.15).
+def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
+    """Recover K from omega ~ K^-T K^-1 (3.13) or omega* ~ K K' (3.14), by Cholesky from the last row up.
 
     Parameters
     ----------
-    K : ndarray (..., 3, 3), calibration matrices
+    image : ndarray (3, 3)
+        Omega, or omega* if ``is_dual``, of any scale and sign.
+    is_dual : bool
+        Whether the image is omega*.
 
     Returns
     -------
-    ndarray (..., 3, 3), dual images of the absolute conic
-    """
-    return np.asarray(K @ np.swapaxes(K, -1, -2))
-
-
-def calibration_from_dual_image(dual_image: F64) -> F64:
-    """Recover K from omega* ~ K K' by the Cholesky factor taken from the last row up.
-
-    Parameters
-    ----------
-    dual_image : ndarray (3, 3), omega* of any scale and sign
-
-    Returns
-    -------
-    ndarray (3, 3), K, upper triangular, positive focal lengths, K33 = 1
+    ndarray (3, 3)
+        K, upper triangular, positive focal lengths, K33 = 1.
 
     Raises
     ------
     ValueError
-        omega* is not definite: no real camera has this image.
+        The conic is not definite: no real camera has this image.
 
     Examples
     --------
-    >>> calibration_from_dual_image(-np.diag([9.0, 4.0, 1.0])).round(9).tolist()
+    >>> calibration_from_image(-np.diag([9.0, 4.0, 1.0]), is_dual=True).round(9).tolist()
     [[3.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]
     """
+    if not np.isfinite(image).all() or not (is_dual or np.linalg.cond(image) < 1e15):
+        raise ValueError("calibration_from_image needs a finite invertible conic")
+    dual_image = image if is_dual else np.asarray(np.linalg.inv(image), dtype=np.float64)
     symmetric = (dual_image + dual_image.T) / 2.0
-    if symmetric[2, 2] == 0.0 or not np.isfinite(symmetric).all():
-        raise ValueError("calibration_from_dual_image needs a finite definite conic")
+    if symmetric[2, 2] == 0.0:
+        raise ValueError("calibration_from_image needs a definite conic")
     try:
         lower = np.linalg.cholesky((symmetric / symmetric[2, 2])[::-1, ::-1])
     except np.linalg.LinAlgError as error:
-        raise ValueError(
-            "calibration_from_dual_image needs a definite conic; no real camera has this image"
-        ) from error
+        raise ValueError("calibration_from_image needs a definite conic") from error
     K = lower[::-1, ::-1]
     return np.asarray(K / K[2, 2])
 
 
-def calibration_from_image(image: F64) -> F64:
-    """Recover K from omega ~ K^-T K^-1.
-
-    Parameters
-    ----------
-    image : ndarray (3, 3), omega of any scale and sign
-
-    Returns
-    -------
-    ndarray (3, 3), K, upper triangular, positive focal lengths, K33 = 1
-
-    Raises
-    ------
-    ValueError
-        omega is singular or not definite.
-    """
-    if not np.isfinite(image).all() or not np.linalg.cond(image) < 1e15:
-        raise ValueError("calibration_from_image needs a finite invertible conic")
-    return calibration_from_dual_image(np.asarray(np.linalg.inv(image), dtype=np.float64))
-
-
-def image_of_infinity(P: F64) -> F64:
-    """Return M of P = [M m], which maps points (x, 0) of the plane at infinity to the image (3.11).
-
-    Parameters
-    ----------
-    P : ndarray (..., 3, 4), cameras
-
-    Returns
-    -------
-    ndarray (..., 3, 3), M, equal to K R in a metric frame; the centre has no effect
-    """
-    return P[..., :3]
-
-
-def dual_quadric_of_plane(K: F64, plane: F64) -> F64:
-    """Return Q* of a projective frame whose first camera is [I 0].
-
-    Q* = [[K K', -K K'p], [-p'K K', p'K K'p]] (Triggs 1997; HZ 19.2).
-
-    Parameters
-    ----------
-    K : ndarray (3, 3), calibration of the first camera
-    plane : ndarray (3,), p of the plane at infinity (p, 1)
-
-    Returns
-    -------
-    ndarray (4, 4), absolute dual quadric
-    """
-    lift = np.vstack([np.eye(3), -plane])
-    return np.asarray(lift @ dual_image_of_absolute_conic(K) @ lift.T)
-
-
 def plane_at_infinity(dual_quadric: F64) -> F64:
-    """Return the plane at infinity: the null vector of the absolute dual quadric.
+    """Return the plane at infinity: the unit null vector of the absolute dual quadric of any frame.
 
     Parameters
     ----------
-    dual_quadric : ndarray (4, 4), absolute dual quadric of any frame
+    dual_quadric : ndarray (4, 4)
+        Absolute dual quadric.
 
     Returns
     -------
-    ndarray (4,), unit plane
-
-    Raises
-    ------
-    ValueError
-        An entry is not finite.
+    ndarray (4,)
 
     Examples
     --------
@@ -441,43 +308,31 @@ def plane_at_infinity(dual_quadric: F64) -> F64:
     return np.asarray(V[:, np.abs(s).argmin()])
 
 
-def angle_between_pixels(image: F64, x: F64, y: F64) -> F64:
-    """Return the angle between the rays of pixels, cos = x'omega y / root(x'omega x . y'omega y) (HZ 8.6).
+def absolute_angle(C: F64, x: F64, y: F64) -> F64:
+    """Return the angle that the absolute conic measures, cos = S(x, y) / root(S(x, x) S(y, y)).
+
+    With omega it is the angle between the rays of two pixels (HZ 8.6), with the absolute dual quadric that
+    between two planes, in any frame (HZ 3.7).
 
     Parameters
     ----------
-    image : ndarray (3, 3), positive definite image of the absolute conic omega
-    x, y : ndarray (..., 3), homogeneous image points; vanishing points give the angle between directions
+    C : ndarray (d, d)
+        omega (d = 3) or the absolute dual quadric (d = 4), of any sign.
+    x, y : ndarray (..., d)
+        Homogeneous image points, or planes.
 
     Returns
     -------
-    ndarray (...), angles, rad
+    ndarray (...)
+        Angles, rad.
 
     Examples
     --------
     >>> omega = image_of_absolute_conic(np.diag([500.0, 500.0, 1.0]))
     >>> x, y = np.array([0.0, 0.0, 1.0]), np.array([500.0, 0.0, 1.0])
-    >>> round(float(np.degrees(angle_between_pixels(omega, x, y))), 9)
+    >>> round(float(np.degrees(absolute_angle(omega, x, y))), 9)
     45.0
     """
-    cosine = bilinear_form(image, x, y) / np.sqrt(bilinear_form(image, x, x) * bilinear_form(image, y, y))
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def angle_between_planes(dual_quadric: F64, plane1: F64, plane2: F64) -> F64:
-    """Return the angle between the normals of planes in any frame.
-
-    cos = Pi'Q* Psi / root(Pi'Q* Pi . Psi'Q* Psi) (HZ 3.7), a projective invariant.
-
-    Parameters
-    ----------
-    dual_quadric : ndarray (4, 4), absolute dual quadric of the frame
-    plane1, plane2 : ndarray (..., 4), planes
-
-    Returns
-    -------
-    ndarray (...), angles, rad
-    """
-    Q = dual_quadric * np.sign(np.trace(dual_quadric))
-    product = bilinear_form(Q, plane1, plane1) * bilinear_form(Q, plane2, plane2)
-    return np.asarray(np.arccos(np.clip(bilinear_form(Q, plane1, plane2) / np.sqrt(product), -1.0, 1.0)))
+    C = C * np.sign(np.trace(C))
+    product = bilinear_form(C, x, x) * bilinear_form(C, y, y)
+    return np.asarray(np.arccos(np.clip(bilinear_form(C, x, y) / np.sqrt(product), -1.0, 1.0)))

@@ -13,13 +13,10 @@ def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]
 
     Parameters
     ----------
-    caller : str, name of the public function, for the message
-    **arrays : (ndarray, tuple), array and shape; equal letters are equal sizes
-
-    Raises
-    ------
-    ValueError
-        A shape does not match.
+    caller : str
+        Name of the public function, for the message.
+    **arrays : (ndarray, tuple)
+        Array and shape; equal letters are equal sizes.
 
     Examples
     --------
@@ -47,64 +44,13 @@ def require_finite(caller: str, *arrays: F64) -> None:
 
     Parameters
     ----------
-    caller : str, name of the public function, for the message
-    *arrays : ndarray, arrays of any shape
-
-    Raises
-    ------
-    ValueError
-        An entry is not finite.
+    caller : str
+        Name of the public function, for the message.
+    *arrays : ndarray
+        Arrays of any shape.
     """
     if not all(np.isfinite(array).all() for array in arrays):
         raise ValueError(f"{caller} needs finite numbers; some are NaN or infinite")
-
-
-def checked_inverse(G: F64, caller: str) -> F64:
-    """Invert matrices.
-
-    Parameters
-    ----------
-    G : ndarray (..., d, d), matrices
-    caller : str, name of the public function, for the message
-
-    Returns
-    -------
-    ndarray (..., d, d), the inverses
-
-    Raises
-    ------
-    ValueError
-        A matrix is singular or not finite.
-    """
-    require_finite(caller, G)
-    try:
-        return np.asarray(np.linalg.inv(G), dtype=np.float64)
-    except np.linalg.LinAlgError as error:
-        raise ValueError(f"{caller} needs an invertible matrix; got a singular one of {G.shape}") from error
-
-
-def checked_unit(array: F64, caller: str) -> F64:
-    """Scale an array to unit Frobenius norm.
-
-    Parameters
-    ----------
-    array : ndarray, array of any shape
-    caller : str, name of the public function, for the message
-
-    Returns
-    -------
-    ndarray, the array over its norm
-
-    Raises
-    ------
-    ValueError
-        The array is zero or not finite.
-    """
-    require_finite(caller, array)
-    norm = float(np.linalg.norm(array))
-    if not norm > 0.0:
-        raise ValueError(f"{caller} needs numbers that are not all zero")
-    return array / norm
 
 
 def homogenize(x: F64) -> F64:
@@ -112,11 +58,12 @@ def homogenize(x: F64) -> F64:
 
     Parameters
     ----------
-    x : ndarray (..., d), points
+    x : ndarray (..., d)
+        Points.
 
     Returns
     -------
-    ndarray (..., d + 1), homogeneous points
+    ndarray (..., d + 1)
 
     Examples
     --------
@@ -131,31 +78,29 @@ def dehomogenize(xh: F64) -> F64:
 
     Parameters
     ----------
-    xh : ndarray (..., d + 1), homogeneous points
+    xh : ndarray (..., d + 1)
+        Homogeneous points.
 
     Returns
     -------
-    ndarray (..., d), points; inf or NaN for points at infinity
-
-    Examples
-    --------
-    >>> dehomogenize(np.array([[4.0, 6.0, 2.0]])).tolist()
-    [[2.0, 3.0]]
+    ndarray (..., d)
+        Inf or NaN for points at infinity.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         return xh[..., :-1] / xh[..., -1:]
 
 
 def cross_matrix(a: F64) -> F64:
-    """Return the skew-symmetric matrix [a]x of the cross product.
+    """Return the skew-symmetric matrix [a]x with [a]x b = a x b.
 
     Parameters
     ----------
-    a : ndarray (..., 3), vectors
+    a : ndarray (..., 3)
+        Vectors.
 
     Returns
     -------
-    ndarray (..., 3, 3), [a]x with [a]x b = a x b
+    ndarray (..., 3, 3)
 
     Examples
     --------
@@ -173,16 +118,12 @@ def normalizing_transform(xy: F64) -> F64:
 
     Parameters
     ----------
-    xy : ndarray (N, 2), image points, px
+    xy : ndarray (N, 2)
+        Image points, px; finite and not all equal.
 
     Returns
     -------
-    ndarray (3, 3), similarity transform of homogeneous image points
-
-    Raises
-    ------
-    ValueError
-        All points are equal, or one is not finite.
+    ndarray (3, 3)
 
     References
     ----------
@@ -204,17 +145,16 @@ def normalizing_transform(xy: F64) -> F64:
 
 
 def pixel_from_unit(sizes: NDArray[np.int64]) -> F64:
-    """Return the transforms from unit-free to pixel coordinates.
-
-    The origin of unit-free coordinates is the image centre, their unit the longer image side.
+    """Return transforms to pixels from coordinates about the image centre in units of the longer side.
 
     Parameters
     ----------
-    sizes : ndarray (V, 2) of int, image width and height, px
+    sizes : ndarray (V, 2) of int
+        Image width and height, px.
 
     Returns
     -------
-    ndarray (V, 3, 3), transforms of homogeneous image points
+    ndarray (V, 3, 3)
     """
     scale = sizes.max(axis=1).astype(np.float64)
     T = np.zeros((len(sizes), 3, 3))
@@ -225,15 +165,17 @@ def pixel_from_unit(sizes: NDArray[np.int64]) -> F64:
 
 
 def pixel_conditioning(xy: F64) -> F64:
-    """Return the transform of the pixels' bounding box to centre 0 and half-diagonal 1.
+    """Return the isotropic transform of the pixels' bounding box to centre 0 and half-diagonal 1.
 
     Parameters
     ----------
-    xy : ndarray (K, 2), pixels
+    xy : ndarray (K, 2)
+        Pixels.
 
     Returns
     -------
-    ndarray (3, 3), isotropic transform, so that residuals only scale; scale 1 if all pixels are equal
+    ndarray (3, 3)
+        Of scale 1 if all pixels are equal, I without pixels.
     """
     if len(xy) == 0:
         return np.eye(3)
@@ -249,12 +191,15 @@ def scene_frame(X: F64) -> tuple[F64, float]:
 
     Parameters
     ----------
-    X : ndarray (N, 3), points
+    X : ndarray (N, 3)
+        Points.
 
     Returns
     -------
-    origin : ndarray (3,), median of each coordinate; 0 without points
-    scale : float, 1 / median distance from the origin; 1 if all points are equal
+    origin : ndarray (3,)
+        Median of each coordinate; 0 without points.
+    scale : float
+        1 / median distance from the origin; 1 if all points are equal.
     """
     if len(X) == 0:
         return np.zeros(3), 1.0
@@ -271,12 +216,15 @@ def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
 
     Parameters
     ----------
-    X : ndarray (N, 4), homogeneous points
-    rounds : int, fixed-point iterations
+    X : ndarray (N, 4)
+        Homogeneous points.
+    rounds : int
+        Fixed-point iterations.
 
     Returns
     -------
-    ndarray (4, 4), M with det M > 0, which keeps orientations; I for fewer than 4 points
+    ndarray (4, 4)
+        det M > 0, which keeps orientations; I for fewer than 4 points.
 
     References
     ----------

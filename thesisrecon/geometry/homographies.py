@@ -5,27 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.geometry._checks import checked_unit
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite
+from thesisrecon.geometry.homogeneous import cross_matrix, require_finite
 from thesisrecon.geometry.two_view import epipoles, unit_norm
 
 
 def image_from_plane(P: F64, plane: F64) -> F64:
     """Return H_Pi = M - m pi' (3.29), which maps the point (x, -pi'x) of the plane (pi, 1) to its image.
 
+    H_Pi is singular if the plane contains the camera centre. For [I 0] it is the identity (3.32).
+
     Parameters
     ----------
-    P : ndarray (3, 4), camera
-    plane : ndarray (4,), plane with a non-zero fourth entry
+    P, plane : ndarray (3, 4) and (4,)
+        Camera [M m] and plane that does not contain the origin, so that x is a coordinate.
 
     Returns
     -------
-    ndarray (3, 3), homography, singular if the plane contains the camera centre
-
-    Raises
-    ------
-    ValueError
-        The plane contains the origin, so that x is no coordinate; use :func:`plane_homography`.
+    ndarray (3, 3)
     """
     if not abs(plane[3]) > 1e-14 * np.linalg.norm(plane):
         raise ValueError("image_from_plane needs a plane that does not contain the origin")
@@ -33,24 +31,20 @@ def image_from_plane(P: F64, plane: F64) -> F64:
 
 
 def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
-    """Return the homography between two images induced by a plane.
+    """Return the homography x2 ~ H x1 of unit norm between two images induced by a plane.
 
     H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane and the point
     is projected. It equals H_Pi2 H_Pi1^-1 (3.30), also for planes through the origin.
 
     Parameters
     ----------
-    P1, P2 : ndarray (3, 4), cameras
-    plane : ndarray (4,), plane
+    P1, P2, plane : ndarray (3, 4), (3, 4) and (4,)
+        Cameras and plane that does not contain the first centre.
 
     Returns
     -------
-    ndarray (3, 3), H of unit norm, x2 ~ H x1; singular if the plane contains the second centre
-
-    Raises
-    ------
-    ValueError
-        The plane contains the first centre, or an argument is zero or not finite.
+    ndarray (3, 3)
+        Singular if the plane contains the second centre.
 
     Examples
     --------
@@ -68,7 +62,7 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
 
 
 def infinite_homography(P1: F64, P2: F64) -> F64:
-    """Return H = M2 M1^-1 (3.31), the homography of the plane (0, 0, 0, 1).
+    """Return H = M2 M1^-1 (3.31), the homography of the plane (0, 0, 0, 1), of unit norm.
 
     K2 R2 R1' K1^-1 in a metric frame (3.28, where the thesis' R are transposed), for any centres. In an
     affine frame it is still the homography of the plane at infinity, in a projective frame that of an
@@ -76,16 +70,12 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
 
     Parameters
     ----------
-    P1, P2 : ndarray (3, 4), cameras
+    P1, P2 : ndarray (3, 4)
+        Cameras, the first not at infinity.
 
     Returns
     -------
-    ndarray (3, 3), H of unit norm
-
-    Raises
-    ------
-    ValueError
-        The first camera is at infinity, or an entry is not finite.
+    ndarray (3, 3)
 
     Examples
     --------
@@ -102,21 +92,16 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
 
 
 def fundamental_from_homography(H: F64, e2: F64) -> F64:
-    """Return F = [e2]x H of the homography of any plane and the epipole (3.37).
+    """Return F = [e2]x H of unit norm from the homography of any plane and the epipole (3.37).
 
     Parameters
     ----------
-    H : ndarray (3, 3), homography, x2 ~ H x1
-    e2 : ndarray (3,), epipole in view 2
+    H, e2 : ndarray (3, 3) and (3,)
+        Homography x2 ~ H x1 and epipole in view 2, not 0.
 
     Returns
     -------
-    ndarray (3, 3), F of unit norm
-
-    Raises
-    ------
-    ValueError
-        The epipole is zero: equal centres have none.
+    ndarray (3, 3)
 
     Examples
     --------
@@ -132,17 +117,19 @@ def fundamental_from_homography(H: F64, e2: F64) -> F64:
 def homography_from_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
     """Return H = -[e2]x F / |e2|^2 + e2 v', the homography of a plane for any v (3.39, 3.41).
 
-    (3.41) is the member v = 0, up to sign and scale: the plane through the second centre whose image is the
-    line e2, hence singular.
+    [e2]x H = F, also in sign, for F of unit norm. (3.41) is the member v = 0, up to sign and scale: the plane
+    through the second centre whose image is the line e2, hence singular.
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
-    plane : ndarray (3,), optional, v; 0 by default
+    F : ndarray (3, 3)
+        Fundamental matrix.
+    plane : ndarray (3,), optional
+        v; 0 by default.
 
     Returns
     -------
-    ndarray (3, 3), H with [e2]x H = F, also in sign, for unit e2 and F of unit norm
+    ndarray (3, 3)
     """
     F = unit_norm(F)
     _, e2 = epipoles(F)
@@ -150,79 +137,37 @@ def homography_from_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
     return H if plane is None else H + np.outer(e2, plane)
 
 
-def homography_through_line(F: F64, line2: F64) -> F64:
-    """Return H = [l]x F, which maps x to the intersection of its epipolar line with a line (proof of 3.41).
-
-    It is the homography of the plane that view 2 sees as the line.
+def camera_from_homography(H: F64, e2: F64, plane: F64) -> F64:
+    """Return P2 = [H + e2 pi', e2] (3.40) beside P1 = [I 0]; pi = 0 for the plane W = 0 (3.37).
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
-    line2 : ndarray (3,), line l of view 2
+    H, e2 : ndarray (3, 3) and (3,)
+        Homography and epipole in view 2, of their true ratio of scales.
+    plane : ndarray (3,)
+        The plane (pi, 1) of the homography.
 
     Returns
     -------
-    ndarray (3, 3), H of rank 2; rank 1 if the line contains e2
+    ndarray (3, 4)
     """
-    return np.asarray(cross_matrix(line2) @ F)
-
-
-def compatibility_residual(H: F64, F: F64) -> float:
-    """Return |H'F + F'H| / (|H| |F|), 0 if H is the homography of a plane for the pair (HZ 13.3).
-
-    x2 = H x1 lies on F x1 for every x1 exactly if H'F is antisymmetric.
-
-    Parameters
-    ----------
-    H : ndarray (3, 3), homography
-    F : ndarray (3, 3), fundamental matrix
-
-    Returns
-    -------
-    float, residual >= 0
-    """
-    S = H.T @ F
-    return float(np.linalg.norm(S + S.T) / (np.linalg.norm(H) * np.linalg.norm(F)))
-
-
-def camera_from_homography(H: F64, e2: F64, *, plane: F64 | None = None) -> F64:
-    """Return P2 = [H + e2 pi', e2] (3.40) beside P1 = [I 0].
-
-    H and e2 must have their true ratio of scales, up to one common factor of e2 that the frame absorbs.
-
-    Parameters
-    ----------
-    H : ndarray (3, 3), homography of the plane (pi, 1) of the frame
-    e2 : ndarray (3,), epipole in view 2
-    plane : ndarray (3,), optional, pi; by default the plane is W = 0 (3.37)
-
-    Returns
-    -------
-    ndarray (3, 4), second camera
-    """
-    M = H if plane is None else H + np.outer(e2, plane)
-    return np.hstack([M, e2[:, None]])
+    return np.hstack([H + np.outer(e2, plane), e2[:, None]])
 
 
 def plane_of_homography(H: F64, P2: F64) -> tuple[F64, float]:
-    """Return the plane of a homography between P1 = [I 0] and P2.
-
-    Least squares of s H = M - m pi' over s and pi (3.38).
+    """Return the plane of a homography between P1 = [I 0] and P2: least squares of s H = M - m pi' (3.38).
 
     Parameters
     ----------
-    H : ndarray (3, 3), homography
-    P2 : ndarray (3, 4), second camera [M m]
+    H, P2 : ndarray (3, 3) and (3, 4)
+        Homography and second camera [M m], m not 0.
 
     Returns
     -------
-    plane : ndarray (4,), plane of unit norm
-    residual : float, |s H - M + m pi'| / |M|, 0 for a true homography
-
-    Raises
-    ------
-    ValueError
-        The cameras share their centre (m = 0).
+    plane : ndarray (4,)
+        Plane of unit norm.
+    residual : float
+        |s H - M + m pi'| / |M|, 0 for a true homography.
 
     Examples
     --------

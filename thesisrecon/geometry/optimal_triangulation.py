@@ -16,20 +16,20 @@ References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite, require_shapes
+from thesisrecon.geometry._checks import checked_unit
+from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, require_shapes
 
-Two = tuple[float, float]
-Four = tuple[float, float, float, float]
+_Two = tuple[float, float]
+_Four = tuple[float, float, float, float]
 
-DEGREE = 6
-MONOTONE = 3.0
+_DEGREE = 6
+_MONOTONE = 3.0
 """If the linear coefficient exceeds the derivative of the others by this factor, Newton's steps contract."""
 _RANK = 1e-13
 """Singular values below this fraction of the largest are zero."""
@@ -38,8 +38,8 @@ _RANK = 1e-13
 @njit(cache=True, nogil=True, error_model="numpy")
 def _horner(c: F64, x: float) -> tuple[float, float]:
     """Return value and derivative of the polynomial c (7,), lowest power first."""
-    value, slope = c[DEGREE], 0.0
-    for k in range(DEGREE - 1, -1, -1):
+    value, slope = c[_DEGREE], 0.0
+    for k in range(_DEGREE - 1, -1, -1):
         slope = slope * x + value
         value = value * x + c[k]
     return value, slope
@@ -68,26 +68,17 @@ def _root_between(c: F64, low: float, high: float, rising: bool) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def roots_in_unit_interval(c: F64, roots: F64) -> int:
-    """Find the real roots in [-1, 1] at which a polynomial changes sign.
+def _roots_in_unit_interval(c: F64, roots: F64) -> int:
+    """Fill roots (8,) with the real roots in [-1, 1] at which c (7,) changes sign; return their number.
 
     The roots of each derivative divide the interval into pieces on which the next lower one is monotone.
-
-    Parameters
-    ----------
-    c : ndarray (7,), coefficients, lowest power first
-    roots : ndarray (8,), output
-
-    Returns
-    -------
-    int, number of roots
     """
-    d = np.empty(DEGREE + 1)
-    cuts = np.empty(DEGREE + 2)
+    d = np.empty(_DEGREE + 1)
+    cuts = np.empty(_DEGREE + 2)
     found = 0
-    for order in range(DEGREE - 1, -1, -1):
+    for order in range(_DEGREE - 1, -1, -1):
         d[:] = 0.0
-        for k in range(order, DEGREE + 1):
+        for k in range(order, _DEGREE + 1):
             factor = 1.0
             for m in range(k - order + 1, k + 1):
                 factor *= m
@@ -148,18 +139,18 @@ def _stationary_polynomial(cost: _PencilCost, c: F64) -> None:
 def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
     """Return the root of c of least cost in [-1, 1], or on the ``whole`` line with infinity; or NaN."""
     n0, n1, E0, E1, E2, G, kappa = pencil
-    roots, backward = np.empty(DEGREE + 2), np.empty(DEGREE + 1)
+    roots, backward = np.empty(_DEGREE + 2), np.empty(_DEGREE + 1)
     best, least = math.nan, math.inf
-    for k in range(roots_in_unit_interval(c, roots)):
+    for k in range(_roots_in_unit_interval(c, roots)):
         x = roots[k]
         cost = G * x * x / (1.0 + kappa * x * x) + (n0 + n1 * x) ** 2 / (E0 + 2.0 * E1 * x + E2 * x * x)
         if cost < least:
             best, least = x, cost
     if whole:
-        for k in range(DEGREE + 1):
-            backward[k] = c[DEGREE - k]
+        for k in range(_DEGREE + 1):
+            backward[k] = c[_DEGREE - k]
         # The reversed polynomial may vanish at 0 without a sign change: infinity is always tried.
-        count = roots_in_unit_interval(backward, roots)
+        count = _roots_in_unit_interval(backward, roots)
         roots[count] = 0.0
         for k in range(count + 1):
             y = roots[k]
@@ -170,7 +161,7 @@ def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _best_in_sector(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, most: float, c: F64) -> Four:
+def _best_in_sector(own: _Two, B: F64, Q: float, D: float, other: _Two, E: F64, most: float, c: F64) -> _Four:
     """Return the best member q of the pencil and n of both images.
 
     q is counted from the line through one image's point. That image has x'L = ``own``, the form B, Q = q'Bq
@@ -189,7 +180,7 @@ def _best_in_sector(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, mo
     cost = _PencilCost(n0, n1, E0, E1, E2, G, kappa)
     _stationary_polynomial(cost, c)
     bend = 2.0 * abs(c[2]) + 3.0 * abs(c[3]) + 4.0 * abs(c[4]) + 5.0 * abs(c[5]) + 6.0 * abs(c[6])
-    if proper and c[1] > MONOTONE * bend:
+    if proper and c[1] > _MONOTONE * bend:
         # A monotone derivative: the only stationary point of the sector is the global minimum.
         x = 0.0
         for _ in range(30):
@@ -206,7 +197,7 @@ def _best_in_sector(own: Two, B: F64, Q: float, D: float, other: Two, E: F64, mo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64, c: F64) -> Four:
+def _best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64, c: F64) -> _Four:
     """Return q0, q1, n1, n2 of least n1^2 / (q'B1q) + n2^2 / (q'B2q), n = a q0 + b q1; c (7,) is scratch."""
     cross = a2 * b1 - b2 * a1
     Q1, Q2 = _form(B1, b1, -a1, b1, -a1), _form(B2, b2, -a2, b2, -a2)
@@ -236,7 +227,7 @@ def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, 
 
     Matches with a NaN are skipped and have q = 0.
     """
-    c = np.empty(DEGREE + 1)
+    c = np.empty(_DEGREE + 1)
     for k in range(len(xy1)):
         x1, y1, x2, y2 = xy1[k, 0], xy1[k, 1], xy2[k, 0], xy2[k, 1]
         pencil[k, 0] = pencil[k, 1] = 0.0
@@ -305,37 +296,22 @@ def _intersect_rays(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: 
             X[k, m] *= norm
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """Pixels centred on a view's points and scaled equally in both views, so that costs compare."""
+def _conditioning(xy: F64) -> tuple[float, F64, F64]:
+    """Return scale, centre (2, 2) and the transforms (2, 3, 3) to ``scale (x - centre)`` of pixels (2, N, 2).
 
-    scale: float
-    centre: F64
-
-    @property
-    def to(self) -> F64:
-        """Transforms from pixels to conditioned coordinates; (2, 3, 3)."""
-        T = np.zeros((2, 3, 3))
-        T[:, 0, 0] = T[:, 1, 1] = self.scale
-        T[:, :2, 2] = -self.scale * self.centre
-        T[:, 2, 2] = 1.0
-        return T
-
-    def conditioned(self, xy: F64) -> F64:
-        return np.ascontiguousarray((xy - self.centre[:, None]) * self.scale)
-
-    def pixels(self, xy: F64) -> F64:
-        return np.asarray(xy / self.scale + self.centre[:, None])
-
-
-def _frame(xy: F64) -> _Frame:
+    Pixels are centred on the points of each view and scaled equally in both, so that costs compare.
+    """
+    scale, centre, T = 1.0, np.zeros((2, 2)), np.zeros((2, 3, 3))
     seen = np.isfinite(xy).all(axis=(0, 2))
-    if not seen.any():
-        return _Frame(1.0, np.zeros((2, 2)))
-    points = xy if seen.all() else xy[:, seen]
-    centre = points.mean(axis=1)
-    spread = float(np.abs(points - centre[:, None]).max())
-    return _Frame(1.0 / spread if spread > 0.0 else 1.0, centre)
+    if seen.any():
+        points = xy if seen.all() else xy[:, seen]
+        centre = points.mean(axis=1)
+        spread = float(np.abs(points - centre[:, None]).max())
+        scale = 1.0 / spread if spread > 0.0 else 1.0
+    T[:, 0, 0] = T[:, 1, 1] = scale
+    T[:, :2, 2] = -scale * centre
+    T[:, 2, 2] = 1.0
+    return scale, centre, T
 
 
 def _balanced(L: F64) -> tuple[F64, F64, F64]:
@@ -360,17 +336,14 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix of rank 2, any scale
-    xy1, xy2 : ndarray (N, 2), matches, px
+    F : ndarray (3, 3)
+        Fundamental matrix of rank 2, any scale.
+    xy1, xy2 : ndarray (N, 2)
+        Matches, px.
 
     Returns
     -------
-    xy1, xy2 : ndarray (N, 2), corrected matches, px
-
-    Raises
-    ------
-    ValueError
-        F has a rank below 2, a shape is wrong, or a number is not finite.
+    xy1, xy2 : ndarray (N, 2)
 
     Examples
     --------
@@ -384,55 +357,18 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     require_finite("correct_matches", xy1, xy2)
     F = checked_unit(np.asarray(F, dtype=np.float64), "correct_matches")
     xy = np.stack([xy1, xy2])
-    frame = _frame(xy)
-    back = np.linalg.inv(frame.to)
+    scale, centre, T = _conditioning(xy)
+    back = np.linalg.inv(T)
     U, s, Vt = np.linalg.svd(back[1].T @ F @ back[0])
     if not s[1] > _RANK * s[0]:
         raise ValueError("correct_matches needs an F of rank 2; got one of rank 1")
     lines1 = Vt[:2].T
     lines2 = (U[:, :2] * s[:2]) @ Vt[:2] @ cross_matrix(Vt[2]) @ lines1
     L, _, B = _balanced(np.stack([lines1, lines2]))
-    moved = frame.conditioned(xy)
+    moved = np.ascontiguousarray((xy - centre[:, None]) * scale)
     _correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], np.empty((len(xy1), 2)))
-    moved = frame.pixels(moved)
+    moved = moved / scale + centre[:, None]
     return moved[0], moved[1]
-
-
-@dataclass(frozen=True)
-class _Pencil:
-    """Two cameras in a frame with P1'P1 + P2'P2 = I in conditioned pixels: the centres are orthonormal.
-
-    ``P`` (2, 3, 4); ``planes`` (4, 3): two that span the epipolar pencil, and the sum of the centres;
-    ``lines`` (2, 3, 2) the images of the planes, ``forms`` (2, 3), ``back`` (4, 4) to the caller's frame of
-    space.
-    """
-
-    P: F64
-    planes: F64
-    lines: F64
-    forms: F64
-    back: F64
-
-
-def _pencil(P: F64, to: F64) -> _Pencil:
-    conditioned = to @ P
-    size = np.linalg.norm(conditioned, axis=(1, 2), keepdims=True)
-    stacked = (conditioned / np.where(size > 0.0, size, 1.0)).reshape(6, 4)
-    columns = np.linalg.norm(stacked, axis=0)
-    columns = np.where(columns > 0.0, columns, 1.0)
-    U, s, Vt = np.linalg.svd(stacked / columns, full_matrices=False)
-    if not s[3] > _RANK * s[0]:
-        raise ValueError("the polynomial method needs two cameras with different centres")
-    Q = np.ascontiguousarray(U.reshape(2, 3, 4))
-    # Eigenvalues 0 and 1 belong to the centres of the second and the first camera.
-    values, vectors = np.linalg.eigh(Q[1].T @ Q[1])
-    if not (values[1] > _RANK and 1.0 - values[2] > _RANK):
-        raise ValueError("the polynomial method needs cameras of rank 3")
-    N = vectors[:, 1:3]
-    lines, basis, forms = _balanced(np.stack([Q[0] @ N / (1.0 - values[1:3]), Q[1] @ N / values[1:3]]))
-    planes = np.column_stack([N @ basis, vectors[:, 0] + vectors[:, 3]])
-    back = (Vt.T / s) / columns[:, None]
-    return _Pencil(Q, planes, lines, forms, np.ascontiguousarray(back))
 
 
 def triangulate_polynomial(P: F64, xy: F64) -> F64:
@@ -443,19 +379,16 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
 
     Parameters
     ----------
-    P : ndarray (2, 3, 4), cameras
-    xy : ndarray (2, N, 2), pixels; NaN for not observed
+    P : ndarray (2, 3, 4)
+        Cameras of rank 3 with different centres.
+    xy : ndarray (2, N, 2)
+        Pixels; NaN for not observed.
 
     Returns
     -------
     ndarray (N, 4)
         Points of unit norm; zeros if not observed twice. A match whose nearest exact pair has one point on an
         epipole gives the centre of the other camera; with both there, some point of the baseline.
-
-    Raises
-    ------
-    ValueError
-        The number of cameras is not two, they share a centre or have a rank below 3, or a shape is wrong.
 
     Examples
     --------
@@ -468,10 +401,27 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
         raise ValueError(f"the polynomial method needs exactly two cameras; got P of shape {P.shape}")
     require_shapes("triangulate_polynomial", xy=(xy, (2, "N", 2)))
     require_finite("triangulate_polynomial", P)
-    frame = _frame(xy)
-    p, moved = _pencil(P, frame.to), frame.conditioned(xy)
+    scale, centre, T = _conditioning(xy)
+    conditioned = T @ P
+    size = np.linalg.norm(conditioned, axis=(1, 2), keepdims=True)
+    stacked = (conditioned / np.where(size > 0.0, size, 1.0)).reshape(6, 4)
+    columns = np.linalg.norm(stacked, axis=0)
+    columns = np.where(columns > 0.0, columns, 1.0)
+    U, s, Vt = np.linalg.svd(stacked / columns, full_matrices=False)
+    if not s[3] > _RANK * s[0]:
+        raise ValueError("the polynomial method needs two cameras with different centres")
+    # In a frame of space with Q1'Q1 + Q2'Q2 = I the centres are orthonormal: eigenvectors of Q2'Q2 of the
+    # eigenvalues 0 (second camera) and 1 (first). The other two span the pencil of epipolar planes.
+    Q = np.ascontiguousarray(U.reshape(2, 3, 4))
+    values, vectors = np.linalg.eigh(Q[1].T @ Q[1])
+    if not (values[1] > _RANK and 1.0 - values[2] > _RANK):
+        raise ValueError("the polynomial method needs cameras of rank 3")
+    N = vectors[:, 1:3]
+    L, basis, B = _balanced(np.stack([Q[0] @ N / (1.0 - values[1:3]), Q[1] @ N / values[1:3]]))
+    planes = np.column_stack([N @ basis, vectors[:, 0] + vectors[:, 3]])
+    back = np.ascontiguousarray((Vt.T / s) / columns[:, None])
+    moved = np.ascontiguousarray((xy - centre[:, None]) * scale)
     q, X = np.empty((xy.shape[1], 2)), np.empty((xy.shape[1], 4))
-    L, B = p.lines, p.forms
     _correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], q)
-    _intersect_rays(p.P, L, p.planes, p.back, moved, q, X)
+    _intersect_rays(Q, L, planes, back, moved, q, X)
     return X

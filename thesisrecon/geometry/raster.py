@@ -1,7 +1,6 @@
 """Smoothing, resizing and cubic interpolation of float32 images in the project's pixel frame.
 
-Resizing by s maps x to (x + 0.5) s - 0.5, so that the corners of the image area stay fixed. The compiled
-loops have NumPy twins in the tests.
+Resizing by s maps x to (x + 0.5) s - 0.5, so that the corners of the image area stay fixed.
 """
 
 from __future__ import annotations
@@ -88,15 +87,16 @@ def _resample_image(image: F32, width: int, height: int) -> F32:
 
 
 def gaussian_taps(sigma_px: float) -> F32:
-    """Return samples of a Gaussian over three sigma to each side.
+    """Return samples of a Gaussian of sum 1 over three sigma to each side.
 
     Parameters
     ----------
-    sigma_px : float, standard deviation, px
+    sigma_px : float
+        Standard deviation, px.
 
     Returns
     -------
-    ndarray (2 r + 1,) of float32, weights of sum 1
+    ndarray (2 r + 1,) of float32
     """
     radius = max(1, int(np.ceil(3.0 * sigma_px)))
     x = np.arange(-radius, radius + 1)
@@ -110,12 +110,14 @@ def smooth(image: F32, sigma_px: float) -> F32:
 
     Parameters
     ----------
-    image : ndarray (H, W) of float32, image
-    sigma_px : float, standard deviation, px
+    image : ndarray (H, W) of float32
+        Image.
+    sigma_px : float
+        Standard deviation, px.
 
     Returns
     -------
-    ndarray (H, W) of float32, smoothed image
+    ndarray (H, W) of float32
     """
     return _convolve_separable(image, gaussian_taps(sigma_px))
 
@@ -125,21 +127,13 @@ def halve(image: F32) -> F32:
 
     Parameters
     ----------
-    image : ndarray (H, W) of float32, image
+    image : ndarray (H, W) of float32
+        Image of at least 2 x 2 pixels.
 
     Returns
     -------
-    ndarray (H // 2, W // 2) of float32, x is mapped to (x + 0.5) / 2 - 0.5
-
-    Raises
-    ------
-    ValueError
-        The image has fewer than 2 x 2 pixels.
-
-    Examples
-    --------
-    >>> halve(np.ones((4, 6), np.float32)).shape
-    (2, 3)
+    ndarray (H // 2, W // 2) of float32
+        x is mapped to (x + 0.5) / 2 - 0.5.
     """
     if min(image.shape) < 2:
         raise ValueError(f"halve needs at least 2 x 2 pixels; got shape {image.shape}")
@@ -151,17 +145,14 @@ def resample(image: F32, width: int, height: int) -> F32:
 
     Parameters
     ----------
-    image : ndarray (H, W) of float32, image
-    width, height : int, new size, px
+    image : ndarray (H, W) of float32
+        Image.
+    width, height : int
+        New size, px.
 
     Returns
     -------
-    ndarray (height, width) of float32, resized image
-
-    Raises
-    ------
-    ValueError
-        The new size is below 1 x 1.
+    ndarray (height, width) of float32
 
     Examples
     --------
@@ -179,13 +170,14 @@ def cubic_weights(fraction: float, weights: NDArray[Any]) -> None:
 
     Parameters
     ----------
-    fraction : float, position between the second and third pixel, in [0, 1]
-    weights : ndarray (>= 4,), output; the first four entries are overwritten
+    fraction : float
+        Position between the second and third pixel, in [0, 1].
+    weights : ndarray (>= 4,)
+        Output; the first four entries are overwritten.
 
     References
     ----------
-    Keys, "Cubic convolution interpolation for digital image processing", IEEE Transactions on Acoustics,
-    Speech, and Signal Processing 29, 1981.
+    Keys, "Cubic convolution interpolation for digital image processing", IEEE Trans. ASSP 29, 1981.
     """
     weights[0] = ((-0.5 * fraction + 1.0) * fraction - 0.5) * fraction
     weights[1] = (1.5 * fraction - 2.5) * fraction * fraction + 1.0
@@ -199,14 +191,16 @@ def weighted_median(values: F32, weights: F64, order: I64, half: float) -> float
 
     Parameters
     ----------
-    values : ndarray (N,) of float32, values
-    weights : ndarray (N,), weights
-    order : ndarray (M,) of int, indices of the values in ascending order, M >= 1
-    half : float, half of the sum of the weights for the lower weighted median
+    values, weights : ndarray (N,)
+        Values, float32, and their weights.
+    order : ndarray (M,) of int
+        Indices of the values in ascending order, M >= 1.
+    half : float
+        Half of the sum of the weights for the lower weighted median.
 
     Returns
     -------
-    float, one of the values
+    float
     """
     total = 0.0
     for k in order:

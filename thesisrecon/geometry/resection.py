@@ -1,8 +1,4 @@
-"""Section 6.4: camera resection, linear (DLT) and from three points (P3P).
-
-Linear (DLT) in any projective frame, and from three points for a calibrated camera (Grunert's quartic in the
-form of Haralick et al., IJCV 13(3), 1994).
-"""
+"""Section 6.4: camera resection, linear (DLT) and, for a calibrated camera, from three points (P3P)."""
 
 from __future__ import annotations
 
@@ -23,21 +19,17 @@ def _dlt_rows(X: F64, xy: F64) -> F64:
 def resect_linear(X: F64, xy: F64) -> F64:
     """Estimate cameras by the direct linear transform, least algebraic residual.
 
+    Coplanar points leave a family, of which some member is returned.
+
     Parameters
     ----------
-    X : ndarray (..., M, 4), M >= 6 homogeneous points, best as whitened unit vectors
-    xy : ndarray (..., M, 2), their pixels
+    X, xy : ndarray (..., M, 4) and (..., M, 2)
+        M >= 6 homogeneous points, best as whitened unit vectors, and their pixels.
 
     Returns
     -------
     ndarray (..., 3, 4)
-        P of unit norm. Coplanar points leave a family; some member is returned and the covariance of the
-        refined camera shows it.
-
-    Raises
-    ------
-    ValueError
-        There are fewer than 6 points, or a value is not finite.
+        P of unit norm.
 
     Examples
     --------
@@ -66,22 +58,20 @@ def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
 
     Parameters
     ----------
-    X : ndarray (B, 3, 3), samples of three points
-    rays : ndarray (B, 3, 3), unit directions in the camera frame
+    X, rays : ndarray (B, 3, 3)
+        Samples of three points and their unit directions in the camera frame.
 
     Returns
     -------
-    R : ndarray (C, 3, 3)
-        Rotations world-to-camera, up to four a sample; none for collinear points or equal rays.
-    t : ndarray (C, 3), translations
-    sample : ndarray (C,) of int, sample of each candidate
+    R, t : ndarray (C, 3, 3) and (C, 3)
+        Rotations world-to-camera and translations, up to four a sample; none for collinear points.
+    sample : ndarray (C,) of int
+        Sample of each candidate.
 
-    Examples
-    --------
-    >>> X = np.array([[[0.0, 0.0, 4.0], [1.0, 0.0, 5.0], [0.0, 1.0, 6.0]]])
-    >>> R, t, sample = pose_from_three_points(X, X / np.linalg.norm(X, axis=2, keepdims=True))
-    >>> bool(np.any(np.abs(t).max(axis=1) < 1e-6))
-    True
+    References
+    ----------
+    Haralick, Lee, Ottenberg and Nolle, "Review and analysis of solutions of the three point perspective pose
+    estimation problem", IJCV 13(3), 1994.
     """
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
     ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))

@@ -17,9 +17,11 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import checked_inverse, dehomogenize, require_finite
+from thesisrecon.geometry._checks import checked_inverse
+from thesisrecon.geometry.homogeneous import dehomogenize
 
 Group = Literal["projective", "affine", "metric", "euclidean"]
+Entity = Literal["points", "planes", "cameras", "conics", "dual conics"]
 
 DEGREES_OF_FREEDOM: dict[Group, int] = {"projective": 15, "affine": 12, "metric": 7, "euclidean": 6}
 """Ordered from the largest group, with the fewest invariants, to the smallest."""
@@ -28,127 +30,43 @@ PLANE_AT_INFINITY = np.array([0.0, 0.0, 0.0, 1.0])
 """Canonical position in the affine and all later strata (3.4.3)."""
 
 
-def transform_points(G: F64, X: F64) -> F64:
-    """Transform points: X -> G X.
+def transform(G: F64, entity: F64, kind: Entity) -> F64:
+    """Transform points, planes, cameras, conics or quadrics, or their duals (table 3.3).
+
+    X -> G X, Pi' -> Pi' G^-1, P -> P G^-1 (which keeps the images P X), C -> G^-T C G^-1, C* -> G C* G'.
 
     Parameters
     ----------
-    G : ndarray (4, 4) or (3, 3), transform of space, or homography
-    X : ndarray (..., 4) or (..., 3), homogeneous points of space, or of the image
+    G : ndarray (4, 4) or (3, 3)
+        Transform of space, or homography; singular ones are a ``ValueError`` where the inverse is needed.
+    entity : ndarray
+        (..., d) points, planes or image lines, (..., 3, 4) cameras, (..., d, d) conics or quadrics. Pluecker
+        matrices transform as duals if they are of points, as conics if they are of planes.
+    kind : {"points", "planes", "cameras", "conics", "dual conics"}
+        Kind of the entity.
 
     Returns
     -------
-    ndarray, transformed points, of the shape of ``X``
+    ndarray
+        Of the shape of ``entity``.
 
     Examples
     --------
-    >>> transform_points(np.diag([2.0, 2.0, 2.0, 1.0]), np.array([1.0, 2.0, 3.0, 1.0])).tolist()
+    >>> transform(np.diag([2.0, 2.0, 2.0, 1.0]), np.array([1.0, 2.0, 3.0, 1.0]), "points").tolist()
     [2.0, 4.0, 6.0, 1.0]
-    """
-    return np.asarray(X @ G.T)
-
-
-def transform_cameras(G: F64, P: F64) -> F64:
-    """Transform cameras: P -> P G^-1, which keeps the images P X.
-
-    Parameters
-    ----------
-    G : ndarray (4, 4), transform of space
-    P : ndarray (..., 3, 4), cameras
-
-    Returns
-    -------
-    ndarray (..., 3, 4), transformed cameras
-
-    Raises
-    ------
-    ValueError
-        G is singular or not finite.
-
-    Examples
-    --------
-    >>> transform_cameras(np.diag([2.0, 2.0, 2.0, 1.0]), np.eye(3, 4)).tolist()
+    >>> transform(np.diag([2.0, 2.0, 2.0, 1.0]), np.eye(3, 4), "cameras").tolist()
     [[0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]]
     """
-    return np.asarray(P @ checked_inverse(G, "transform_cameras"))
+    if kind == "points":
+        return np.asarray(entity @ G.T)
+    if kind == "dual conics":
+        return np.asarray(G @ entity @ G.T)
+    inverse = checked_inverse(G, "transform")
+    return np.asarray(inverse.T @ entity @ inverse if kind == "conics" else entity @ inverse)
 
 
-def transform_planes(G: F64, plane: F64) -> F64:
-    """Transform planes or image lines: Pi' -> Pi' G^-1.
-
-    Parameters
-    ----------
-    G : ndarray (4, 4) or (3, 3), transform of space, or homography
-    plane : ndarray (..., 4) or (..., 3), planes, or image lines
-
-    Returns
-    -------
-    ndarray, transformed planes or lines, of the shape of ``plane``
-
-    Raises
-    ------
-    ValueError
-        G is singular or not finite.
-    """
-    return np.asarray(plane @ checked_inverse(G, "transform_planes"))
-
-
-def transform_conics(G: F64, C: F64) -> F64:
-    """Transform conics or quadrics: C -> G^-T C G^-1.
-
-    Parameters
-    ----------
-    G : ndarray (3, 3) or (4, 4), homography, or transform of space
-    C : ndarray (..., 3, 3) or (..., 4, 4), conics, or quadrics; also Pluecker matrices L* of planes
-
-    Returns
-    -------
-    ndarray, transformed conics or quadrics, of the shape of ``C``
-
-    Raises
-    ------
-    ValueError
-        G is singular or not finite.
-    """
-    inverse = checked_inverse(G, "transform_conics")
-    return np.asarray(inverse.T @ C @ inverse)
-
-
-def transform_dual_conics(G: F64, C: F64) -> F64:
-    """Transform dual conics or quadrics: C* -> G C* G'.
-
-    Parameters
-    ----------
-    G : ndarray (3, 3) or (4, 4), homography, or transform of space
-    C : ndarray (..., 3, 3) or (..., 4, 4), dual conics, or dual quadrics; also Pluecker matrices L of points
-
-    Returns
-    -------
-    ndarray, transformed dual conics or quadrics, of the shape of ``C``
-    """
-    return np.asarray(G @ C @ G.T)
-
-
-def affine_transform(A: F64, t: F64) -> F64:
-    """Return the transform X -> A X + t of 12 degrees of freedom.
-
-    Parameters
-    ----------
-    A : ndarray (3, 3), invertible matrix; s R makes the transform metric (7), R Euclidean (6)
-    t : ndarray (3,), translation
-
-    Returns
-    -------
-    ndarray (4, 4), transform
-
-    Raises
-    ------
-    ValueError
-        A is singular or not finite.
-    """
-    require_finite("affine_transform", A, t)
-    if not np.linalg.cond(A) < 1e14:
-        raise ValueError("affine_transform needs an invertible matrix")
+def _affine_transform(A: F64, t: F64) -> F64:
+    """Return the transform X -> A X + t; s R makes it metric, R Euclidean."""
     G = np.eye(4)
     G[:3, :3], G[:3, 3] = A, t
     return G
@@ -161,19 +79,20 @@ def random_transform(group: Group, rng: np.random.Generator) -> F64:
     ----------
     group : {"projective", "affine", "metric", "euclidean"}
         Group of the transform.
-    rng : numpy.random.Generator, source of randomness
+    rng : numpy.random.Generator
+        Source of randomness.
 
     Returns
     -------
-    ndarray (4, 4), transform
+    ndarray (4, 4)
     """
     if group == "projective":
         return np.eye(4) + _shift_of_norm(rng, (4, 4), 0.5)
     t, scale = rng.normal(size=3), float(np.exp(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 1.0)))
     if group == "affine":
-        return affine_transform(scale * (np.eye(3) + _shift_of_norm(rng, (3, 3), 0.5)), t)
+        return _affine_transform(scale * (np.eye(3) + _shift_of_norm(rng, (3, 3), 0.5)), t)
     R = scipy.spatial.transform.Rotation.random(random_state=rng).as_matrix()
-    return affine_transform(scale * R if group == "metric" else R, t)
+    return _affine_transform(scale * R if group == "metric" else R, t)
 
 
 def _shift_of_norm(rng: np.random.Generator, shape: tuple[int, int], norm: float) -> F64:
@@ -183,7 +102,7 @@ def _shift_of_norm(rng: np.random.Generator, shape: tuple[int, int], norm: float
 
 
 def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
-    """Return the smallest group that a transform belongs to.
+    """Return the smallest group that a transform belongs to (figure 3.1).
 
     Affine: the plane at infinity is fixed, the last row is a multiple of (0, 0, 0, 1). Metric: the absolute
     conic is fixed too, A'A is a multiple of I and det A > 0 for W = 1 (a reflection is only affine here).
@@ -191,25 +110,19 @@ def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
 
     Parameters
     ----------
-    G : ndarray (4, 4), transform of any scale
-    tolerance : float, relative tolerance
+    G : ndarray (4, 4)
+        Transform of any scale, finite and invertible.
+    tolerance : float
+        Relative tolerance.
 
     Returns
     -------
     {"projective", "affine", "metric", "euclidean"}
-        Name of the group.
-
-    Raises
-    ------
-    ValueError
-        G is not finite, (4, 4) and invertible.
 
     Examples
     --------
-    >>> group_of(np.diag([2.0, 2.0, 2.0, 1.0]))
-    'metric'
-    >>> group_of(np.diag([1.0, 2.0, 2.0, 1.0]))
-    'affine'
+    >>> group_of(np.diag([2.0, 2.0, 2.0, 1.0])), group_of(np.diag([1.0, 2.0, 2.0, 1.0]))
+    ('metric', 'affine')
     """
     if G.shape != (4, 4) or not np.isfinite(G).all() or not np.linalg.cond(G) < 1e14:
         raise ValueError(f"group_of needs a finite invertible (4, 4) matrix; got shape {G.shape}")
@@ -232,21 +145,17 @@ def affine_from_projective(plane: F64) -> F64:
 
     Parameters
     ----------
-    plane : ndarray (4,), plane at infinity in the projective frame
+    plane : ndarray (4,)
+        Plane at infinity in the projective frame, not 0.
 
     Returns
     -------
-    ndarray (4, 4), transform to an affine frame
-
-    Raises
-    ------
-    ValueError
-        The plane is zero or not finite.
+    ndarray (4, 4)
 
     Examples
     --------
     >>> plane = np.array([0.5, 0.0, 0.0, 2.0])
-    >>> transform_planes(affine_from_projective(plane), plane).tolist()
+    >>> transform(affine_from_projective(plane), plane, "planes").tolist()
     [0.0, 0.0, 0.0, 2.0]
     """
     norm = float(np.linalg.norm(plane))
@@ -269,28 +178,19 @@ def metric_from_affine(absolute_conic: F64) -> F64:
 
     Parameters
     ----------
-    absolute_conic : ndarray (3, 3), definite conic on the plane at infinity, of any sign
+    absolute_conic : ndarray (3, 3)
+        Definite conic on the plane at infinity, of any sign.
 
     Returns
     -------
-    ndarray (4, 4), transform to a metric frame
-
-    Raises
-    ------
-    ValueError
-        The conic is not definite.
-
-    Examples
-    --------
-    >>> metric_from_affine(np.diag([4.0, 4.0, 4.0])).round(9).tolist() == np.eye(4).tolist()
-    True
+    ndarray (4, 4)
     """
     sign = 1.0 if np.trace(absolute_conic) > 0.0 else -1.0
     try:
         lower = np.linalg.cholesky(sign * (absolute_conic + absolute_conic.T) / 2.0)
     except np.linalg.LinAlgError as error:
         raise ValueError("metric_from_affine needs a definite absolute conic") from error
-    return affine_transform(lower.T / np.cbrt(np.linalg.det(lower)), np.zeros(3))
+    return _affine_transform(lower.T / np.cbrt(np.linalg.det(lower)), np.zeros(3))
 
 
 def metric_from_projective(dual_quadric: F64) -> F64:
@@ -301,23 +201,18 @@ def metric_from_projective(dual_quadric: F64) -> F64:
 
     Parameters
     ----------
-    dual_quadric : ndarray (4, 4), absolute dual quadric of a projective frame, of any sign
+    dual_quadric : ndarray (4, 4)
+        Absolute dual quadric of a projective frame, of any sign; s1, s2 and s3 have one sign.
 
     Returns
     -------
-    ndarray (4, 4), transform to a metric frame
-
-    Raises
-    ------
-    ValueError
-        The three largest eigenvalues do not have one sign.
+    ndarray (4, 4)
 
     Examples
     --------
     >>> Q = np.diag([4.0, 4.0, 4.0, 0.0])
-    >>> G = metric_from_projective(Q)
-    >>> transform_dual_conics(G, Q).round(9).tolist() == np.diag([1.0, 1.0, 1.0, 0.0]).tolist()
-    True
+    >>> transform(metric_from_projective(Q), Q, "dual conics").diagonal().round(9).tolist()
+    [1.0, 1.0, 1.0, 0.0]
     """
     s, V = np.linalg.eigh((dual_quadric + dual_quadric.T) / 2.0)
     order = np.argsort(-np.abs(s))
@@ -329,18 +224,18 @@ def metric_from_projective(dual_quadric: F64) -> F64:
     return np.asarray(np.linalg.inv(V * size))
 
 
-def cross_ratio(X: F64, *, tolerance: float = 1e-6) -> float:
+def cross_ratio(X: F64) -> float:
     """Return (l1 - l3)(l2 - l4) / ((l1 - l4)(l2 - l3)) of four collinear points X_i ~ X + l_i X' (3.4.2).
 
     Parameters
     ----------
     X : ndarray (4, d)
         Homogeneous points of any scale, d = 2, 3 or 4; a point may be the base point X' itself (l infinite).
-    tolerance : float, largest third singular value of the unit vectors
 
     Returns
     -------
-    float, cross-ratio, inf if X1 = X4 or X2 = X3
+    float
+        Inf if X1 = X4 or X2 = X3.
 
     Raises
     ------
@@ -356,7 +251,7 @@ def cross_ratio(X: F64, *, tolerance: float = 1e-6) -> float:
         raise ValueError(f"cross_ratio needs four finite points (4, d); got {X.shape}")
     unit = X / np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300)
     _, s, Vt = np.linalg.svd(unit)
-    if len(s) > 2 and s[2] > tolerance:
+    if len(s) > 2 and s[2] > 1e-6:
         raise ValueError(f"cross_ratio needs collinear points; they deviate by {s[2]:.2g}")
     a, b = Vt[:2] @ unit.T
     difference = np.outer(a, b) - np.outer(b, a)
@@ -367,135 +262,51 @@ def cross_ratio(X: F64, *, tolerance: float = 1e-6) -> float:
     return float(above / below) if below != 0.0 else np.inf
 
 
-def parallelism_sine(plane1: F64, plane2: F64) -> F64:
-    """Return the sine of the angle between the normals of two planes.
-
-    Zero is invariant to affine transforms, other values only to metric ones.
-
-    Parameters
-    ----------
-    plane1, plane2 : ndarray (..., 4), planes
-
-    Returns
-    -------
-    ndarray (...), sines, 0 for parallel planes
-    """
-    a, b = plane1[..., :3], plane2[..., :3]
-    size = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
-    return np.asarray(np.linalg.norm(np.cross(a, b), axis=-1) / np.maximum(size, 1e-300))
-
-
 def volume(X: F64) -> float:
-    """Return the signed volume of a tetrahedron.
+    """Return the signed volume of a tetrahedron; ratios of volumes are affine invariants (3.4.3).
 
     Parameters
     ----------
-    X : ndarray (4, 4), four finite homogeneous points
+    X : ndarray (4, 4)
+        Four finite homogeneous points.
 
     Returns
     -------
-    float, volume, cubic units of space
+    float
     """
     corners = dehomogenize(X)
     return float(np.linalg.det(corners[1:] - corners[0])) / 6.0
 
 
-def volume_ratio(X: F64, Y: F64) -> float:
-    """Return the ratio of the signed volumes of two tetrahedra, an affine invariant.
-
-    Parameters
-    ----------
-    X, Y : ndarray (4, 4), four finite homogeneous points each
-
-    Returns
-    -------
-    float, ratio, inf if Y is flat
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.float64(volume(X)) / np.float64(volume(Y)))
-
-
-def centroid(X: F64) -> F64:
-    """Return the centroid of points, which affine transforms move with the points.
-
-    Parameters
-    ----------
-    X : ndarray (N, 4), finite homogeneous points
-
-    Returns
-    -------
-    ndarray (4,), centroid with W = 1
-    """
-    return np.append(dehomogenize(X).mean(axis=0), 1.0)
-
-
-def segment_ratio(X: F64, Y: F64, Z: F64) -> float:
-    """Return l with Z = X + l (Y - X) of three collinear points, an affine invariant.
-
-    It is the cross-ratio of the points and the line's point at infinity.
-
-    Parameters
-    ----------
-    X, Y, Z : ndarray (4,), finite homogeneous points; a Z off the line is projected onto it
-
-    Returns
-    -------
-    float, position of Z
-
-    Examples
-    --------
-    >>> X, Y, Z = np.array([[0.0, 0, 0, 1], [1.0, 0, 0, 1], [3.0, 0, 0, 1]])
-    >>> segment_ratio(X, Y, Z)
-    3.0
-    """
-    x, y, z = (dehomogenize(point) for point in (X, Y, Z))
-    return float((z - x) @ (y - x) / ((y - x) @ (y - x)))
-
-
 def length(X: F64, Y: F64) -> F64:
-    """Return the distance of points, a Euclidean invariant.
+    """Return the distance of points, a Euclidean invariant (3.4.5).
+
+    Ratios of lengths are metric invariants (3.4.4), those along a line affine ones.
 
     Parameters
     ----------
-    X, Y : ndarray (..., 4), finite homogeneous points
+    X, Y : ndarray (..., 4)
+        Finite homogeneous points.
 
     Returns
     -------
-    ndarray (...), distances, units of space
+    ndarray (...)
     """
     return np.asarray(np.linalg.norm(dehomogenize(X) - dehomogenize(Y), axis=-1))
 
 
-def length_ratio(X: F64, Y: F64, Z: F64) -> F64:
-    """Return |XY| / |XZ|, a metric invariant.
-
-    Parameters
-    ----------
-    X, Y, Z : ndarray (..., 4), finite homogeneous points
-
-    Returns
-    -------
-    ndarray (...), ratios
-    """
-    return np.asarray(length(X, Y) / length(X, Z))
-
-
 def angle(apex: F64, X: F64, Y: F64) -> F64:
-    """Return the angle at ``apex`` between the directions to X and Y, a metric invariant.
+    """Return the angle at ``apex`` between the directions to X and Y, a metric invariant (3.4.4).
 
     Parameters
     ----------
-    apex, X, Y : ndarray (..., 4), finite homogeneous points
+    apex, X, Y : ndarray (..., 4)
+        Finite homogeneous points.
 
     Returns
     -------
-    ndarray (...), angles, rad
-
-    Examples
-    --------
-    >>> apex, X, Y = np.array([[0.0, 0, 0, 1], [2.0, 0, 0, 1], [0.0, 3, 0, 1]])
-    >>> float(np.degrees(angle(apex, X, Y)))
-    90.0
+    ndarray (...)
+        Angles, rad.
     """
     a, b = (dehomogenize(point) - dehomogenize(apex) for point in (X, Y))
     sine = np.linalg.norm(np.cross(a, b), axis=-1)

@@ -1,13 +1,8 @@
-"""Section 3.6.3: the trifocal tensor of three views, and its linear estimation.
+"""Section 3.6.3: the trifocal tensor of three views, and its linear equations.
 
 T (3, 3, 3) is indexed T[i, j, k] = T_i^jk: i is a coordinate of a point of view 1, j and k of lines of views
 2 and 3 (Hartley 1997; Hartley and Zisserman, chapter 15). A point x of view 1 and lines l2, l3 through its
 matches satisfy sum x^i l2_j l3_k T_i^jk = 0; every relation of points and lines follows from this one.
-
-Linear estimation brings every match into this form (HZ table 15.1): a triplet of points gives four equations,
-the two axis-parallel lines through x2 with those through x3; a triplet of lines gives two, for the two ends
-of its segment in view 1. The 27 entries found are not those of any cameras;
-:meth:`TensorEquations.solve_with_epipoles` restores the constraints (HZ algorithm 16.2).
 """
 
 from __future__ import annotations
@@ -17,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.geometry._checks import checked_inverse, checked_unit
 from thesisrecon.geometry.homogeneous import (
-    checked_inverse,
-    checked_unit,
     cross_matrix,
     dehomogenize,
     homogenize,
@@ -31,22 +25,23 @@ from thesisrecon.geometry.lines_and_planes import unit_normals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import unit_norm
 
-MAX_PX = 1e15
-"""Largest coordinate: beyond, fourth powers overflow and a double resolves no fraction of a pixel."""
 NEEDED_EQUATIONS = 26
 """Seven points, thirteen lines, or a mixture (HZ 16.1)."""
+_MAX_PX = 1e15
+"""Largest coordinate: beyond, fourth powers overflow and a double resolves no fraction of a pixel."""
 
 
 def unit_tensor(T: F64) -> F64:
-    """Scale a tensor to unit norm.
+    """Scale a tensor to unit norm; zeros stay zeros.
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor; zeros stay zeros
+    T : ndarray (3, 3, 3)
+        Tensor.
 
     Returns
     -------
-    ndarray (3, 3, 3), scaled tensor
+    ndarray (3, 3, 3)
     """
     norm = float(np.linalg.norm(T))
     return T / norm if norm > 0.0 else T
@@ -59,16 +54,13 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
 
     Parameters
     ----------
-    P1, P2, P3 : ndarray (3, 4), cameras of any frame and scale
+    P1, P2, P3 : ndarray (3, 4)
+        Cameras of any frame and scale.
 
     Returns
     -------
-    ndarray (3, 3, 3), T of unit norm; zero if all three centres coincide
-
-    Raises
-    ------
-    ValueError
-        A camera is zero or not finite.
+    ndarray (3, 3, 3)
+        T of unit norm; zero if all three centres coincide.
 
     Examples
     --------
@@ -88,66 +80,41 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
     return unit_tensor(T)
 
 
-def trifocal_incidence(T: F64, x1: F64, l2: F64, l3: F64) -> F64:
-    """Return sum x^i l2_j l3_k T_i^jk.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3), tensor
-    x1 : ndarray (..., 3), points of view 1
-    l2, l3 : ndarray (..., 3), lines of views 2 and 3
-
-    Returns
-    -------
-    ndarray (...), values, 0 for corresponding points and lines
-    """
-    return np.asarray(np.einsum("...i,...j,...k,ijk->...", x1, l2, l3, T))
-
-
 def point_residuals(T: F64, x1: F64, x2: F64, x3: F64) -> F64:
     """Return [x2]x (sum x^i T_i) [x3]x (HZ 15.7), nine equations of which four are independent.
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor
-    x1, x2, x3 : ndarray (..., 3), homogeneous points of the three views
+    T : ndarray (3, 3, 3)
+        Tensor.
+    x1, x2, x3 : ndarray (..., 3)
+        Homogeneous points of the three views.
 
     Returns
     -------
-    ndarray (..., 3, 3), residuals, 0 for the images of one point
+    ndarray (..., 3, 3)
+        0 for the images of one point.
     """
     middle = np.einsum("...i,ijk->...jk", x1, T)
     return np.asarray(cross_matrix(x2) @ middle @ cross_matrix(x3))
 
 
 def line_residuals(T: F64, l1: F64, l2: F64, l3: F64) -> F64:
-    """Return l1 x (l2'T_i l3), three equations of which two are independent.
+    """Return l1 x (l2_j l3_k T_i^jk), three equations of which two are independent.
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor
-    l1, l2, l3 : ndarray (..., 3), lines of the three views
+    T : ndarray (3, 3, 3)
+        Tensor.
+    l1, l2, l3 : ndarray (..., 3)
+        Lines of the three views.
 
     Returns
     -------
-    ndarray (..., 3), residuals, 0 for the images of one line of space
+    ndarray (..., 3)
+        0 for the images of one line of space.
     """
-    return np.cross(l1, transfer_lines_to_first(T, l2, l3))
-
-
-def transfer_lines_to_first(T: F64, l2: F64, l3: F64) -> F64:
-    """Transfer lines of views 2 and 3 to view 1: l_i = l2_j l3_k T_i^jk.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3), tensor
-    l2, l3 : ndarray (..., 3), lines of views 2 and 3
-
-    Returns
-    -------
-    ndarray (..., 3), lines; zero for lines of one epipolar plane of views 2 and 3
-    """
-    return np.asarray(np.einsum("...j,...k,ijk->...i", l2, l3, T))
+    return np.cross(l1, np.einsum("...j,...k,ijk->...i", l2, l3, T))
 
 
 def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
@@ -158,17 +125,15 @@ def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor
-    l1, l2 : ndarray (..., 3), lines of views 1 and 2
+    T : ndarray (3, 3, 3)
+        Tensor.
+    l1, l2 : ndarray (..., 3)
+        Lines of views 1 and 2.
 
     Returns
     -------
-    ndarray (..., 3), unit lines of view 3
-
-    Raises
-    ------
-    ValueError
-        An entry is not finite.
+    ndarray (..., 3)
+        Unit lines of view 3.
     """
     require_finite("transfer_lines", T, l1, l2)
     M = np.einsum("...j,ijk->...ik", l2, T)
@@ -176,37 +141,24 @@ def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
     return np.asarray(np.linalg.svd(cross_matrix(scaled) @ M)[2][..., 2, :])
 
 
-def point_transfer_homography(T: F64, l2: F64) -> F64:
-    """Return H = l2_j T_i^jk from view 1 to view 3 through the plane that view 2 sees as l2.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3), tensor
-    l2 : ndarray (..., 3), lines of view 2
-
-    Returns
-    -------
-    ndarray (..., 3, 3), homographies
-    """
-    return np.asarray(np.einsum("...j,ijk->...ki", l2, T))
-
-
 def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
     """Transfer matches of views 1 and 2 to view 3 (figure 3.14).
 
-    The matches are moved to the nearest pair that satisfies the epipolar constraint (6.3.3); then the line
-    through x2 perpendicular to its epipolar line transfers x1 (HZ 15.3), so that the result does not depend
-    on the choice of the line. Unlike the intersection of two epipolar lines this is valid for points of the
-    plane of the three centres.
+    The matches are moved to the nearest pair that satisfies the epipolar constraint (6.3.3); then the line l2
+    through x2 perpendicular to its epipolar line transfers x1 by the homography l2_j T_i^jk (HZ 15.3). Unlike
+    the intersection of two epipolar lines this is valid for points of the plane of the three centres.
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor
-    xy1, xy2 : ndarray (N, 2), matches of views 1 and 2, px
+    T : ndarray (3, 3, 3)
+        Tensor.
+    xy1, xy2 : ndarray (N, 2)
+        Matches of views 1 and 2, px.
 
     Returns
     -------
-    ndarray (N, 2), pixels of view 3; inf or NaN for points of the line through the centres of views 1 and 2
+    ndarray (N, 2)
+        Pixels of view 3; inf or NaN for points of the line through the centres of views 1 and 2.
 
     Examples
     --------
@@ -220,16 +172,18 @@ def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
     x1, x2 = homogenize(xy1), homogenize(xy2)
     epipolar = x1 @ F21.T
     across = np.cross(x2, np.column_stack([epipolar[:, :2], np.zeros(len(x2))]))
-    return dehomogenize(np.einsum("nki,ni->nk", point_transfer_homography(T, across), x1))
+    return dehomogenize(np.einsum("nki,ni->nk", np.einsum("nj,ijk->nki", across, T), x1))
 
 
 def transfer_by_epipolar_lines(F31: F64, F32: F64, xy1: F64, xy2: F64) -> F64:
-    """Transfer matches of views 1, 2 to the intersection of their epipolar lines in view 3 (3.6.3).
+    """Transfer matches of views 1 and 2 to the intersection of their epipolar lines in view 3 (3.6.3).
 
     Parameters
     ----------
-    F31, F32 : ndarray (3, 3), fundamental matrices from views 1 and 2 to view 3
-    xy1, xy2 : ndarray (N, 2), matches of views 1 and 2, px
+    F31, F32 : ndarray (3, 3)
+        Fundamental matrices from views 1 and 2 to view 3.
+    xy1, xy2 : ndarray (N, 2)
+        Matches of views 1 and 2, px.
 
     Returns
     -------
@@ -240,23 +194,19 @@ def transfer_by_epipolar_lines(F31: F64, F32: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def tensor_epipoles(T: F64) -> tuple[F64, F64]:
-    """Return the epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
+    """Return the unit epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
 
     e2 is orthogonal to the left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones; least
     squares for a noisy T.
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor
+    T : ndarray (3, 3, 3)
+        Tensor.
 
     Returns
     -------
-    e2, e3 : ndarray (3,), unit epipoles
-
-    Raises
-    ------
-    ValueError
-        An entry is not finite.
+    e2, e3 : ndarray (3,)
     """
     require_finite("tensor_epipoles", T)
     U, _, Vt = np.linalg.svd(T)
@@ -264,16 +214,17 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
 
 
 def fundamentals_from_tensor(T: F64) -> tuple[F64, F64]:
-    """Return F21 = [e2]x [T_1, T_2, T_3] e3 and F31 = [e3]x [T_1', T_2', T_3'] e2 (HZ 15.1).
+    """Return F21 = [e2]x [T_1, T_2, T_3] e3 and F31 = [e3]x [T_1', T_2', T_3'] e2 of unit norm (HZ 15.1).
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor
+    T : ndarray (3, 3, 3)
+        Tensor.
 
     Returns
     -------
     F21, F31 : ndarray (3, 3)
-        Unit norm, x2'F21 x1 = 0 and x3'F31 x1 = 0. F32 follows from the cameras.
+        x2'F21 x1 = 0 and x3'F31 x1 = 0.
 
     Examples
     --------
@@ -293,12 +244,13 @@ def cameras_from_tensor(T: F64) -> tuple[F64, F64, F64]:
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor of cameras
+    T : ndarray (3, 3, 3)
+        Tensor of cameras.
 
     Returns
     -------
     P1, P2, P3 : ndarray (3, 4)
-        Cameras of one projective frame with tensor T; the epipoles have unit norm, which P3 needs.
+        Cameras of one projective frame with tensor T.
     """
     e2, e3 = tensor_epipoles(T)
     A = np.einsum("ijk,k->ji", T, e3)
@@ -311,57 +263,32 @@ def transform_tensor(T: F64, H1: F64, H2: F64, H3: F64) -> F64:
 
     Parameters
     ----------
-    T : ndarray (3, 3, 3), tensor
-    H1, H2, H3 : ndarray (3, 3), transforms of the three images
+    T : ndarray (3, 3, 3)
+        Tensor.
+    H1, H2, H3 : ndarray (3, 3)
+        Transforms of the three images, H1 invertible.
 
     Returns
     -------
-    ndarray (3, 3, 3), tensor of unit norm
-
-    Raises
-    ------
-    ValueError
-        H1 is singular.
+    ndarray (3, 3, 3)
+        Of unit norm.
     """
     return unit_tensor(np.einsum("ri,js,kt,rst->ijk", checked_inverse(H1, "transform_tensor"), H2, H3, T))
-
-
-def reorder_tensor(T: F64, order: tuple[int, int, int]) -> F64:
-    """Return the tensor of the same views in another order.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3), tensor
-    order : tuple of int, permutation of 0, 1, 2; (2, 0, 1) puts view 3 first
-
-    Returns
-    -------
-    ndarray (3, 3, 3), tensor
-
-    Raises
-    ------
-    ValueError
-        The order is no permutation of 0, 1, 2.
-    """
-    if sorted(order) != [0, 1, 2]:
-        raise ValueError(f"reorder_tensor needs an order of 0, 1, 2; got {order}")
-    if order[0] == 0:
-        return T if order[1] == 1 else np.swapaxes(T, 1, 2)
-    P = cameras_from_tensor(T)
-    return tensor_from_cameras(P[order[0]], P[order[1]], P[order[2]])
 
 
 @dataclass(frozen=True)
 class TensorEquations:
     """Linear equations A t = 0 of the tensor entries t, in conditioned image coordinates.
 
-    Attributes
+    Parameters
     ----------
-    A : ndarray (27, 27), triangular factor of all equations, with the same |A t|
+    A : ndarray (27, 27)
+        Triangular factor of all equations, with the same |A t|.
     noise : ndarray (27, 27)
         Triangular factor of their derivatives by the pixels: |noise t|^2 is the mean of |A t|^2 for the true
         t and noise of 1 px.
-    transforms : ndarray (3, 3, 3), from pixels to conditioned coordinates
+    transforms : ndarray (3, 3, 3)
+        Transforms from pixels to conditioned coordinates.
     """
 
     A: F64
@@ -369,11 +296,12 @@ class TensorEquations:
     transforms: F64
 
     def solve(self) -> F64:
-        """Return the tensor of least |A t|.
+        """Return the tensor of least |A t| over all tensors (HZ algorithm 16.1), not one of cameras.
 
         Returns
         -------
-        ndarray (3, 3, 3), T of unit norm, in conditioned coordinates
+        ndarray (3, 3, 3)
+            T of unit norm, in conditioned coordinates.
 
         Raises
         ------
@@ -388,7 +316,7 @@ class TensorEquations:
         return np.asarray(Vt[26].reshape(3, 3, 3))
 
     def noise_levels_px(self) -> F64:
-        """Return the noise that would explain each of 27 solutions of the equations, the best first.
+        """Return the noise that would explain each of 27 solutions of the equations, px, the best first.
 
         Roots of the eigenvalues of A'A relative to those of unit noise. If the matches leave a family of
         tensors (a plane, a rotation, parallel lines), as many values as the family has dimensions are at or
@@ -396,7 +324,7 @@ class TensorEquations:
 
         Returns
         -------
-        ndarray (27,), standard deviations, px
+        ndarray (27,)
 
         References
         ----------
@@ -414,11 +342,13 @@ class TensorEquations:
 
         Parameters
         ----------
-        e2, e3 : ndarray (3,), epipoles in views 2 and 3
+        e2, e3 : ndarray (3,)
+            Epipoles in views 2 and 3.
 
         Returns
         -------
-        ndarray (3, 3, 3), T of unit norm, in conditioned coordinates
+        ndarray (3, 3, 3)
+            T of unit norm, in conditioned coordinates.
         """
         eye = np.eye(3)
         left = np.einsum("ri,sj,k->ijkrs", eye, eye, e3).reshape(27, 9)
@@ -432,27 +362,34 @@ class TensorEquations:
 
         Parameters
         ----------
-        T : ndarray (3, 3, 3), tensor in conditioned coordinates
+        T : ndarray (3, 3, 3)
+            Tensor in conditioned coordinates.
 
         Returns
         -------
-        ndarray (3, 3, 3), tensor of unit norm in pixels
+        ndarray (3, 3, 3)
+            Of unit norm.
         """
         H1, H2, H3 = np.linalg.inv(self.transforms)
         return transform_tensor(T, H1, H2, H3)
 
 
 def tensor_equations(points: F64, segments: F64) -> TensorEquations:
-    """Set up the linear equations of point and line matches in three views.
+    """Set up the linear equations of point and line matches in three views (HZ table 15.1).
+
+    A triplet of points gives four equations, the two axis-parallel lines through x2 with those through x3; a
+    triplet of lines gives two, for the two ends of its segment in view 1.
 
     Parameters
     ----------
-    points : ndarray (3, N, 2), point matches, px
-    segments : ndarray (3, M, 2, 2), ends of line matches, px; the ends of different views need not correspond
+    points : ndarray (3, N, 2)
+        Point matches, px.
+    segments : ndarray (3, M, 2, 2)
+        Ends of line matches, px; the ends of different views need not correspond. 4 N + 2 M >= 26.
 
     Returns
     -------
-    TensorEquations, 4 N + 2 M equations
+    TensorEquations
 
     Raises
     ------
@@ -517,12 +454,14 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
 
     Parameters
     ----------
-    points : ndarray (3, N, 2), point matches, px
-    segments : ndarray (3, M, 2, 2), ends of line matches, px
+    points : ndarray (3, N, 2)
+        Point matches, px.
+    segments : ndarray (3, M, 2, 2)
+        Ends of line matches, px.
 
     Returns
     -------
-    points, segments : ndarray, checked arrays
+    points, segments : ndarray
 
     Raises
     ------
@@ -534,8 +473,8 @@ def check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
     points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
     require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
     require_finite("a trifocal tensor", points, segments)
-    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
-        raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
+    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > _MAX_PX:
+        raise ValueError(f"points and segments must be pixels of an image; some are beyond {_MAX_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
     return points, segments
@@ -547,26 +486,3 @@ def _axis_parallel_lines(x: F64) -> F64:
     lines[:, 0, 0] = lines[:, 1, 1] = 1.0
     lines[:, :, 2] = -x[:, :2]
     return lines
-
-
-def estimate_tensor_linear(points: F64, segments: F64) -> F64:
-    """Estimate T with the least algebraic error over all tensors (HZ algorithm 16.1).
-
-    Exact for exact data; with noise a start for the refinement, not a tensor of cameras.
-
-    Parameters
-    ----------
-    points : ndarray (3, N, 2), point matches, px; N may be 0
-    segments : ndarray (3, M, 2, 2), ends of line matches, px; M may be 0, 4 N + 2 M >= 26
-
-    Returns
-    -------
-    ndarray (3, 3, 3), T of unit norm, in pixels
-
-    Raises
-    ------
-    ValueError
-        There are too few matches, or they do not determine T.
-    """
-    equations = tensor_equations(points, segments)
-    return unit_tensor(equations.in_pixels(equations.solve()))

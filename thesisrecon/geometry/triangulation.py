@@ -10,9 +10,8 @@ method         views criterion                          use
 ``optimal``    any   reprojection error, local minimum  best for more views, in any frame
 ============== ===== ================================== ==================================================
 
-The compiled loops take observations sorted by point; ``start`` (N + 1,) is the first observation of each
-point. Points with fewer than two observations are zeros, all others have unit norm (mid-points X4 = 1). See
-docs/triangulation.md for a comparison.
+Near an epipole ``optimal`` may end in a higher minimum than ``polynomial``. Points with fewer than two
+observations are zeros, all others have unit norm (mid-points X4 = 1). See docs/triangulation.md.
 
 References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 """
@@ -20,7 +19,7 @@ References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
@@ -30,7 +29,7 @@ from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
-PASSES = 10
+_PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
 _AT_REST = 1e-6
 """Relative change of all depths at which the iterated linear method has converged."""
@@ -106,18 +105,12 @@ def _least_singular_vector(R: F64, x: F64) -> None:
         if change < 1e-13:
             x[0], x[1], x[2], x[3] = x0, x1, x2, x3
             return
-    jacobi_least(R, x)
+    _jacobi_least(R, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def jacobi_least(R: F64, x: F64) -> None:
-    """Fill in the unit vector of least |R x| by one-sided Jacobi rotations (Hestenes): slow and safe.
-
-    Parameters
-    ----------
-    R : ndarray (4, 4), upper triangular matrix
-    x : ndarray (4,), output
-    """
+def _jacobi_least(R: F64, x: F64) -> None:
+    """Fill x (4,) with the unit vector of least |R x| by one-sided Jacobi rotations (Hestenes)."""
     A, V = R.copy(), np.eye(4)
     for i in range(1, 4):
         A[i, :i] = 0.0
@@ -183,9 +176,9 @@ def _triangulate_each_linear(
 ) -> None:
     """Fill X (N, 4) by the linear method, the rows of a view times its ``scale`` (V,).
 
-    ``passes`` > 0: repeat with each row over the depth p3'X of the last pass until no depth changes by more
-    than ``tolerance``, relative. Without convergence the better reprojection of the last and the linear
-    answer is kept.
+    ``start`` (N + 1,) is the first observation of each point. ``passes`` > 0: repeat with each row over the
+    depth p3'X of the last pass until no depth changes by more than ``tolerance``, relative. Without
+    convergence the better reprojection of the last and the linear answer is kept.
     """
     R, row, x, y = np.zeros((4, 4)), np.empty(4), np.empty(4), np.empty(4)
     weight = np.empty(len(xy))
@@ -270,164 +263,15 @@ _SortedPixels = tuple[I64, I64, F64]
 """Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
 
 
-def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
-    """Triangulate a list of observations by the linear method.
-
-    The criterion is that of :func:`triangulate_linear`.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4), cameras
-    view, point : ndarray (K,) of int
-        View and point of each observation, in any order; sorted by point is fastest.
-    xy : ndarray (K, 2), pixels
-    n_points : int, number of points
-
-    Returns
-    -------
-    ndarray (n_points, 4), points of unit norm; zeros for fewer than two observations
-
-    Examples
-    --------
-    >>> P = np.stack([np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])])
-    >>> xy = np.array([[0.0, 0.0], [-0.5, 0.0]])
-    >>> X = triangulate_observations(P, np.array([0, 1]), np.array([0, 0]), xy, 1)
-    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
-    True
-    """
-    if not (point[1:] >= point[:-1]).all():
-        order = np.argsort(point, kind="stable")
-        view, point, xy = view[order], point[order], xy[order]
-    start = np.searchsorted(point, np.arange(n_points + 1)).astype(np.int64)
-    listed = (start, np.ascontiguousarray(view, dtype=np.int64), np.ascontiguousarray(xy, dtype=np.float64))
-    return _linear(P, listed, 0)
-
-
-def triangulate_linear(P: F64, xy: F64) -> F64:
-    """Triangulate by the linear method (6.3.1).
-
-    Least sum of squares of u p3'X - p1'X and v p3'X - p2'X over unit X. Of Hartley's normalisation the shift
-    has no effect on these rows; its scale is the weight of a view: the rows are divided by the norm of M's
-    first two, with the pixel origin in the middle of the view's points. In a metric frame that is the focal
-    length, so that rows are depths times angles. The result depends on the projective frame.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4), cameras
-    xy : ndarray (V, N, 2), pixels; NaN for not observed
-
-    Returns
-    -------
-    ndarray (N, 4), points of unit norm; zeros if observed in fewer than two views
-
-    Raises
-    ------
-    ValueError
-        As :func:`triangulate`.
-    """
-    P, xy = _checked(P, xy)
-    return _linear(P, _listed(xy), 0)
-
-
-def triangulate_iterated(P: F64, xy: F64) -> F64:
-    """Triangulate by the iterated linear method (Iterative-LS of Hartley and Sturm).
-
-    The rows are divided by the depth p3'X of the last pass, which makes them reprojection residuals at
-    convergence, and solved again, at most ten times; without convergence the better of the last and the
-    linear answer is kept. The limit is near the least reprojection error, not at it, because depths count as
-    constants.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4), cameras
-    xy : ndarray (V, N, 2), pixels; NaN for not observed
-
-    Returns
-    -------
-    ndarray (N, 4), points of unit norm; zeros if observed in fewer than two views
-
-    Raises
-    ------
-    ValueError
-        As :func:`triangulate`.
-    """
-    P, xy = _checked(P, xy)
-    return _linear(P, _listed(xy), PASSES)
-
-
-def triangulate_midpoint(P: F64, xy: F64) -> F64:
-    """Triangulate by the point nearest to all rays (6.3.2).
-
-    Least sum of squared distances in space: meaningful in a metric frame only.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4), cameras
-    xy : ndarray (V, N, 2), pixels; NaN for not observed
-
-    Returns
-    -------
-    ndarray (N, 4), points with X4 = 1; zeros for parallel rays and for fewer than two views
-
-    Raises
-    ------
-    ValueError
-        As :func:`triangulate`, and if the centre of a camera is at infinity.
-    """
-    P, xy = _checked(P, xy)
-    M = P[:, :, :3]
-    if not (np.abs(np.linalg.det(M)) > 1e-14 * np.linalg.norm(M, axis=(1, 2)) ** 3).all():
-        raise ValueError("the mid-point method needs finite cameras; the left 3x3 part of one is singular")
-    inverses = np.linalg.inv(M)
-    centres = np.ascontiguousarray(-np.einsum("vab,vb->va", inverses, P[:, :, 3]))
-    X = np.empty((xy.shape[1], 4))
-    _triangulate_each_midpoint(np.ascontiguousarray(inverses), centres, *_listed(xy), _PARALLEL, X)
-    return X
-
-
-def triangulate_optimal(P: F64, xy: F64) -> F64:
-    """Triangulate by least reprojection error from any number of views.
-
-    Levenberg-Marquardt from the linear result to the minimum of the sum of squared distances: the same point
-    in every projective frame. The minimum is a local one; near an epipole :func:`triangulate_polynomial` may
-    find a lower one for two views. There is no robust loss: wrong observations count in full.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4), cameras
-    xy : ndarray (V, N, 2), pixels; NaN for not observed
-
-    Returns
-    -------
-    ndarray (N, 4), points of unit norm; zeros if observed in fewer than two views
-
-    Raises
-    ------
-    ValueError
-        As :func:`triangulate`.
-
-    Examples
-    --------
-    >>> P = np.stack([np.hstack([np.eye(3), [[-x], [0.0], [0.0]]]) for x in (0.0, 1.0, 2.0)])
-    >>> X = triangulate_optimal(P, np.array([[[0.0, 0.0]], [[-0.5, 0.0]], [[-1.0, 0.0]]]))
-    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
-    True
-    """
-    P, xy = _checked(P, xy)
-    start, view, pixels = listed = _listed(xy)
-    point = np.repeat(np.arange(xy.shape[1]), np.diff(start))
-    X = minimize_reprojection(P, _linear(P, listed, 0), view, point, pixels)
-    sizes = np.linalg.norm(X, axis=1, keepdims=True)
-    return np.asarray(X / np.where(sizes > 0.0, sizes, 1.0))
-
-
 def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
     """Triangulate space points by one of the methods of section 6.3.
 
     Parameters
     ----------
-    P : ndarray (V, 3, 4), cameras of any scale, V >= 2
-    xy : ndarray (V, N, 2), pixels; NaN for not observed
+    P : ndarray (V, 3, 4)
+        Cameras of any scale, V >= 2.
+    xy : ndarray (V, N, 2)
+        Pixels; NaN for not observed.
     method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}
         "polynomial": optimal for exactly two views; "linear" and "iterated": algebraic; "midpoint": metric
         frames only; "optimal": least reprojection error from any number of views.
@@ -451,16 +295,44 @@ def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
     >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
     True
     """
-    methods = {
-        "polynomial": triangulate_polynomial,
-        "linear": triangulate_linear,
-        "midpoint": triangulate_midpoint,
-        "iterated": triangulate_iterated,
-        "optimal": triangulate_optimal,
-    }
-    if method not in methods:
-        raise ValueError(f"method must be one of {', '.join(methods)}; got {method!r}")
-    return methods[method](*_checked(P, xy))
+    if method not in get_args(Method):
+        raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}")
+    P, xy = _checked(P, xy)
+    if method == "polynomial":
+        return triangulate_polynomial(P, xy)
+    listed = _listed(xy)
+    if method == "midpoint":
+        return _midpoint(P, listed)
+    if method == "optimal":
+        return _optimal(P, listed)
+    return _linear(P, listed, _PASSES if method == "iterated" else 0)
+
+
+def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
+    """Triangulate a list of observations by the linear method of :func:`triangulate`.
+
+    Parameters
+    ----------
+    P : ndarray (V, 3, 4)
+        Cameras.
+    view, point : ndarray (K,) of int
+        View and point of each observation, in any order; sorted by point is fastest.
+    xy : ndarray (K, 2)
+        Pixels.
+    n_points : int
+        Number of points.
+
+    Returns
+    -------
+    ndarray (n_points, 4)
+        Points of unit norm; zeros for fewer than two observations.
+    """
+    if not (point[1:] >= point[:-1]).all():
+        order = np.argsort(point, kind="stable")
+        view, point, xy = view[order], point[order], xy[order]
+    start = np.searchsorted(point, np.arange(n_points + 1)).astype(np.int64)
+    listed = (start, np.ascontiguousarray(view, dtype=np.int64), np.ascontiguousarray(xy, dtype=np.float64))
+    return _linear(P, listed, 0)
 
 
 def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: int) -> F64:
@@ -468,21 +340,13 @@ def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: 
 
     Parameters
     ----------
-    centres : ndarray (V, 3), camera centres
-    view, point : ndarray (K,) of int, view and point of each observation
-    X : ndarray (n_points, 3), points
-    n_points : int, number of points
+    centres, view, point, X, n_points : ndarray (V, 3), (K,), (K,) and (n_points, 3), int
+        Camera centres, view and point of each observation, and points.
 
     Returns
     -------
-    ndarray (n_points,), angles, rad; 0 without observations
-
-    Examples
-    --------
-    >>> centres, X = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]])
-    >>> angles = triangulation_angles(centres, np.array([0, 1]), np.array([0, 0]), X, 1)
-    >>> np.degrees(angles).round(6).tolist()
-    [45.0]
+    ndarray (n_points,)
+        Angles, rad; 0 without observations.
     """
     rays = X[point] - centres[view]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
@@ -519,7 +383,13 @@ def _listed(xy: F64) -> _SortedPixels:
 
 
 def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
-    """Solve by the linear method, iterated if ``passes`` > 0."""
+    """Linear method (6.3.1): least sum of squares of u p3'X - p1'X and v p3'X - p2'X over unit X.
+
+    Of Hartley's normalisation the shift has no effect on these rows; its scale is the weight of a view: the
+    rows are divided by the norm of M's first two, with the pixel origin in the middle of the view's points,
+    in a metric frame the focal length. The result depends on the projective frame. ``passes`` > 0:
+    Iterative-LS, whose limit is near the least reprojection error.
+    """
     start, view, xy = listed
     P = np.ascontiguousarray(P, dtype=np.float64)
     counts = np.maximum(np.bincount(view, minlength=len(P)), 1)
@@ -529,3 +399,24 @@ def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
     X = np.empty((len(start) - 1, 4))
     _triangulate_each_linear(P, 1.0 / np.where(size > 0.0, size, 1.0), start, view, xy, passes, _AT_REST, X)
     return X
+
+
+def _midpoint(P: F64, listed: _SortedPixels) -> F64:
+    """Point nearest to all rays (6.3.2), meaningful in a metric frame only; zeros for parallel rays."""
+    M = P[:, :, :3]
+    if not (np.abs(np.linalg.det(M)) > 1e-14 * np.linalg.norm(M, axis=(1, 2)) ** 3).all():
+        raise ValueError("the mid-point method needs finite cameras; the left 3x3 part of one is singular")
+    inverses = np.linalg.inv(M)
+    centres = np.ascontiguousarray(-np.einsum("vab,vb->va", inverses, P[:, :, 3]))
+    X = np.empty((len(listed[0]) - 1, 4))
+    _triangulate_each_midpoint(np.ascontiguousarray(inverses), centres, *listed, _PARALLEL, X)
+    return X
+
+
+def _optimal(P: F64, listed: _SortedPixels) -> F64:
+    """Local minimum of the reprojection error by Levenberg-Marquardt from the linear result."""
+    start, view, pixels = listed
+    point = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    X = minimize_reprojection(P, _linear(P, listed, 0), view, point, pixels)
+    sizes = np.linalg.norm(X, axis=1, keepdims=True)
+    return np.asarray(X / np.where(sizes > 0.0, sizes, 1.0))

@@ -9,9 +9,9 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._checks import checked_unit
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import (
-    checked_unit,
     cross_matrix,
     dehomogenize,
     homogenize,
@@ -20,20 +20,21 @@ from thesisrecon.geometry.homogeneous import (
     require_shapes,
 )
 
-PARALLAX_PER_NOISE, MIN_PARALLAX_PX = 3.0, 0.05
+_PARALLAX_PER_NOISE, _MIN_PARALLAX_PX = 3.0, 0.05
 """Least displacement that no homography explains (90 % quantile), over the epipolar distances and in px."""
 
 
 def unit_norm(F: F64) -> F64:
-    """Scale matrices to unit Frobenius norm.
+    """Scale matrices to unit Frobenius norm; zeros stay zeros.
 
     Parameters
     ----------
-    F : ndarray (..., 3, 3), matrices; zeros stay zeros
+    F : ndarray (..., 3, 3)
+        Matrices.
 
     Returns
     -------
-    ndarray (..., 3, 3), scaled matrices
+    ndarray (..., 3, 3)
     """
     norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))
     return F / np.where(norm > 0.0, norm, 1.0)
@@ -49,16 +50,12 @@ def enforce_rank_two(F: F64) -> F64:
 
     Parameters
     ----------
-    F : ndarray (3, 3), matrix
+    F : ndarray (3, 3)
+        Matrix.
 
     Returns
     -------
-    ndarray (3, 3), matrix of rank 2
-
-    Raises
-    ------
-    ValueError
-        Wrong shape, or an entry that is not finite.
+    ndarray (3, 3)
 
     Examples
     --------
@@ -71,23 +68,23 @@ def enforce_rank_two(F: F64) -> F64:
 
 
 def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
-    """Return F = [e2]x P2 P1^+ of two cameras, e2 = P2 C1 (3.33).
+    """Return F = [e2]x P2 P1^+ of two cameras, of unit norm, e2 = P2 C1 (3.33).
 
     The line of x joins e2 and the image of P1^+ x, another point of its ray; F has rank 2 (3.35).
 
     Parameters
     ----------
-    P1, P2 : ndarray (3, 4), cameras with different centres
+    P1, P2 : ndarray (3, 4)
+        Cameras of rank 3.
 
     Returns
     -------
-    ndarray (3, 3), F of unit norm
+    ndarray (3, 3)
 
     Raises
     ------
     ValueError
-        The centres coincide (the views are related by a homography), or a camera is zero, not finite or of a
-        rank below 3.
+        The centres coincide (the views are related by a homography), or a camera is unsuitable.
 
     Examples
     --------
@@ -107,19 +104,13 @@ def epipoles(F: F64) -> tuple[F64, F64]:
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
+    F : ndarray (3, 3)
+        Fundamental matrix.
 
     Returns
     -------
-    e1 : ndarray (3,)
-        Unit epipole in image 1, the image of the second centre: the thesis' e_ji (section 5.3 exchanges the
-        two).
-    e2 : ndarray (3,), unit epipole in image 2, the thesis' e_ij
-
-    Raises
-    ------
-    ValueError
-        Wrong shape, or an entry that is not finite.
+    e1, e2 : ndarray (3,)
+        Unit epipoles in images 1 and 2, the thesis' e_ji and e_ij (section 5.3 exchanges the two).
 
     Examples
     --------
@@ -137,12 +128,15 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix; F' for the lines in image 1 of points of image 2
-    xy1 : ndarray (N, 2), pixels
+    F : ndarray (3, 3)
+        Fundamental matrix; F' for the lines in image 1 of points of image 2.
+    xy1 : ndarray (N, 2)
+        Pixels.
 
     Returns
     -------
-    ndarray (N, 3), lines; zero for an epipole
+    ndarray (N, 3)
+        Zero for an epipole.
 
     Examples
     --------
@@ -156,16 +150,17 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 
 
 def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Return the distances of x1 to the line F' x2 and of x2 to F x1 (5.5).
+    """Return the distances of x1 to the line F' x2 and of x2 to F x1 (5.5); both are multiples of x2' F x1.
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
-    xy1, xy2 : ndarray (N, 2), matches, px
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches, px.
 
     Returns
     -------
-    ndarray (N, 2), distances in images 1 and 2, px; both are multiples of x2' F x1
+    ndarray (N, 2)
+        Distances in images 1 and 2, px.
 
     Examples
     --------
@@ -183,12 +178,12 @@ def algebraic_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
-    xy1, xy2 : ndarray (N, 2), matches, px
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches, px.
 
     Returns
     -------
-    ndarray (N,), residuals
+    ndarray (N,)
     """
     residuals: F64 = np.einsum("na,ab,nb->n", homogenize(xy2), F, homogenize(xy1))
     return residuals
@@ -208,12 +203,12 @@ def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
-    xy1, xy2 : ndarray (N, 2), matches, px
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches, px.
 
     Returns
     -------
-    ndarray (N,), distances, px
+    ndarray (N,)
 
     Examples
     --------
@@ -230,32 +225,28 @@ def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
-    xy1, xy2 : ndarray (N, 2), matches, px
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches, px.
 
     Returns
     -------
-    ndarray (N,), distances >= 0, px
+    ndarray (N,)
     """
     g2, g1 = _gradients(F, xy1, xy2)
     return np.abs(algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
 
 
 def estimate_homography(xy1: F64, xy2: F64) -> F64:
-    """Estimate the homography x2 ~ H x1 by normalised DLT (HZ algorithm 4.2).
+    """Estimate the homography x2 ~ H x1 of unit norm by normalised DLT (HZ algorithm 4.2).
 
     Parameters
     ----------
-    xy1, xy2 : ndarray (N, 2), N >= 4 matches, px
+    xy1, xy2 : ndarray (N, 2)
+        N >= 4 matches, px, not all equal.
 
     Returns
     -------
-    ndarray (3, 3), H of unit norm
-
-    Raises
-    ------
-    ValueError
-        There are fewer than 4 matches, a shape is wrong, or all points are equal.
+    ndarray (3, 3)
 
     Examples
     --------
@@ -280,12 +271,13 @@ def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
 
     Parameters
     ----------
-    H : ndarray (3, 3), homography
-    xy1, xy2 : ndarray (N, 2), matches, px
+    H, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Homography and matches, px.
 
     Returns
     -------
-    ndarray (N,), distances, px; inf for points that H maps to infinity
+    ndarray (N,)
+        Inf for points that H maps to infinity.
     """
     moved = dehomogenize(homogenize(xy1) @ H.T)
     with np.errstate(invalid="ignore"):
@@ -294,19 +286,19 @@ def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def homography_sampson_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
-    """Return whitened residuals of x2 ~ H x1 (Sampson distance).
+    """Return whitened residuals of x2 ~ H x1 (Sampson distance), px.
 
     To first order the two parts of the distance to the nearest exact match, each with the standard deviation
     of one image coordinate.
 
     Parameters
     ----------
-    H : ndarray (3, 3), homography
-    xy1, xy2 : ndarray (N, 2), matches, px
+    H, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Homography and matches, px.
 
     Returns
     -------
-    ndarray (N, 2), residuals, px
+    ndarray (N, 2)
 
     References
     ----------
@@ -338,11 +330,13 @@ def quasi_euclidean_planes(F: F64) -> F64:
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
+    F : ndarray (3, 3)
+        Fundamental matrix.
 
     Returns
     -------
-    ndarray (2, 3), v, that of the smaller rotation first
+    ndarray (2, 3)
+        v, that of the smaller rotation first.
 
     References
     ----------
@@ -365,20 +359,16 @@ def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
+    F : ndarray (3, 3)
+        Fundamental matrix.
     plane : ndarray (3,), optional
-        v, the coordinates of the plane taken as infinity; by default the first of
-        :func:`quasi_euclidean_planes`.
-    scale : float, last of the four free parameters, not 0
+        v, the plane taken as infinity; by default the first of :func:`quasi_euclidean_planes`.
+    scale : float
+        Last of the four free parameters, not 0.
 
     Returns
     -------
-    P1, P2 : ndarray (3, 4), cameras of a projective frame
-
-    Raises
-    ------
-    ValueError
-        The scale is 0 or not finite.
+    P1, P2 : ndarray (3, 4)
 
     Examples
     --------
@@ -405,16 +395,12 @@ def require_parallax_of_matches(
 
     Parameters
     ----------
-    F : ndarray (3, 3), fundamental matrix
-    xy1, xy2 : ndarray (N, 2), N >= 4 inliers of F, px
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and N >= 4 of its inliers, px.
     at_infinity : ndarray (3, 3), optional
         Homography of the plane at infinity of known cameras; a plane of the scene then has parallax.
-    advice : str, text appended to the advice of the failure
-
-    Raises
-    ------
-    StageFailure
-        The images show no parallax.
+    advice : str
+        Text appended to the advice of the failure.
     """
     noise = float(np.quantile(np.abs(sampson_residuals(F, xy1, xy2)), 0.9))
     if at_infinity is None:
@@ -422,7 +408,7 @@ def require_parallax_of_matches(
     else:
         residuals = homography_residuals(at_infinity, xy1, xy2)
     parallax = float(np.quantile(residuals, 0.9))
-    if parallax > PARALLAX_PER_NOISE * noise + MIN_PARALLAX_PX:
+    if parallax > _PARALLAX_PER_NOISE * noise + _MIN_PARALLAX_PX:
         return
     what = "one homography" if at_infinity is None else "a scene at infinity"
     raise StageFailure(

@@ -1,7 +1,4 @@
-"""Z-buffer: the mesh face that each pixel of a camera sees, exact in perspective.
-
-The compiled loops have plain twins in the tests.
-"""
+"""Z-buffer: the mesh face that each pixel of a camera sees, exact in perspective."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from thesisrecon.camera import Camera
 
 SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
-NEAR = 1e-6
+_NEAR = 1e-6
 """Nearest depth that is drawn, relative to the depth of the farthest vertex."""
 
 
@@ -66,27 +63,14 @@ def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int
 
 
 @njit(cache=True, nogil=True)
-def rasterize_rows(
+def _rasterize_rows(
     corners: F64, near: float, rows: tuple[int, int], depth: F32, face: I64, weights: F32
 ) -> None:
-    """Draw triangles into a strip of rows of a z-buffer.
+    """Draw triangles ``corners`` (M, 3, 3) into some rows of a z-buffer; the first of equal depths stays.
 
     With the image points of a face as the columns of M, the barycentric coordinates of the point seen at (x,
     y), each over its depth, are M^-1 (x, y, 1): linear in the pixel, exact in perspective, without clipping
-    at the near plane. Of equal depths the first face stays.
-
-    Parameters
-    ----------
-    corners : ndarray (M, 3, 3), three image points K (R X + t) of each face; the last entry is the depth
-    near : float, nearest depth
-    rows : tuple of int, first and last + 1 row
-    depth : ndarray (H, W) of float32, depth, updated; inf if empty
-    face : ndarray (H, W) of int, face numbers, updated
-    weights : ndarray (H, W, 2) of float32, barycentric coordinates of corners 1 and 2, updated
-
-    References
-    ----------
-    Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997.
+    at the near plane (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997).
     """
     width = depth.shape[1]
     inverse = np.empty((3, 3))
@@ -126,39 +110,8 @@ def rasterize_rows(
 
 
 @njit(cache=True, nogil=True)
-def interpolate_corners(face: I64, weights: F32, values: F32, out: F32) -> None:
-    """Interpolate values of face corners at each pixel; pixels without a face keep their value.
-
-    Parameters
-    ----------
-    face : ndarray (H, W) of int, face of each pixel, -1 for none
-    weights : ndarray (H, W, 2) of float32, barycentric coordinates of corners 1 and 2
-    values : ndarray (M, 3, C) of float32, values of the corners
-    out : ndarray (H, W, C) of float32, output
-    """
-    for y in range(face.shape[0]):
-        for x in range(face.shape[1]):
-            m = face[y, x]
-            if m < 0:
-                continue
-            b, c = weights[y, x, 0], weights[y, x, 1]
-            a = np.float32(1.0) - b - c
-            for k in range(values.shape[2]):
-                out[y, x, k] = a * values[m, 0, k] + b * values[m, 1, k] + c * values[m, 2, k]
-
-
-@njit(cache=True, nogil=True)
-def interpolate_vertices(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> None:
-    """Interpolate values of mesh vertices at each pixel; pixels without a face keep their value.
-
-    Parameters
-    ----------
-    face : ndarray (H, W) of int, face of each pixel, -1 for none
-    weights : ndarray (H, W, 2) of float32, barycentric coordinates of corners 1 and 2
-    faces : ndarray (M, 3) of int, vertices of each face
-    values : ndarray (N, C) of float32, values of the vertices
-    out : ndarray (H, W, C) of float32, output
-    """
+def _interpolate(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> None:
+    """Fill out (H, W, C) where there is a face with the values (N, C) of the vertices of ``faces``."""
     for y in range(face.shape[0]):
         for x in range(face.shape[1]):
             m = face[y, x]
@@ -177,10 +130,14 @@ def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
 
     Parameters
     ----------
-    texture : ndarray (TH, TW, 3), texture, uint8 or float32
-    uv : ndarray (H, W, 2) of float32, texture coordinates of each pixel, px
-    drawn : ndarray (H, W) of int, pixels with values >= 0 are filled
-    out : ndarray (H, W, 3) of float32, output
+    texture : ndarray (TH, TW, 3)
+        Texture, uint8 or float32.
+    uv : ndarray (H, W, 2) of float32
+        Texture coordinates of each pixel, px.
+    drawn : ndarray (H, W) of int
+        Pixels with values >= 0 are filled.
+    out : ndarray (H, W, 3) of float32
+        Output.
     """
     height, width = texture.shape[:2]
     for y in range(uv.shape[0]):
@@ -204,58 +161,50 @@ def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
 class Raster:
     """Visible faces of a mesh.
 
-    Attributes
+    Parameters
     ----------
-    depth : ndarray (H, W) of float32, depth, inf for none
-    face : ndarray (H, W) of int64, face of each pixel, -1 for none
-    weights : ndarray (H, W, 2) of float32, barycentric coordinates of the face's corners 1 and 2
+    depth, face : ndarray (H, W) of float32 and int64
+        Depth, inf for none, and face of each pixel, -1 for none.
+    weights : ndarray (H, W, 2) of float32
+        Barycentric coordinates of the face's corners 1 and 2.
     """
 
     depth: F32
     face: I64
     weights: F32
 
-    def interpolate(self, values: F64 | F32) -> F32:
-        """Interpolate values of face corners.
+    def interpolate(self, values: F64 | F32, faces: I64 | None = None) -> F32:
+        """Interpolate values of mesh vertices, or of face corners, at each pixel.
 
         Parameters
         ----------
-        values : ndarray (M, 3, C), values of the corners of all faces
+        values : ndarray (N, C) or (M, 3, C)
+            Values of the vertices, or of the corners of all faces.
+        faces : ndarray (M, 3) of int, optional
+            Vertices of each face, for values of vertices.
 
         Returns
         -------
-        ndarray (H, W, C) of float32, value of each pixel, 0 without a face
+        ndarray (H, W, C) of float32
+            0 without a face.
         """
-        out = np.zeros((*self.face.shape, values.shape[2]), dtype=np.float32)
-        interpolate_corners(self.face, self.weights, np.ascontiguousarray(values, dtype=np.float32), out)
-        return out
-
-    def interpolate_vertices(self, faces: I64, values: F32) -> F32:
-        """Interpolate values of mesh vertices.
-
-        Parameters
-        ----------
-        faces : ndarray (M, 3) of int, vertices of each face
-        values : ndarray (N, C) of float32, values of the vertices
-
-        Returns
-        -------
-        ndarray (H, W, C) of float32, value of each pixel, 0 without a face
-        """
+        if faces is None:
+            faces, values = np.arange(3 * len(values)).reshape(-1, 3), values.reshape(-1, values.shape[2])
         out = np.zeros((*self.face.shape, values.shape[1]), dtype=np.float32)
-        interpolate_vertices(self.face, self.weights, faces, values, out)
+        _interpolate(self.face, self.weights, faces, np.ascontiguousarray(values, dtype=np.float32), out)
         return out
 
     def rows(self, first: int, last: int) -> Raster:
-        """Return a strip of rows.
+        """Return the rows ``first`` to ``last`` - 1, without a copy.
 
         Parameters
         ----------
-        first, last : int, first and last + 1 row
+        first, last : int
+            Rows.
 
         Returns
         -------
-        Raster, the strip, without a copy
+        Raster
         """
         return Raster(self.depth[first:last], self.face[first:last], self.weights[first:last])
 
@@ -265,15 +214,16 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
 
     Parameters
     ----------
-    vertices : ndarray (N, 3), mesh vertices
-    faces : ndarray (M, 3) of int, mesh faces; both sides are visible
-    camera : Camera, camera with the image size
+    vertices, faces : ndarray (N, 3) and (M, 3) of int
+        Mesh; both sides of a face are visible.
+    camera : Camera
+        Camera with the image size and without distortion.
     threads : int
         Threads; each draws a strip of rows. The result does not depend on their number.
 
     Returns
     -------
-    Raster, visible faces
+    Raster
     """
     if not camera.is_pinhole:
         raise ValueError(
@@ -281,16 +231,33 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
         )
     width, height = camera.size
     seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
-    corners = np.ascontiguousarray(seen[faces])
-    near = NEAR * max(float(np.abs(seen[:, 2]).max(initial=0.0)), 1e-300)
-    depth = np.full((height, width), np.inf, dtype=np.float32)
-    face = np.full((height, width), -1, dtype=np.int64)
-    weights = np.zeros((height, width, 2), dtype=np.float32)
+    near = _NEAR * max(float(np.abs(seen[:, 2]).max(initial=0.0)), 1e-300)
+    return rasterize_corners(seen[faces], near, (height, width), threads=threads)
 
-    def draw(rows: tuple[int, int]) -> None:
-        rasterize_rows(corners, near, rows, depth, face, weights)
 
-    run_in_strips(draw, height, threads)
+def rasterize_corners(corners: F64, near: float, shape: tuple[int, int], *, threads: int = 1) -> Raster:
+    """Find the face seen at the centre of each pixel from the image points of the face corners.
+
+    Parameters
+    ----------
+    corners : ndarray (M, 3, 3)
+        Three image points K (R X + t) of each face; the last entry is the depth.
+    near : float
+        Nearest depth that is drawn.
+    shape : (int, int)
+        Height and width, px.
+    threads : int
+        As in :func:`rasterize`.
+
+    Returns
+    -------
+    Raster
+    """
+    corners = np.ascontiguousarray(corners)
+    depth = np.full(shape, np.inf, dtype=np.float32)
+    face = np.full(shape, -1, dtype=np.int64)
+    weights = np.zeros((*shape, 2), dtype=np.float32)
+    run_in_strips(lambda rows: _rasterize_rows(corners, near, rows, depth, face, weights), shape[0], threads)
     return Raster(depth, face, weights)
 
 
@@ -299,9 +266,10 @@ def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads:
 
     Parameters
     ----------
-    work : callable, called with (first, last + 1) row of each strip
-    height : int, number of rows
-    threads : int, number of strips and threads
+    work : callable
+        Called with the first and last + 1 row of each strip.
+    height, threads : int
+        Number of rows, and of strips and threads.
     """
     edges = np.linspace(0, height, max(threads, 1) + 1).round().astype(int)
     strips = [(int(a), int(b)) for a, b in pairwise(edges)]

@@ -10,26 +10,21 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.geometry.strata import affine_from_projective, transform_cameras, transform_points
+from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration.absolute_conic import (
-    CalibrationProblem,
-    FixedPlaneQuadric,
-    LinearAbsoluteConic,
+from thesisrecon.selfcalibration._candidates import Candidate, as_stage_failure, select_candidate
+from thesisrecon.selfcalibration._frame import (
+    PlaneCandidates,
+    ProjectiveScene,
+    projective_scene,
 )
-from thesisrecon.selfcalibration.candidates import (
-    Candidate,
-    as_stage_failure,
-    select_candidate,
-)
-from thesisrecon.selfcalibration.cheirality import CheiralitySearch, PlaneCandidates, ProjectiveScene
-from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
+from thesisrecon.selfcalibration._refinement import RotationCriterion
+from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.quadric import dual_image_residuals, minimize_quadric
-from thesisrecon.selfcalibration.refinement import RotationCriterion
-from thesisrecon.selfcalibration.unknowns import SolverUnknowns, conic_constraints, solver_unknowns
 
 # Number of closed-form candidates to refine.
 _MAX_REFINED = 3
@@ -88,27 +83,9 @@ class Stratified:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction.
-
-        Parameters
-        ----------
-        reconstruction, prior, rng
-            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
-
-        Returns
-        -------
-        SelfCalibration
-            The upgrade with its identifiability.
-
-        Raises
-        ------
-        StageFailure
-            If no plane is found, or no plane has a calibration (the reason is that of the best plane).
-        """
+        """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         scene = projective_scene(reconstruction, prior)
-        found = self.plane.locate(scene, rng)
-        unknown = solver_unknowns(scene.frame, prior)
-        candidates = self._candidates(scene, found, unknown)
+        candidates = self._candidates(scene, self.plane.locate(scene, rng))
         return select_candidate(
             scene.frame, reconstruction, self.criterion, candidates,
             max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
@@ -122,80 +99,43 @@ class Stratified:
         Parameters
         ----------
         reconstruction, prior, rng
-            As in :meth:`calibrate`.
+            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
 
         Returns
         -------
         ndarray (4,)
             Unit-norm plane in the projective frame.
-
-        Raises
-        ------
-        StageFailure
-            If no plane is found.
         """
         scene = projective_scene(reconstruction, prior)
         p = self.plane.locate(scene, rng).planes[0]
         plane = np.append(p, 1.0) @ scene.frame.reference_from_projective
         return np.asarray(plane / np.linalg.norm(plane))
 
-    def _candidates(
-        self, scene: ProjectiveScene, found: PlaneCandidates, unknown: SolverUnknowns
-    ) -> list[Candidate]:
-        problem = CalibrationProblem(scene.frame, scene.constraints, unknown, found.orthogonal)
+    def _candidates(self, scene: ProjectiveScene, found: PlaneCandidates) -> list[Candidate]:
+        frame = scene.frame
+        method = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
         candidates: list[Candidate] = []
         failures: list[StageFailure] = []
         for plane in found.planes:
             try:
-                K = self.calibration.calibrations(problem, plane)
+                K = self.calibration.calibrations(scene, plane, found.orthogonal)
             except StageFailure as failure:
                 failures.append(failure)
                 continue
-            candidates.append(self._candidate(scene.frame, plane, K))
+            r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
+            candidates.append(Candidate(plane, K, float(np.mean(np.sum(r**2, axis=-1))), method))
         if not candidates:
             raise failures[0]
         if not self.refine:
             return candidates
-        best = sorted(candidates, key=lambda candidate: candidate.cost)[
-            : max(self.max_candidates, _MAX_REFINED)
-        ]
-        return [_refined_candidate(scene.frame, unknown, candidate) for candidate in best]
-
-    def _candidate(self, frame: ReferenceFrame, plane: F64, K: F64) -> Candidate:
-        r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
-        name = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
-        return Candidate(plane, K, float(np.mean(np.sum(r**2, axis=-1))), name)
-
-
-def _refined_candidate(frame: ReferenceFrame, unknown: SolverUnknowns, candidate: Candidate) -> Candidate:
-    """Return the nearest minimum of the nonlinear quadric over plane and intrinsics."""
-    log_f = 0.5 * np.log(candidate.K[:, 0, 0] * candidate.K[:, 1, 1])
-    least = minimize_quadric(frame, unknown, candidate.plane, log_f)
-    return Candidate(least.plane, least.K, least.cost, f"{candidate.method}, refined", least.K_std)
-
-
-def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> ProjectiveScene:
-    """Return the input of the methods for the plane at infinity.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    prior : IntrinsicsPrior
-        Prior of all views.
-
-    Returns
-    -------
-    ProjectiveScene
-        Scene in a normalized reference frame.
-
-    Raises
-    ------
-    StageFailure
-        Below three registered cameras.
-    """
-    frame = normalized_frame(reconstruction, prior)
-    return ProjectiveScene(reconstruction, frame, conic_constraints(frame, prior))
+        best = sorted(candidates, key=lambda candidate: candidate.cost)
+        return [
+            minimize_quadric(
+                frame, scene.unknown, candidate.plane,
+                0.5 * np.log(candidate.K[:, 0, 0] * candidate.K[:, 1, 1]), method=f"{method}, refined",
+            )
+            for candidate in best[: max(self.max_candidates, _MAX_REFINED)]
+        ]  # fmt: skip
 
 
 def upgrade_to_affine(reconstruction: Reconstruction, plane: F64) -> Reconstruction:
@@ -225,17 +165,17 @@ def upgrade_to_affine(reconstruction: Reconstruction, plane: F64) -> Reconstruct
     if reconstruction.stratum != "projective":
         raise ValueError(f"upgrade_to_affine takes a projective reconstruction; got {reconstruction.stratum}")
     G = affine_from_projective(np.asarray(plane, dtype=np.float64))
-    X = transform_points(G, reconstruction.X)
+    X = transform(G, reconstruction.X, "points")
     size = np.linalg.norm(X, axis=1)
     valid = reconstruction.valid & (np.abs(X[:, 3]) > _NEAR_INFINITY * np.maximum(size, 1e-300))
     X[~valid] = 0.0
     X[valid] /= X[valid, 3:]
-    P = np.where(reconstruction.registered[:, None, None], transform_cameras(G, reconstruction.P), 0.0)
+    P = np.where(reconstruction.registered[:, None, None], transform(G, reconstruction.P, "cameras"), 0.0)
     affine = replace(reconstruction, stratum="affine", P=P, X=X, valid=valid)
     affine = replace(affine, P=_facing(affine))
     T = _nominal_frame(affine)
-    X[valid] = transform_points(T, X[valid])
-    return replace(affine, P=transform_cameras(T, affine.P), X=X)
+    X[valid] = transform(T, X[valid], "points")
+    return replace(affine, P=transform(T, affine.P, "cameras"), X=X)
 
 
 def _nominal_frame(affine: Reconstruction) -> F64:

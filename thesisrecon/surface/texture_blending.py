@@ -9,27 +9,19 @@ from itertools import combinations
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, I64, U8
-from thesisrecon.geometry.raster import smooth
-from thesisrecon.geometry.zbuffer import interpolate_corners, rasterize, rasterize_rows
+from thesisrecon.geometry.zbuffer import rasterize, rasterize_corners
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface.mesh import vertex_normals
-from thesisrecon.surface.texture_kernels import (
+from thesisrecon.surface._texture_kernels import (
     ViewSurface,
     combine_colors,
     continue_faces,
     grow_colors,
     observe_points,
 )
-from thesisrecon.surface.texture_views import (
-    DEPTH_TOLERANCE_PX,
-    Charts,
-    project_to_view,
-    sample_view,
-    view_camera,
-)
+from thesisrecon.surface._texture_views import DEPTH_TOLERANCE_PX, view_camera
+from thesisrecon.surface.mesh import vertex_normals
 
 POINTS_PER_CHUNK = 1 << 17
 """Points processed at a time, which bounds the memory."""
@@ -58,18 +50,6 @@ GAIN_POINTS = 50_000
 DARK, BRIGHT = 16.0, 240.0
 """Colours outside this range are clipped or noisy and not used for gains."""
 
-SMOOTHNESS = 0.1
-"""Weight of a difference within a chart relative to one at a seam."""
-
-ANCHOR = 1e-4
-"""Weight of the correction itself."""
-
-BLUR_PX = 2.0
-"""Blur of the images before comparison: charts are aligned to about a pixel."""
-
-SEAM_TEXELS = 3
-"""Texels beyond a chart that get its corrections."""
-
 
 @dataclass(frozen=True)
 class BlendedTexture:
@@ -87,14 +67,11 @@ class BlendedTexture:
         Distance from the median colour in grey levels at which the weight is a quarter.
     feather_px : float
         Width of the border in which the weight decreases.
-    level : bool
-        Equalise the brightness of the images first.
     """
 
     power: float = 2.0
     scatter: float = 20.0
     feather_px: float = 8.0
-    level: bool = True
 
     def __post_init__(self) -> None:
         if not (self.power >= 0.0 and self.scatter > 0.0 and self.feather_px > 0.0):
@@ -104,7 +81,13 @@ class BlendedTexture:
             )
 
     def paint(
-        self, mesh: TexturedMesh, views: Sequence[PinholeView], charts: Charts, *, threads: int = 1
+        self,
+        mesh: TexturedMesh,
+        views: Sequence[PinholeView],
+        uv: F64,
+        cut_out: U8,
+        *,
+        threads: int = 1,
     ) -> U8:
         """Compute the colours of a texture.
 
@@ -125,12 +108,12 @@ class BlendedTexture:
         """
         prepared = self.prepare(mesh, views, threads=threads)
         normals = vertex_normals(mesh)
-        texture = charts.cut_out.copy()
+        texture = cut_out.copy()
         drawn = np.zeros(texture.shape[:2], dtype=bool)
 
         def work(first: int) -> None:
             rows = slice(first, min(first + STRIP_ROWS, len(texture)))
-            at, points, towards = _points_of_rows(mesh, normals, charts, rows)
+            at, points, towards = _points_of_rows(mesh, normals, uv, rows, texture.shape[1])
             color, shown = prepared.colors(points, towards)
             at = at[shown]
             texture[at[:, 0], at[:, 1]] = np.clip(np.rint(color[shown]), 0, 255)
@@ -159,30 +142,25 @@ class BlendedTexture:
         """
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             prepared = list(pool.map(lambda view: _prepared(mesh, view, self.feather_px), views))
-        gains = np.ones((len(views), 3), dtype=np.float32)
-        blending = ViewBlender(self, tuple(prepared), gains)
-        if not self.level:
-            return blending
+        blending = ViewBlender(self, tuple(prepared), np.ones((len(views), 3), dtype=np.float32))
         stride = max(1, len(mesh.vertices) // GAIN_POINTS)
         normals = vertex_normals(mesh)
         weight, color = blending.observe(mesh.vertices[::stride], normals[::stride])
         return ViewBlender(self, tuple(prepared), _equalizing_gains(weight, color))
 
 
-def _points_of_rows(mesh: TexturedMesh, normals: F64, charts: Charts, rows: slice) -> tuple[I64, F64, F64]:
+def _points_of_rows(
+    mesh: TexturedMesh, normals: F64, uv: F64, rows: slice, width: int
+) -> tuple[I64, F64, F64]:
     """Texels (N, 2) as row and column, points (N, 3) and normals (N, 3) of some rows of the texture."""
-    uv = charts.uv
     top, bottom = uv[..., 1].min(axis=1), uv[..., 1].max(axis=1)
-    some = np.flatnonzero(
-        (charts.label >= 0) & (bottom >= rows.start - RIM_TEXELS) & (top <= rows.stop + RIM_TEXELS)
-    )
+    # Comparisons with NaN are false: such faces are not seen.
+    some = np.flatnonzero((bottom >= rows.start - RIM_TEXELS) & (top <= rows.stop + RIM_TEXELS))
     corners = np.concatenate([uv[some], np.ones((len(some), 3, 1))], axis=2)
     corners[..., 1] -= rows.start - RIM_TEXELS
-    shape = (rows.stop - rows.start + 2 * RIM_TEXELS, charts.cut_out.shape[1])
-    depth = np.full(shape, np.inf, dtype=np.float32)
-    face = np.full(shape, -1, dtype=np.int64)
-    weights = np.zeros((*shape, 2), dtype=np.float32)
-    rasterize_rows(corners, 1e-3, (0, shape[0]), depth, face, weights)
+    shape = (rows.stop - rows.start + 2 * RIM_TEXELS, width)
+    raster = rasterize_corners(corners, 1e-3, shape)
+    face, weights = raster.face, raster.weights
     for _ in range(RIM_TEXELS):
         continue_faces(corners, BEYOND_FACE, face, weights)
     face, weights = face[RIM_TEXELS:-RIM_TEXELS], weights[RIM_TEXELS:-RIM_TEXELS]
@@ -296,132 +274,3 @@ def _equalizing_gains(weight: F32, color: F32) -> F32:
                 b[j] -= ratio
         gains[:, k] = np.exp(np.linalg.lstsq(A, b, rcond=None)[0])
     return gains
-
-
-@dataclass(frozen=True)
-class SeamLeveledTexture:
-    """Colours of one image per chart with levelled seams (Lempitsky and Ivanov 2007).
-
-    Each vertex of each chart has a correction; corrections compensate the differences at seams and vary as
-    slowly as possible within a chart.
-
-    Parameters
-    ----------
-    level : bool
-        Apply the corrections.
-    """
-
-    level: bool = True
-
-    def paint(
-        self,
-        mesh: TexturedMesh,
-        views: Sequence[PinholeView],
-        charts: Charts,
-        *,
-        threads: int = 1,  # noqa: ARG002 - one linear system for all
-    ) -> NDArray[np.uint8]:
-        """Compute the colours of a texture.
-
-        Parameters
-        ----------
-        mesh : TexturedMesh
-        views : sequence of PinholeView
-            Undistorted images with their cameras.
-        charts : Charts
-            Layout of the texture.
-        threads : int
-            Ignored.
-
-        Returns
-        -------
-        ndarray (H, W, 3) uint8
-            The texture.
-        """
-        if not self.level:
-            return charts.cut_out
-        return _level_seams(mesh, views, charts.label, charts.chart, uv=charts.uv, texture=charts.cut_out)
-
-
-def _level_seams(
-    mesh: TexturedMesh, views: Sequence[PinholeView], label: I64, chart: I64, *, uv: F64, texture: np.ndarray
-) -> np.ndarray:
-    """Texture (H, W, 3) with the corrections of all charts added."""
-    seen = np.flatnonzero(label >= 0)
-    # One node per vertex and chart.
-    key = chart[seen][:, None] * len(mesh.vertices) + mesh.faces[seen]
-    nodes, number = np.unique(key, return_inverse=True)
-    number = number.reshape(key.shape)
-    view = np.zeros(len(nodes), dtype=np.int64)
-    view[number.ravel()] = np.repeat(label[seen], 3)
-    vertex = nodes % len(mesh.vertices)
-    color = _colors(mesh, views, view, vertex)
-    first, second = _meeting(vertex)
-    if not len(first):
-        return texture
-    correction = _solve(color, (first, second), _sides(number))
-    values = np.zeros((len(mesh.faces), 3, 3), dtype=np.float32)
-    values[seen] = correction[number]
-    return _added(texture, uv, values, seen)
-
-
-def _colors(mesh: TexturedMesh, views: Sequence[PinholeView], view: I64, vertex: I64) -> F64:
-    """(N, 3) colour of every node in its own image."""
-    color = np.zeros((len(view), 3))
-    for v, one in enumerate(views):
-        mine = view == v
-        if mine.any():
-            planes = [smooth(one.rgb[..., k].astype(np.float32), BLUR_PX) for k in range(3)]
-            xy = project_to_view(view_camera(one), mesh.vertices[vertex[mine]])[0]
-            color[mine] = sample_view(one, xy, np.stack(planes, axis=-1))
-    return color
-
-
-def _meeting(vertex: I64) -> tuple[I64, I64]:
-    """Pairs of nodes at one vertex."""
-    order = np.argsort(vertex, kind="stable")
-    same = vertex[order][1:] == vertex[order][:-1]
-    return order[:-1][same], order[1:][same]
-
-
-def _sides(number: I64) -> tuple[I64, I64]:
-    """Sides of all faces as pairs of nodes, each once."""
-    start, stop = number.ravel(), np.roll(number, -1, axis=1).ravel()
-    pairs = np.unique(np.stack([np.minimum(start, stop), np.maximum(start, stop)], axis=1), axis=0)
-    return pairs[:, 0], pairs[:, 1]
-
-
-def _solve(color: F64, seams: tuple[I64, I64], sides: tuple[I64, I64]) -> F32:
-    """Corrections (N, 3) by least squares: a Laplacian over seams and sides."""
-    count = len(color)
-    row = np.concatenate([seams[0], sides[0]])
-    column = np.concatenate([seams[1], sides[1]])
-    weight = np.concatenate([np.ones(len(seams[0])), np.full(len(sides[0]), SMOOTHNESS)])
-    W = scipy.sparse.coo_array((weight, (row, column)), shape=(count, count)).tocsr()
-    W = W + W.T
-    degree = np.asarray(W.sum(axis=1)).ravel() + ANCHOR
-    A = (scipy.sparse.diags_array(degree) - W).tocsr()
-    M = scipy.sparse.linalg.LinearOperator(A.shape, matvec=lambda x: x / degree)
-    difference = color[seams[1]] - color[seams[0]]
-    solution = np.zeros((count, 3), dtype=np.float32)
-    for k in range(3):
-        b = np.bincount(seams[0], difference[:, k], minlength=count)
-        b -= np.bincount(seams[1], difference[:, k], minlength=count)
-        solution[:, k] = scipy.sparse.linalg.cg(A, b, rtol=1e-4, maxiter=500, M=M)[0]
-    return solution
-
-
-def _added(texture: np.ndarray, uv: F64, values: F32, seen: I64) -> np.ndarray:
-    """Texture with the corner values (M, 3, 3) added over the faces ``seen``."""
-    height, width = texture.shape[:2]
-    corners = np.concatenate([uv[seen], np.ones((len(seen), 3, 1))], axis=2)
-    depth = np.full((height, width), np.inf, dtype=np.float32)
-    face = np.full((height, width), -1, dtype=np.int64)
-    weights = np.zeros((height, width, 2), dtype=np.float32)
-    rasterize_rows(np.ascontiguousarray(corners), 1e-3, (0, height), depth, face, weights)
-    offset = np.zeros((height, width, 3), dtype=np.float32)
-    interpolate_corners(face, weights, np.ascontiguousarray(values[seen]), offset)
-    distance, nearest = scipy.ndimage.distance_transform_edt(face < 0, return_indices=True)
-    offset = offset[tuple(nearest)]
-    offset[distance > SEAM_TEXELS] = 0.0
-    return np.asarray(np.clip(np.rint(texture + offset), 0, 255), dtype=np.uint8)

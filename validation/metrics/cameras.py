@@ -8,8 +8,8 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
-from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.records import Reconstruction
+from validation.metrics.similarity import estimate_similarity
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from PIL import Image
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.optimal_triangulation import correct_matches
-from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io.files import write_atomically
 from validation.references.sift import SiftKeypoints, detect_sift, match_sift
@@ -114,7 +114,7 @@ def exact_correspondences(P1: F64, P2: F64, xy1: F64, xy2: F64) -> F64:
     F = fundamental_from_cameras(P1, P2)
     near = np.abs(sampson_residuals(F, xy1, xy2)) < CONSISTENT_PX
     exact1, exact2 = correct_matches(F, xy1[near], xy2[near])
-    Xh = triangulate_linear(np.stack([P1, P2]), np.stack([exact1, exact2]))
+    Xh = triangulate(np.stack([P1, P2]), np.stack([exact1, exact2]), method="linear")
     depths = np.stack([Xh @ P1[2], Xh @ P2[2]]) / Xh[:, 3]
     typical = np.median(depths, axis=1, keepdims=True)
     seen = np.all((depths > 0.0) & (depths < FARTHEST * typical), axis=0)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
-from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.records import Image
 from thesisrecon.view_interpolation import prepare_pair, prepare_rectified_pair
 from thesisrecon.views.interpolation import InterpolatedPair
@@ -90,7 +90,7 @@ def prepare_yard() -> Yard:
     xy1, xy2 = np.stack([x, y], axis=1), truth.places[0][::8, ::8].reshape(-1, 2).astype(np.float64)
     inside = np.all((xy2 > 0.0) & (xy2 < np.array(SIZE)), axis=1)
     xy1, xy2 = xy1[inside], xy2[inside]
-    Xh = triangulate_linear(np.stack(cameras_of(truth)), np.stack([xy1, xy2]))
+    Xh = triangulate(np.stack(cameras_of(truth)), np.stack([xy1, xy2]), method="linear")
     return Yard(truth, prepare_pair(images[0], images[1]), Xh[:, :3] / Xh[:, 3:], xy1, xy2)
 
 

@@ -27,7 +27,7 @@ from thesisrecon.geometry.camera_matrix import compose_camera, project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, pixel_from_unit
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import random_transform
-from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_observations
+from thesisrecon.geometry.triangulation import triangulate, triangulate_observations
 from thesisrecon.geometry.two_view import canonical_cameras, epipoles, unit_norm
 from thesisrecon.numerics.partial_bundle import refine_points
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
@@ -274,7 +274,7 @@ def measure_cameras(P: F64, xy: F64) -> tuple[float, float, float]:
     """
     T = pixel_from_unit(SIZES)
     M = np.linalg.inv(T[1]) @ P[1, :, :3] @ np.linalg.inv(P[0, :, :3]) @ T[0]
-    X, best = triangulate_linear(P, xy), triangulate_polynomial(P, xy)
+    X, best = triangulate(P, xy, method="linear"), triangulate_polynomial(P, xy)
     side = np.sign(X[:, 3] * (X @ P[0, 2]))
     beyond = 50.0 * (1.0 - abs(float(side.mean())))
     return float(np.linalg.cond(M)), beyond, _rms_px(P, X, xy) / _rms_px(P, best, xy)

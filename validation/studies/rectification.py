@@ -18,24 +18,19 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import project, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.records import Reconstruction, TwoView
-from thesisrecon.stereo.epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo.planar import PlanarRectification
-from thesisrecon.stereo.planar_rectifiers import (
-    CommonOrientationRectifier,
-    HartleyRectifier,
-    LoopZhangRectifier,
-    MinimumDistortionRectifier,
+from thesisrecon.stereo._epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
+from thesisrecon.stereo.planar import (
+    PlanarRectification,
+    common_orientation,
+    hartley,
+    loop_zhang,
+    minimum_distortion,
 )
-from thesisrecon.stereo.polar import PolarRectifier
-from thesisrecon.stereo.rectification import (
-    AnyRectification,
-    RectificationQuality,
-    jacobians,
-    measure_quality,
-    rectify,
-)
+from thesisrecon.stereo.polar import polar
+from thesisrecon.stereo.rectification import RectificationQuality, jacobians, measure_quality, rectify
+from thesisrecon.stereo.resampling import Rectification
 from validation.metrics.record import Metric
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
 from validation.scenes.real import data_root
@@ -64,7 +59,9 @@ class Measured:
     """One method on one pair; ``kept`` is the kept share of the common region, the lesser of both sides."""
 
     quality: RectificationQuality
+    dy_frame_px: float
     dy_px: float
+    disparities_px: float
     kept: float
     seconds: float
     polar: bool
@@ -113,12 +110,12 @@ def _opencv_cameras(pair: RealPair) -> PlanarRectification:
     return opencv_calibrated(pair.metric.cameras[0], pair.metric.cameras[1], pair.metric.sizes[0])
 
 
-METHODS: Mapping[str, tuple[bool, Callable[[RealPair], AnyRectification | None]]] = {
-    "Hartley": (False, lambda p: HartleyRectifier().rectify(p.loose)),
-    "Loop-Zhang": (False, lambda p: LoopZhangRectifier().rectify(p.loose)),
-    "least distortion": (False, lambda p: MinimumDistortionRectifier().rectify(p.loose)),
-    "polar": (False, lambda p: PolarRectifier().rectify(p.loose)),
-    "metric": (True, lambda p: CommonOrientationRectifier().rectify(p.metric)),
+METHODS: Mapping[str, tuple[bool, Callable[[RealPair], Rectification | None]]] = {
+    "Hartley": (False, lambda p: hartley(p.loose)),
+    "Loop-Zhang": (False, lambda p: loop_zhang(p.loose)),
+    "least distortion": (False, lambda p: minimum_distortion(p.loose)),
+    "polar": (False, lambda p: polar(p.loose)),
+    "metric": (True, lambda p: common_orientation(p.metric)),
     BEST_F: (False, lambda p: rectify(p.loose)),
     BEST: (True, lambda p: rectify(p.metric)),
     OPENCV_F: (False, _opencv_f),
@@ -134,7 +131,7 @@ def seen_by_other(pair: EpipolarPair, side: int) -> F64:
     """
     assert pair.cameras is not None
     P = pair.cameras if side == 0 else pair.cameras[::-1]
-    X = dehomogenize(triangulate_linear(pair.cameras, np.stack(pair.matches)))
+    X = dehomogenize(triangulate(pair.cameras, np.stack(pair.matches), method="linear"))
     z = np.quantile(X @ P[0, 2, :3] + P[0, 2, 3], [0.01, 0.99])
     width, height = pair.sizes[side]
     x, y = ((np.arange(GRID) + 0.5) / GRID * length - 0.5 for length in (width, height))
@@ -167,10 +164,18 @@ def measure(pair: RealPair, name: str) -> Measured | None:
         kept.append(float(np.mean(inside)) if len(pixels) else 1.0)
     quality = measure_quality(found, seen)
     polar = not isinstance(found, PlanarRectification)
-    return Measured(quality, _dy_of_image(found, seen), min(kept), seconds, polar)
+    dy, disparities = _dy_and_range(found, seen)
+    return Measured(quality, dy, _dy_of_image(found, seen), disparities, min(kept), seconds, polar)
 
 
-def _dy_of_image(rectified: AnyRectification, pair: EpipolarPair) -> float:
+def _dy_and_range(rectified: Rectification, pair: EpipolarPair) -> tuple[float, float]:
+    """RMS of y1 - y2 and disparity range (1 to 99 % quantile) of the matches in pixels of the frame."""
+    left, right = (rectified.rectified_from_original(s, xy) for s, xy in enumerate(pair.matches))
+    d, dy = (left - right)[np.isfinite(left + right).all(axis=1)].T
+    return float(np.sqrt(np.mean(dy**2))), float(np.ptp(np.quantile(d, [0.01, 0.99])))
+
+
+def _dy_of_image(rectified: Rectification, pair: EpipolarPair) -> float:
     """Return the RMS of y1 - y2 of the matches in pixels of the images."""
     rows = [rectified.rectified_from_original(s, xy)[:, 1] for s, xy in enumerate(pair.matches)]
     steps = [np.linalg.norm(jacobians(rectified, s, xy)[:, 1], axis=1) for s, xy in enumerate(pair.matches)]
@@ -184,7 +189,7 @@ def _off(values: tuple[float, float], ideal: float) -> float:
 
 
 QUANTITIES: tuple[tuple[str, str, Callable[[Measured], float], float | None, bool], ...] = (
-    ("RMS |dy| of inliers", "px of the frame", lambda m: m.quality.rms_dy_px, None, True),
+    ("RMS |dy| of inliers", "px of the frame", lambda m: m.dy_frame_px, None, True),
     ("RMS |dy| of inliers", "px of the image", lambda m: m.dy_px, DY_PX, True),
     (
         "angle of midlines off 90",
@@ -200,7 +205,7 @@ QUANTITIES: tuple[tuple[str, str, Callable[[Measured], float], float | None, boo
     ("distortion", "", lambda m: m.quality.distortion, None, True),
     ("least scale", "", lambda m: m.quality.min_scale, None, False),
     ("pixels over the image's", "", lambda m: m.quality.size_ratio, None, True),
-    ("range of disparities", "px", lambda m: float(np.ptp(m.quality.disparities)), None, True),
+    ("range of disparities", "px", lambda m: m.disparities_px, None, True),
     ("time", "ms", lambda m: 1e3 * m.seconds, None, True),
 )
 """Name, unit, number, bound, and whether small values are good."""
@@ -254,14 +259,19 @@ def check_hand_made(names: Sequence[str]) -> list[Metric]:
             rows.add(name, {"RMS |dy|": None}, "px", note=str(reason))
             continue
         q = measure_quality(chosen, pair)
-        values = {"matches": float(len(found.xy1)), "RMS |dy|": q.rms_dy_px, "distortion": q.distortion}
-        values |= {
-            "kept of A": q.coverage[0],
-            "kept of B": q.coverage[1],
-            "pixels over the image's": q.size_ratio,
-        }
+        kept = [_kept(chosen, side, size) for side, size in enumerate(sizes)]
+        values = {"matches": float(len(found.xy1)), "RMS |dy|": _dy_and_range(chosen, pair)[0]}
+        values |= {"distortion": q.distortion, "kept of A": kept[0], "kept of B": kept[1]}
+        values |= {"pixels over the image's": q.size_ratio}
         rows.add(name, values, note="planar" if isinstance(chosen, PlanarRectification) else "polar")
     return rows
+
+
+def _kept(rectified: Rectification, side: int, size: Size) -> float:
+    """Share of an image inside the frame."""
+    x, y = ((np.arange(GRID) + 0.5) / GRID * length - 0.5 for length in size)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return float(np.isfinite(rectified.rectified_from_original(side, grid)).all(axis=1).mean())
 
 
 def _size(path: Path) -> Size:
@@ -269,7 +279,7 @@ def _size(path: Path) -> Size:
         return image.size
 
 
-def draw_pair(rectified: AnyRectification, images: Sequence[np.ndarray], to: Path) -> None:
+def draw_pair(rectified: Rectification, images: Sequence[np.ndarray], to: Path) -> None:
     """Draw both sides beside each other with red lines."""
     sides = [rectified.warp(image.astype(np.float32), side) for side, image in enumerate(images)]
     shown = np.hstack([np.where(np.isnan(s), 40.0, np.clip(s, 0.0, 255.0)).astype(np.uint8) for s in sides])

@@ -17,12 +17,7 @@ from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import Group, random_transform
-from thesisrecon.geometry.triangulation import (
-    triangulate_iterated,
-    triangulate_linear,
-    triangulate_midpoint,
-    triangulate_optimal,
-)
+from thesisrecon.geometry.triangulation import triangulate
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
@@ -36,10 +31,10 @@ Method = Callable[[F64, F64], F64]
 POLYNOMIAL, OPTIMAL, LINEAR = "polynomial", "optimal", "linear"
 OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV linear", "OpenCV polynomial", "COLMAP"
 ANY_VIEWS: dict[str, Method] = {
-    LINEAR: triangulate_linear,
-    "iterated": triangulate_iterated,
-    "mid-point": triangulate_midpoint,
-    OPTIMAL: triangulate_optimal,
+    LINEAR: partial(triangulate, method="linear"),
+    "iterated": partial(triangulate, method="iterated"),
+    "mid-point": partial(triangulate, method="midpoint"),
+    OPTIMAL: partial(triangulate, method="optimal"),
     COLMAP: colmap_points,
 }
 TWO_VIEWS: dict[str, Method] = ANY_VIEWS | {
@@ -226,7 +221,7 @@ def check_optimum(kind: str, *, trials: int, points: int) -> Metric:
         xh = np.einsum("vab,nb->vna", P, X)
         xy = xh[..., :2] / xh[..., 2:] + (0.5, 2.0, 10.0)[seed % 3] * rng.normal(size=(2, points, 2))
         ours = squared_distances(P, triangulate_polynomial(P, xy), xy)
-        many = squared_distances(P, triangulate_optimal(P, xy), xy)
+        many = squared_distances(P, triangulate(P, xy, method="optimal"), xy)
         # Costs of some matches are nearly 0, so the rounding of distances is subtracted.
         allowed = 2.0 * np.sqrt(many) * ROUNDING_PX
         excess.append((ours - many - allowed) / many)
@@ -240,14 +235,15 @@ def check_speed(*, points: int = 2000, repeats: int = 15) -> list[Metric]:
     """Measure microseconds per point on one thread, the least of ``repeats`` runs that take turns."""
     one_thread()
     rng = np.random.default_rng(0)
+    linear = ANY_VIEWS[LINEAR]
     calls: dict[str, dict[str, Method]] = {
         "polynomial, 2 views": {"ours": triangulate_polynomial, "OpenCV": opencv_polynomial},
-        "linear, 2 views": {"ours": triangulate_linear, "OpenCV": opencv_linear, COLMAP: colmap_points},
-        "iterated, 2 views": {"ours": triangulate_iterated},
-        "mid-point, 2 views": {"ours": triangulate_midpoint},
-        "least reprojection, 2 views": {"ours": triangulate_optimal},
-        "linear, 5 views": {"ours": triangulate_linear, COLMAP: colmap_points},
-        "least reprojection, 5 views": {"ours": triangulate_optimal},
+        "linear, 2 views": {"ours": linear, "OpenCV": opencv_linear, COLMAP: colmap_points},
+        "iterated, 2 views": {"ours": ANY_VIEWS["iterated"]},
+        "mid-point, 2 views": {"ours": ANY_VIEWS["mid-point"]},
+        "least reprojection, 2 views": {"ours": ANY_VIEWS[OPTIMAL]},
+        "linear, 5 views": {"ours": linear, COLMAP: colmap_points},
+        "least reprojection, 5 views": {"ours": ANY_VIEWS[OPTIMAL]},
     }
     targets = {"polynomial, 2 views": POLYNOMIAL_US, "linear, 2 views": LINEAR_US}
     rows = Rows("time", "ours")

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.similarity import Similarity, estimate_similarity
 from thesisrecon.records import Reconstruction
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Task, slug
 from validation.harness.scenes import is_photographs, load_photographs
 from validation.harness.stages.cameras import COLMAP, COLMAP_PP, OURS, read_model
 from validation.metrics.record import Metric
+from validation.metrics.similarity import Similarity, estimate_similarity
 from validation.references.open3d_clouds import refine_by_icp, render_difference
 from validation.scenes.real import Scene
 

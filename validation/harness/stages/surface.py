@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.config import preset
-from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
@@ -30,6 +29,7 @@ from validation.harness.stages.depth import (
 )
 from validation.metrics.depth import coloured, true_from_maps
 from validation.metrics.record import Metric
+from validation.metrics.similarity import Similarity
 from validation.metrics.surfaces import CAPPED, SAMPLES, judge_surface, load_truth
 from validation.references.open3d_surfaces import OpenTsdf, poisson_mesh
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
-from thesisrecon.geometry.triangulation import triangulate_linear, triangulate_midpoint, triangulate_optimal
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
 from validation.metrics.record import Metric
@@ -109,7 +109,7 @@ def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
     P = problem.P * (1.0 + MOVED * rng.normal(size=problem.P.shape))
     view, point = np.tile(np.arange(views), points), np.repeat(np.arange(points), views)
     seen = problem.xy.swapaxes(0, 1).reshape(-1, 2)
-    start = triangulate_linear(P, problem.xy)
+    start = triangulate(P, problem.xy, method="linear")
     fit = refine_projective_bundle(P, start, view, point, seen, loss_px=1e3, max_iterations=DESCENT)
     return fit.P, fit.X
 
@@ -129,9 +129,9 @@ def _adjustment(scene: str, problems: list[Problem], kept: Mapping[str, F64] | N
 def _solver(method: str, views: int) -> Method | None:
     """Return None if a method is limited to two views and there are more."""
     if method == OURS:
-        return triangulate_polynomial if views == 2 else triangulate_optimal
+        return partial(triangulate, method="polynomial" if views == 2 else "optimal")
     if method in (LINEAR, MIDPOINT):
-        return triangulate_linear if method == LINEAR else triangulate_midpoint
+        return partial(triangulate, method="linear" if method == LINEAR else "midpoint")
     if method == COLMAP:
         return colmap_points
     if views > 2:

@@ -12,30 +12,14 @@ from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 
 @dataclass(frozen=True)
 class Similarity:
-    """The similarity y = scale R x + t.
-
-    Attributes
-    ----------
-    scale : float, positive factor
-    R : ndarray (3, 3), rotation
-    t : ndarray (3,), translation
-    """
+    """The similarity y = scale R x + t, R (3, 3) a rotation, t (3,)."""
 
     scale: float
     R: F64
     t: F64
 
     def apply(self, X: F64) -> F64:
-        """Transform points.
-
-        Parameters
-        ----------
-        X : ndarray (N, 3), points
-
-        Returns
-        -------
-        ndarray (N, 3), transformed points
-        """
+        """Transform points (N, 3)."""
         return self.scale * X @ self.R.T + self.t
 
     @property
@@ -48,32 +32,10 @@ class Similarity:
 
 
 def estimate_similarity(source: F64, target: F64) -> Similarity:
-    """Estimate the least-squares similarity that takes ``source`` to ``target``.
+    """Estimate the least-squares similarity that takes ``source`` (N, 3) to ``target`` (N, 3).
 
-    Parameters
-    ----------
-    source, target : ndarray (N, 3), N >= 3 corresponding points
-
-    Returns
-    -------
-    Similarity, transform from ``source`` to ``target``
-
-    Raises
-    ------
-    ValueError
-        There are fewer than 3 points, they are collinear (the rotation about the line is free) or not finite.
-
-    References
-    ----------
-    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
-    1991.
-
-    Examples
-    --------
-    >>> source = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-    >>> similarity = estimate_similarity(source, 2.0 * source + [1.0, 2.0, 3.0])
-    >>> round(similarity.scale, 9), similarity.t.round(9).tolist()
-    (2.0, [1.0, 2.0, 3.0])
+    Raises ValueError for fewer than 3 points, or collinear ones (the rotation about the line is free).
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI, 1991.
     """
     require_shapes("estimate_similarity", source=(source, ("N", 3)), target=(target, ("N", 3)))
     if len(source) < 3:
