@@ -6,16 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from thesisrecon.config import (
-    KINDS,
-    PRESETS,
-    config_from_tables,
-    config_from_toml,
-    preset,
-    tables_from_config,
-    tables_from_settings,
-    toml_from_config,
-)
+from thesisrecon.config import KINDS, PRESETS, preset
 from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import (
     INTRINSICS,
@@ -27,7 +18,15 @@ from thesisrecon.intrinsics import (
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.stratified import Stratified
-from thesisrecon.settings import parse_word, toml_from_tables
+from thesisrecon.settings import (
+    config_from_tables,
+    config_from_toml,
+    parse_word,
+    tables_from_config,
+    tables_from_settings,
+    toml_from_config,
+    toml_from_tables,
+)
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets
 
@@ -306,9 +305,9 @@ def test_presets_survive_their_own_text(name):
         ({"aspect_ratio": 0.0}, "aspect_ratio must be above 0"),
         ({"k1_std": 0.0}, "mode known"),
         ({"aspect_std": -0.1}, "aspect_std must be above 0"),
-        ({"skew_px": np.inf}, "skew_px must be a number"),
-        ({"k1_value": np.nan}, "k1_value must be a number"),
-        ({"principal_point_px": (np.inf, 0.0)}, "principal_point_px must be two numbers"),
+        ({"skew_px": np.inf}, "skew_px must be finite"),
+        ({"k1_value": np.nan}, "k1_value must be finite"),
+        ({"principal_point_px": (np.inf, 0.0)}, "principal_point_px must be finite"),
         ({"k1_std": np.inf}, "k1_std must be finite"),
         ({"focal_std_rel": 0.1}, "has no effect without a focal length"),
         ({"focal": "known", "focal_px": 9.0, "focal_std_rel": 0.1}, "has no effect with focal = known"),

@@ -17,7 +17,7 @@ from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.intrinsics import IntrinsicsOptions, camera_groups, prior_warnings
+from thesisrecon.intrinsics import IntrinsicsOptions, camera_numbers, prior_warnings
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.pipeline.state import name_images
@@ -406,8 +406,8 @@ def test_no_accepted_pair_is_a_failure_with_the_best_pair_named(tmp_path):
 
 def test_cameras_are_shared_by_size_or_not_at_all():
     sizes = [(4, 3), (3, 4), (4, 3)]
-    assert camera_groups(sizes, "shared").tolist() == [0, 1, 0]
-    assert camera_groups(sizes, "per-image").tolist() == [0, 1, 2]
+    assert camera_numbers(sizes, IntrinsicsOptions()).tolist() == [0, 1, 0]
+    assert camera_numbers(sizes, IntrinsicsOptions(cameras="per-image")).tolist() == [0, 1, 2]
 
 
 def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path):

@@ -72,7 +72,7 @@ def match_rectified(
     Parameters
     ----------
     left, right : path or ndarray (H, W) or (H, W, 3)
-        Files (read at full size), or grey levels 0 to 255 with NaN for missing pixels.
+        Files (read at full size), or grey levels 0 to 255 with NaN for missing pixels; of one size.
     max_disparity_px : float
         Largest disparity; x_right = x_left - d with d from 0 to this.
     config : PipelineConfig, optional
@@ -85,12 +85,8 @@ def match_rectified(
 
     Raises
     ------
-    UsageError
-        If a file does not exist.
-    StageFailure
-        If a file cannot be read.
-    ValueError
-        If the sizes differ.
+    UsageError, StageFailure
+        If a file does not exist, or cannot be read.
 
     Examples
     --------
@@ -159,17 +155,10 @@ def self_calibrate(
     >>> xy = np.stack([camera.project(X) for camera in cameras], axis=1).reshape(-1, 2)
     >>> tracks = Tracks(np.tile(np.arange(6), 80), np.repeat(np.arange(80), 6), xy, 6, 80)
     >>> H = np.random.default_rng(1).normal(size=(4, 4))
+    >>> P = np.array([camera.P for camera in cameras]) @ np.linalg.inv(H)
     >>> projective = Reconstruction(
-    ...     stratum="projective",
-    ...     P=np.array([camera.P for camera in cameras]) @ np.linalg.inv(H),
-    ...     X=np.column_stack([X, np.ones(80)]) @ H.T,
-    ...     registered=np.ones(6, bool),
-    ...     valid=np.ones(80, bool),
-    ...     inlier=np.ones(480, bool),
-    ...     tracks=tracks,
-    ...     sizes=np.tile([640, 480], (6, 1)),
-    ...     sigma_px=0.5,
-    ...     reasons=("",) * 6,
+    ...     "projective", P, np.column_stack([X, np.ones(80)]) @ H.T, np.ones(6, bool), np.ones(80, bool),
+    ...     np.ones(480, bool), tracks, sizes=np.tile([640, 480], (6, 1)), sigma_px=0.5, reasons=("",) * 6,
     ... )
     >>> round(self_calibrate(projective).K[0, 0, 0])
     800

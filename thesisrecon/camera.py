@@ -26,10 +26,8 @@ class Camera:
     ----------
     K : ndarray (3, 3)
         Calibration matrix in pixels; (0, 0) is the centre of the top-left pixel.
-    R : ndarray (3, 3)
-        Rotation from world to camera (the thesis writes its transpose).
-    t : ndarray (3,)
-        Translation, -R centre.
+    R, t : ndarray (3, 3), ndarray (3,)
+        Rotation from world to camera (the thesis writes its transpose) and translation -R centre.
     size : tuple of int
         Image (width, height) in pixels.
     distortion : ndarray (C,), optional
@@ -78,29 +76,30 @@ class Camera:
         apart = np.abs(R.T @ R - np.eye(3)).max()
         if not apart <= _ORTHOGONAL:
             raise ValueError(f"Camera needs a rotation R; R'R deviates from the identity by {apart:.2g}")
-        for name, value in {**fields, "size": _checked_size(self.size)}.items():
+        try:
+            width, height = (operator.index(side) for side in self.size)
+        except (TypeError, ValueError):
+            raise ValueError(f"Camera needs a size of two whole numbers; got {self.size}") from None
+        if min(width, height) < 1:
+            raise ValueError(f"Camera needs a size of at least 1 x 1; got {self.size}")
+        for name, value in {**fields, "size": (width, height)}.items():
             object.__setattr__(self, name, value)
 
     @classmethod
     def from_matrix(cls, P: F64, size: tuple[int, int]) -> Camera:
-        """Return the camera of a matrix of any scale and sign.
+        """Return the camera of a matrix of any scale and sign, by RQ decomposition (HZ 6.2.4).
 
         Parameters
         ----------
         P : ndarray (3, 4)
-            Finite camera matrix.
+            Finite camera matrix; ``ValueError`` if the camera centre is at infinity.
         size : tuple of int
             Image (width, height).
 
         Returns
         -------
         Camera
-            K, R and t by RQ decomposition (HZ 6.2.4), without distortion.
-
-        Raises
-        ------
-        ValueError
-            If P is not (3, 4) or not finite, the camera centre is at infinity, or the size is invalid.
+            Without distortion.
         """
         P = np.asarray(P, dtype=np.float64)
         require_shapes("Camera.from_matrix", P=(P, (3, 4)))
@@ -133,11 +132,6 @@ class Camera:
         -------
         ndarray (N, 2)
             Pixels xy.
-
-        Raises
-        ------
-        ValueError
-            If X is not (N, 3).
         """
         X = np.asarray(X, dtype=np.float64)
         require_shapes("Camera.project", X=(X, ("N", 3)))
@@ -157,11 +151,6 @@ class Camera:
         -------
         ndarray (N, 3)
             Points, or unit directions from the centre, in the world frame.
-
-        Raises
-        ------
-        ValueError
-            If xy is not (N, 2) or depth is not (N,).
         """
         xy = np.asarray(xy, dtype=np.float64)
         require_shapes("Camera.unproject", xy=(xy, ("N", 2)))
@@ -179,17 +168,12 @@ class Camera:
         Parameters
         ----------
         factor : float
-            New size over old size; the sides are rounded to whole pixels.
+            New size over old size, above 0; the sides are rounded to whole pixels.
 
         Returns
         -------
         Camera
             The camera of the resized image.
-
-        Raises
-        ------
-        ValueError
-            If the factor is not positive and finite.
         """
         if not 0.0 < factor < math.inf:
             raise ValueError(f"Camera.scaled needs a finite factor above 0; got {factor}")
@@ -201,13 +185,3 @@ class Camera:
     @property
     def _coefficients(self) -> F64:
         return np.zeros(1) if self.distortion is None else np.asarray(self.distortion, dtype=np.float64)
-
-
-def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
-    try:
-        width, height = (operator.index(side) for side in size)
-    except (TypeError, ValueError):
-        raise ValueError(f"Camera needs a size (width, height) of whole numbers; got {size}") from None
-    if min(width, height) < 1:
-        raise ValueError(f"Camera needs a size of at least 1 x 1; got {size}")
-    return width, height

@@ -50,11 +50,9 @@ from thesisrecon.records import (
     Tracks,
     TwoView,
 )
-from thesisrecon.selfcalibration.focal_scan import FocalScan
-from thesisrecon.selfcalibration.focals_from_fundamental import FocalsFromFundamental
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations
-from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric, ScannedQuadric
+from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
 from thesisrecon.stereo.correspondence import PairMatching, RectifiedPair
 from thesisrecon.stereo.depth import MultiViewScene, MultiViewStereo
@@ -91,11 +89,8 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
         "hypotheses-and-refinement": HypothesesAndRefinement,
         "stratified": Stratified,
         "linear-quadric": LinearQuadric,
-        "scanned-quadric": ScannedQuadric,
         "nonlinear-quadric": NonlinearQuadric,
         "kruppa-equations": KruppaEquations,
-        "focals-from-fundamental": FocalsFromFundamental,
-        "focal-scan": FocalScan,
     },
     "metric": {"metric-refinement": MetricRefinement},
     "dense": {"multi-view-stereo": MultiViewStereo},
@@ -398,26 +393,118 @@ class MetricRefiner(Protocol):
 
 
 class DepthEstimator(Protocol):
-    """Estimate depth maps one view at a time (2.5).
+    """Estimate depth maps one view at a time (2.5)."""
 
-    ``match_rectified`` matches a rectified pair; ``match_two_views`` rectifies two images by their F (by
-    homographies if ``planar``) and matches both directions. ``required_views`` returns the views that the map
-    of one view needs, including itself.
-    """
+    def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap:
+        """Compute the disparities of a rectified pair.
 
-    def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap: ...
+        Parameters
+        ----------
+        left, right : array_like (H, W) or (H, W, 3)
+            Grey levels 0 .. 255, integer or floating point, NaN = no pixel; rows correspond.
+        max_disparity_px : float
+            Disparity of the nearest point.
+
+        Returns
+        -------
+        DisparityMap
+            x_right = x_left - d, NaN = unknown or occluded.
+        """
+        ...
 
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
-    ) -> RectifiedPair: ...
+    ) -> RectifiedPair:
+        """Rectify two images by their F and match both directions.
 
-    def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene: ...
+        Parameters
+        ----------
+        image1, image2 : Image
+            The images.
+        F : ndarray (3, 3)
+            Fundamental matrix, x2' F x1 = 0.
+        xy1, xy2 : ndarray (N >= 8, 2)
+            Inlier matches in pixels.
+        planar : bool
+            Rectify by homographies only.
 
-    def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]: ...
+        Returns
+        -------
+        RectifiedPair
+            Rectified images and disparities of both.
+        """
+        ...
 
-    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap: ...
+    def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
+        """Undistort the views and select their neighbours.
 
-    def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap: ...
+        Parameters
+        ----------
+        images : sequence of Image
+            The V images.
+        reconstruction : Reconstruction
+            Metric reconstruction of these images.
+
+        Returns
+        -------
+        MultiViewScene
+            Input of the other methods.
+        """
+        ...
+
+    def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
+        """Return the views that the depth map of a view and its confirmation need.
+
+        Parameters
+        ----------
+        scene : MultiViewScene
+            All views.
+        view : int
+            Number of the view.
+
+        Returns
+        -------
+        frozenset of int
+            Numbers of the views, the view among them.
+        """
+        ...
+
+    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
+        """Compute the depth map of one view from its neighbours.
+
+        Parameters
+        ----------
+        scene : MultiViewScene
+            All views, or those of ``required_views``.
+        view : int
+            Number of the view.
+
+        Returns
+        -------
+        DepthMap
+            NaN = unknown, everywhere if the view has no neighbours or all pairs fail; ``views`` counts the
+            neighbours that agree.
+        """
+        ...
+
+    def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
+        """Complete a depth map, and keep the depths that the maps of other views confirm.
+
+        Parameters
+        ----------
+        scene : MultiViewScene
+            All views, or those of ``required_views``.
+        depth_maps : mapping of int to DepthMap
+            Results of ``depth_map``.
+        view : int
+            Number of the view.
+
+        Returns
+        -------
+        DepthMap
+            ``views`` is the number of confirming views.
+        """
+        ...
 
 
 class ModelBuilder(Protocol):

@@ -1,9 +1,12 @@
-"""Errors with advice for the user."""
+"""Errors with advice for the user, and the words of messages."""
 
 from __future__ import annotations
 
+import difflib
 import errno
+from collections.abc import Iterable
 from os import PathLike, fspath
+from typing import Any
 
 REMEDIES = {
     errno.ENOSPC: "free space there",
@@ -22,31 +25,90 @@ REMEDIES = {
 """Advice for a file that cannot be written."""
 WRITE_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors that only writing causes."""
+_MAX_SHOWN = 120
 
 
 def counted(number: int, noun: str, shown: str = "") -> str:
-    """Return a number with its noun, singular or plural.
+    """Return a number with its noun, singular or plural, such as "1 image" or "2 matches".
 
     Parameters
     ----------
-    number : int
-    noun : str
-        Singular noun.
+    number, noun : int, str
+        The number and the singular noun.
     shown : str
         Formatted number, if other than ``str(number)``.
 
     Returns
     -------
     str
-        Such as "1 image" or "2 matches".
-
-    Examples
-    --------
-    >>> counted(1, "image"), counted(2, "match")
-    ('1 image', '2 matches')
     """
     ending = "" if number == 1 else "es" if noun.endswith("ch") else "s"
     return f"{shown or number} {noun}{ending}"
+
+
+def in_words(value: Any) -> str:
+    """Return the ``repr`` of a value for a message, shortened.
+
+    Parameters
+    ----------
+    value : object
+        Any value.
+
+    Returns
+    -------
+    str
+    """
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        # Python refuses to print numbers of thousands of digits and infinite nesting.
+        text = f"{type(value).__name__} too large to print"
+    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
+
+
+def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
+    """Return the error for an unknown key of a table, with the nearest known ones.
+
+    Parameters
+    ----------
+    where, key : str
+        Dotted name of the table, and the key.
+    names : iterable of str
+        Its known keys.
+
+    Returns
+    -------
+    UsageError
+    """
+    near = difflib.get_close_matches(key, names := list(names), n=3, cutoff=0.6)
+    known = " or ".join(f"{where}.{name}" for name in near)
+    hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
+    return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint}")
+
+
+def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
+    """Return a message about an unknown word with the nearest known ones, or all.
+
+    Parameters
+    ----------
+    what, word : str, object
+        Kind of word, and the word.
+    known : iterable of str
+        Known words.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> unknown_word("preset", "tesis", ["default", "thesis"])
+    "unknown preset 'tesis'; did you mean thesis?"
+    """
+    known = list(known)
+    near = difflib.get_close_matches(word, known, n=3, cutoff=0.6) if isinstance(word, str) else []
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known)}"
+    return f"unknown {what} {in_words(word)}; {hint}"
 
 
 class StageFailure(Exception):
@@ -54,12 +116,8 @@ class StageFailure(Exception):
 
     Parameters
     ----------
-    reason : str
-        What happened, as one clause ("only 1 image could be read").
-    evidence : str
-        What was measured, with numbers and units ("at least 2 are needed").
-    advice : str
-        What to do.
+    reason, evidence, advice : str
+        What happened, what was measured (with numbers and units), and what to do, as clauses.
 
     Examples
     --------

@@ -1,7 +1,6 @@
-"""Prior knowledge of the intrinsics: the user's options and the per-view table that every stage reads.
+"""Prior knowledge of the intrinsics: the user's :class:`IntrinsicsOptions` give one :class:`IntrinsicsPrior`.
 
-:class:`IntrinsicsOptions` (settings) -> :func:`prior_from_options` -> :class:`IntrinsicsPrior` (one row per
-view or camera). Self-calibration and bundle adjustment derive their unknowns from the latter.
+Self-calibration and bundle adjustment derive their unknowns from the prior.
 """
 
 from __future__ import annotations
@@ -23,7 +22,9 @@ Mode = Literal["known", "constant", "free"]
 INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
 """Columns of every per-view table of intrinsics."""
 
-MAX_CENTRE_OFFSET = 1.0
+_OF_COLUMN = ("focal", "aspect", "skew", "principal_point", "principal_point", "k1")
+"""Mode setting of each column."""
+_MAX_CENTRE_OFFSET = 1.0
 """Largest distance of a principal point from the image border, in long sides (crops may exclude it)."""
 _STD_SETTINGS = {
     "focal_std_rel": "focal",
@@ -39,7 +40,7 @@ _STD_SETTINGS = {
 class IntrinsicsPrior:
     """Gaussian prior of the intrinsics of V views or cameras.
 
-    Attributes
+    Parameters
     ----------
     mean, std : ndarray (V, C)
         C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3. Pixels at working size for focal, skew
@@ -71,7 +72,7 @@ class IntrinsicsPrior:
         Parameters
         ----------
         mean, std, kind, spread
-            As the attributes; ``kind`` None: no kinds.
+            As the fields; ``kind`` None: no kinds.
 
         Returns
         -------
@@ -106,10 +107,8 @@ class IntrinsicsOptions:
     common_prior : bool
         Images of one size come from cameras of one kind: values that are not shared scatter about a common
         mean (hierarchical prior; the scatter is estimated).
-    focal : {"known", "constant", "free"}
-        Mode of the focal length.
-    focal_px, focal_std_rel : float, optional
-        Focal length in pixels of the original images and its relative standard deviation.
+    focal, focal_px, focal_std_rel : Mode, float, float
+        Focal length in pixels of the original images; its standard deviation is relative.
     exif : bool
         Read the focal length from EXIF (35 mm equivalent) if ``focal_px`` is not given. A known focal length
         that is missing in EXIF is estimated as constant.
@@ -157,11 +156,10 @@ class IntrinsicsOptions:
             value = getattr(self, name)
             if value is not None and not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{name} must be above 0; got {value}")
-        for name in ("skew_px", "k1_value"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} must be a number; got {getattr(self, name)}")
-        if not all(math.isfinite(value) for value in self.principal_point_px or ()):
-            raise ValueError(f"principal_point_px must be two numbers; got {self.principal_point_px}")
+        for name in ("skew_px", "k1_value", "principal_point_px"):
+            value = getattr(self, name)
+            if value is not None and not np.isfinite(value).all():
+                raise ValueError(f"{name} must be finite; got {value}")
         self._check_stds(given)
 
     def _check_stds(self, focal_given: bool) -> None:
@@ -183,27 +181,9 @@ class IntrinsicsOptions:
                 "or exif = true"
             )
 
-    @property
-    def modes(self) -> tuple[Mode, ...]:
-        """The mode of each of :data:`INTRINSICS`."""
-        return self.focal, self.aspect, self.skew, self.principal_point, self.principal_point, self.k1
 
-
-def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I64:
-    """Return the camera number (V,) of each image.
-
-    Parameters
-    ----------
-    original_sizes : sequence of (width, height)
-        Sizes of the V original images.
-    cameras : {"shared", "per-image"}
-        One number per distinct size, or one per image.
-
-    Returns
-    -------
-    ndarray (V,) of int
-        Camera numbers in order of first appearance.
-    """
+def _camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I64:
+    """Camera number (V,) of each image in order of appearance: one per distinct size, or one per image."""
     if cameras == "per-image":
         return np.arange(len(original_sizes), dtype=np.int64)
     distinct = list(dict.fromkeys(original_sizes))
@@ -213,7 +193,7 @@ def camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I6
 def camera_numbers(
     original_sizes: Sequence[tuple[int, int]], options: IntrinsicsOptions, exif_focal_px: F64 | None = None
 ) -> I64:
-    """Number the cameras so that views of one number agree in all intrinsics.
+    """Number the cameras so that views of one number agree in all intrinsics, known or shared.
 
     Parameters
     ----------
@@ -223,7 +203,7 @@ def camera_numbers(
     Returns
     -------
     ndarray (V,) of int
-        0-based numbers in the order of the views. Views agree by sharing a value or by a known one.
+        0-based numbers in the order of the views.
     """
     n = len(original_sizes)
     exif = np.full(n, np.nan) if exif_focal_px is None else exif_focal_px
@@ -231,7 +211,7 @@ def camera_numbers(
     known = prior.std == 0.0
     tied = np.where(known, -1, prior.shared).tolist()
     values = np.where(known, prior.mean, 0.0).tolist()
-    group = camera_groups(original_sizes, options.cameras).tolist()
+    group = _camera_groups(original_sizes, options.cameras).tolist()
     keys = [(g, *t, *v) for g, t, v in zip(group, tied, values, strict=True)]
     distinct = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return np.array([distinct[key] for key in keys], dtype=np.int64)
@@ -245,12 +225,11 @@ def prior_from_options(
     Parameters
     ----------
     options : IntrinsicsOptions
+        The user's settings.
     original_sizes : sequence of (width, height)
         Sizes of the original images.
-    exif_focal_px : ndarray (V,)
-        Focal lengths from EXIF in original pixels, NaN if missing.
-    scales : ndarray (V,)
-        Working size over original size.
+    exif_focal_px, scales : ndarray (V,)
+        Focal lengths from EXIF in original pixels (NaN if missing), and working over original size.
 
     Returns
     -------
@@ -264,13 +243,14 @@ def prior_from_options(
     """
     n = len(original_sizes)
     check_sizes(options, original_sizes)
-    group, own = camera_groups(original_sizes, options.cameras), np.arange(n, dtype=np.int64)
+    group, own = _camera_groups(original_sizes, options.cameras), np.arange(n, dtype=np.int64)
     # A known value is known for every view: sharing it would add nothing.
-    shared = np.stack([group if mode == "constant" else own for mode in options.modes], axis=1)
-    kind = camera_groups(original_sizes, "shared") if options.common_prior else own
+    modes = [getattr(options, name) for name in _OF_COLUMN]
+    shared = np.stack([group if mode == "constant" else own for mode in modes], axis=1)
+    kind = _camera_groups(original_sizes, "shared") if options.common_prior else own
     mean, std = _values(options, np.array(original_sizes, dtype=np.float64).reshape(n, 2), exif_focal_px)
     for column, name in enumerate(INTRINSICS):
-        if options.modes[column] == "known":
+        if modes[column] == "known":
             std[:, column] = 0.0
         if name in ("principal_x", "principal_y"):
             # (0, 0) is the centre of the first pixel: x goes to (x + 0.5) s - 0.5.
@@ -309,25 +289,19 @@ def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None 
 
 
 def check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]]) -> None:
-    """Check that the given principal point is possible for all image sizes.
+    """Raise ``UsageError`` if the given principal point lies more than one long side outside an image.
 
     Parameters
     ----------
-    options : IntrinsicsOptions
-    original_sizes : sequence of (width, height)
-        Sizes of the original images.
-
-    Raises
-    ------
-    UsageError
-        If it lies more than one long side outside an image.
+    options, original_sizes
+        As for :func:`prior_from_options`.
     """
     if options.principal_point_px is None:
         return
     x, y = options.principal_point_px
     for width, height in dict.fromkeys(original_sizes):
         outside = max(-x, x - width, -y, y - height)
-        if outside > MAX_CENTRE_OFFSET * max(width, height):
+        if outside > _MAX_CENTRE_OFFSET * max(width, height):
             raise UsageError(
                 f"principal_point_px = ({x:g}, {y:g}) is {outside:.0f} px outside an image of "
                 f"{width} x {height} px, more than its long side. Give it in pixels of the original images"
@@ -336,45 +310,35 @@ def check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, 
 
 def _values(options: IntrinsicsOptions, sizes: F64, exif_focal_px: F64) -> tuple[F64, F64]:
     """Means and standard deviations (V, 6) in original pixels, modes ignored."""
-    n = len(sizes)
-    focal = np.full(n, np.nan)
-    if options.focal_px is not None:
-        focal[:] = options.focal_px
-    elif options.exif:
+    n, one, given = len(sizes), np.ones(len(sizes)), options.principal_point_px
+    focal = options.focal_px * one if options.focal_px is not None else np.nan * one
+    if options.focal_px is None and options.exif:
         focal = exif_focal_px.astype(np.float64)
-    given = options.principal_point_px
     centre = (sizes - 1.0) / 2.0 if given is None else np.tile(given, (n, 1))
-    one = np.ones(n)
     mean = np.column_stack(
         [focal, options.aspect_ratio * one, options.skew_px * one, centre, options.k1_value * one]
     )
-    stds = (
-        options.focal_std_rel, options.aspect_std, options.skew_std_px, options.principal_point_std_rel,
-        options.principal_point_std_rel, options.k1_std,
-    )  # fmt: skip
-    std = np.tile([np.inf if value is None else value for value in stds], (n, 1))
+    stds = {intrinsic: getattr(options, name) for name, intrinsic in _STD_SETTINGS.items()}
+    std = np.tile([np.inf if stds[name] is None else stds[name] for name in _OF_COLUMN], (n, 1))
     std[:, 3:5] *= sizes.max(axis=1, keepdims=True)
     return mean, std
 
 
 def prior_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
-    """Return warnings about requested EXIF focal lengths that are missing.
+    """Return a warning about requested EXIF focal lengths that are missing.
 
     Parameters
     ----------
-    options : IntrinsicsOptions
-    exif_focal_px : ndarray (V,)
-        Focal lengths from EXIF, NaN if missing.
+    options, exif_focal_px
+        As for :func:`prior_from_options`.
 
     Returns
     -------
     list of str
         One sentence, or none.
     """
-    if not options.exif or options.focal_px is not None or not len(exif_focal_px):
-        return []
     missing, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
-    if not missing:
+    if not options.exif or options.focal_px is not None or not missing:
         return []
     # A known focal that is estimated instead must be reported.
     instead = ": it is estimated instead, one value per camera (constant)"

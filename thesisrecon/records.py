@@ -50,127 +50,59 @@ class Image:
 
 @dataclass(frozen=True)
 class Seeds:
-    """Corners of several scales with a normalised patch each, matched without a search radius.
+    """Corners of several scales with a normalised patch each, matched without a search radius."""
 
-    Parameters
-    ----------
-    xy : ndarray (S, 2)
-        Positions, px.
-    scale : ndarray (S,)
-        Pixels per sample of the pyramid level.
-    angle : ndarray (S,)
-        Rotation of the patch, rad; 0 = upright.
-    patches : ndarray (S, D)
-        Patches of zero mean and unit norm, float32.
-    """
-
-    xy: F64
-    scale: F32
-    angle: F32
-    patches: F32
+    xy: F64  #: (S, 2) positions, px
+    scale: F32  #: (S,) pixels per sample of the pyramid level
+    angle: F32  #: (S,) rotation of the patch, rad; 0 = upright
+    patches: F32  #: (S, D) patches of zero mean and unit norm
 
 
 @dataclass(frozen=True)
 class Features:
-    """Corners of one image, strongest first.
+    """Corners of one image, strongest first."""
 
-    Parameters
-    ----------
-    xy : ndarray (N, 2)
-        Positions, px.
-    scale : ndarray (N,)
-        Scale of each corner.
-    response : ndarray (N,)
-        Corner response, float32.
-    seeds : Seeds, optional
-        Patches for matching without a search radius.
-    """
-
-    xy: F64
-    scale: F32
-    response: F32
+    xy: F64  #: (N, 2) positions, px
+    scale: F32  #: (N,) scale of each corner
+    response: F32  #: (N,) corner response
     seeds: Seeds | None = None
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Matched corners of views i and j.
-
-    Parameters
-    ----------
-    i, j : int
-        View numbers.
-    index1, index2 : ndarray (M,) of int
-        Indices into ``Features.xy``, each corner at most once.
-    xy1, xy2 : ndarray (M, 2)
-        Positions after sub-pixel alignment, px.
-    score : ndarray (M,)
-        Correlation in [-1, 1].
-    affine : ndarray (M, 2, 2)
-        Local map from image 1 to image 2; identity if it was not estimated.
-    """
+    """Matched corners of views i and j."""
 
     i: int
     j: int
-    index1: I64
-    index2: I64
-    xy1: F64
+    index1: I64  #: (M,) indices into ``Features.xy`` of view i, each corner at most once
+    index2: I64  #: the same of view j
+    xy1: F64  #: (M, 2) positions after sub-pixel alignment, px
     xy2: F64
-    score: F32
-    affine: F64
+    score: F32  #: (M,) correlation in [-1, 1]
+    affine: F64  #: (M, 2, 2) local map from image 1 to image 2; identity if it was not estimated
 
 
 @dataclass(frozen=True)
 class PairChoice:
-    """The pairs of views to match.
+    """The pairs of views to match."""
 
-    Parameters
-    ----------
-    pairs : ndarray (M, 2) of int
-        View numbers, the smaller first, sorted.
-    how : str
-        How the pairs were selected.
-    compared : int
-        Number of pairs whose overlap was estimated.
-    """
-
-    pairs: I64
-    how: str
-    compared: int = 0
+    pairs: I64  #: (M, 2) view numbers, the smaller first, sorted
+    how: str  #: how the pairs were selected
+    compared: int = 0  #: number of pairs whose overlap was estimated
 
 
 @dataclass(frozen=True)
 class DegeneracyReport:
-    """Whether the matches of a pair determine its F, with the evidence.
-
-    Parameters
-    ----------
-    determined : bool
-        True if no other F explains the matches as well.
-    reasons : tuple of str
-        Why F is undetermined.
-    off_plane : float
-        Inliers off the dominant plane; matches at one position count once.
-    contradicted : float
-        Those among them that lie between matches of the plane, where no surface can be.
-    log10_false_alarms : float
-        log10 of how often chance gives as many inliers off the plane.
-    competing_margin : float
-        Standard errors by which the best competing model explains fewer matches.
-    competing_model : ndarray (3, 3), optional
-        That model.
-    expected_error_px : float
-        RMS distance of exact matches to their epipolar lines by the covariance of F.
-    """
+    """Whether the matches of a pair determine its F (no other F explains them as well), with the evidence."""
 
     determined: bool
-    reasons: tuple[str, ...] = ()
-    off_plane: float = 0.0
-    contradicted: float = 0.0
-    log10_false_alarms: float = 0.0
-    competing_margin: float = float("inf")
+    reasons: tuple[str, ...] = ()  #: why F is undetermined
+    off_plane: float = 0.0  #: inliers off the dominant plane; matches at one position count once
+    contradicted: float = 0.0  #: those among them between matches of the plane, where no surface can be
+    log10_false_alarms: float = 0.0  #: of how often chance gives as many inliers off the plane
+    competing_margin: float = float("inf")  #: standard errors by which the best one explains fewer
     competing_model: F64 | None = None
-    expected_error_px: float = float("inf")
+    expected_error_px: float = float("inf")  #: RMS epipolar distance of exact matches by the covariance of F
 
 
 @dataclass(frozen=True)
@@ -218,20 +150,14 @@ class TwoView:
         Fundamental matrix.
     sigma_px : float
         Standard deviation of one image coordinate.
-    index1, index2 : ndarray (M,) of int
-        Corner indices of the verified matches.
-    xy1, xy2 : ndarray (M, 2)
-        Positions, px.
-    affine : ndarray (M, 2, 2)
-        Local maps from image 1 to image 2.
+    index1, index2, xy1, xy2, affine : ndarray
+        Verified matches, as in :class:`Matches`.
     candidates : int
         Number of matches before verification.
     homography_inlier_ratio : float
         Fraction of the verified matches that one homography explains; near 1 for a plane or a pure rotation.
-    accepted : bool
-        Whether the pair enters the tracks.
-    reason : str
-        Why it does not.
+    accepted, reason : bool, str
+        Whether the pair enters the tracks, else why not.
     configuration : str
         "general", "plane", "pure rotation" or "pure translation"; empty for too few matches.
     degeneracy : DegeneracyReport, optional
@@ -298,12 +224,8 @@ class Reconstruction:
         Camera matrices, zeros where not registered; K [R t] before distortion in the metric stratum.
     X : ndarray (N, 4)
         Homogeneous points, zeros where not valid; last coordinate 1 in the metric stratum.
-    registered : ndarray (V,) of bool
-        Registered views.
-    valid : ndarray (N,) of bool
-        Reconstructed points.
-    inlier : ndarray (K,) of bool
-        Inlier observations.
+    registered, valid, inlier : ndarray (V,), (N,), (K,) of bool
+        Registered views, reconstructed points and inlier observations.
     tracks : Tracks
         The K observations.
     sizes : ndarray (V, 2) of int
@@ -315,8 +237,7 @@ class Reconstruction:
     K : ndarray (V, 3, 3), optional
         Calibration matrices (metric stratum).
     distortion : ndarray (V, 3), optional
-        Radial coefficients k1, k2, k3; a normalised point (x, y) is imaged at
-        (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6). None: no distortion.
+        Radial coefficients k1, k2, k3 as in :class:`thesisrecon.Camera`. None: no distortion.
     """
 
     stratum: Stratum
@@ -335,52 +256,24 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class Upgrade:
-    """One candidate of self-calibration.
+    """One candidate of self-calibration."""
 
-    Parameters
-    ----------
-    metric_from_projective : ndarray (4, 4)
-        Upgrading transform.
-    K : ndarray (V, 3, 3)
-        Calibration matrices, zeros where not registered.
-    cost : float
-        Value of the criterion.
-    method : str
-        The method it came from.
-    """
-
-    metric_from_projective: F64
-    K: F64
-    cost: float
-    method: str
+    metric_from_projective: F64  #: (4, 4)
+    K: F64  #: (V, 3, 3) calibration matrices, zeros where not registered
+    cost: float  #: value of the criterion
+    method: str  #: the method it came from
 
 
 @dataclass(frozen=True)
 class IdentifiabilityReport:
-    """Whether the views determine the calibration under the prior, and the nearest critical motion.
+    """Whether the views determine the calibration under the prior, and the nearest critical motion."""
 
-    Parameters
-    ----------
-    identifiable : bool
-        Whether the calibration is determined; the prior may resolve a critical motion.
-    motion : str
-        Nearest critical motion ("pure translation", "turntable", ...), empty if not measurable.
-    critical : bool
-        Whether the cameras cannot be distinguished from that motion.
-    evidence : mapping
-        Measure -> number.
-    sentences : tuple of str
-        What was found, what it means and what to do.
-    undetermined : tuple of int
-        Views whose own focal length is not determined.
-    """
-
-    identifiable: bool
-    motion: str
-    critical: bool
+    identifiable: bool  #: the prior may resolve a critical motion
+    motion: str  #: nearest critical motion ("pure translation", "turntable", ...), empty if not measurable
+    critical: bool  #: whether the cameras cannot be distinguished from that motion
     evidence: Mapping[str, float]
-    sentences: tuple[str, ...] = ()
-    undetermined: tuple[int, ...] = ()
+    sentences: tuple[str, ...] = ()  #: what was found, what it means and what to do
+    undetermined: tuple[int, ...] = ()  #: views whose own focal length is not determined
 
 
 @dataclass(frozen=True)
@@ -391,15 +284,11 @@ class SelfCalibration:
     ----------
     metric_from_projective : ndarray (4, 4)
         Upgrading transform of the best candidate.
-    K : ndarray (V, 3, 3)
-        Calibration matrices, zeros where not registered.
-    K_std : ndarray (V, 3, 3)
-        Standard deviations of the entries of K: 0 if known, that of the prior if not estimated, NaN if
-        unknown.
-    identifiable : bool
-        Whether the views determine the calibration.
-    reasons : tuple of str
-        Why they do not.
+    K, K_std : ndarray (V, 3, 3)
+        Calibration matrices, zeros where not registered, and the standard deviations of their entries: 0 if
+        known, that of the prior if not estimated, NaN if unknown.
+    identifiable, reasons : bool, tuple of str
+        Whether the views determine the calibration, else why not.
     candidates : tuple of Upgrade
         All candidates, best first.
     identifiability : IdentifiabilityReport, optional
@@ -423,15 +312,7 @@ class SelfCalibration:
 
 @dataclass(frozen=True)
 class IntrinsicInterval:
-    """One intrinsic of one view.
-
-    Parameters
-    ----------
-    value, std : float
-        Value and standard deviation, in pixels or dimensionless.
-    source : str
-        Where they come from.
-    """
+    """One intrinsic of one view with its standard deviation (in pixels or dimensionless) and source."""
 
     value: float
     std: float
@@ -442,29 +323,16 @@ class IntrinsicInterval:
 class MetricResult:
     """Result of the metric stage.
 
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Metric cameras and points.
-    intrinsics : tuple of mapping
-        Per view "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px", "k1", "k2",
-        "k3" -> :class:`IntrinsicInterval` (std 0: as assumed); empty where not registered.
-    self_check : mapping
-        Name -> measured number.
-    trusted : bool
-        Whether the self-check passed.
-    failed_checks : tuple of str
-        A sentence for each failed check.
-    warnings : tuple of str
-        Sentences about a trusted result, such as focal lengths that rest on other cameras.
+    ``intrinsics`` has per view "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px",
+    "k1", "k2", "k3" (std 0: as assumed), and nothing where the view is not registered.
     """
 
     reconstruction: Reconstruction
     intrinsics: tuple[Mapping[str, IntrinsicInterval], ...]
     self_check: Mapping[str, float]
-    trusted: bool
+    trusted: bool  #: whether the self-check passed
     failed_checks: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  #: about a trusted result, such as focals that rest on other cameras
 
 
 @dataclass(frozen=True)
@@ -507,49 +375,23 @@ class DisparityMap:
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth map of one view, distortion removed.
-
-    Parameters
-    ----------
-    view : int
-        View number.
-    P : ndarray (3, 4)
-        K [R t] for the pixels of this map, which may be fewer than those of the image.
-    depth : ndarray (H, W) float32
-        z in the camera frame, NaN where unknown.
-    std : ndarray (H, W) float32
-        Standard deviation.
-    views : ndarray (H, W) uint8
-        Number of other views that confirm it.
-    """
+    """Depth map of one view, distortion removed."""
 
     view: int
-    P: F64
-    depth: F32
-    std: F32
-    views: NDArray[np.uint8]
+    P: F64  #: K [R t] for the pixels of this map, which may be fewer than those of the image
+    depth: F32  #: (H, W) z in the camera frame, NaN where unknown
+    std: F32  #: (H, W)
+    views: NDArray[np.uint8]  #: (H, W) number of other views that confirm it
 
 
 @dataclass(frozen=True)
 class PinholeView:
-    """An image with its distortion removed.
-
-    Parameters
-    ----------
-    view : int
-        View number.
-    P : ndarray (3, 4)
-        K [R t].
-    rgb : ndarray (H, W, 3) uint8
-        Pixels.
-    seen : ndarray (H, W) of bool
-        Pixels inside the original image.
-    """
+    """An image with its distortion removed."""
 
     view: int
-    P: F64
-    rgb: NDArray[np.uint8]
-    seen: B8
+    P: F64  #: K [R t]
+    rgb: NDArray[np.uint8]  #: (H, W, 3)
+    seen: B8  #: (H, W) pixels inside the original image
 
 
 @dataclass(frozen=True)
@@ -564,10 +406,8 @@ class TexturedMesh:
         Vertex indices, counter-clockwise seen from outside.
     colors : ndarray (N, 3) uint8, optional
         Vertex colours.
-    uv : ndarray (M, 3, 2), optional
-        Texture coordinates of the corners in texels, x right, y down, (0, 0) = centre of the top-left texel.
-    texture : ndarray (H, W, 3) uint8, optional
-        Texture.
+    uv, texture : ndarray (M, 3, 2), ndarray (H, W, 3) uint8, optional
+        Texture, and texture coordinates of the corners in texels, (0, 0) = centre of the top-left texel.
     untextured : ndarray (M,) of bool, optional
         Faces that no view sees.
     """
@@ -582,57 +422,23 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A rendered mesh.
+    """A rendered mesh."""
 
-    Parameters
-    ----------
-    color : ndarray (H, W, 3) uint8
-        Image.
-    depth : ndarray (H, W) float32
-        z in the camera frame, NaN where empty.
-    valid : ndarray (H, W) of bool
-        Pixels with a surface.
-    """
-
-    color: NDArray[np.uint8]
-    depth: F32
-    valid: B8
+    color: NDArray[np.uint8]  #: (H, W, 3)
+    depth: F32  #: (H, W) z in the camera frame, NaN where empty
+    valid: B8  #: (H, W) pixels with a surface
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Comparison of a held-out image with the rendered model.
-
-    Parameters
-    ----------
-    view : int
-        View number.
-    real, rendered : ndarray (H, W, 3) uint8
-        The image without distortion, and the model.
-    compared : ndarray (H, W) of bool
-        Pixels that both cover.
-    psnr_db : float
-        Peak signal-to-noise ratio in dB.
-    ssim : float
-        Structural similarity, 1 = identical.
-
-    Raises
-    ------
-    ValueError
-        If the sizes differ.
-    """
+    """Comparison of a held-out image, distortion removed, with the rendered model."""
 
     view: int
-    real: NDArray[np.uint8]
-    rendered: NDArray[np.uint8]
-    compared: B8
-    psnr_db: float
-    ssim: float
-
-    def __post_init__(self) -> None:
-        shapes = (self.real.shape, self.rendered.shape, (*self.compared.shape, 3))
-        if len(set(shapes)) > 1:
-            raise ValueError(f"a held-out comparison needs images and a mask of one size; got {shapes}")
+    real: NDArray[np.uint8]  #: (H, W, 3)
+    rendered: NDArray[np.uint8]  #: (H, W, 3)
+    compared: B8  #: (H, W) pixels that both cover
+    psnr_db: float  #: peak signal-to-noise ratio
+    ssim: float  #: structural similarity, 1 = identical
 
     @property
     def share(self) -> float:
@@ -642,19 +448,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class StageReport:
-    """Report of one stage.
-
-    Parameters
-    ----------
-    stage : str
-        Name.
-    seconds : float
-        Computing time.
-    counts, metrics : mapping
-        Name -> number.
-    warnings : tuple of str
-        Sentences.
-    """
+    """Computing time, numbers and warnings of one stage."""
 
     stage: str
     seconds: float
@@ -673,36 +467,20 @@ class RunResult:
     ----------
     out : Path
         Output folder.
-    images : tuple of Image
-        The V views at working size.
-    refused : mapping
+    images, features : tuple of Image, tuple of Features
+        The V views at working size and their corners.
+    unread : mapping
         File name -> reason of unreadable images.
-    features : tuple of Features
-        One per view.
     pairs : tuple of TwoView
         All matched pairs, accepted or not.
     groups : ndarray (V,) of int
         Camera number of each view.
     settings : mapping
         Stage -> field -> value.
-    pair_choice : PairChoice, optional
-        How the pairs were selected.
-    tracks : Tracks, optional
-        Tracks.
-    projective : Reconstruction, optional
-        Projective reconstruction.
-    calibration : SelfCalibration, optional
-        Self-calibration.
-    metric : MetricResult, optional
-        Metric result.
-    views : tuple of PinholeView
-        Undistorted images.
-    depth_maps : tuple of DepthMap
-        Depth maps.
-    mesh : TexturedMesh, optional
-        Surface model.
-    held_out : HeldOut, optional
-        Comparison with a held-out image.
+    pair_choice, tracks, projective, calibration, metric, mesh, held_out : optional
+        Results of the stages.
+    views, depth_maps : tuple of PinholeView, tuple of DepthMap
+        Undistorted images and their depth maps.
     reports : tuple of StageReport
         One per stage.
     warnings : tuple of str
@@ -715,7 +493,7 @@ class RunResult:
 
     out: Path
     images: tuple[Image, ...]
-    refused: Mapping[str, str]
+    unread: Mapping[str, str]
     features: tuple[Features, ...]
     pairs: tuple[TwoView, ...]
     groups: I64
@@ -733,3 +511,13 @@ class RunResult:
     warnings: tuple[str, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
     failure: str = ""
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """File name -> reason of every image without a camera: unreadable or not registered."""
+        best = self.metric.reconstruction if self.metric is not None else self.projective
+        if best is None:
+            return dict(self.unread)
+        views = zip(self.images, best.registered, best.reasons, strict=True)
+        reasons = {image.name: reason or "no reason was recorded" for image, in_, reason in views if not in_}
+        return {**self.unread, **reasons}

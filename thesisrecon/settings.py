@@ -1,309 +1,199 @@
-"""Frozen dataclasses as plain tables and TOML: types are checked, unknown keys refused.
+"""The configuration as text: TOML, ``--set stage.field=value`` and plain tables, with checked types.
 
-Fields are numbers, text, tuples of these or dataclasses. ``None`` is written as the word ``none``, since TOML
-has no null.
+A stage is a table: ``kind`` selects the method, the other keys are its fields: numbers, text, tuples of these
+or dataclasses. ``None`` is written as the word ``none``, since TOML has no null.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
+import tomllib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
-from thesisrecon.errors import UsageError
+from thesisrecon.config import KINDS, PipelineConfig, kind_of, preset
+from thesisrecon.errors import UsageError, in_words, unknown_setting, unknown_word
 
 T = TypeVar("T")
 Table = dict[str, Any]
-NONE = "none"
-KIND = "kind"
-MAX_SHOWN = 120
-"""Maximum length of a value in a message."""
+_NONE, _KIND = "none", "kind"
+_MAX_DEPTH = 16
+"""Maximum nesting of a setting, from its stage to its field."""
 
 
-def table_from_dataclass(value: Any) -> Table:
-    """Convert a dataclass to a table of plain values.
+def config_from_toml(
+    text: str,
+    base: PipelineConfig | None = None,
+    *,
+    fixed_preset: bool = False,
+    changes: Sequence[Mapping[str, Any]] = (),
+) -> PipelineConfig:
+    """Read a configuration.
 
-    Parameters
-    ----------
-    value : dataclass
-
-    Returns
-    -------
-    dict
-        Field -> number, text, list or table; a table of one of several dataclasses begins with ``kind``.
-    """
-    hints = typing.get_type_hints(type(value))
-    table = {}
-    for name in _settings_of(type(value)):
-        content, several = getattr(value, name), alternatives(typing.get_args(hints[name]))
-        head = {KIND: word_of(type(content))} if type(content) in several.values() else {}
-        table[name] = head | _plain(content) if head else _plain(content)
-    return table
-
-
-def _settings_of(kind: type[Any]) -> list[str]:
-    """Names of the fields without those that the pipeline fills with data (metadata ``given``)."""
-    return [f.name for f in dataclasses.fields(kind) if not f.metadata.get("given")]
-
-
-def word_of(kind: type[Any]) -> str:
-    """Return the word of a class in text.
-
-    Parameters
-    ----------
-    kind : type
-
-    Returns
-    -------
-    str
-        Its name in kebab case: "modulus-constraint" for ``ModulusConstraint``.
-    """
-    return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()
-
-
-def alternatives(union: Iterable[Any]) -> dict[str, type[Any]]:
-    """Return the dataclasses among the members of a union, if there are several.
-
-    Parameters
-    ----------
-    union : iterable
-        Members of the union.
-
-    Returns
-    -------
-    dict
-        Word -> class; empty with fewer than two.
-    """
-    classes = [a for a in union if isinstance(a, type) and dataclasses.is_dataclass(a)]
-    return {word_of(a): a for a in classes} if len(classes) > 1 else {}
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return table_from_dataclass(value)
-    if isinstance(value, tuple):
-        return [_plain(v) for v in value]
-    return NONE if value is None else value
-
-
-def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, base: T | None = None) -> T:
-    """Build a dataclass from a table.
-
-    Parameters
-    ----------
-    kind : type
-    table : mapping
-        Field -> plain value.
-    where : str
-        Dotted name of the table, for messages.
-    base : dataclass, optional
-        Supplies the other fields; None: the defaults.
-
-    Returns
-    -------
-    dataclass
-        An instance of ``kind``.
-
-    Raises
-    ------
-    UsageError
-        If a key is unknown, or a value has the wrong type or is refused by the dataclass.
-    """
-    hints = typing.get_type_hints(kind)
-    names = _settings_of(kind)
-    changes = {}
-    for key, value in table.items():
-        place = f"{where}.{key}"
-        if key not in names:
-            raise unknown_setting(where, key, names)
-        changes[key] = coerce(value, hints[key], place, None if base is None else getattr(base, key))
-    try:
-        return kind(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
-    except (ValueError, TypeError) as error:
-        raise UsageError(f"[{where}] {error}") from None
-
-
-def coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
-    """Convert a plain value to an annotated type.
-
-    An int is accepted for a float, never the reverse; text is never accepted for a number.
-
-    Parameters
-    ----------
-    value : object
-        Plain value.
-    annotation : type
-        bool, int, float, str, Literal, tuple, dataclass, or an optional of these.
-    where : str
-        Dotted name of the setting, for messages.
-    current : object, optional
-        Base of a dataclass.
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    UsageError
-        If the value has the wrong type.
-    """
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin in (typing.Union, types.UnionType):
-        return _coerce_optional(value, arguments, where, current)
-    if origin is Literal:
-        if value in arguments and isinstance(value, str):
-            return value
-        raise UsageError(unknown_word(f"value of {where}", value, [str(a) for a in arguments]))
-    if origin is tuple and isinstance(value, list | tuple):
-        return _coerce_tuple(value, arguments, where)
-    if dataclasses.is_dataclass(annotation) and isinstance(annotation, type) and isinstance(value, Mapping):
-        return dataclass_from_table(annotation, value, where, current)
-    if annotation is float and _is_number(value):
-        return float(value)
-    if annotation in (str, bool) and type(value) is annotation:
-        return value
-    if annotation is int and type(value) is int and _fits(value):
-        return value
-    raise UsageError(f"{where} takes {_type_words(annotation)}; got {in_words(value)}")
-
-
-def _fits(number: int) -> bool:
-    """Whether it fits in 64 bits."""
-    return abs(number) < 2**63
-
-
-def _is_number(value: Any) -> bool:
-    if type(value) is int:
-        return _fits(value)
-    return type(value) is float and not math.isnan(value)
-
-
-def _coerce_optional(value: Any, arguments: tuple[Any, ...], where: str, current: Any) -> Any:
-    if value is None or value == NONE:
-        return None
-    if several := alternatives(arguments):
-        return _coerce_alternative(value, several, where, current)
-    rest = [a for a in arguments if a is not type(None)]
-    return coerce(value, rest[0], where, current)
-
-
-def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str, current: Any) -> Any:
-    """One of several dataclasses from its word, or from a table with ``kind`` (default: unchanged)."""
-    table = {KIND: value} if isinstance(value, str) else value
-    if not isinstance(table, Mapping):
-        one_of = f"one of {', '.join(several)} or a table of settings"
-        raise UsageError(f"{where} takes {one_of}; got {in_words(value)}")
-    kind = table.get(KIND, word_of(type(current)))
-    if not isinstance(kind, str) or kind not in several:
-        raise UsageError(unknown_word(f"kind of {where}", kind, several))
-    fields = {key: v for key, v in table.items() if key != KIND}
-    base = current if type(current) is several[kind] else None
-    return dataclass_from_table(several[kind], fields, where, base)
-
-
-def _coerce_tuple(
-    value: list[Any] | tuple[Any, ...], arguments: tuple[Any, ...], where: str
-) -> tuple[Any, ...]:
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        arguments = (arguments[0],) * len(value)
-    if len(value) != len(arguments):
-        raise UsageError(f"{where} takes a list of {len(arguments)} values; got {len(value)}")
-    return tuple(coerce(v, a, f"{where}[{n}]") for n, (v, a) in enumerate(zip(value, arguments, strict=True)))
-
-
-def _type_words(annotation: Any) -> str:
-    words = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
-    if annotation in words:
-        return words[annotation]
-    return "a list" if typing.get_origin(annotation) is tuple else "a table of settings"
-
-
-def in_words(value: Any) -> str:
-    """Return a value as text for a message, shortened to ``MAX_SHOWN``.
-
-    Parameters
-    ----------
-    value : object
-
-    Returns
-    -------
-    str
-        Its ``repr``.
-    """
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):
-        # Python refuses to print numbers of thousands of digits and infinite nesting.
-        text = f"{type(value).__name__} too large to print"
-    return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 3] + "..."
-
-
-def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
-    """Return the error for an unknown key, with the nearest known ones.
-
-    Parameters
-    ----------
-    where : str
-        Dotted name of the table.
-    key : str
-        The unknown key.
-    names : iterable of str
-        Its known keys.
-
-    Returns
-    -------
-    UsageError
-    """
-    near = difflib.get_close_matches(key, names := list(names), n=3, cutoff=0.6)
-    known = " or ".join(f"{where}.{name}" for name in near)
-    hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
-    return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint}")
-
-
-def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
-    """Return a message about an unknown word with the nearest known ones, or all.
-
-    Parameters
-    ----------
-    what : str
-        Kind of word.
-    word : object
-        The unknown word.
-    known : iterable of str
-        Known words.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> unknown_word("preset", "tesis", ["default", "thesis"])
-    "unknown preset 'tesis'; did you mean thesis?"
-    """
-    known = list(known)
-    near = difflib.get_close_matches(word, known, n=3, cutoff=0.6) if isinstance(word, str) else []
-    hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known)}"
-    return f"unknown {what} {in_words(word)}; {hint}"
-
-
-def parse_word(text: str) -> Any:
-    """Parse the value of ``--set key=value``.
+    All tables are merged before values are checked, so settings that need each other may come from different
+    tables.
 
     Parameters
     ----------
     text : str
+        TOML. A line ``preset = "thesis"`` at its top selects the base, unless ``fixed_preset``.
+    base : PipelineConfig, optional
+        Base; None: the preset ``default``.
+    fixed_preset : bool
+        Ignore the preset of the text.
+    changes : sequence of mapping
+        Further tables, later ones override.
+
+    Returns
+    -------
+    PipelineConfig
+
+    Raises
+    ------
+    UsageError
+        For invalid TOML, unknown stages, kinds or settings, and values of the wrong type.
+
+    Examples
+    --------
+    >>> from thesisrecon.settings import config_from_toml
+    >>> config_from_toml("[images]\\nmax_size_px = 800").images.max_size_px
+    800
+    """
+    try:
+        tables = tomllib.loads(text)
+    except ValueError as error:
+        raise UsageError(f"the configuration is not TOML: {error}") from None
+    except RecursionError:
+        raise UsageError("the configuration is nested too deeply") from None
+    name = tables.pop("preset", None)
+    if name is not None and not fixed_preset:
+        base = preset(name)
+    base = base or PipelineConfig()
+    merged: dict[str, Any] = {}
+    for change in (tables, *changes):
+        merged = _merged_stages(merged, change, base)
+    return config_from_tables(merged, base)
+
+
+def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
+    """``over`` merged into ``under``; another kind drops the settings of the old one."""
+    merged = dict(under)
+    for stage, table in over.items():
+        old = under.get(stage)
+        if isinstance(old, Mapping) and isinstance(table, Mapping):
+            kind = old.get(_KIND, kind_of(stage, getattr(base, stage))) if stage in KINDS else None
+            merged[stage] = table if table.get(_KIND, kind) != kind else _merged(old, table)
+        else:
+            merged[stage] = table
+    return merged
+
+
+def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """``over`` merged into ``under``, table by table."""
+    merged = dict(under)
+    for key, value in over.items():
+        old = merged.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        merged[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return merged
+
+
+def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = None) -> PipelineConfig:
+    """Change a configuration by plain tables.
+
+    Parameters
+    ----------
+    tables : mapping
+        Stage -> field -> value; ``UsageError`` as :func:`config_from_toml`.
+    base : PipelineConfig, optional
+        Base; None: the preset ``default``.
+
+    Returns
+    -------
+    PipelineConfig
+    """
+    config = base or PipelineConfig()
+    stages = [item.name for item in dataclasses.fields(config)]
+    for stage, table in tables.items():
+        if stage not in stages:
+            raise UsageError(unknown_word("stage", stage, ["preset", *stages]))
+        if not isinstance(table, Mapping):
+            raise UsageError(f"{stage} takes a table of settings; got {in_words(table)}")
+        method = _stage_from_table(stage, table, getattr(config, stage))
+        config = dataclasses.replace(config, **{stage: method})
+    return config
+
+
+def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any:
+    if stage not in KINDS:
+        return dataclass_from_table(type(current), table, stage, current)
+    fields = {key: value for key, value in table.items() if key != _KIND}
+    kind = table.get(_KIND, kind_of(stage, current))
+    if not isinstance(kind, str) or (kind not in KINDS[stage] and type(current).__name__ != kind):
+        raise UsageError(unknown_word(f"kind of {stage}", kind, KINDS[stage]))
+    variant = KINDS[stage].get(kind, type(current))
+    names = [item.name for item in dataclasses.fields(variant)]
+    for key in fields:
+        if key not in names:
+            raise unknown_setting(stage, key, [_KIND, *names])
+    return dataclass_from_table(variant, fields, stage, current if type(current) is variant else None)
+
+
+def tables_from_settings(settings: Sequence[str]) -> Table:
+    """Parse the values of ``--set``.
+
+    Parameters
+    ----------
+    settings : sequence of str
+        ``stage.field=value``, or ``stage.field.field=value`` for nested ones; later ones override.
+
+    Returns
+    -------
+    dict
+        Tables for :func:`config_from_tables`.
+
+    Raises
+    ------
+    UsageError
+        If a text has another form.
+
+    Examples
+    --------
+    >>> from thesisrecon.settings import tables_from_settings
+    >>> tables_from_settings(["features.kind=harris-corners", "images.max_size_px=800"])
+    {'features': {'kind': 'harris-corners'}, 'images': {'max_size_px': 800}}
+    """
+    tables: Table = {}
+    for setting in settings:
+        place, equals, text = setting.partition("=")
+        path = place.strip().split(".")
+        if not equals or not 2 <= len(path) <= _MAX_DEPTH or not all(path):
+            raise UsageError(
+                "--set takes stage.field=value, for example features.kind=harris-corners; "
+                f"got {in_words(setting)}"
+            )
+        value = parse_word(text)
+        for key in reversed(path):
+            value = {key: value}
+        tables = _merged(tables, value)
+    return tables
+
+
+def parse_word(text: str) -> Any:
+    """Parse the value of ``--set``.
+
+    Parameters
+    ----------
+    text : str
+        true, false, a number, a flat list ``[a, b]``, else text.
 
     Returns
     -------
     bool, int, float, list or str
-        true, false, a number, a flat list ``[a, b]``, else the text.
 
     Examples
     --------
@@ -328,18 +218,193 @@ def _parse_plain(text: str) -> Any:
     return text.strip("\"'")
 
 
-def toml_from_tables(tables: Mapping[str, Any]) -> str:
-    """Write nested tables as TOML, which ``tomllib`` reads back.
+def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
+    """Return the complete configuration as plain tables.
 
     Parameters
     ----------
-    tables : mapping
-        Nested tables of plain values.
+    config : PipelineConfig
+        The configuration.
+
+    Returns
+    -------
+    dict
+        Stage -> field -> value.
+    """
+    tables = {}
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        head = {_KIND: kind_of(item.name, value)} if item.name in KINDS else {}
+        tables[item.name] = head | table_from_dataclass(value)
+    return tables
+
+
+def table_from_dataclass(value: Any) -> Table:
+    """Convert a dataclass to a table of plain values.
+
+    Parameters
+    ----------
+    value : dataclass
+        A method or its settings.
+
+    Returns
+    -------
+    dict
+        Field -> number, text, list or table; a table of one of several dataclasses begins with ``kind``.
+    """
+    hints = typing.get_type_hints(type(value))
+    table = {}
+    for name in _settings_of(type(value)):
+        content, several = getattr(value, name), _alternatives(typing.get_args(hints[name]))
+        head = {_KIND: _word_of(type(content))} if type(content) in several.values() else {}
+        table[name] = head | _plain(content) if head else _plain(content)
+    return table
+
+
+def _settings_of(kind: type[Any]) -> list[str]:
+    """Names of the fields without those that the pipeline fills with data (metadata ``given``)."""
+    return [f.name for f in dataclasses.fields(kind) if not f.metadata.get("given")]
+
+
+def _word_of(kind: type[Any]) -> str:
+    """The name of a class in kebab case: "modulus-constraint" for ``ModulusConstraint``."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()
+
+
+def _alternatives(union: Iterable[Any]) -> dict[str, type[Any]]:
+    """Word -> class of the dataclasses among the members of a union, if there are several."""
+    classes = [a for a in union if isinstance(a, type) and dataclasses.is_dataclass(a)]
+    return {_word_of(a): a for a in classes} if len(classes) > 1 else {}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return table_from_dataclass(value)
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return _NONE if value is None else value
+
+
+def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, base: T | None = None) -> T:
+    """Build a dataclass from a table; unknown keys and values of wrong types are a ``UsageError``.
+
+    Parameters
+    ----------
+    kind : type
+        The dataclass.
+    table : mapping
+        Field -> plain value.
+    where : str
+        Dotted name of the table, for messages.
+    base : dataclass, optional
+        Supplies the other fields; None: the defaults.
+
+    Returns
+    -------
+    dataclass
+    """
+    hints = typing.get_type_hints(kind)
+    names = _settings_of(kind)
+    changes = {}
+    for key, value in table.items():
+        if key not in names:
+            raise unknown_setting(where, key, names)
+        current = None if base is None else getattr(base, key)
+        changes[key] = _coerce(value, hints[key], f"{where}.{key}", current)
+    try:
+        return kind(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"[{where}] {error}") from None
+
+
+def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
+    """Convert a plain value to an annotated type; ``current`` is the base of a dataclass.
+
+    An int is accepted for a float, never the reverse; text is never accepted for a number.
+    """
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in (typing.Union, types.UnionType):
+        return _coerce_optional(value, arguments, where, current)
+    if origin is Literal:
+        if value in arguments and isinstance(value, str):
+            return value
+        raise UsageError(unknown_word(f"value of {where}", value, [str(a) for a in arguments]))
+    if origin is tuple and isinstance(value, list | tuple):
+        return _coerce_tuple(value, arguments, where)
+    if dataclasses.is_dataclass(annotation) and isinstance(annotation, type) and isinstance(value, Mapping):
+        return dataclass_from_table(annotation, value, where, current)
+    whole = type(value) is int and abs(value) < 2**63
+    if annotation is float and (whole or (type(value) is float and not math.isnan(value))):
+        return float(value)
+    if type(value) is annotation and (annotation in (str, bool) or whole):
+        return value
+    raise UsageError(f"{where} takes {_type_words(annotation)}; got {in_words(value)}")
+
+
+def _coerce_optional(value: Any, arguments: tuple[Any, ...], where: str, current: Any) -> Any:
+    if value is None or value == _NONE:
+        return None
+    if several := _alternatives(arguments):
+        return _coerce_alternative(value, several, where, current)
+    rest = [a for a in arguments if a is not type(None)]
+    return _coerce(value, rest[0], where, current)
+
+
+def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str, current: Any) -> Any:
+    """One of several dataclasses from its word, or from a table with ``kind`` (default: unchanged)."""
+    table = {_KIND: value} if isinstance(value, str) else value
+    if not isinstance(table, Mapping):
+        one_of = f"one of {', '.join(several)} or a table of settings"
+        raise UsageError(f"{where} takes {one_of}; got {in_words(value)}")
+    kind = table.get(_KIND, _word_of(type(current)))
+    if not isinstance(kind, str) or kind not in several:
+        raise UsageError(unknown_word(f"kind of {where}", kind, several))
+    fields = {key: v for key, v in table.items() if key != _KIND}
+    base = current if type(current) is several[kind] else None
+    return dataclass_from_table(several[kind], fields, where, base)
+
+
+def _coerce_tuple(value: Sequence[Any], arguments: tuple[Any, ...], where: str) -> tuple[Any, ...]:
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        arguments = (arguments[0],) * len(value)
+    if len(value) != len(arguments):
+        raise UsageError(f"{where} takes a list of {len(arguments)} values; got {len(value)}")
+    return tuple(_coerce(v, arguments[n], f"{where}[{n}]") for n, v in enumerate(value))
+
+
+def _type_words(annotation: Any) -> str:
+    words = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    if annotation in words:
+        return words[annotation]
+    return "a list" if typing.get_origin(annotation) is tuple else "a table of settings"
+
+
+def toml_from_config(config: PipelineConfig) -> str:
+    """Return the configuration as TOML, which :func:`config_from_toml` reads back.
+
+    Parameters
+    ----------
+    config : PipelineConfig
+        The configuration.
 
     Returns
     -------
     str
-        TOML text.
+    """
+    return toml_from_tables(tables_from_config(config))
+
+
+def toml_from_tables(tables: Mapping[str, Any]) -> str:
+    """Write nested tables of plain values as TOML, which ``tomllib`` reads back.
+
+    Parameters
+    ----------
+    tables : mapping
+        Nested tables.
+
+    Returns
+    -------
+    str
     """
     return "\n".join(_toml_lines(tables, ())).strip() + "\n"
 

@@ -24,7 +24,7 @@ from thesisrecon.io.files import read_json
 from thesisrecon.pipeline import state as preparing
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.pipeline.state import PreparedViews, batch_pairs
-from thesisrecon.runtime import dask_cluster as cluster
+from thesisrecon.runtime import _dask_cluster as cluster
 from thesisrecon.runtime import executors as workers
 from thesisrecon.runtime.executors import Workers
 

@@ -25,8 +25,8 @@ from thesisrecon.records import (
     StageReport,
     Tracks,
 )
-from thesisrecon.runtime.record_files import ChangedRecord, _seal, bytes_from_record, read_record
-from thesisrecon.runtime.run_folder import RunDirectory, StageFolder, code_key, key_of
+from thesisrecon.runtime._record_files import ChangedRecord, _seal, bytes_from_record, read_record
+from thesisrecon.runtime._run_folder import RunDirectory, StageFolder, code_key, key_of
 from validation.studies.robustness import (
     Refusal,
     SmallRuns,

@@ -146,16 +146,13 @@ def _config(
     preset: str | None, file: Path | None, options: Mapping[str, Mapping[str, Any]], settings: list[str]
 ) -> PipelineConfig:
     """Apply the preset (of the command, else of the file), the file, the options and --set, in this order."""
-    from thesisrecon import config as configs
+    from thesisrecon.config import preset as preset_of
     from thesisrecon.io.files import read_text
+    from thesisrecon.settings import config_from_toml, tables_from_settings
 
-    text = "" if file is None else read_text(file)
-    return configs.config_from_toml(
-        text,
-        configs.preset(preset or "default"),
-        fixed_preset=preset is not None,
-        changes=(options, configs.tables_from_settings(settings)),
-    )
+    text, base = "" if file is None else read_text(file), preset_of(preset or "default")
+    changes = (options, tables_from_settings(settings))
+    return config_from_toml(text, base, fixed_preset=preset is not None, changes=changes)
 
 
 def _run(

@@ -15,7 +15,8 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.state import PipelineState, PreparedViews, batch_pairs, cache_friendly_order
 from thesisrecon.records import Features, Image, PairChoice, TwoView
-from thesisrecon.runtime.run import Batch, stream
+from thesisrecon.runtime._run_state import Batch
+from thesisrecon.runtime.run import stream
 
 MIN_CORNERS = 16
 

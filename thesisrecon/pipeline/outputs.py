@@ -12,10 +12,9 @@ import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon.arrays import F32, U8
-from thesisrecon.config import toml_from_config
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views
-from thesisrecon.io.colmap_files import write_colmap_model
+from thesisrecon.io.colmap_model import write_colmap_model
 from thesisrecon.io.exports import cameras_table, write_point_cloud
 from thesisrecon.io.files import read_json, write_json, write_text
 from thesisrecon.io.meshes import write_mesh
@@ -24,9 +23,11 @@ from thesisrecon.records import Image, Reconstruction, RunResult, TexturedMesh
 from thesisrecon.report.data import ReportData, ReportImage
 from thesisrecon.report.page import write_report
 from thesisrecon.report.summary import point_colors, summarize
-from thesisrecon.runtime.run import Run, Until
-from thesisrecon.runtime.run_folder import RunDirectory
+from thesisrecon.runtime._run_folder import RunDirectory
+from thesisrecon.runtime._run_state import Run
+from thesisrecon.runtime.run import Until
 from thesisrecon.selfcalibration.stratified import affine_camera_centres, upgrade_to_affine
+from thesisrecon.settings import toml_from_config
 from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
@@ -248,7 +249,7 @@ def _report_data(run: Run, result: RunResult, colors: U8 | None, failure: StageF
         config_text=toml_from_config(run.config),
         summary=result.summary,
         version=__version__,
-        unread=tuple(result.refused.items()),
+        unread=tuple(result.unread.items()),
         pairs=result.pairs,
         pair_choice=result.pair_choice,
         reconstruction=result.projective,

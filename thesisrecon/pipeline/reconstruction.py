@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Unpack
 
-from thesisrecon.config import PipelineConfig, tables_from_config
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
 from thesisrecon.io.images import ImageSet, ImageSource, list_images, read_images, scene_name
@@ -15,7 +15,9 @@ from thesisrecon.pipeline.outputs import RESULT_FILES, write_outputs
 from thesisrecon.pipeline.state import PipelineState, name_images
 from thesisrecon.pipeline.surface import build_model, estimate_depth_maps
 from thesisrecon.records import RunResult
-from thesisrecon.runtime.run import Progress, Run, RunOptions, start_run
+from thesisrecon.runtime._run_state import Run, start_run
+from thesisrecon.runtime.run import Progress, RunOptions
+from thesisrecon.settings import tables_from_config
 
 STEPS = {
     "features": (find_features,),
@@ -88,7 +90,7 @@ def reconstruct(
         run.title = scene_name(Path(images)) or run.title
     # Claim the folder first: reading images takes long.
     claim = run.directory.claim(_settings_identity(run), overwrite=overwrite)
-    with run.workers, claim, run.with_resume_path():
+    with run.workers, claim, run.resumable():
         inputs = _read_inputs(run, images)
         if until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
@@ -151,7 +153,7 @@ def _empty_result(run: Run, inputs: ImageSet) -> RunResult:
     return RunResult(
         out=run.directory.path,
         images=inputs.images,
-        refused=inputs.refused,
+        unread=inputs.refused,
         features=(),
         pairs=(),
         groups=groups,

@@ -17,7 +17,7 @@ from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io.images import ImageSet
 from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Features, Image, RunResult
-from thesisrecon.runtime.run import Run
+from thesisrecon.runtime._run_state import Run
 
 CACHE_BYTES = 2**30
 """Prepared views take several times the memory of their image and are quickly prepared again."""
@@ -195,7 +195,7 @@ class PipelineState:
         """
         found, needed = len(self.result.images), 1 if self.until == "features" else 2
         if found < needed:
-            refused = [f"{name} {reason}" for name, reason in self.result.refused.items()]
+            refused = [f"{name} {reason}" for name, reason in self.result.unread.items()]
             why = "; ".join([*refused[:3], f"and {len(refused) - 3} more"] if len(refused) > 3 else refused)
             wanted = "two different ones are" if needed == 2 else "one is"
             raise StageFailure(

@@ -13,7 +13,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.pipeline.state import PipelineState
 from thesisrecon.records import DepthMap, HeldOut, Image, PinholeView, Reconstruction, TexturedMesh
-from thesisrecon.runtime.run_folder import code_key
+from thesisrecon.runtime._run_folder import code_key
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
@@ -116,7 +116,7 @@ def estimate_depth_maps(state: PipelineState) -> None:
             part, near = seen_from(view)
             yield state.config, part, {j: maps[j] for j in sorted(near)}, view
 
-    with run.clock("dense"), run.resumable("dense"):
+    with run.clock("dense"):
         run.workers.run(_confirmed, confirmations(), lambda n, depths: confirmed.update({order[n]: depths}))
     final = [confirmed[i] for i in order]
     state.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))

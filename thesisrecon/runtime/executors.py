@@ -16,7 +16,7 @@ import pickle
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -24,10 +24,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from thesisrecon.errors import UsageError, WorkersLost
-from thesisrecon.runtime.dask_cluster import Cluster, connect_dask, is_dask_address, tcp_address
+from thesisrecon.errors import UsageError, WorkersLost, unknown_word
+from thesisrecon.runtime._dask_cluster import Cluster, connect_dask, is_dask_address, tcp_address
 from thesisrecon.runtime.signals import CODES, starting_processes
-from thesisrecon.settings import unknown_word
 
 NAMES = ("local", "processes", "dask://HOST:PORT")
 AHEAD = 2
@@ -67,7 +66,6 @@ def available_threads() -> int:
     Returns
     -------
     int
-        At least 1.
     """
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
@@ -86,11 +84,6 @@ class Workers:
         tasks; a custom executor gets twice as many tasks at a time.
     executor : str or concurrent.futures.Executor
         "local" (threads), "processes", "dask://HOST:PORT" or an executor, which is not shut down.
-
-    Raises
-    ------
-    UsageError
-        If ``threads`` is below 1 or the executor is unknown.
     """
 
     threads: int
@@ -101,15 +94,13 @@ class Workers:
     def __post_init__(self) -> None:
         if self.threads < 1:
             raise UsageError(f"threads must be at least 1; got {self.threads}")
-        if isinstance(self.executor, futures.Executor):
-            return
-        if not isinstance(self.executor, str):
+        if not isinstance(self.executor, str | futures.Executor):
             raise UsageError(
                 f"executor must be {', '.join(NAMES)} or a concurrent.futures.Executor; got {self.executor!r}"
             )
         if is_dask_address(self.executor):
-            tcp_address(self.executor)
-        elif self.executor not in NAMES:
+            tcp_address(str(self.executor))
+        elif isinstance(self.executor, str) and self.executor not in NAMES:
             raise UsageError(unknown_word("executor", self.executor, NAMES))
 
     @property
@@ -125,8 +116,8 @@ class Workers:
     def __enter__(self) -> Workers:
         """Connect to the cluster; processes start when needed."""
         self._open_stack = ExitStack()
-        if isinstance(self.executor, str) and is_dask_address(self.executor):
-            self._remote = self._open_stack.enter_context(self._opened(1))
+        if is_dask_address(self.executor):
+            self._remote = self._open_stack.enter_context(self._opened())
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -135,19 +126,16 @@ class Workers:
             stack.__exit__(*error)  # type: ignore[arg-type]
 
     def parallel(self) -> int:
-        """Return the number of tasks processed at a time.
+        """Return the number of tasks processed at a time, at least 1.
 
         Returns
         -------
         int
-            At least 1.
         """
         return self.threads if self._remote is None else self._remote.parallel()
 
     def run(self, function: Callable[..., Any], tasks: Iterable[Task], finished: Finished) -> None:
-        """Call a function for all tasks.
-
-        The first error cancels the rest and is raised.
+        """Call a function for all tasks; the first error cancels the rest and is raised.
 
         Parameters
         ----------
@@ -169,19 +157,21 @@ class Workers:
         elif self.executor == "local":
             with futures.ThreadPoolExecutor(self.threads) as pool:
                 _run_all(_Remote(pool, lambda: self.threads), (function, False), tasks, finished)
+        elif self._open_stack is None:
+            with self:
+                self.run(function, tasks, finished)
         else:
-            with self._remote_for(tasks) as remote:
-                _run_all(remote, (function, not self.in_process), tasks, finished)
+            if self._remote is None:
+                self._remote = self._open_stack.enter_context(self._opened())
+            _run_all(self._remote, (function, not self.in_process), tasks, finished)
 
     def map_all(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Map a function over items in threads, for short tasks such as reading files.
 
         Parameters
         ----------
-        function : callable
-            Function of one item.
-        items : iterable
-            The items.
+        function, items : callable, iterable
+            Function of one item, and the items.
 
         Returns
         -------
@@ -192,26 +182,20 @@ class Workers:
             return list(pool.map(function, items))
 
     @contextmanager
-    def _remote_for(self, tasks: Iterable[Task]) -> Iterator[_Remote]:
-        if self._open_stack is None:
-            with self._opened(len(tasks) if isinstance(tasks, Sequence) else self.threads) as remote:
-                yield remote
-            return
-        if self._remote is None:
-            self._remote = self._open_stack.enter_context(self._opened(self.threads))
-        yield self._remote
-
-    @contextmanager
-    def _opened(self, tasks: int) -> Iterator[_Remote]:
+    def _opened(self) -> Iterator[_Remote]:
         if isinstance(self.executor, futures.Executor):
             yield _Remote(self.executor, lambda: self.threads)
         elif is_dask_address(self.executor):
             with connect_dask(self.executor) as cluster:
                 yield _Remote(cluster.executor, cluster.parallel, cluster)
         else:
-            count = max(1, min(self.threads, tasks))
-            with _processes(count) as pool:
-                yield _Remote(pool, lambda: count)
+            pool = ProcessPool(self.threads)
+            try:
+                yield _Remote(pool, lambda: self.threads)
+                pool.shutdown(wait=True)
+            finally:
+                # At once after an error.
+                pool.abandon()
 
 
 @dataclass(frozen=True)
@@ -234,12 +218,12 @@ def _run_all(
         while True:
             # After workers died, more tasks may be waiting than AHEAD allows.
             for n, given in islice(left, max(AHEAD * remote.parallel() - len(waiting), 0)):
-                what = (
+                task = (
                     (_answer, package_key(), pickle.dumps((function, given), 5))
                     if pickled
                     else (function, *given)
                 )
-                waiting[remote.executor.submit(*what)] = n
+                waiting[remote.executor.submit(*task)] = n
             if not waiting:
                 return
             done, _ = futures.wait(waiting, CHECK_S, return_when=futures.FIRST_COMPLETED)
@@ -299,15 +283,12 @@ class ProcessPool(futures.ProcessPoolExecutor):
 
         Parameters
         ----------
-        fn : callable
-            Function.
-        *args, **kwargs
-            Its arguments.
+        fn, *args, **kwargs
+            As for :class:`concurrent.futures.Executor`.
 
         Returns
         -------
         concurrent.futures.Future
-            The result to come.
         """
         with starting_processes():
             return super().submit(fn, *args, **kwargs)
@@ -316,17 +297,6 @@ class ProcessPool(futures.ProcessPoolExecutor):
         """Kill the processes at once."""
         self._held.close()
         self.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def _processes(count: int) -> Iterator[futures.Executor]:
-    """Processes that end with the block, at once after an error."""
-    pool = ProcessPool(count)
-    try:
-        yield pool
-        pool.shutdown(wait=True)
-    finally:
-        pool.abandon()
 
 
 def _end_with_parent(watched: multiprocessing.connection.Connection) -> None:

@@ -1,25 +1,16 @@
-"""One run: its settings, workers and folder, and the clock, cache and reports of its stages."""
+"""Options, stages and random streams of a run."""
 
 from __future__ import annotations
 
-import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 
-from thesisrecon.config import PipelineConfig, kind_of, tables_from_config
-from thesisrecon.errors import OutputError, UsageError, WorkersLost
-from thesisrecon.records import StageReport
-from thesisrecon.runtime.executors import Workers, available_threads
-from thesisrecon.runtime.record_files import ChangedRecord
-from thesisrecon.runtime.run_folder import RunDirectory, code_key, key_of
-from thesisrecon.settings import table_from_dataclass, unknown_word
+from thesisrecon.errors import UsageError
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
@@ -64,18 +55,15 @@ class RunOptions(TypedDict, total=False):
     shared: str | Path | None
 
 
-Batch = tuple[Sequence[int], tuple[Any, ...]]
-"""Numbers of some items, and the arguments of the function that computes their records."""
-
-
 def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
     """Return the random generator of one task, which depends only on the arguments.
 
     Parameters
     ----------
     seed : int
-        Seed of the run.
+        Seed of the run; ``ValueError`` if it is not a whole number of at least 0.
     stage : str
+        Name of the stage.
     *ids : int
         Numbers of the task, such as view or pair.
 
@@ -83,339 +71,28 @@ def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
     -------
     numpy.random.Generator
 
-    Raises
-    ------
-    ValueError
-        If the seed is not a whole number of at least 0.
-
     Examples
     --------
     >>> from thesisrecon.runtime.run import stream
     >>> stream(0, "matches", 1, 2).integers(100) == stream(0, "matches", 1, 2).integers(100)
     np.True_
     """
-    if not _is_seed(seed):
-        raise ValueError(f"the seed must be a whole number of at least 0; got {seed!r}")
-    return np.random.default_rng(np.random.SeedSequence([int(seed), zlib.crc32(stage.encode()), *ids]))
+    entropy = [checked_seed(seed), zlib.crc32(stage.encode()), *ids]
+    return np.random.default_rng(np.random.SeedSequence(entropy))
 
 
-def _is_seed(seed: Any) -> bool:
-    return isinstance(seed, int | np.integer) and not isinstance(seed, bool) and int(seed) >= 0
-
-
-@dataclass
-class _StageLog:
-    """Time, keys and number of computed items of a stage."""
-
-    seconds: float = 0.0
-    keys: dict[str, str] = field(default_factory=dict)
-    computed: int = 0
-
-
-@dataclass
-class Run:
-    """Settings and state of one run.
-
-    Attributes
-    ----------
-    config : PipelineConfig
-    seed : int
-    workers : Workers
-    directory : RunDirectory
-        Output folder.
-    progress : callable
-        See :data:`Progress`.
-    title : str
-        Title of the report.
-    logs, reports : dict
-        Times and keys, and reports, of the stages.
-    resumed : list of str
-        Stages read from the cache.
-    warnings : list of str
-        All warnings.
-    started : float
-        Start time.
-    """
-
-    config: PipelineConfig
-    seed: int
-    workers: Workers
-    directory: RunDirectory
-    progress: Progress
-    title: str
-    logs: dict[str, _StageLog] = field(default_factory=dict)
-    reports: dict[str, StageReport] = field(default_factory=dict)
-    resumed: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    started: float = field(default_factory=time.perf_counter)
-
-    @property
-    def elapsed_s(self) -> float:
-        """Wall time (s) since the start; times of cached stages are those of the run that computed them."""
-        return time.perf_counter() - self.started
-
-    @contextmanager
-    def clock(self, stage: str) -> Iterator[_StageLog]:
-        """Add the time of the block to a stage.
-
-        Parameters
-        ----------
-        stage : str
-
-        Yields
-        ------
-        _StageLog
-            Log of the stage.
-        """
-        log = self.logs.setdefault(stage, _StageLog())
-        start = time.perf_counter()
-        try:
-            yield log
-        finally:
-            log.seconds += time.perf_counter() - start
-
-    def variant_key(self, stage: str) -> list[Any]:
-        """Return the part of a key that identifies the method of a stage.
-
-        Parameters
-        ----------
-        stage : str
-            Field of the config.
-
-        Returns
-        -------
-        list
-            Class, parameters and code of the method.
-        """
-        variant = getattr(self.config, stage)
-        module = type(variant).__module__
-        return [module, type(variant).__qualname__, table_from_dataclass(variant), code_key(module)]
-
-    def cached(self, stage: str, item: str, key: str, compute: Callable[[], Any]) -> Any:
-        """Return the record of one item, from the cache or computed.
-
-        Parameters
-        ----------
-        stage, item, key : str
-            Name of the stage and the item, and its key.
-        compute : callable
-            Returns the record.
-
-        Returns
-        -------
-        object
-        """
-        with self.clock(stage) as log:
-            log.keys[item] = key
-            (record,) = self._loaded(stage, {item: key})
-            if record is None:
-                record = compute()
-                log.computed += 1
-                self.directory.stage(FOLDERS[stage]).save(item, key, record)
-            return record
-
-    def _loaded(self, stage: str, keys: Mapping[str, str]) -> list[Any]:
-        """Cached records of items, None if missing; warns of changed ones."""
-        folder = self.directory.stage(FOLDERS[stage])
-        records: list[Any] = []
-        changed: list[str] = []
-        for item, key in keys.items():
-            try:
-                records.append(folder.load(item, key))
-            except ChangedRecord:
-                records.append(None)
-                changed.append(f"{FOLDERS[stage]}/{item}.npz")
-        if changed:
-            more, were = (f" and {len(changed) - 1} more", "were") if len(changed) > 1 else ("", "was")
-            self.warnings.append(
-                f"{changed[0]}{more} {were} damaged or changed by another program and {were} computed again"
-            )
-        return records
-
-    def map_cached(
-        self,
-        stage: str,
-        keys: Mapping[str, str],
-        function: Callable[..., Sequence[Any]],
-        batches: Callable[[Sequence[int]], Iterable[Batch]],
-    ) -> list[Any]:
-        """Return the records of all items of a stage, missing ones computed by the workers.
-
-        Parameters
-        ----------
-        stage : str
-        keys : mapping
-            Item -> key.
-        function : callable
-            Computes the records of a batch.
-        batches : callable
-            Divides the numbers of the missing items into batches (numbers, arguments of ``function``).
-
-        Returns
-        -------
-        list
-            Records in the order of ``keys``.
-        """
-        with self.clock(stage) as log:
-            log.keys.update(keys)
-            folder = self.directory.stage(FOLDERS[stage])
-            names = list(keys)
-            records = self._loaded(stage, keys)
-            missing = [n for n, record in enumerate(records) if record is None]
-            done = len(names) - len(missing)
-            self.progress(stage, done, len(names))
-            submitted: list[Sequence[int]] = []
-
-            def tasks() -> Iterator[tuple[Any, ...]]:
-                for numbers, given in batches(missing) if missing else ():
-                    submitted.append(numbers)
-                    yield given
-
-            def finished(k: int, found: Sequence[Any]) -> None:
-                nonlocal done
-                for n, record in zip(submitted[k], found, strict=True):
-                    records[n] = record
-                    folder.save(names[n], keys[names[n]], record)
-                done, log.computed = done + len(found), log.computed + len(found)
-                self.progress(stage, done, len(names))
-
-            with self.resumable(stage):
-                self.workers.run(function, tasks(), finished)
-            return records
-
-    @contextmanager
-    def resumable(self, stage: str) -> Iterator[None]:
-        """Add resume advice to the error if the workers are lost in the block.
-
-        Parameters
-        ----------
-        stage : str
-
-        Raises
-        ------
-        WorkersLost
-            With the advice.
-        """
-        try:
-            yield
-        except WorkersLost as lost:
-            raise WorkersLost(
-                f"{lost} (in the stage {stage}). Finished work is kept in {self.directory.path}: repeat the "
-                "command to resume, with this executor or another"
-            ) from None
-
-    @contextmanager
-    def with_resume_path(self) -> Iterator[None]:
-        """Add resume advice to the error if a file cannot be written in the block.
-
-        Raises
-        ------
-        OutputError
-            With the advice.
-        """
-        try:
-            yield
-        except OutputError as refused:
-            raise OutputError(refused.place, refused.error, self.directory.path) from None
-
-    def finish(
-        self,
-        stage: str,
-        *,
-        counts: Mapping[str, int],
-        metrics: Mapping[str, float] | None = None,
-        warnings: Sequence[str] = (),
-    ) -> None:
-        """End a stage: write its manifest and report; a cached stage keeps its old report.
-
-        Parameters
-        ----------
-        stage : str
-        counts, metrics : mapping
-            Name -> number.
-        warnings : sequence of str
-            Sentences.
-        """
-        log = self.logs.setdefault(stage, _StageLog())
-        report = StageReport(stage, log.seconds, dict(counts), dict(metrics or {}), tuple(warnings))
-        if stage in FOLDERS:
-            folder = self.directory.stage(FOLDERS[stage])
-            old = None if log.computed else folder.finished(log.keys)
-            if old is not None:
-                self.resumed.append(stage)
-                report = old
-            else:
-                folder.finish(report, self._settings_of(stage), log.keys)
-        self.reports[stage] = report
-        self.warnings.extend(w for w in warnings if w not in self.warnings)
-
-    def _settings_of(self, stage: str) -> dict[str, Any]:
-        """Settings tables of a stage."""
-        stages = ("matching", "epipolar", "verification") if stage == "matches" else (stage,)
-        tables = tables_from_config(self.config)
-        return {s: {"kind": kind_of(s, getattr(self.config, s))} | tables[s] for s in stages}
-
-    def key(self, stage: str, *parts: Any) -> str:
-        """Return the cache key of an item.
-
-        Parameters
-        ----------
-        stage : str
-        *parts : object
-            Everything the item depends on: settings, code and inputs.
-
-        Returns
-        -------
-        str
-        """
-        return key_of(FOLDERS[stage], *parts)
-
-
-def start_run(
-    out: str | Path, config: PipelineConfig, seed: int, progress: Progress | None, options: Mapping[str, Any]
-) -> tuple[Until, Run, bool]:
-    """Check the options of a call and set up the run.
+def checked_seed(seed: Any) -> int:
+    """Return the seed as an int.
 
     Parameters
     ----------
-    out : path
-        Output folder.
-    config : PipelineConfig
     seed : int
-    progress : callable or None
-        See :data:`Progress`.
-    options : mapping
-        See :class:`RunOptions`.
+        Seed of a run; ``UsageError`` if it is not a whole number of at least 0.
 
     Returns
     -------
-    until : str
-        Last stage.
-    run : Run
-    overwrite : bool
-        Whether another run may be replaced.
-
-    Raises
-    ------
-    UsageError
-        If an option is invalid.
-    TypeError
-        If an option is unknown.
+    int
     """
-    unknown = sorted(set(options) - set(RunOptions.__annotations__))
-    if unknown:
-        raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
-    until: Until = options.get("until") or "model"
-    if until not in get_args(Until):
-        raise UsageError(unknown_word("stage", str(until), get_args(Until)))
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
         raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
-    threads = options.get("threads") or available_threads()
-    workers = Workers(threads, options.get("executor", "local"))
-    if not str(out).strip():
-        raise UsageError("the output folder has no name; write . for the current one")
-    shared = options.get("shared")
-    directory = RunDirectory(Path(out), None if shared is None else Path(shared))
-    report = progress or (lambda *_: None)
-    run = Run(config, seed, workers, directory, report, directory.path.absolute().name)
-    return until, run, bool(options.get("overwrite", False))
+    return int(seed)

@@ -40,10 +40,8 @@ def install_signal_handlers(program: str, advice: str = "repeat the command to r
 
     Parameters
     ----------
-    program : str
-        Name of the program in the message.
-    advice : str
-        What to do, unless :func:`with_resume_advice` says otherwise.
+    program, advice : str
+        Name of the program in the message, and what to do unless :func:`with_resume_advice` says otherwise.
     """
     _advice.append(advice)
     pipe, written = os.pipe()

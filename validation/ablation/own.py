@@ -13,8 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from thesisrecon.errors import UsageError
-from thesisrecon.settings import unknown_word
+from thesisrecon.errors import UsageError, unknown_word
 
 PREFIX = "ablation_own_"
 

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, overload
 
-from thesisrecon.config import tables_from_config
 from thesisrecon.errors import WorkersLost
 from thesisrecon.io.files import write_json
 from thesisrecon.runtime.executors import CHECK_S
-from thesisrecon.settings import table_from_dataclass
+from thesisrecon.settings import table_from_dataclass, tables_from_config
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.row import Job, carry_out, pack
 from validation.ablation.store import STEPS, WORK, Outcome, Store, finite

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.config import PipelineConfig, config_from_tables, preset
-from thesisrecon.errors import UsageError
+from thesisrecon.config import PipelineConfig, preset
+from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.io.files import read_bytes
-from thesisrecon.settings import dataclass_from_table, unknown_word
+from thesisrecon.settings import config_from_tables, dataclass_from_table
 from validation.ablation.own import is_own, load_own
 from validation.ablation.study import Measure, Study
 from validation.ablation.tasks import TASKS

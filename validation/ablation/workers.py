@@ -9,10 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from thesisrecon.errors import UsageError
-from thesisrecon.runtime.dask_cluster import Cluster, connect_dask, is_dask_address
+from thesisrecon.errors import UsageError, unknown_word
+from thesisrecon.runtime._dask_cluster import Cluster, connect_dask, is_dask_address
 from thesisrecon.runtime.executors import NAMES, ProcessPool, available_threads
-from thesisrecon.settings import unknown_word
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MANY = 64

@@ -10,9 +10,8 @@ from typing import ClassVar
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.records import Reconstruction
-from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
 from validation.scenes.rigs import Rig
 from validation.studies.selfcalibration import (

@@ -12,8 +12,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.epipolar.precision import fundamental_bound
-from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.settings import unknown_word
+from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from validation.ablation.study import Measure, Place
 from validation.scenes.cube import make_cube
 from validation.studies.epipolar_cube import CubePair, cube_pairs, measure_pair

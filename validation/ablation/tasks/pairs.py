@@ -13,11 +13,10 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.io.images import read_images
 from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
 from thesisrecon.records import Image
-from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.scenes.real import load_real_scene

@@ -11,12 +11,12 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 
 import thesisrecon
-from thesisrecon.config import KINDS, PipelineConfig, tables_from_config
-from thesisrecon.errors import UsageError
+from thesisrecon.config import KINDS, PipelineConfig
+from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.records import RunResult
+from thesisrecon.runtime._run_folder import code_key, key_of
 from thesisrecon.runtime.run import Until
-from thesisrecon.runtime.run_folder import code_key, key_of
-from thesisrecon.settings import unknown_word
+from thesisrecon.settings import tables_from_config
 from validation.ablation.study import Measure, Place
 from validation.harness.records import ReportOptions
 from validation.harness.scenes import PHOTOGRAPHS, load_photographs, truth_of

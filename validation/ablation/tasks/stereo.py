@@ -10,8 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import UsageError
-from thesisrecon.settings import unknown_word
+from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair

@@ -9,9 +9,8 @@ from typing import ClassVar, get_args
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.strata import Group
-from thesisrecon.settings import unknown_word
 from validation.ablation.study import Measure, Place
 from validation.studies.triangulation import POLYNOMIAL, SCENES, TWO_VIEWS, compare_on_rig, draw_rig
 

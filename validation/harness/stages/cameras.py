@@ -11,14 +11,15 @@ from typing import Any, Literal
 import numpy as np
 
 import thesisrecon
-from thesisrecon.config import PipelineConfig, config_from_tables, preset
+from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_files import read_colmap_model
+from thesisrecon.io.colmap_model import read_colmap_model
 from thesisrecon.io.files import read_json
 from thesisrecon.records import Reconstruction
+from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
 from thesisrecon.runtime.run import FOLDERS
-from thesisrecon.runtime.run_folder import MANIFEST_FILE, RunDirectory
+from thesisrecon.settings import config_from_tables
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Task
 from validation.harness.scenes import is_photographs, load_photographs, truth_of
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection

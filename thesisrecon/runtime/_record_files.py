@@ -29,25 +29,7 @@ class ChangedRecord(Exception):
 
 
 def bytes_from_record(record: Any, key: str) -> bytes:
-    """Serialize a record; equal records give equal bytes.
-
-    Parameters
-    ----------
-    record : object
-        A record of :mod:`thesisrecon.records`.
-    key : str
-        Its key.
-
-    Returns
-    -------
-    bytes
-        Content of an npz file.
-
-    Raises
-    ------
-    TypeError
-        If the record contains other values than arrays, numbers, text and records.
-    """
+    """Content of an npz file; equal records give equal bytes."""
     arrays: dict[str, np.ndarray[Any, Any]] = {}
     description = json.dumps({"key": key, "record": _describe(record, arrays)}, sort_keys=True)
     stream = io.BytesIO()
@@ -99,24 +81,7 @@ def _rebuild(value: Any, arrays: Mapping[str, Any]) -> Any:
 
 
 def read_record(path: Path, key: str) -> Any:
-    """Read a record.
-
-    Parameters
-    ----------
-    path : Path
-    key : str
-        The expected key.
-
-    Returns
-    -------
-    object or None
-        None if the file is missing or has another key.
-
-    Raises
-    ------
-    ChangedRecord
-        If the file is damaged, changed or not a regular file.
-    """
+    """Read a record; None if the file is missing or has another key."""
     if not os.path.lexists(path):
         return None
     try:

@@ -22,39 +22,12 @@ _ADDRESS = re.compile(r"(?P<host>[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d
 
 
 def is_dask_address(executor: object) -> bool:
-    """Return whether an executor is given as a Dask address.
-
-    Parameters
-    ----------
-    executor : object
-        Value of the option.
-
-    Returns
-    -------
-    bool
-        True for text that begins with ``dask:``.
-    """
+    """Whether an executor is given as a Dask address."""
     return isinstance(executor, str) and executor.partition(":")[0].lower() == "dask"
 
 
 def tcp_address(executor: str) -> str:
-    """Convert ``dask://HOST:PORT`` to ``tcp://HOST:PORT``.
-
-    Parameters
-    ----------
-    executor : str
-        Value of the option.
-
-    Returns
-    -------
-    str
-        Address of the scheduler.
-
-    Raises
-    ------
-    UsageError
-        If it is no such address.
-    """
+    """Convert ``dask://HOST:PORT`` to ``tcp://HOST:PORT``."""
     found = _ADDRESS.fullmatch(executor.removeprefix(SCHEME)) if executor.startswith(SCHEME) else None
     if found is None or not 0 < int(found["port"]) < 65536:
         raise UsageError(
@@ -66,16 +39,7 @@ def tcp_address(executor: str) -> str:
 
 @dataclass
 class Cluster:
-    """A connection to a scheduler, and its executor.
-
-    Attributes
-    ----------
-    address : str
-        HOST:PORT.
-    client : distributed.Client
-    executor : concurrent.futures.Executor
-        Its executor.
-    """
+    """A connection to a scheduler (HOST:PORT), and its executor."""
 
     address: str
     client: Any
@@ -83,23 +47,11 @@ class Cluster:
     _alone_since: float | None = field(default=None, repr=False)
 
     def parallel(self) -> int:
-        """Return the number of worker threads.
-
-        Returns
-        -------
-        int
-            At least 1: a worker may come back.
-        """
+        """Number of worker threads, at least 1: a worker may come back."""
         return max(1, sum(self._threads().values()))
 
     def check(self) -> None:
-        """Check the connection.
-
-        Raises
-        ------
-        WorkersLost
-            If the scheduler is gone or has had no worker for ``WORKERLESS_S``.
-        """
+        """Raise ``WorkersLost`` if the scheduler is gone or has had no worker for ``WORKERLESS_S``."""
         if self._threads():
             self._alone_since = None
             return
@@ -111,12 +63,7 @@ class Cluster:
             )
 
     def lost(self) -> WorkersLost:
-        """Return the error for tasks that were cancelled.
-
-        Returns
-        -------
-        WorkersLost
-        """
+        """The error for tasks that were cancelled."""
         return WorkersLost(f"the Dask scheduler at {self.address} is gone")
 
     def _threads(self) -> dict[str, int]:
@@ -130,22 +77,7 @@ class Cluster:
 
 @contextmanager
 def connect_dask(executor: str) -> Iterator[Cluster]:
-    """Connect to a Dask scheduler for the duration of a block.
-
-    Parameters
-    ----------
-    executor : str
-        ``dask://HOST:PORT``.
-
-    Yields
-    ------
-    Cluster
-
-    Raises
-    ------
-    UsageError
-        If the extra is not installed, or no scheduler or worker answers.
-    """
+    """Connect to a Dask scheduler for the duration of a block."""
     address = tcp_address(executor)
     try:
         import dask

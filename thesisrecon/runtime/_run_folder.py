@@ -23,7 +23,7 @@ import numpy as np
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io.files import as_read, is_partial, link, read_json, write_atomically, write_json
 from thesisrecon.records import StageReport
-from thesisrecon.runtime.record_files import ChangedRecord, bytes_from_record, read_record
+from thesisrecon.runtime._record_files import ChangedRecord, bytes_from_record, read_record
 
 try:
     import fcntl
@@ -32,31 +32,12 @@ except ImportError:  # pragma: no cover - only where there is no POSIX
 
 FORMAT = 2
 RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
-_FOUNDATIONS = (
-    *("arrays.py", "camera.py", "errors.py", "intrinsics.py", "records.py"),
-    *("geometry", "numerics"),
-)
+_FOUNDATIONS = ("arrays.py", "camera.py", "errors.py", "intrinsics.py", "records.py", "geometry", "numerics")
 """Code that every stage may use."""
 
 
 def key_of(*parts: Any) -> str:
-    """Return a digest of JSON-like parts and arrays, equal on every machine.
-
-    Parameters
-    ----------
-    *parts : object
-        Plain values, sequences, mappings and arrays.
-
-    Returns
-    -------
-    str
-        32 hexadecimal digits.
-
-    Raises
-    ------
-    TypeError
-        If a part is of another type.
-    """
+    """Digest (32 hexadecimal digits) of JSON-like parts and arrays, equal on every machine."""
     text = json.dumps(parts, sort_keys=True, default=_json_value, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
@@ -71,17 +52,9 @@ def _json_value(value: Any) -> Any:
 
 @cache
 def code_key(module: str) -> str:
-    """Return a digest of the code behind a method, so that results of other code are not reused.
+    """Digest of the code behind a method, so that results of other code are not reused.
 
-    Parameters
-    ----------
-    module : str
-        Module of the method. In this package its stage folder and the foundations count; elsewhere its file.
-
-    Returns
-    -------
-    str
-        32 hexadecimal digits.
+    In this package the stage folder of the module and the foundations count; elsewhere its file.
     """
     package = Path(__file__).parent.parent
     parts = module.split(".")
@@ -103,37 +76,19 @@ def _file_of(module: str) -> list[Path]:
 class StageFolder:
     """The folder of one stage: a file per item, and a readable manifest.
 
-    Parameters
-    ----------
-    path : Path
-    shared : Path, optional
-        Folder of results of several runs, named by their keys.
+    ``shared`` is the folder of the results of several runs, named by their keys.
     """
 
     path: Path
     shared: Path | None = None
 
     def load(self, item: str, key: str) -> Any:
-        """Return the cached record of an item, from this run or the shared folder.
+        """Return the record of an item, from this run or the shared folder; None if it must be computed.
 
-        Parameters
-        ----------
-        item, key : str
-            Name and key of the item.
-
-        Returns
-        -------
-        object or None
-            None if it must be computed.
-
-        Raises
-        ------
-        ChangedRecord
-            If its file was changed or damaged.
+        Raises ``ChangedRecord`` if its file was changed or damaged.
         """
         own, changed = self.path / f"{item}.npz", None
-        places = [own] if self.shared is None else [own, self.shared / f"{key}.npz"]
-        for place in places:
+        for place in [own] if self.shared is None else [own, self.shared / f"{key}.npz"]:
             try:
                 record = read_record(place, key)
             except ChangedRecord as error:
@@ -148,35 +103,14 @@ class StageFolder:
         return None
 
     def save(self, item: str, key: str, record: Any) -> None:
-        """Write the record of an item.
-
-        Parameters
-        ----------
-        item, key : str
-            Name and key of the item.
-        record : object
-        """
+        """Write the record of an item."""
         own = self.path / f"{item}.npz"
         write_atomically(own, bytes_from_record(record, key))
         if self.shared is not None:
             link(own, self.shared / f"{key}.npz")
 
     def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
-        """Write the manifest of a finished stage and remove stale and partial files.
-
-        Parameters
-        ----------
-        report : StageReport
-            Report of the stage.
-        settings : mapping
-        keys : mapping
-            Item -> key.
-
-        Raises
-        ------
-        OutputError
-            If a file cannot be removed or written.
-        """
+        """Write the manifest of a finished stage and remove stale and partial files."""
         try:
             for stale in [*self.path.glob("*.npz"), *self.path.glob(".*.partial")]:
                 if is_partial(stale.name) or stale.stem not in keys:
@@ -187,23 +121,10 @@ class StageFolder:
         write_json(self.path / MANIFEST_FILE, content)
 
     def finished(self, keys: Mapping[str, str]) -> StageReport | None:
-        """Return the report of the run that computed these items.
-
-        Parameters
-        ----------
-        keys : mapping
-            Item -> key.
-
-        Returns
-        -------
-        StageReport or None
-            None if the stage was not finished with the same keys.
-        """
+        """Return the report of the run that computed these items; None if the keys differ."""
         content = read_json(self.path / MANIFEST_FILE)
         try:
-            if content["keys"] != dict(keys):
-                return None
-            return _report(**content["report"])
+            return _report(**content["report"]) if content["keys"] == dict(keys) else None
         except (TypeError, KeyError, AttributeError):
             return None
 
@@ -220,87 +141,33 @@ def _report(*, seconds: Any, counts: Any, metrics: Any, warnings: Any, stage: An
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """The output folder of one run.
-
-    Parameters
-    ----------
-    path : Path
-    shared : Path, optional
-        Folder of results shared with other runs.
-    """
+    """The output folder of one run, and the folder of results shared with other runs, if any."""
 
     path: Path
     shared: Path | None = None
 
     def stage(self, folder: str) -> StageFolder:
-        """Return the folder of a stage.
-
-        Parameters
-        ----------
-        folder : str
-            Its name, such as ``01-features``.
-
-        Returns
-        -------
-        StageFolder
-        """
+        """The folder of a stage, such as ``01-features``."""
         return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
 
     @contextmanager
     def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
-        """Lock the folder for a run.
+        """Lock the folder for a run of this identity, as far as it is known before the images are read.
 
-        Parameters
-        ----------
-        identity : mapping
-            The part of the run's identity that is known before its images are read.
-        overwrite : bool
-            Allow another run in the folder.
-
-        Raises
-        ------
-        UsageError
-            If the folder cannot be written, is in use, or holds other files or another run. Nothing is
-            changed.
+        A ``UsageError`` if it cannot be written, is in use, or holds other files or another run.
         """
         with _locked(self.path):
             self._check(identity, overwrite)
             yield
 
     def adopt(self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()) -> None:
-        """Make the claimed folder that of a run; the same run is resumed, another one replaced.
-
-        Parameters
-        ----------
-        identity : mapping
-            Settings, seed and digests of the images.
-        overwrite : bool
-            Allow another run in the folder.
-        results : sequence of str
-            Files of a replaced run to remove.
-
-        Raises
-        ------
-        UsageError
-            As for :meth:`claim`.
-        """
+        """Resume the same run in the claimed folder, or replace another one and remove its ``results``."""
         if self._check(identity, overwrite):
             self.remove(results)
         write_json(self.path / RUN_FILE, identity)
 
     def remove(self, names: Sequence[str]) -> None:
-        """Remove files and the folders that are empty afterwards.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Paths in the folder; missing ones are ignored.
-
-        Raises
-        ------
-        OutputError
-            If a file cannot be removed.
-        """
+        """Remove files and the folders that are empty afterwards."""
         try:
             for path in (self.path / name for name in names):
                 path.unlink(missing_ok=True)
@@ -370,18 +237,14 @@ def _locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise OutputError(f"the output folder {folder}", error) from None
     try:
-        _lock(handle, folder)
-        yield
-    finally:
-        os.close(handle)
-
-
-def _lock(handle: int, folder: Path) -> None:
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
+        os.close(handle)
         raise UsageError(
             f"another run is writing to the output folder {folder}; choose another one"
         ) from None
+    try:
+        yield
+    finally:
+        os.close(handle)

@@ -1,0 +1,201 @@
+"""One run: its settings, workers and folder, and the clock, cache and reports of its stages."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import OutputError, UsageError, WorkersLost, unknown_word
+from thesisrecon.records import StageReport
+from thesisrecon.runtime._record_files import ChangedRecord
+from thesisrecon.runtime._run_folder import RunDirectory, code_key, key_of
+from thesisrecon.runtime.executors import Workers, available_threads
+from thesisrecon.runtime.run import FOLDERS, Progress, RunOptions, Until, checked_seed
+from thesisrecon.settings import table_from_dataclass, tables_from_config
+
+Batch = tuple[Sequence[int], tuple[Any, ...]]
+"""Numbers of some items, and the arguments of the function that computes their records."""
+
+
+@dataclass
+class _StageLog:
+    """Time, keys and number of computed items of a stage."""
+
+    seconds: float = 0.0
+    keys: dict[str, str] = field(default_factory=dict)
+    computed: int = 0
+
+
+@dataclass
+class Run:
+    """Settings and state of one run."""
+
+    config: PipelineConfig
+    seed: int
+    workers: Workers
+    directory: RunDirectory
+    progress: Progress
+    title: str  #: of the report
+    logs: dict[str, _StageLog] = field(default_factory=dict)
+    reports: dict[str, StageReport] = field(default_factory=dict)
+    resumed: list[str] = field(default_factory=list)  #: stages read from the cache
+    warnings: list[str] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+    _stage: str = ""  # the one being computed
+
+    @property
+    def elapsed_s(self) -> float:
+        """Wall time (s) since the start; times of cached stages are those of the run that computed them."""
+        return time.perf_counter() - self.started
+
+    @contextmanager
+    def clock(self, stage: str) -> Iterator[_StageLog]:
+        """Add the time of the block to a stage; yields the log of the stage."""
+        log, self._stage = self.logs.setdefault(stage, _StageLog()), stage
+        start = time.perf_counter()
+        try:
+            yield log
+        finally:
+            log.seconds += time.perf_counter() - start
+
+    def variant_key(self, stage: str) -> list[Any]:
+        """The part of a key that identifies the method of a stage: class, parameters and code."""
+        variant = getattr(self.config, stage)
+        module = type(variant).__module__
+        return [module, type(variant).__qualname__, table_from_dataclass(variant), code_key(module)]
+
+    def cached(self, stage: str, item: str, key: str, compute: Callable[[], Any]) -> Any:
+        """Return the record of one item, from the cache or computed."""
+        with self.clock(stage) as log:
+            log.keys[item] = key
+            (record,) = self._loaded(stage, {item: key})
+            if record is None:
+                record = compute()
+                log.computed += 1
+                self.directory.stage(FOLDERS[stage]).save(item, key, record)
+            return record
+
+    def _loaded(self, stage: str, keys: Mapping[str, str]) -> list[Any]:
+        """Cached records of items, None if missing; warns of changed ones."""
+        folder = self.directory.stage(FOLDERS[stage])
+        records: list[Any] = []
+        changed: list[str] = []
+        for item, key in keys.items():
+            try:
+                records.append(folder.load(item, key))
+            except ChangedRecord:
+                records.append(None)
+                changed.append(f"{FOLDERS[stage]}/{item}.npz")
+        if changed:
+            more, were = (f" and {len(changed) - 1} more", "were") if len(changed) > 1 else ("", "was")
+            how = f"damaged or changed by another program and {were} computed again"
+            self.warnings.append(f"{changed[0]}{more} {were} {how}")
+        return records
+
+    def map_cached(
+        self,
+        stage: str,
+        keys: Mapping[str, str],
+        function: Callable[..., Sequence[Any]],
+        batches: Callable[[Sequence[int]], Iterable[Batch]],
+    ) -> list[Any]:
+        """Return the records of all items (item -> key) of a stage, missing ones computed by the workers.
+
+        ``function`` computes the records of a batch; ``batches`` divides the missing items into batches.
+        """
+        with self.clock(stage) as log:
+            log.keys.update(keys)
+            folder = self.directory.stage(FOLDERS[stage])
+            names = list(keys)
+            records = self._loaded(stage, keys)
+            missing = [n for n, record in enumerate(records) if record is None]
+            done = len(names) - len(missing)
+            self.progress(stage, done, len(names))
+            submitted: list[Sequence[int]] = []
+
+            def tasks() -> Iterator[tuple[Any, ...]]:
+                for numbers, given in batches(missing) if missing else ():
+                    submitted.append(numbers)
+                    yield given
+
+            def finished(k: int, found: Sequence[Any]) -> None:
+                nonlocal done
+                for n, record in zip(submitted[k], found, strict=True):
+                    records[n] = record
+                    folder.save(names[n], keys[names[n]], record)
+                done, log.computed = done + len(found), log.computed + len(found)
+                self.progress(stage, done, len(names))
+
+            self.workers.run(function, tasks(), finished)
+            return records
+
+    @contextmanager
+    def resumable(self) -> Iterator[None]:
+        """Add resume advice to the error if workers are lost or a file cannot be written in the block."""
+        try:
+            yield
+        except WorkersLost as lost:
+            raise WorkersLost(
+                f"{lost} (in the stage {self._stage}). Finished work is kept in {self.directory.path}: "
+                "repeat the command to resume, with this executor or another"
+            ) from None
+        except OutputError as refused:
+            raise OutputError(refused.place, refused.error, self.directory.path) from None
+
+    def finish(
+        self,
+        stage: str,
+        *,
+        counts: Mapping[str, int],
+        metrics: Mapping[str, float] | None = None,
+        warnings: Sequence[str] = (),
+    ) -> None:
+        """End a stage: write its manifest and report; a cached stage keeps its old report."""
+        log = self.logs.setdefault(stage, _StageLog())
+        report = StageReport(stage, log.seconds, dict(counts), dict(metrics or {}), tuple(warnings))
+        if stage in FOLDERS:
+            folder = self.directory.stage(FOLDERS[stage])
+            old = None if log.computed else folder.finished(log.keys)
+            if old is not None:
+                self.resumed.append(stage)
+                report = old
+            else:
+                folder.finish(report, self._settings_of(stage), log.keys)
+        self.reports[stage] = report
+        self.warnings.extend(w for w in warnings if w not in self.warnings)
+
+    def _settings_of(self, stage: str) -> dict[str, Any]:
+        """Settings tables of a stage."""
+        stages = ("matching", "epipolar", "verification") if stage == "matches" else (stage,)
+        tables = tables_from_config(self.config)
+        return {s: tables[s] for s in stages}
+
+    def key(self, stage: str, *parts: Any) -> str:
+        """Cache key of an item; ``parts`` are everything it depends on: settings, code and inputs."""
+        return key_of(FOLDERS[stage], *parts)
+
+
+def start_run(
+    out: str | Path, config: PipelineConfig, seed: int, progress: Progress | None, options: Mapping[str, Any]
+) -> tuple[Until, Run, bool]:
+    """Check the options of a call; return the last stage, the run and whether to overwrite another."""
+    unknown = sorted(set(options) - set(RunOptions.__annotations__))
+    if unknown:
+        raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
+    until: Until = options.get("until") or "model"
+    if until not in get_args(Until):
+        raise UsageError(unknown_word("stage", str(until), get_args(Until)))
+    if not str(out).strip():
+        raise UsageError("the output folder has no name; write . for the current one")
+    seed = checked_seed(seed)
+    workers = Workers(options.get("threads") or available_threads(), options.get("executor", "local"))
+    shared = options.get("shared")
+    directory = RunDirectory(Path(out), None if shared is None else Path(shared))
+    report = progress or (lambda *_: None)
+    run = Run(config, seed, workers, directory, report, directory.path.absolute().name)
+    return until, run, bool(options.get("overwrite", False))
