@@ -9,7 +9,7 @@ from tests.hostile import files
 from tests.hostile.files import links, pipe, sparse, writes
 from tests.io.test_colmap import _SMALL as SMALL_MODEL
 from tests.io.test_colmap import _plain_names
-from thesisrecon.io.colmap_files import write_colmap_model
+from thesisrecon.io.colmap_model import write_colmap_model
 
 
 def own_scene(tmp_path, *, binary):

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.io.colmap import colmap_from_reconstruction, reconstruction_from_colmap
-from thesisrecon.io.colmap_files import read_colmap_model, write_colmap_model
-from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints
+from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints, read_colmap_model, write_colmap_model
 from thesisrecon.records import Reconstruction, Tracks
 
 V, N = 5, 40

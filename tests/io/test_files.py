@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
-from thesisrecon.io.colmap_files import write_colmap_model
-from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints
+from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints, write_colmap_model
 from thesisrecon.io.exports import read_cameras, write_point_cloud
 from thesisrecon.io.files import (
     is_partial,

@@ -9,9 +9,7 @@ import PIL.Image
 import pytest
 
 from thesisrecon.errors import UsageError
-from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
-from thesisrecon.io.images import MAX_DECODED_BYTES, list_images, read_images, scene_name
-from thesisrecon.io.pixels import (
+from thesisrecon.io._pixels import (
     EXIF_TRANSFORMS,
     STORED,
     MemoryBudget,
@@ -19,6 +17,8 @@ from thesisrecon.io.pixels import (
     decoding_bytes,
     resized_to,
 )
+from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
+from thesisrecon.io.images import MAX_DECODED_BYTES, list_images, read_images, scene_name
 
 
 def picture(seed=0, size=(96, 80)):
@@ -367,10 +367,6 @@ def test_one_frame_is_an_animation_too(suffix, tmp_path):
 
 def test_an_unwritable_animation_is_reported(tmp_path):
     (one,) = frames(tmp_path, 1)
-    with pytest.raises(ValueError, match=r"written as \.webp or \.png; got all\.gif"):
-        write_animation(tmp_path / "all.gif", [one])
-    with pytest.raises(ValueError, match="at least one frame"):
-        write_animation(tmp_path / "all.webp", [])
     with pytest.raises(UsageError, match=r"absent\.png cannot be read"):
         write_animation(tmp_path / "all.webp", [one, tmp_path / "absent.png"])
     with pytest.raises(UsageError, match="cannot be written"):

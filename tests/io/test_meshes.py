@@ -148,9 +148,7 @@ def test_no_points_are_a_file_too(tmp_path):
     assert b"element vertex 0\n" in (tmp_path / "points.ply").read_bytes()
 
 
-def test_wrong_shapes_and_infinite_points_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="uint8"):
-        write_point_cloud(tmp_path / "points.ply", np.zeros((2, 3)), np.zeros((2, 3)))
+def test_infinite_points_are_refused(tmp_path):
     with pytest.raises(ValueError, match="finite"):
         write_point_cloud(tmp_path / "points.ply", np.full((2, 3), np.nan), np.zeros((2, 3), np.uint8))
     assert not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import colmap_from_reconstruction
-from thesisrecon.io.colmap_files import write_colmap_model
+from thesisrecon.io.colmap_model import write_colmap_model
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric

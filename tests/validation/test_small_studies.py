@@ -15,8 +15,7 @@ import pytest
 
 from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
-from thesisrecon.io.colmap_files import read_colmap_model
-from thesisrecon.io.colmap_model import MODEL_NUMBERS, inconsistency
+from thesisrecon.io.colmap_model import PARAMETER_COUNTS, inconsistency, read_colmap_model
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import PairChoice
 from validation.metrics.record import Metric
@@ -173,7 +172,7 @@ def test_a_torn_write_leaves_no_half_file_under_its_name(tmp_path):
 
 def test_good_inputs_are_models(tmp_path):
     inputs = fuzz_colmap.valid_inputs()
-    assert len(inputs) == len(MODEL_NUMBERS) + 6
+    assert len(inputs) == len(PARAMETER_COUNTS) + 6
     assert max(map(len, inputs)) <= fuzz_colmap.MAX_INPUT
     for data in inputs:
         fuzz_colmap.read_input(data)

@@ -32,8 +32,6 @@ _PARTIAL = ".partial"
 def printable(name: str) -> str:
     """Escape a file name for display in one line.
 
-    Invalid UTF-8, line ends, other control characters and direction marks become their codes.
-
     Parameters
     ----------
     name : str
@@ -42,15 +40,11 @@ def printable(name: str) -> str:
     Returns
     -------
     str
-        Valid Unicode.
+        Valid Unicode: invalid UTF-8, line ends, other control characters and direction marks become codes.
     """
-    text = name.encode("utf-8", "surrogateescape" if _from_bytes(name) else "backslashreplace")
+    from_bytes = all("\udc80" <= c <= "\udcff" for c in name if "\ud800" <= c <= "\udfff")
+    text = name.encode("utf-8", "surrogateescape" if from_bytes else "backslashreplace")
     return "".join(_escaped(c) for c in text.decode("utf-8", "backslashreplace"))
-
-
-def _from_bytes(name: str) -> bool:
-    """Whether all surrogates in a text, if any, are bytes of a file name."""
-    return all("\udc80" <= c <= "\udcff" for c in name if "\ud800" <= c <= "\udfff")
 
 
 def _escaped(c: str) -> str:
@@ -98,12 +92,12 @@ def shorten_middle(text: str, longest: int = 600) -> str:
 
 
 def read_bytes(path: Path, *, largest: int = MAX_TEXT_BYTES) -> bytes:
-    """Read a regular file.
+    """Read a regular file; reading a pipe or a device may never end, so they are refused.
 
     Parameters
     ----------
     path : Path
-        The file; reading a pipe or a device may never end, so they are refused.
+        The file.
     largest : int
         Limit in bytes.
 
@@ -164,7 +158,7 @@ def is_partial(name: str) -> bool:
     Returns
     -------
     bool
-        True for names made by :func:`write_atomically` and :func:`link`.
+        True for the names of unfinished files of this module.
     """
     return name.startswith(".") and name.endswith(_PARTIAL)
 
@@ -223,7 +217,7 @@ def write_json(path: Path, value: Any) -> None:
     value : Any
         Mappings, sequences, numbers, text and NumPy arrays.
     """
-    write_text(path, json.dumps(_finite(value), indent=2, ensure_ascii=False, default=_number) + "\n")
+    write_text(path, json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n")
 
 
 def as_read(value: Any) -> Any:
@@ -239,21 +233,16 @@ def as_read(value: Any) -> Any:
     Any
         Dicts, lists, numbers, text and None.
     """
-    return json.loads(json.dumps(_finite(value), default=_number))
+    return json.loads(json.dumps(_plain(value)))
 
 
-def _number(value: Any) -> Any:
+def _plain(value: Any) -> Any:
     # No NumPy here: `thesisrecon --help` should start fast.
-    if hasattr(value, "tolist"):
-        return _finite(value.tolist())
-    raise TypeError(f"{type(value).__name__} is not JSON")
-
-
-def _finite(value: Any) -> Any:
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
+        return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [_plain(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -57,7 +57,7 @@ def write_frame(folder: Path, number: int, rgb: NDArray[np.uint8]) -> Path:
 
     Raises
     ------
-    UsageError
+    OutputError
         If it cannot be written.
     """
     encoded = io.BytesIO()
@@ -86,7 +86,7 @@ def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 4
     path : Path
         Ends in ``.webp`` (one frame in memory at a time) or ``.png``.
     frames : sequence of Path
-        Image files of one size.
+        Image files of one size, at least one.
     milliseconds : int
         Time per frame.
 
@@ -97,20 +97,13 @@ def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 4
 
     Raises
     ------
-    ValueError
-        For another suffix, or without frames.
     UsageError
         If a frame cannot be read or the file cannot be written.
     """
-    if path.suffix not in (".webp", ".png"):
-        raise ValueError(f"an animation is written as .webp or .png; got {path.name}")
-    if not frames:
-        raise ValueError("an animation needs at least one frame")
-    encoded = io.BytesIO()
-    sequence = _Sequence(frames)
-    lossy = {"quality": _WEBP_QUALITY, "method": _WEBP_METHOD} if path.suffix == ".webp" else {}
-    kind = "WEBP" if path.suffix == ".webp" else "PNG"
-    sequence.save(encoded, kind, save_all=True, duration=milliseconds, loop=0, **lossy)
+    encoded, webp = io.BytesIO(), path.suffix == ".webp"
+    lossy = {"quality": _WEBP_QUALITY, "method": _WEBP_METHOD} if webp else {}
+    kind = "WEBP" if webp else "PNG"
+    _Sequence(frames).save(encoded, kind, save_all=True, duration=milliseconds, loop=0, **lossy)
     write_atomically(path, encoded.getvalue())
     return path
 

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.files import SPECIAL_FILE, printable
-from thesisrecon.io.pixels import (
+from thesisrecon.io._pixels import (
     EXIF_TRANSFORMS,
     STORED,
     ExifTransform,
@@ -35,6 +34,7 @@ from thesisrecon.io.pixels import (
     image_from_array,
     resized_to,
 )
+from thesisrecon.io.files import SPECIAL_FILE, printable
 from thesisrecon.records import Image
 
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
@@ -268,16 +268,14 @@ def _names(names: Iterable[str]) -> list[str]:
 
 
 def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
-    if isinstance(item, Image):
-        return _finish(DecodedImage(item, ""))
+    """Read an image, refuse small and blank ones, and hash the content."""
     if isinstance(item, Path):
-        return _finish(_decode(name, item, max_size_px))
-    stored = image_from_array(item)
-    return _finish(DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), ""))
-
-
-def _finish(decoded: DecodedImage) -> DecodedImage:
-    """Refuse small and blank images, and hash the content."""
+        decoded = _decode(name, item, max_size_px)
+    elif isinstance(item, Image):
+        decoded = DecodedImage(item, "")
+    else:
+        stored = image_from_array(item)
+        decoded = DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), "")
     rgb = decoded.image.rgb
     if min(rgb.shape[:2]) < MIN_SIDE:
         raise UnusableImage(
@@ -291,7 +289,17 @@ def _finish(decoded: DecodedImage) -> DecodedImage:
 
 
 def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
-    _require_file(path)
+    # Special files are refused: reading a pipe or a device may never end.
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise UnusableImage(f"cannot be read: {error.strerror}") from None
+    if not stat.S_ISREG(found.st_mode):
+        raise UnusableImage(f"is {SPECIAL_FILE}, not a file")
+    if found.st_size > MAX_FILE_BYTES:
+        raise UnusableImage(
+            f"is a file of {found.st_size / 2**30:.1f} GiB; the limit is {MAX_FILE_BYTES / 2**30:.0f} GiB"
+        )
     try:
         # Opened here, since Pillow does not close files that it cannot read.
         with path.open("rb") as stream, PIL.Image.open(stream, formats=_formats()) as file:
@@ -335,20 +343,6 @@ def _too_large(file: PIL.Image.Image, needed: int) -> str:
         f"{needed / 2**30:.1f} GiB of memory, more than the limit of {MAX_DECODED_BYTES / 2**30:.1f} GiB; "
         "save it as PNG or TIFF"
     )
-
-
-def _require_file(path: Path) -> None:
-    """Refuse special files: reading a pipe or a device may never end."""
-    try:
-        found = path.stat()
-    except OSError as error:
-        raise UnusableImage(f"cannot be read: {error.strerror}") from None
-    if not stat.S_ISREG(found.st_mode):
-        raise UnusableImage(f"is {SPECIAL_FILE}, not a file")
-    if found.st_size > MAX_FILE_BYTES:
-        raise UnusableImage(
-            f"is a file of {found.st_size / 2**30:.1f} GiB; the limit is {MAX_FILE_BYTES / 2**30:.0f} GiB"
-        )
 
 
 @cache

@@ -51,7 +51,7 @@ def _require_plain_glb(content: bytes) -> None:
         raise ValueError("it must hold one mesh with one primitive")
     if sum("mesh" in node for node in nodes) > 1:
         raise ValueError("it instantiates its mesh several times")
-    _require_tree([_children(node) for node in nodes])
+    _require_tree(nodes)
 
 
 def _header(content: bytes) -> tuple[dict[str, Any], int]:
@@ -98,16 +98,12 @@ def _list(header: dict[str, Any], name: str) -> list[dict[str, Any]]:
     return found
 
 
-def _children(node: dict[str, Any]) -> list[int]:
-    children = node.get("children", [])
-    if not isinstance(children, list) or not all(isinstance(child, int) for child in children):
-        raise ValueError("its nodes are not a tree")
-    return children
-
-
-def _require_tree(children: list[list[int]]) -> None:
+def _require_tree(nodes: list[dict[str, Any]]) -> None:
     """Require at most one parent per node and no cycles."""
-    held = [child for own in children for child in own]
+    children = [node.get("children", []) for node in nodes]
+    held = [child for own in children if isinstance(own, list) for child in own]
+    if not all(isinstance(own, list) for own in children) or not all(isinstance(c, int) for c in held):
+        raise ValueError("its nodes are not a tree")
     if len(set(held)) < len(held) or not all(0 <= child < len(children) for child in held):
         raise ValueError("its nodes are not a tree")
     waiting, reached = sorted(set(range(len(children))) - set(held)), 0
@@ -139,11 +135,16 @@ def write_mesh(path: Path, mesh: TexturedMesh) -> None:
     OutputError
         If the file cannot be written.
     """
-    kind = path.suffix.lower().lstrip(".")
-    writers = {"glb": _write_glb, "obj": _write_obj, "ply": _write_ply}
-    if kind not in writers:
+    kind = path.suffix.lower()
+    if kind == ".glb":
+        write_atomically(path, _trimesh(mesh, gltf_axes=True).export(file_type="glb"))
+    elif kind == ".ply":
+        bare = TexturedMesh(mesh.vertices, mesh.faces, colors=mesh.colors)
+        write_atomically(path, _trimesh(bare, gltf_axes=False).export(file_type="ply"))
+    elif kind == ".obj":
+        _write_obj(path, mesh)
+    else:
         raise ValueError(f"a mesh is written as .glb, .obj or .ply; got {path.name}")
-    writers[kind](path, mesh)
 
 
 def read_mesh(path: Path) -> TexturedMesh:
@@ -265,15 +266,6 @@ def _trimesh(mesh: TexturedMesh, *, gltf_axes: bool) -> Any:
     material = new_material(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
     visual = new_visual(uv=_normalized(uv, mesh.texture), material=material)
     return trimesh.Trimesh(vertices * turn, faces, visual=visual, process=False)
-
-
-def _write_glb(path: Path, mesh: TexturedMesh) -> None:
-    write_atomically(path, _trimesh(mesh, gltf_axes=True).export(file_type="glb"))
-
-
-def _write_ply(path: Path, mesh: TexturedMesh) -> None:
-    bare = TexturedMesh(mesh.vertices, mesh.faces, colors=mesh.colors)
-    write_atomically(path, _trimesh(bare, gltf_axes=False).export(file_type="ply"))
 
 
 def _write_obj(path: Path, mesh: TexturedMesh) -> None:

@@ -60,8 +60,7 @@ def _names(line: str) -> list[str]:
         return [name.strip() for name in line.strip().split("\t")]
     try:
         return shlex.split(line)
-    except ValueError:
-        # No closing quote.
+    except ValueError:  # No closing quote.
         return []
 
 

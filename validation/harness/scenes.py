@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_files import read_colmap_model
+from thesisrecon.io.colmap_model import read_colmap_model
 from validation.harness.records import ReportOptions
 from validation.metrics.cameras import TrueCameras
 from validation.scenes.real import (

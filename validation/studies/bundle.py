@@ -23,7 +23,7 @@ import thesisrecon
 from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import UsageError
 from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_files import read_colmap_model
+from thesisrecon.io.colmap_model import read_colmap_model
 from thesisrecon.numerics.losses import LossName
 from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics.metric_cameras import MetricCameras

@@ -26,15 +26,15 @@ import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_files import decode_model, encode_model
 from thesisrecon.io.colmap_model import (
-    MODEL_NUMBERS,
     NO_POINT,
     PARAMETER_COUNTS,
     ColmapCamera,
     ColmapImage,
     ColmapModel,
     ColmapPoints,
+    decode_model,
+    encode_model,
     inconsistency,
 )
 from validation.studies.runner import Part, Rows
@@ -101,7 +101,7 @@ def input_of(model: ColmapModel) -> bytes:
 
 def valid_inputs() -> list[bytes]:
     """Return valid inputs: every camera model, no views, no points, long and non-ASCII names."""
-    models = [small_model(1, 1, kind=kind) for kind in MODEL_NUMBERS]
+    models = [small_model(1, 1, kind=kind) for kind in PARAMETER_COUNTS]
     models += [small_model(0, 0), small_model(2, 0), small_model(2, 3), small_model(4, 8)]
     models += [small_model(1, 2, name="größe 写真 \udcff{}.jpg"), small_model(1, 1, name="x" * 300)]
     return [input_of(model) for model in models]

@@ -7,7 +7,7 @@ import pytest
 from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_files import read_colmap_model
+from thesisrecon.io.colmap_model import read_colmap_model
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from validation.references.colmap_mapping import give_calibration

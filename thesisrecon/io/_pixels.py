@@ -34,31 +34,14 @@ class UnusableImage(Exception):
 
 
 class MemoryBudget:
-    """A number of bytes that the threads of the program share.
-
-    Parameters
-    ----------
-    total : int
-        Size of the budget.
-    """
+    """A number of bytes that the threads of the program share."""
 
     def __init__(self, total: int) -> None:
         self._total, self._held, self._change = total, 0, threading.Condition()
 
     @contextmanager
     def reserve(self, amount: int) -> Iterator[None]:
-        """Hold bytes for a block; wait until they are free, or until nothing else is held.
-
-        Parameters
-        ----------
-        amount : int
-            Bytes.
-
-        Yields
-        ------
-        None
-            Nothing.
-        """
+        """Hold bytes for a block; wait until they are free, or until nothing else is held."""
         with self._change:
             self._change.wait_for(lambda: not self._held or self._held + amount <= self._total)
             self._held += amount
@@ -74,16 +57,6 @@ def decoding_bytes(file: PIL.Image.Image) -> int:
     """Estimate the peak memory of decoding an opened file.
 
     A progressive JPEG holds all its coefficients, two bytes each, beside its pixels.
-
-    Parameters
-    ----------
-    file : PIL.Image.Image
-        Opened, not yet decoded.
-
-    Returns
-    -------
-    int
-        Bytes.
     """
     each = _DECODED_BYTES_OF.get(file.format or "", _DECODED_BYTES)
     if file.info.get("progressive"):
@@ -117,15 +90,7 @@ EXIF_TRANSFORMS = {
 
 @dataclass(frozen=True)
 class StoredImage:
-    """A decoded Pillow image of any mode, seen upright and as 8-bit RGB.
-
-    Parameters
-    ----------
-    stored : PIL.Image.Image
-        As decoded.
-    transform : ExifTransform
-        To the upright image.
-    """
+    """A decoded Pillow image of any mode, seen upright by its ``transform`` and as 8-bit RGB."""
 
     stored: PIL.Image.Image
     transform: ExifTransform = STORED
@@ -137,35 +102,13 @@ class StoredImage:
         return (height, width) if self.transform.columns else (width, height)
 
     def rows(self, start: int, stop: int) -> PIL.Image.Image:
-        """Convert some rows of the upright image to RGB.
-
-        Parameters
-        ----------
-        start, stop : int
-            First row, and the row after the last.
-
-        Returns
-        -------
-        PIL.Image.Image
-            In mode RGB.
-        """
+        """Rows ``start`` to ``stop`` of the upright image in RGB."""
         part = self._stored_part(start, stop)
         rgb = self._eight_bit(part) if self._deep else _rgb(part)
         return rgb if self.transform.method is None else rgb.transpose(self.transform.method)
 
     def stripes(self, height: int = _STRIPE_ROWS) -> Iterator[tuple[int, int]]:
-        """Divide the rows of the upright image into stripes.
-
-        Parameters
-        ----------
-        height : int
-            Rows of a stripe.
-
-        Returns
-        -------
-        iterator of tuple
-            (start, stop) of each stripe.
-        """
+        """(start, stop) of stripes of rows of the upright image."""
         return ((start, min(start + height, self.size[1])) for start in range(0, self.size[1], height))
 
     def _stored_part(self, start: int, stop: int) -> PIL.Image.Image:
@@ -211,24 +154,9 @@ def _rgb(part: PIL.Image.Image) -> PIL.Image.Image:
 
 
 def resized_to(image: StoredImage, max_size_px: int) -> U8:
-    """Reduce an image by one exact scale s along both axes, (x + 0.5) s - 0.5.
+    """Reduce an image to a long side by one exact scale s along both axes, (x + 0.5) s - 0.5.
 
-    Parameters
-    ----------
-    image : StoredImage
-        The image; it is not enlarged.
-    max_size_px : int
-        Largest long side.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8
-        RGB.
-
-    Raises
-    ------
-    UnusableImage
-        If the short side would vanish.
+    It is never enlarged. Raises UnusableImage if the short side would vanish.
     """
     width, height = image.size
     scale = max_size_px / max(width, height)
@@ -263,23 +191,7 @@ def _resized(image: StoredImage, size: tuple[int, int], extent: tuple[float, flo
 
 
 def image_from_array(array: Any) -> StoredImage:
-    """Wrap an array as an image.
-
-    Parameters
-    ----------
-    array : array_like (H, W) or (H, W, 3) uint8
-        Grey levels or RGB.
-
-    Returns
-    -------
-    StoredImage
-        The image.
-
-    Raises
-    ------
-    ValueError
-        If the array has another shape or type.
-    """
+    """Wrap an (H, W) or (H, W, 3) uint8 array as an image."""
     array = np.asarray(array)
     if array.dtype != np.uint8 or array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
         raise ValueError(f"an image array must be (H, W) or (H, W, 3) uint8; got {array.shape} {array.dtype}")
