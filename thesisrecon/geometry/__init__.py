@@ -3,7 +3,7 @@
 ===================== ============================================================================
 section               module
 ===================== ============================================================================
-3.2                   ``homogeneous``, ``lines_and_planes``
+3.2                   ``homogeneous``
 3.3, 3.4.1-3.4.5      ``strata``: transforms of every entity, the four groups, their invariants
 3.4.6, (3.1)-(3.15)   ``conics``: conics, quadrics, the absolute conic
 3.5, (3.16)-(3.27)    ``camera_matrix``: P = K [R t], projection, distortion, cheirality

@@ -150,38 +150,6 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     return first[None] if touches else np.stack([first, second])
 
 
-def conic_through(x: F64) -> F64:
-    """Fit the conic of unit norm with the least sum of squared x'C x to points.
-
-    Parameters
-    ----------
-    x : ndarray (N, 3)
-        N >= 5 homogeneous points that determine one conic; exact for 5.
-
-    Returns
-    -------
-    ndarray (3, 3)
-
-    Examples
-    --------
-    >>> C = conic_through(np.array([[1.0, 0, 1], [-1.0, 0, 1], [0, 1.0, 1], [0, -1.0, 1], [0.6, 0.8, 1]]))
-    >>> np.allclose(C / C[0, 0], np.diag([1.0, 1.0, -1.0]))
-    True
-    """
-    if x.ndim != 2 or x.shape[1] != 3 or len(x) < 5 or not np.isfinite(x).all():
-        raise ValueError(f"conic_through needs finite points (N >= 5, 3); got {x.shape}")
-    unit = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
-    a, b = np.triu_indices(3)
-    rows = unit[:, a] * unit[:, b] * np.where(a == b, 1.0, np.sqrt(2.0))
-    _, s, Vt = np.linalg.svd(rows)
-    if not s[4] > 1e-12 * s[0]:
-        raise ValueError("conic_through needs points that determine one conic")
-    C = np.zeros((3, 3))
-    C[a, b] = Vt[5] * np.where(a == b, 1.0, np.sqrt(0.5))
-    C[b, a] = C[a, b]
-    return C
-
-
 def curvature_sign(Q: F64) -> int:
     """Return the sign of the Gaussian curvature of a quadric's real points, a projective invariant (3.4.2).
 
@@ -202,49 +170,22 @@ def curvature_sign(Q: F64) -> int:
     return 0 if abs(det) < 1e-14 else -int(np.sign(det))
 
 
-def project_dual_quadric(P: F64, dual_quadric: F64) -> F64:
-    """Project a dual quadric to the dual conic of its outline: C* = P Q* P' (HZ 8.5).
-
-    A line is tangent to the outline if its plane P'l is tangent to the quadric. The absolute dual quadric
-    gives omega* = K K' (3.14), the inverse of omega (3.15).
-
-    Parameters
-    ----------
-    P, dual_quadric : ndarray (..., 3, 4) and (4, 4)
-        Cameras and dual quadric.
-
-    Returns
-    -------
-    ndarray (..., 3, 3)
-
-    Examples
-    --------
-    >>> P = np.diag([800.0, 800.0, 1.0]) @ np.eye(3, 4)
-    >>> np.diag(project_dual_quadric(P, ABSOLUTE_DUAL_QUADRIC)).tolist()
-    [640000.0, 640000.0, 1.0]
-    """
-    return np.asarray(P @ dual_quadric @ np.swapaxes(P, -1, -2))
-
-
-def image_of_absolute_conic(K: F64) -> F64:
-    """Return omega = K^-T K^-1 (3.13).
+def image_of_absolute_conic(K: F64, *, is_dual: bool = False) -> F64:
+    """Return omega = K^-T K^-1 (3.13), or its inverse omega* = K K' (3.14, 3.15).
 
     Parameters
     ----------
     K : ndarray (..., 3, 3)
         Calibration matrices.
+    is_dual : bool
+        Whether omega* is returned.
 
     Returns
     -------
     ndarray (..., 3, 3)
-
-    Examples
-    --------
-    >>> image_of_absolute_conic(np.diag([2.0, 2.0, 1.0])).tolist()
-    [[0.25, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, 0.0, 1.0]]
     """
-    inverse = checked_inverse(K, "image_of_absolute_conic")
-    return np.asarray(np.swapaxes(inverse, -1, -2) @ inverse)
+    factor = K if is_dual else np.swapaxes(checked_inverse(K, "image_of_absolute_conic"), -1, -2)
+    return np.asarray(factor @ np.swapaxes(factor, -1, -2))
 
 
 def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
@@ -284,55 +225,3 @@ def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
         raise ValueError("calibration_from_image needs a definite conic") from error
     K = lower[::-1, ::-1]
     return np.asarray(K / K[2, 2])
-
-
-def plane_at_infinity(dual_quadric: F64) -> F64:
-    """Return the plane at infinity: the unit null vector of the absolute dual quadric of any frame.
-
-    Parameters
-    ----------
-    dual_quadric : ndarray (4, 4)
-        Absolute dual quadric.
-
-    Returns
-    -------
-    ndarray (4,)
-
-    Examples
-    --------
-    >>> np.abs(plane_at_infinity(ABSOLUTE_DUAL_QUADRIC)).tolist()
-    [0.0, 0.0, 0.0, 1.0]
-    """
-    require_finite("plane_at_infinity", dual_quadric)
-    s, V = np.linalg.eigh((dual_quadric + dual_quadric.T) / 2.0)
-    return np.asarray(V[:, np.abs(s).argmin()])
-
-
-def absolute_angle(C: F64, x: F64, y: F64) -> F64:
-    """Return the angle that the absolute conic measures, cos = S(x, y) / root(S(x, x) S(y, y)).
-
-    With omega it is the angle between the rays of two pixels (HZ 8.6), with the absolute dual quadric that
-    between two planes, in any frame (HZ 3.7).
-
-    Parameters
-    ----------
-    C : ndarray (d, d)
-        omega (d = 3) or the absolute dual quadric (d = 4), of any sign.
-    x, y : ndarray (..., d)
-        Homogeneous image points, or planes.
-
-    Returns
-    -------
-    ndarray (...)
-        Angles, rad.
-
-    Examples
-    --------
-    >>> omega = image_of_absolute_conic(np.diag([500.0, 500.0, 1.0]))
-    >>> x, y = np.array([0.0, 0.0, 1.0]), np.array([500.0, 0.0, 1.0])
-    >>> round(float(np.degrees(absolute_angle(omega, x, y))), 9)
-    45.0
-    """
-    C = C * np.sign(np.trace(C))
-    product = bilinear_form(C, x, x) * bilinear_form(C, y, y)
-    return np.asarray(np.arccos(np.clip(bilinear_form(C, x, y) / np.sqrt(product), -1.0, 1.0)))

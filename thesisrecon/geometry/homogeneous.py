@@ -90,6 +90,22 @@ def dehomogenize(xh: F64) -> F64:
         return xh[..., :-1] / xh[..., -1:]
 
 
+def unit_normals(l: F64) -> F64:
+    """Scale lines l or planes such that l . (x, 1) is a signed distance; those at infinity stay as they are.
+
+    Parameters
+    ----------
+    l : ndarray (..., 3) or (..., 4)
+        Lines or planes; a point lies on them if l . x = 0.
+
+    Returns
+    -------
+    ndarray (..., 3) or (..., 4)
+    """
+    norm = np.linalg.norm(l[..., :-1], axis=-1, keepdims=True)
+    return l / np.where(norm > 0.0, norm, 1.0)
+
+
 def cross_matrix(a: F64) -> F64:
     """Return the skew-symmetric matrix [a]x with [a]x b = a x b.
 

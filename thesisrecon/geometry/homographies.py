@@ -91,29 +91,6 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
     return unit_norm(np.asarray(H, dtype=np.float64))
 
 
-def fundamental_from_homography(H: F64, e2: F64) -> F64:
-    """Return F = [e2]x H of unit norm from the homography of any plane and the epipole (3.37).
-
-    Parameters
-    ----------
-    H, e2 : ndarray (3, 3) and (3,)
-        Homography x2 ~ H x1 and epipole in view 2, not 0.
-
-    Returns
-    -------
-    ndarray (3, 3)
-
-    Examples
-    --------
-    >>> F = fundamental_from_homography(np.eye(3), np.array([1.0, 0.0, 0.0]))
-    >>> (F * np.sqrt(2.0)).round(9).tolist()
-    [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    """
-    if not np.linalg.norm(e2) > 0.0:
-        raise ValueError("fundamental_from_homography needs an epipole; equal centres have none")
-    return unit_norm(cross_matrix(e2 / np.linalg.norm(e2)) @ H)
-
-
 def homography_from_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
     """Return H = -[e2]x F / |e2|^2 + e2 v', the homography of a plane for any v (3.39, 3.41).
 
@@ -152,40 +129,3 @@ def camera_from_homography(H: F64, e2: F64, plane: F64) -> F64:
     ndarray (3, 4)
     """
     return np.hstack([H + np.outer(e2, plane), e2[:, None]])
-
-
-def plane_of_homography(H: F64, P2: F64) -> tuple[F64, float]:
-    """Return the plane of a homography between P1 = [I 0] and P2: least squares of s H = M - m pi' (3.38).
-
-    Parameters
-    ----------
-    H, P2 : ndarray (3, 3) and (3, 4)
-        Homography and second camera [M m], m not 0.
-
-    Returns
-    -------
-    plane : ndarray (4,)
-        Plane of unit norm.
-    residual : float
-        |s H - M + m pi'| / |M|, 0 for a true homography.
-
-    Examples
-    --------
-    >>> P2 = np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])
-    >>> plane, residual = plane_of_homography(np.array([[1.0, 0, -0.5], [0, 1.0, 0], [0, 0, 1.0]]), P2)
-    >>> np.allclose(plane / plane[2], [0.0, 0.0, 1.0, -2.0])
-    True
-    """
-    M, m = P2[:, :3], P2[:, 3]
-    squared = float(m @ m)
-    if not squared > 1e-28 * float(np.sum(M**2)):
-        raise ValueError("plane_of_homography needs cameras with different centres")
-    # The unknown plane has no effect orthogonally to m, which determines s.
-    away = np.eye(3) - np.outer(m, m) / squared
-    h, g = away @ H, away @ M
-    size = float(np.sum(h**2))
-    s = float(np.sum(h * g)) / size if size > 0.0 else 0.0
-    pi = (M - s * H).T @ m / squared
-    plane = np.append(pi, 1.0)
-    residual = float(np.linalg.norm(s * H - M + np.outer(m, pi)) / np.linalg.norm(M))
-    return plane / np.linalg.norm(plane), residual

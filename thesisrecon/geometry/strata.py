@@ -293,21 +293,3 @@ def length(X: F64, Y: F64) -> F64:
     ndarray (...)
     """
     return np.asarray(np.linalg.norm(dehomogenize(X) - dehomogenize(Y), axis=-1))
-
-
-def angle(apex: F64, X: F64, Y: F64) -> F64:
-    """Return the angle at ``apex`` between the directions to X and Y, a metric invariant (3.4.4).
-
-    Parameters
-    ----------
-    apex, X, Y : ndarray (..., 4)
-        Finite homogeneous points.
-
-    Returns
-    -------
-    ndarray (...)
-        Angles, rad.
-    """
-    a, b = (dehomogenize(point) - dehomogenize(apex) for point in (X, Y))
-    sine = np.linalg.norm(np.cross(a, b), axis=-1)
-    return np.asarray(np.arctan2(sine, np.sum(a * b, axis=-1)))

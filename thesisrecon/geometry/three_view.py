@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._checks import checked_inverse, checked_unit
+from thesisrecon.geometry._checks import checked_unit
 from thesisrecon.geometry.homogeneous import (
     cross_matrix,
     dehomogenize,
@@ -20,8 +20,8 @@ from thesisrecon.geometry.homogeneous import (
     normalizing_transform,
     require_finite,
     require_shapes,
+    unit_normals,
 )
-from thesisrecon.geometry.lines_and_planes import unit_normals
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import unit_norm
 
@@ -258,24 +258,6 @@ def cameras_from_tensor(T: F64) -> tuple[F64, F64, F64]:
     return np.eye(3, 4), np.column_stack([A, e2]), np.column_stack([B, e3])
 
 
-def transform_tensor(T: F64, H1: F64, H2: F64, H3: F64) -> F64:
-    """Transform a tensor to image coordinates x' = H x: T'_i^jk = (H1^-1)^r_i H2^j_s H3^k_t T_r^st.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Tensor.
-    H1, H2, H3 : ndarray (3, 3)
-        Transforms of the three images, H1 invertible.
-
-    Returns
-    -------
-    ndarray (3, 3, 3)
-        Of unit norm.
-    """
-    return unit_tensor(np.einsum("ri,js,kt,rst->ijk", checked_inverse(H1, "transform_tensor"), H2, H3, T))
-
-
 @dataclass(frozen=True)
 class TensorEquations:
     """Linear equations A t = 0 of the tensor entries t, in conditioned image coordinates.
@@ -358,7 +340,7 @@ class TensorEquations:
         return np.asarray((basis @ best).reshape(3, 3, 3))
 
     def in_pixels(self, T: F64) -> F64:
-        """Transform a conditioned tensor to pixels.
+        """Transform a conditioned tensor to pixels x' = H x: T'_i^jk = (H1^-1)^r_i H2^j_s H3^k_t T_r^st.
 
         Parameters
         ----------
@@ -370,8 +352,8 @@ class TensorEquations:
         ndarray (3, 3, 3)
             Of unit norm.
         """
-        H1, H2, H3 = np.linalg.inv(self.transforms)
-        return transform_tensor(T, H1, H2, H3)
+        _, H2, H3 = np.linalg.inv(self.transforms)
+        return unit_tensor(np.einsum("ri,js,kt,rst->ijk", self.transforms[0], H2, H3, T))
 
 
 def tensor_equations(points: F64, segments: F64) -> TensorEquations:
