@@ -291,7 +291,7 @@ class TrackBuilder(Protocol):
 
 
 class ProjectiveReconstructor(Protocol):
-    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
+    """Reconstruction up to a projective transform (chapter 6)."""
 
     def reconstruct(
         self,
@@ -301,7 +301,32 @@ class ProjectiveReconstructor(Protocol):
         *,
         rng: np.random.Generator,
         attempt: int = 0,
-    ) -> Reconstruction: ...
+    ) -> Reconstruction:
+        """Reconstruct cameras and points from tracks and verified pairs.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            All tracks; a selection is used.
+        pairs : sequence of TwoView
+            Verified pairs.
+        sizes : ndarray (V, 2) of int
+            Width and height of each image.
+        rng : numpy.random.Generator
+            Source of the resection samples.
+        attempt : int
+            Number of the attempt; each begins with another initial pair.
+
+        Returns
+        -------
+        Reconstruction
+            Projective reconstruction.
+
+        Raises
+        ------
+        StageFailure
+            If no pair is accepted, shows parallax or is left.
+        """
 
 
 class SelfCalibrator(Protocol):
@@ -512,7 +537,28 @@ class ModelBuilder(Protocol):
 
     def build(
         self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
-    ) -> TexturedMesh: ...
+    ) -> TexturedMesh:
+        """Build the textured surface of a scene.
+
+        Parameters
+        ----------
+        depth_maps : sequence of DepthMap
+            Depths of the views.
+        views : sequence of PinholeView
+            Undistorted images with their cameras.
+        threads : int
+            Number of threads; the result does not depend on it.
+
+        Returns
+        -------
+        TexturedMesh
+            The model.
+
+        Raises
+        ------
+        StageFailure
+            If the maps contain no depths or no view sees the surface.
+        """
 
     def color(
         self,
@@ -521,7 +567,24 @@ class ModelBuilder(Protocol):
         *,
         without: int | None = None,
         threads: int = 1,
-    ) -> TexturedMesh: ...
+    ) -> TexturedMesh:
+        """Texture a surface.
+
+        Parameters
+        ----------
+        surface : TexturedMesh
+            Surface without colours.
+        views, threads
+            As in :meth:`build`.
+        without : int, optional
+            Number of a view that is not used, for comparison of its image with a rendering of the model. Its
+            depths remain part of the surface.
+
+        Returns
+        -------
+        TexturedMesh
+            The textured surface.
+        """
 
 
 @dataclass(frozen=True)

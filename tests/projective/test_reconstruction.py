@@ -11,18 +11,18 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project, project_camera
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate
-from thesisrecon.projective.factorization import Factorization
-from thesisrecon.projective.incremental import (
-    IncrementalProjective,
-    _epipolar_inlier_ratios,
+from thesisrecon.projective._model import ProjectiveModel, consistent_observations, retriangulate_points
+from thesisrecon.projective._resection import (
+    epipolar_inlier_ratios,
     find_inconsistent_view,
     projection_std_px,
     resect_ransac,
 )
+from thesisrecon.projective._track_selection import select_tracks, select_tracks_with_parallax
+from thesisrecon.projective.factorization import Factorization
+from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.projective.initial_pair import initial_cameras, rank_initial_pairs
-from thesisrecon.projective.model import ProjectiveModel, consistent_observations, retriangulate_points
 from thesisrecon.projective.sequential import SequentialProjective
-from thesisrecon.projective.track_selection import select_tracks, select_tracks_with_parallax
 from thesisrecon.records import DegeneracyReport, Tracks
 
 VARIANTS = [IncrementalProjective(), SequentialProjective(), Factorization()]
@@ -355,7 +355,7 @@ def test_a_camera_that_wrong_matches_placed_is_discarded_with_its_reason():
 def test_the_view_that_contradicts_its_pairs_is_named():
     scene = make_scene(seed=6)
     pairs, registered = true_pairs(scene), np.ones(8, dtype=bool)
-    assert (_epipolar_inlier_ratios(scene.P, registered, pairs, threshold_px=1.0) == 1.0).all()
+    assert (epipolar_inlier_ratios(scene.P, registered, pairs, threshold_px=1.0) == 1.0).all()
     assert find_inconsistent_view(scene.P, registered, pairs, threshold_px=1.0, min_ratio=0.5) is None
     P = scene.P.copy()
     P[3] = P[3] + 0.05 * np.random.default_rng(0).normal(size=(3, 4)) * np.abs(P[3])
@@ -363,7 +363,7 @@ def test_the_view_that_contradicts_its_pairs_is_named():
     assert found is not None
     assert found[0] == 3
     registered[3] = False
-    shares = _epipolar_inlier_ratios(P, registered, pairs, threshold_px=1.0)
+    shares = epipolar_inlier_ratios(P, registered, pairs, threshold_px=1.0)
     assert np.isnan([share for share, pair in zip(shares, pairs, strict=True) if 3 in (pair.i, pair.j)]).all()
 
 

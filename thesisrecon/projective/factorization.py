@@ -1,11 +1,8 @@
 """Projective factorization: cameras and points of a complete table of matches at once.
 
-P. Sturm, B. Triggs, "A factorization based algorithm for multi-image projective structure and motion", ECCV
-1996 (HZ 18.4): with the right projective depths w the matrix of all w (u, v, 1) has rank 4, and its factors
-are cameras and points. Fundamental matrices give the depths; or they are iterated with the factors from any
-start (B. Triggs, CVPR 1996; J. Oliensis, R. Hartley, PAMI 29(12), 2007, on convergence).
-:class:`Factorization` reconstructs a core of views this way and adds the others incrementally, which depends
-less on one initial pair.
+P. Sturm, B. Triggs, ECCV 1996 (HZ 18.4): with the right projective depths w the matrix of all w (u, v, 1) has
+rank 4, and its factors are cameras and points. Fundamental matrices give the depths; or they are iterated
+with the factors from any start (B. Triggs, CVPR 1996; J. Oliensis, R. Hartley, PAMI 29(12), 2007).
 """
 
 from __future__ import annotations
@@ -21,56 +18,49 @@ from thesisrecon.geometry.camera_matrix import orient_signs
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, require_finite
 from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_sampson_residuals
 from thesisrecon.numerics.noise import noise_from_distances
-from thesisrecon.projective.incremental import IncrementalProjective
-from thesisrecon.projective.initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
-from thesisrecon.projective.model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
-from thesisrecon.projective.track_selection import (
+from thesisrecon.projective._model import (
+    ProjectiveModel,
+    adjust_all,
+    retriangulate_points,
+    to_reconstruction,
+)
+from thesisrecon.projective._track_selection import (
     expand_to_all_tracks,
     select_tracks,
     select_tracks_with_parallax,
     subset_tracks,
 )
+from thesisrecon.projective.incremental import IncrementalProjective
+from thesisrecon.projective.initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 _BALANCING_ITERATIONS = 10
 # Relative gain of an iteration below which the factors have converged.
 _MIN_GAIN_REL = 1e-4
+# Minimum number of complete tracks.
 _MIN_POINTS = 16
-"""Minimum number of complete tracks of a factorization."""
 _MAX_ROUNDS = 5
+# Distances from a homography, in noise sigmas, of the points that it explains.
 _PLANE_SIGMAS = 3.0
-"""Whitened distances from a homography, in noise sigmas, of the points that it explains."""
+
+Edge = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Factors:
     """Result of a factorization.
 
-    Attributes
+    Parameters
     ----------
     P, X : ndarray (V, 3, 4), (N, 4)
         Cameras for pixels and points of unit norm.
-    depths : ndarray (V, N)
-        Balanced projective depths.
     residual_px : ndarray (V, N)
         Reprojection distances.
-    gap : float
-        Fifth over fourth singular value: 0 for exact matches and right depths.
-    iterations : int
-        Number of iterations.
     """
 
     P: F64
     X: F64
-    depths: F64
     residual_px: F64
-    gap: float
-    iterations: int
-
-    @property
-    def rms_px(self) -> float:
-        """Root of the mean squared residual."""
-        return float(np.sqrt(np.mean(self.residual_px**2)))
 
 
 def depths_from_fundamentals(
@@ -78,15 +68,15 @@ def depths_from_fundamentals(
 ) -> F64:
     """Compute projective depths from fundamental matrices along a tree of views.
 
-    For an edge (i, j): w_i F x_i = w_j (e_j x x_j), with the least-squares solution w_j = w_i (e_j x x_j) .
-    (F x_i) / |e_j x x_j|^2 (Sturm and Triggs, eq. 3). Points near an epipole get inaccurate depths.
+    For an edge (i, j): w_i F x_i = w_j (e_j x x_j), in least squares (Sturm and Triggs, eq. 3). Points near
+    an epipole get inaccurate depths.
 
     Parameters
     ----------
     xy : ndarray (V, N, 2)
         Matches in pixels.
     F : mapping of (int, int) to ndarray (3, 3)
-        ``F[i, j]`` with x_j' F x_i = 0; its scale and sign are those of a whole view.
+        ``F[i, j]`` with x_j' F x_i = 0.
     tree : sequence of (int, int)
         Edges (i, j), i reached before j.
 
@@ -99,10 +89,6 @@ def depths_from_fundamentals(
     ------
     ValueError
         If the tree does not reach every view once from its first.
-
-    References
-    ----------
-    P. Sturm, B. Triggs, ECCV 1996, eq. 3.
     """
     x = homogenize(xy)
     depths = np.full(xy.shape[:2], np.nan)
@@ -156,10 +142,6 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
     ------
     ValueError
         Below two views or eight points, or for other shapes or non-finite values.
-
-    References
-    ----------
-    P. Sturm, B. Triggs, ECCV 1996; HZ 18.4.
     """
     if xy.ndim != 3 or xy.shape[2] != 2 or xy.shape[0] < 2 or xy.shape[1] < 8:
         raise ValueError(f"factorize needs xy (V >= 2, N >= 8, 2); got {xy.shape}")
@@ -170,9 +152,8 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
     T = np.stack([normalizing_transform(view) for view in xy])
     x = np.einsum("vab,vnb->vna", T, homogenize(xy))
     sizes = np.linalg.norm(x, axis=2)
-    least, best, done = np.inf, depths, -1
-    while done < iterations:
-        done += 1
+    least, best = np.inf, depths
+    for _ in range(iterations + 1):
         depths = _balance_depths(depths, sizes)
         fitted, residual = _rank_four(depths[:, :, None] * x)
         if residual < least:
@@ -181,7 +162,15 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
             break
         least = residual
         depths = np.einsum("vna,vna->vn", fitted, x) / sizes**2
-    return _factors(xy, x, T, best, done)
+    U, s, Vt = np.linalg.svd(_measurements(best[:, :, None] * x), full_matrices=False)
+    # Whitens the points approximately.
+    P, X = np.linalg.solve(T, U[:, :4].reshape(-1, 3, 4)), Vt[:4].T * s[:4]
+    lengths = np.linalg.norm(X, axis=1, keepdims=True)
+    X = X / np.where(lengths > 0.0, lengths, 1.0)
+    xh = np.einsum("vab,nb->vna", P, X)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.linalg.norm(xh[..., :2] / xh[..., 2:] - xy, axis=2)
+    return Factors(P, X, np.nan_to_num(distance, nan=np.inf))
 
 
 def _measurements(wx: F64) -> F64:
@@ -198,22 +187,6 @@ def _rank_four(wx: F64) -> tuple[F64, float]:
     return fitted.reshape(len(wx), 3, -1).swapaxes(1, 2), residual
 
 
-def _factors(xy: F64, x: F64, T: F64, depths: F64, iterations: int) -> Factors:
-    U, s, Vt = np.linalg.svd(_measurements(depths[:, :, None] * x), full_matrices=False)
-    # Whitens the points approximately.
-    P, X = np.linalg.solve(T, U[:, :4].reshape(-1, 3, 4)), Vt[:4].T * s[:4]
-    lengths = np.linalg.norm(X, axis=1, keepdims=True)
-    X = X / np.where(lengths > 0.0, lengths, 1.0)
-    xh = np.einsum("vab,nb->vna", P, X)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        residual = np.linalg.norm(xh[..., :2] / xh[..., 2:] - xy, axis=2)
-    gap = float(s[4] / s[3]) if s[3] > 0.0 else 1.0
-    return Factors(P, X, depths, np.nan_to_num(residual, nan=np.inf), gap, iterations)
-
-
-Edge = tuple[int, int]
-
-
 @dataclass(frozen=True)
 class Factorization:
     """Projective factorization of a core of views; the others are added by resection.
@@ -226,10 +199,6 @@ class Factorization:
         Maximum number of depth updates; 0 is the published algorithm of Sturm and Triggs.
     growth : IncrementalProjective
         Adds the other views.
-
-    References
-    ----------
-    P. Sturm, B. Triggs, ECCV 1996; HZ 18.4.
     """
 
     core_points: int = 100
@@ -252,25 +221,7 @@ class Factorization:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """Reconstruct cameras and points from tracks and verified pairs.
-
-        Parameters
-        ----------
-        tracks, pairs, sizes, rng
-            As in :meth:`~thesisrecon.projective.incremental.IncrementalProjective.reconstruct`.
-        attempt : int
-            Number of the attempt; each grows the core from another pair.
-
-        Returns
-        -------
-        Reconstruction
-            Projective reconstruction.
-
-        Raises
-        ------
-        StageFailure
-            If no pair shows parallax or is left, or the initial pair shares too few tracks.
-        """
+        """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
         ranked = rank_initial_pairs(tracks, pairs)
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
@@ -282,34 +233,12 @@ class Factorization:
         usable = select_tracks_with_parallax(tracks, pairs)
         keep = select_tracks(tracks, usable, points_per_view=self.growth.points_per_view)
         selected = subset_tracks(tracks, keep)
-        model = self.begin(selected, pairs, ranked[attempt], sizes)
+        model = self._core(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)
         return expand_to_all_tracks(to_reconstruction(model), tracks, keep)
 
-    def begin(self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64) -> ProjectiveModel:
-        """Reconstruct the core by factorization and adjust it.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            Observations.
-        pairs : sequence of TwoView
-            Verified pairs.
-        start : TwoView
-            Initial pair.
-        sizes : ndarray (V, 2) of int
-            Width and height.
-
-        Returns
-        -------
-        ProjectiveModel
-            Model of the core.
-
-        Raises
-        ------
-        StageFailure
-            If ``start`` shares too few tracks.
-        """
+    def _core(self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64) -> ProjectiveModel:
+        """Reconstruct the core that grows from ``start`` by factorization and adjust it."""
         xy = np.full((tracks.n_views, tracks.n_points, 2), np.nan)
         xy[tracks.view_index, tracks.point_index] = tracks.xy
         F = {(p.i, p.j): p.F for p in pairs} | {(p.j, p.i): p.F.T for p in pairs}
@@ -326,18 +255,12 @@ class Factorization:
                 f"{table.shape[1]} tracks, at least {_MIN_POINTS} are needed",
             )
         depths = depths_from_fundamentals(table, {e: F[v] for e, v in zip(edges, tree, strict=True)}, edges)
-        factors, _ = _factorize_robustly(table, depths, self.growth.outlier_sigmas[1], self.iterations)
-        return self._adjusted(tracks, sizes, _tree_views(tree), factors, sigma_px)
-
-    def _adjusted(
-        self, tracks: Tracks, sizes: I64, views: list[int], factors: Factors, sigma_px: float
-    ) -> ProjectiveModel:
-        """Return the adjusted core with all its points, including those seen by some of its views only."""
-        growth, early = self.growth, self.growth.outlier_sigmas[0]
+        growth, early, views = self.growth, self.growth.outlier_sigmas[0], _tree_views(tree)
+        factors, _ = _factorize_robustly(table, depths, growth.outlier_sigmas[1], self.iterations)
         model = ProjectiveModel.empty(tracks, sizes, sigma_px=sigma_px, noise_floor_px=growth.noise_floor_px)
         # Before bundle adjustment the residuals are those of the factors.
         model.sigma_px = max(model.sigma_px, noise_from_distances(factors.residual_px.ravel()))
-        every = np.indices(factors.depths.shape).reshape(2, -1)
+        every = np.indices(factors.residual_px.shape).reshape(2, -1)
         signs, _, _ = orient_signs(factors.P, factors.X, every[0], every[1])
         model.P[views] = factors.P * signs[:, None, None]
         model.registered[views] = True

@@ -2,9 +2,8 @@
 
 An initial pair, then one camera after the other: resection, triangulation, bundle adjustment, outlier
 removal. A camera is accepted if its covariance shows that it is determined: a view of a single plane fits its
-points at subpixel residuals with an arbitrary P. It is kept if it explains its points and agrees with the
-verified matches of its pairs, since many wrong matches can determine a wrong camera. Other views are deferred
-to calibrated resection.
+points with an arbitrary P. It is kept if it explains its points and agrees with the verified matches of its
+pairs. Other views are deferred to calibrated resection.
 """
 
 from __future__ import annotations
@@ -14,18 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import whitening_transform
-from thesisrecon.geometry.resection import resect_linear
-from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.numerics.partial_bundle import refine_camera
-from thesisrecon.projective.initial_pair import (
-    initial_cameras,
-    rank_initial_pairs,
-    require_pair_with_parallax,
-)
-from thesisrecon.projective.model import (
+from thesisrecon.projective._model import (
     LOSS_SIGMAS,
     ProjectiveModel,
     adjust_all,
@@ -33,183 +24,25 @@ from thesisrecon.projective.model import (
     retriangulate_points,
     to_reconstruction,
 )
-from thesisrecon.projective.track_selection import (
+from thesisrecon.projective._resection import find_inconsistent_view, projection_std_px, resect_ransac
+from thesisrecon.projective._track_selection import (
     coverage_of_views,
     expand_to_all_tracks,
     select_tracks,
     select_tracks_with_parallax,
     subset_tracks,
 )
+from thesisrecon.projective.initial_pair import (
+    initial_cameras,
+    rank_initial_pairs,
+    require_pair_with_parallax,
+)
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
-_SAMPLE = 6
 # Required share of inliers among the points that a camera sees.
 _MIN_INLIER_RATIO = 0.3
 # Quantile over all points of the projection standard deviations that is tested.
 _STD_QUANTILE = 0.8
-
-
-def resect_ransac(
-    X: F64, xy: F64, *, threshold_px: float, rng: np.random.Generator, batch: int = 64, max_batches: int = 12
-) -> tuple[F64 | None, B8]:
-    """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
-
-    Samples are drawn in batches until one without outliers was drawn with probability 0.999 at the best
-    inlier ratio.
-
-    Parameters
-    ----------
-    X : ndarray (M, 4)
-        Points, signed so that depths have one sign; points of the other sign are outliers.
-    xy : ndarray (M, 2)
-        Pixels.
-    threshold_px : float
-        Inlier threshold.
-    rng : numpy.random.Generator
-        Draws the samples.
-    batch, max_batches : int
-        Samples per batch and maximum number of batches.
-
-    Returns
-    -------
-    P : ndarray (3, 4) or None
-        Camera estimated from the inliers, depths positive; None below six inliers.
-    inlier : ndarray (M,) of bool
-        Inliers.
-    """
-    none = np.zeros(len(X), dtype=bool)
-    if len(X) < _SAMPLE:
-        return None, none
-    # The points of one view may fill a corner of the frame: whitening keeps all digits.
-    M = whitening_transform(X)
-    Y = X @ M.T
-    Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
-    best_cost, best, drawn = np.inf, None, 0
-    scored = rng.choice(len(Y), 1000, replace=False) if len(Y) > 1000 else np.arange(len(Y))
-    for _ in range(max_batches):
-        samples = rng.random((batch, len(Y))).argpartition(_SAMPLE - 1, axis=1)[:, :_SAMPLE]
-        P = resect_linear(Y[samples], xy[samples])
-        P = np.concatenate([P, -P])
-        squared = _squared_residuals(P, Y[scored], xy[scored]) / threshold_px**2
-        cost = np.minimum(squared, 1.0).sum(axis=1)
-        drawn += batch
-        if cost.min() < best_cost:
-            best_cost, best = float(cost.min()), P[cost.argmin()]
-        share = 1.0 - best_cost / len(scored)
-        if drawn * np.log1p(-min(share**_SAMPLE, 1 - 1e-9)) < np.log(1e-3):
-            break
-    if best is None:
-        return None, none
-    found, inlier = _refit(best, Y, xy, threshold_px)
-    return (None if found is None else found @ M), inlier
-
-
-def _refit(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:
-    inlier = _squared_residuals(P[None], X, xy)[0] < threshold_px**2
-    for _ in range(2):
-        if inlier.sum() < _SAMPLE:
-            return None, inlier
-        candidate = resect_linear(X[inlier], xy[inlier])
-        candidate *= np.sign(np.median(X[inlier] @ candidate[2])) or 1.0
-        support = _squared_residuals(candidate[None], X, xy)[0] < threshold_px**2
-        if support.sum() < inlier.sum():
-            break
-        P, inlier = candidate, support
-    return P, inlier
-
-
-def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
-    """Return squared reprojection residuals (B, M), inf on or behind the principal plane."""
-    xh = np.einsum("bij,mj->bmi", P, X)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=-1)
-    return np.where((xh[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
-
-
-def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
-    """Compute the standard deviation of projections under the covariance of a camera.
-
-    The root of half the trace of J C J'.
-
-    Parameters
-    ----------
-    P : ndarray (3, 4)
-        Camera.
-    covariance : ndarray (12, 12)
-        Covariance of its entries, row-major.
-    X : ndarray (N, 4)
-        Points of the whole scene.
-
-    Returns
-    -------
-    ndarray (N,)
-        Standard deviations in pixels; inf near the principal plane.
-    """
-    xh = X @ P.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uv = xh[:, :2] / xh[:, 2:]
-        A = X / xh[:, 2:]
-    blocks = covariance.reshape(3, 4, 3, 4)
-    quadratic = np.einsum("na,rasb,nb->nrs", A, blocks, A)
-    var_u = quadratic[:, 0, 0] - 2 * uv[:, 0] * quadratic[:, 0, 2] + uv[:, 0] ** 2 * quadratic[:, 2, 2]
-    var_v = quadratic[:, 1, 1] - 2 * uv[:, 1] * quadratic[:, 1, 2] + uv[:, 1] ** 2 * quadratic[:, 2, 2]
-    spread = np.sqrt(np.maximum((var_u + var_v) / 2.0, 0.0))
-    return np.where(np.isfinite(spread), spread, np.inf)
-
-
-def _epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float) -> F64:
-    """Return the share (M,) of verified matches of each pair within ``threshold_px`` (Sampson) of F.
-
-    NaN for pairs that are not accepted, not registered, or have one camera centre.
-    """
-    shares = np.full(len(pairs), np.nan)
-    for n, pair in enumerate(pairs):
-        if not (pair.accepted and registered[pair.i] and registered[pair.j]):
-            continue
-        try:
-            F = fundamental_from_cameras(P[pair.i], P[pair.j])
-        except ValueError:
-            continue
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = np.abs(sampson_residuals(F, pair.xy1, pair.xy2))
-        shares[n] = float(np.mean(distance < threshold_px))
-    return shares
-
-
-def find_inconsistent_view(
-    P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float, min_ratio: float
-) -> tuple[int, float] | None:
-    """Find the registered view that agrees least with the verified matches of its pairs.
-
-    One view at a time, since a wrong camera also lowers the ratios of its partners.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4)
-        Cameras.
-    registered : ndarray (V,) of bool
-        Views with a camera.
-    pairs : sequence of TwoView
-        Verified pairs.
-    threshold_px : float
-        Largest Sampson distance of an inlier.
-    min_ratio : float
-        Required inlier ratio over all matches of a view with registered views.
-
-    Returns
-    -------
-    tuple of (int, float) or None
-        The view and its ratio; None if all views reach ``min_ratio``.
-    """
-    shares = _epipolar_inlier_ratios(P, registered, pairs, threshold_px=threshold_px)
-    total, agreed = np.zeros(len(P)), np.zeros(len(P))
-    for pair, share in zip(pairs, shares, strict=True):
-        if np.isfinite(share):
-            total[[pair.i, pair.j]] += pair.inliers
-            agreed[[pair.i, pair.j]] += share * pair.inliers
-    share_of_view = np.where(total > 0, agreed / np.maximum(total, 1.0), 1.0)
-    worst = int(np.argmin(share_of_view))
-    return (worst, float(share_of_view[worst])) if share_of_view[worst] < min_ratio else None
 
 
 @dataclass(frozen=True)
@@ -222,10 +55,8 @@ class IncrementalProjective:
         Approximate number of tracks per view, longest first; the metric stage uses all.
     min_points : int
         Matches needed for resection: twice the six that always agree.
-    outlier_sigmas : (float, float)
-        Inlier thresholds in noise sigmas of the early and late rounds.
-    noise_floor_px : float
-        Lower bound of the noise (localization of corners).
+    outlier_sigmas, noise_floor_px : (float, float), float
+        Inlier thresholds in noise sigmas of the early and late rounds, and lower bound of the noise.
     max_projection_std_rel : float, optional
         Largest 80 % quantile of the projection standard deviations over all points, as a share of the long
         side; None accepts every camera.
@@ -233,16 +64,10 @@ class IncrementalProjective:
         Required share of verified matches on the epipolar lines of the finished model.
     bundle_iterations, final_rounds : int
         Levenberg-Marquardt steps after each camera; final rounds of triangulation, adjustment and filtering.
-    global_bundle_growth : float
-        Growth factor of the number of cameras after which everything is adjusted.
-    local_bundle_views : int
-        Number of views adjusted with a new one in between.
+    global_bundle_growth, local_bundle_views : float, int
+        Everything is adjusted after this growth of the number of cameras, this many views with a new one.
     max_initial_pairs : int
         Initial pairs tried in one attempt while usable views are missing.
-
-    References
-    ----------
-    P. Beardsley, A. Zisserman, D. Murray, IJCV 23, 1997; HZ 18.
     """
 
     points_per_view: int = 1500
@@ -266,31 +91,7 @@ class IncrementalProjective:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """Reconstruct cameras and points from tracks and verified pairs.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            All tracks; a selection is used.
-        pairs : sequence of TwoView
-            Verified pairs.
-        sizes : ndarray (V, 2) of int
-            Width and height.
-        rng : numpy.random.Generator
-            Draws the resection samples.
-        attempt : int
-            Number of the attempt; each begins with other initial pairs.
-
-        Returns
-        -------
-        Reconstruction
-            Projective reconstruction.
-
-        Raises
-        ------
-        StageFailure
-            If no pair is accepted, shows parallax or is left.
-        """
+        """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
         ranked = rank_initial_pairs(tracks, pairs)
         if not ranked:
             raise StageFailure(
@@ -336,16 +137,12 @@ class IncrementalProjective:
         return best
 
     def complete(self, model: ProjectiveModel, pairs: Sequence[TwoView], rng: np.random.Generator) -> None:
-        """Add views to a model in place and remove those that prove wrong.
+        """Add views to a model of two cameras or more in place and remove those that prove wrong.
 
         Parameters
         ----------
-        model : ProjectiveModel
-            Model with at least two cameras.
-        pairs : sequence of TwoView
-            Verified pairs.
-        rng : numpy.random.Generator
-            Draws the resection samples.
+        model, pairs, rng : ProjectiveModel, sequence of TwoView, numpy.random.Generator
+            Model, verified pairs, and source of the resection samples.
         """
         self._grow(model, rng)
         while self._discard_camera(model, pairs):
@@ -357,10 +154,8 @@ class IncrementalProjective:
 
         Parameters
         ----------
-        tracks : Tracks
-            Observations.
-        pair : TwoView
-            Initial pair.
+        tracks, pair : Tracks, TwoView
+            Observations and initial pair.
         sizes : ndarray (V, 2) of int
             Width and height.
 
@@ -398,10 +193,8 @@ class IncrementalProjective:
 
         Parameters
         ----------
-        model : ProjectiveModel
-            Model, changed in place.
-        rng : numpy.random.Generator
-            Draws the resection samples.
+        model, rng : ProjectiveModel, numpy.random.Generator
+            Model, changed in place, and source of the resection samples.
 
         Returns
         -------

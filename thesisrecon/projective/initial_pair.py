@@ -41,10 +41,8 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
     Parameters
     ----------
-    tracks : Tracks
-        All tracks.
-    pairs : sequence of TwoView
-        Verified pairs.
+    tracks, pairs : Tracks, sequence of TwoView
+        All tracks and verified pairs.
 
     Returns
     -------
@@ -73,7 +71,7 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     return ranked
 
 
-def require_pair_with_parallax(pairs: Sequence[TwoView], *, max_ratio: float = NO_PARALLAX) -> None:
+def require_pair_with_parallax(pairs: Sequence[TwoView]) -> None:
     """Raise an error if no accepted pair shows parallax.
 
     Without parallax (rotation about the camera centre, a static camera, a planar scene) no F is determined,
@@ -83,8 +81,6 @@ def require_pair_with_parallax(pairs: Sequence[TwoView], *, max_ratio: float = N
     ----------
     pairs : sequence of TwoView
         Verified pairs.
-    max_ratio : float
-        Homography inlier ratio from which a pair shows no parallax.
 
     Raises
     ------
@@ -96,7 +92,7 @@ def require_pair_with_parallax(pairs: Sequence[TwoView], *, max_ratio: float = N
         return
     shares = [pair.homography_inlier_ratio for pair in accepted]
     kinds = Counter(pair.configuration for pair in accepted)
-    if min(shares) >= max_ratio or all(kind in _NO_PARALLAX_REASONS for kind in kinds):
+    if min(shares) >= NO_PARALLAX or all(kind in _NO_PARALLAX_REASONS for kind in kinds):
         meaning = _NO_PARALLAX_REASONS.get(
             kinds.most_common(1)[0][0], "the camera only rotates, hardly moves, or sees one plane"
         )

@@ -9,9 +9,9 @@ import numpy as np
 
 from thesisrecon.arrays import I64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.projective._model import adjust_all, to_reconstruction
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.projective.initial_pair import require_pair_with_parallax
-from thesisrecon.projective.model import adjust_all, to_reconstruction
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
@@ -20,8 +20,7 @@ class SequentialProjective:
     """Projective reconstruction of one view after the other in image order.
 
     The pair of neighbours with most matches begins; each further view is resected, new points are
-    triangulated and outliers removed. There is no covariance test. One bundle adjustment at the end replaces
-    the lost chapter of the thesis on it.
+    triangulated and outliers removed. One bundle adjustment at the end replaces the lost chapter on it.
 
     Parameters
     ----------
@@ -43,25 +42,7 @@ class SequentialProjective:
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """Reconstruct cameras and points from tracks and verified pairs.
-
-        Parameters
-        ----------
-        tracks, pairs, sizes, rng
-            As in :meth:`IncrementalProjective.reconstruct`.
-        attempt : int
-            Number of the attempt; each begins with the next best pair of neighbours.
-
-        Returns
-        -------
-        Reconstruction
-            Projective reconstruction.
-
-        Raises
-        ------
-        StageFailure
-            If no pair shows parallax or is left.
-        """
+        """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
         require_pair_with_parallax(pairs)
         neighbours = [p for p in pairs if p.accepted and p.j == p.i + 1]
         candidates = neighbours or [p for p in pairs if p.accepted]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -13,7 +13,7 @@ from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.numerics.partial_bundle import refine_points
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
-from thesisrecon.projective.track_selection import observation_cells
+from thesisrecon.projective._track_selection import observation_cells
 from thesisrecon.records import Reconstruction, Tracks
 
 # Residual beyond which the loss of bundle adjustment is linear, in noise sigmas.
@@ -25,28 +25,7 @@ _POINT_ITERATIONS = 4
 
 @njit(cache=True, nogil=True)
 def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen: B8) -> tuple[F64, F64]:
-    """Project the points of some observations.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4)
-        Cameras.
-    X : ndarray (N, 4)
-        Points.
-    view, point : ndarray (K,) of int
-        View and point of each observation.
-    xy : ndarray (K, 2)
-        Observed pixels.
-    chosen : ndarray (K,) of bool
-        Observations to project.
-
-    Returns
-    -------
-    depth : ndarray (K,)
-        Third coordinate w of P X; 0 if not chosen.
-    distance : ndarray (K,)
-        Distance in pixels; inf if not chosen or in the focal plane.
-    """
+    """Return depths (K,), 0 if not chosen, and distances (K,) px, inf if not chosen or in the focal plane."""
     depth, distance = np.zeros(len(xy)), np.full(len(xy), np.inf)
     for k in range(len(xy)):
         if not chosen[k]:
@@ -67,28 +46,10 @@ def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen:
 class ProjectiveModel:
     """Projective reconstruction in progress.
 
-    Attributes
-    ----------
-    tracks : Tracks
-        Observations.
-    sizes : ndarray (V, 2) of int
-        Image sizes.
-    P, X : ndarray (V, 3, 4), (N, 4)
-        Cameras and points, zeros if missing, signed so that depths are positive.
-    registered : ndarray (V,) of bool
-        Views with a camera.
-    inlier : ndarray (K,) of bool
-        Observations that agree with the current cameras.
-    sigma_px, noise_floor_px : float
-        Noise and its lower bound.
-    reasons : list of str
-        Why a view is not registered.
-    deferred : ndarray (V,) of bool
-        Views whose camera failed the covariance test.
-    rejected : ndarray (V,) of bool
-        Views that were removed as wrong.
-    cell : ndarray (K,) of int
-        Grid cell of each observation.
+    ``P`` (V, 3, 4) and ``X`` (N, 4) are zeros if missing, signed so that depths are positive; ``inlier`` (K,)
+    are observations that agree with the cameras. ``reasons`` say why a view is not registered; ``deferred``
+    (V,) views failed the covariance test, ``rejected`` ones were removed as wrong. ``cell`` (K,) is the grid
+    cell of each observation.
     """
 
     tracks: Tracks
@@ -99,29 +60,14 @@ class ProjectiveModel:
     inlier: B8
     sigma_px: float
     noise_floor_px: float
-    reasons: list[str] = field(default_factory=list)
-    deferred: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    rejected: B8 = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    cell: I64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    reasons: list[str]
+    deferred: B8
+    rejected: B8
+    cell: I64
 
     @staticmethod
     def empty(tracks: Tracks, sizes: I64, *, sigma_px: float, noise_floor_px: float) -> ProjectiveModel:
-        """Create a model without cameras.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            Observations.
-        sizes : ndarray (V, 2) of int
-            Image sizes.
-        sigma_px, noise_floor_px : float
-            Noise and its lower bound.
-
-        Returns
-        -------
-        ProjectiveModel
-            Empty model.
-        """
+        """Create a model without cameras; ``sizes`` (V, 2) are the image sizes."""
         n = tracks.n_views
         return ProjectiveModel(
             tracks, sizes, np.zeros((n, 3, 4)), np.zeros((tracks.n_points, 4)), np.zeros(n, dtype=bool),
@@ -140,15 +86,7 @@ class ProjectiveModel:
         return np.bincount(self.tracks.point_index[self.used], minlength=self.tracks.n_points) >= 2
 
     def inlier_ratios(self) -> tuple[I64, F64]:
-        """Count the inliers of each view.
-
-        Returns
-        -------
-        counts : ndarray (V,) of int
-            Inlier observations.
-        ratios : ndarray (V,)
-            Their share of the observations of valid points.
-        """
+        """Return the inliers of each view, and their share of its observations of valid points."""
         t, n = self.tracks, self.tracks.n_views
         ready = self.valid[t.point_index]
         counts = np.bincount(t.view_index[ready & self.used], minlength=n)
@@ -156,18 +94,9 @@ class ProjectiveModel:
 
 
 def retriangulate_points(model: ProjectiveModel, sigmas: float, *, points: B8 | None = None) -> None:
-    """Triangulate points from all registered views and update the inliers (6.3).
+    """Triangulate the ``points`` (N,), or all, from all registered views and update the inliers (6.3).
 
     A point with a wrong observation is triangulated again from :func:`consistent_observations`.
-
-    Parameters
-    ----------
-    model : ProjectiveModel
-        Model, changed in place.
-    sigmas : float
-        Inlier threshold in noise sigmas.
-    points : ndarray (N,) of bool, optional
-        Points to triangulate; all by default.
     """
     t = model.tracks
     near = model.registered[t.view_index]
@@ -194,24 +123,10 @@ def _triangulate(model: ProjectiveModel, chosen: B8) -> None:
 
 
 def consistent_observations(model: ProjectiveModel, chosen: B8, threshold_px: float) -> B8:
-    """Find the observations of each point that agree with its best two-view triangulation.
+    """Return the observations (K,) of each point that agree with its best two-view triangulation.
 
     A wrong observation can shift a least-squares point so far that right ones look wrong. Each point is
-    triangulated from pairs of its observations; the pair with the lowest truncated squares over all selects.
-
-    Parameters
-    ----------
-    model : ProjectiveModel
-        Model.
-    chosen : ndarray (K,) of bool
-        Observations to test.
-    threshold_px : float
-        Largest accepted distance.
-
-    Returns
-    -------
-    ndarray (K,) of bool
-        Consistent observations.
+    triangulated from pairs of its ``chosen`` observations; the lowest truncated squares over all select one.
     """
     t = model.tracks
     k = np.flatnonzero(chosen)
@@ -246,15 +161,7 @@ def _residuals(P: F64, X: F64, xy: F64) -> F64:
 
 
 def update_inliers(model: ProjectiveModel, sigmas: float) -> None:
-    """Orient the points with their cameras and mark inliers: in front and within the threshold (6.5).
-
-    Parameters
-    ----------
-    model : ProjectiveModel
-        Model, changed in place.
-    sigmas : float
-        Inlier threshold in noise sigmas.
-    """
+    """Orient the points with their cameras and mark inliers: in front and within the threshold (6.5)."""
     t = model.tracks
     chosen = model.registered[t.view_index] & (np.abs(model.X).sum(axis=1) > 0)[t.point_index]
     depth, distance = project_observations(model.P, model.X, t.view_index, t.point_index, t.xy, chosen)
@@ -265,17 +172,7 @@ def update_inliers(model: ProjectiveModel, sigmas: float) -> None:
 
 
 def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
-    """Run bundle adjustment of everything (6.7), estimate the noise and retriangulate.
-
-    Parameters
-    ----------
-    model : ProjectiveModel
-        Model, changed in place.
-    iterations : int
-        Maximum number of steps.
-    sigmas : float
-        Inlier threshold in noise sigmas.
-    """
+    """Run bundle adjustment of everything (6.7), estimate the noise and retriangulate."""
     t, used = model.tracks, model.used
     if used.sum() < 2 * 8:
         return
@@ -293,22 +190,9 @@ def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
 def adjust_locally(
     model: ProjectiveModel, view: int, iterations: int, sigmas: float, *, n_views: int
 ) -> None:
-    """Run bundle adjustment of one view, the views that share most points with it, and their points.
+    """Run bundle adjustment of one view, the ``n_views`` that share most points with it, and their points.
 
     The other cameras that see these points are fixed and define the frame.
-
-    Parameters
-    ----------
-    model : ProjectiveModel
-        Model, changed in place.
-    view : int
-        New view.
-    iterations : int
-        Maximum number of steps.
-    sigmas : float
-        Inlier threshold in noise sigmas.
-    n_views : int
-        Number of other free views.
     """
     t, used = model.tracks, model.used
     its = np.zeros(t.n_points, dtype=bool)
@@ -341,18 +225,7 @@ def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
 
 
 def to_reconstruction(model: ProjectiveModel) -> Reconstruction:
-    """Return the reconstruction record, with a reason for every unregistered view.
-
-    Parameters
-    ----------
-    model : ProjectiveModel
-        Finished model.
-
-    Returns
-    -------
-    Reconstruction
-        Projective reconstruction.
-    """
+    """Return the reconstruction record, with a reason for every unregistered view."""
     for view in np.flatnonzero(~model.registered):
         if not model.reasons[view]:
             model.reasons[view] = "shares no points with the model"
