@@ -7,9 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import projective_reconstruction
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
-from thesisrecon.selfcalibration.absolute_conic import CalibrationProblem
-from thesisrecon.selfcalibration.stratified import projective_scene
-from thesisrecon.selfcalibration.unknowns import solver_unknowns
+from thesisrecon.selfcalibration._frame import projective_scene
 
 NOTHING_BUT_CONSTANT = IntrinsicsOptions(
     aspect="constant", skew="constant", principal_point="constant", principal_point_std_rel=None
@@ -25,13 +23,9 @@ def prior_for(scene, options=CENTRED):
 
 
 def setup(scene, options=CENTRED, *, seed=0):
-    """The scene behind a random projective transform, the true p, and what calibration is given."""
-    prior = prior_for(scene, options)
-    found = projective_scene(projective_reconstruction(scene, seed=seed), prior)
-    problem = CalibrationProblem(
-        found.frame, found.constraints, solver_unknowns(found.frame, prior), np.zeros((0, 2, 3))
-    )
-    return found, true_plane(scene, found), problem
+    """The scene behind a random projective transform, and the true p."""
+    found = projective_scene(projective_reconstruction(scene, seed=seed), prior_for(scene, options))
+    return found, true_plane(scene, found)
 
 
 def true_plane(scene, found):
@@ -57,10 +51,7 @@ def true_plane(scene, found):
 def turned_about_one_axis(scene, degrees):
     """The cameras of a scene with rotations about the y-axis alone."""
     R = Rotation.from_rotvec(np.outer(np.radians(degrees), [0.0, 1.0, 0.0])).as_matrix()
-    centres = np.einsum("vba,b->va", R, [0.0, 0.0, -8.0]) + np.linspace(-0.4, 0.4, len(R))[:, None] * [
-        1,
-        0.7,
-        0.2,
-    ]
+    along = np.linspace(-0.4, 0.4, len(R))[:, None]
+    centres = np.einsum("vba,b->va", R, [0.0, 0.0, -8.0]) + along * [1, 0.7, 0.2]
     centres[:, 1] += 0.3 * np.cos(np.arange(len(R)) * 2.0)
     return replace(scene, R=R, t=-np.einsum("vab,vb->va", R, centres))

@@ -10,23 +10,23 @@ from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.records import Tracks, Upgrade
+from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration.critical_motions import (
     UpgradedCameras,
-    infinite_homography_shift,
+    _infinite_homography_shift,
+    _planarity_ratio,
     measure_motion,
     nearest_critical_motion,
-    planarity_ratio,
     projective_infinity_shifts,
 )
-from thesisrecon.selfcalibration.frame import normalized_frame
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.identifiability import (
     MAX_FOCAL_STD,
     MAX_NOISE_RATIO,
     MIN_INFINITY_SHIFT,
     MIN_ROTATION_SIGNIFICANCE,
+    _excess_equations,
     check_identifiability,
-    excess_equations,
     identifiability_without_calibration,
 )
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
@@ -86,8 +86,8 @@ def test_cameras_without_tilt_are_detected_at_any_focal(motion):
     cameras = true_cameras(scene)
     for factor in (0.3, 1.0, 4.0):
         H = replace(cameras, focal=factor * cameras.focal).infinite_homographies()
-        assert infinite_homography_shift(H, roll=True) < 1e-9
-    assert (infinite_homography_shift(H, roll=False) < 1e-9) == (motion is Motion.TRANSLATION)
+        assert _infinite_homography_shift(H, roll=True) < 1e-9
+    assert (_infinite_homography_shift(H, roll=False) < 1e-9) == (motion is Motion.TRANSLATION)
 
 
 def test_missing_tilt_is_detected_from_projective_cameras():
@@ -107,8 +107,8 @@ def test_thickness_forgives_a_few_far_points():
     rng = np.random.default_rng(0)
     wall = rng.uniform(-1.0, 1.0, (300, 3)) * [1.0, 1.0, 0.005]
     wall[:5] += 30.0 * rng.normal(size=(5, 3))
-    assert planarity_ratio(wall) < 0.01
-    assert planarity_ratio(rng.uniform(-1.0, 1.0, (300, 3))) > 0.5
+    assert _planarity_ratio(wall) < 0.01
+    assert _planarity_ratio(rng.uniform(-1.0, 1.0, (300, 3))) > 0.5
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_thickness_forgives_a_few_far_points():
 def test_the_counting_argument(known, views, spare):
     estimate = projective_reconstruction(make_scene(views=8))
     registered = np.arange(8) < views
-    assert excess_equations(prior_for(estimate, known), registered) == spare
+    assert _excess_equations(prior_for(estimate, known), registered) == spare
 
 
 def test_square_pixels_resolve_a_turntable_and_this_is_reported():

@@ -8,12 +8,11 @@ import pytest
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.selfcalibration.candidates import select_candidate
-from thesisrecon.selfcalibration.focal_scan import SCAN_WEIGHTS, plane_from_focals, scan_cost
-from thesisrecon.selfcalibration.frame import build_frame, normalized_frame
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration._candidates import select_candidate
+from thesisrecon.selfcalibration._frame import normalized_frame
+from thesisrecon.selfcalibration._refinement import RotationCriterion
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement, plane_from_focals
 from thesisrecon.selfcalibration.quadric import quadric_hypotheses
-from thesisrecon.selfcalibration.refinement import RotationCriterion
 from thesisrecon.selfcalibration.stratified import Stratified
 
 METHODS = [HypothesesAndRefinement(), Stratified()]
@@ -61,7 +60,8 @@ def test_points_end_in_front_of_the_cameras():
 
 def test_each_closed_form_contains_the_truth():
     scene = make_scene(seed=6)
-    frame = build_frame(projective_reconstruction(scene, seed=6), np.zeros(8, dtype=np.int64))
+    reconstruction = projective_reconstruction(scene, seed=6)
+    frame = normalized_frame(reconstruction, prior_for(reconstruction))
     f = scene.K[0, 0, 0] / 1536.0
     criterion = RotationCriterion(focal_weight=0.0)
     planes, focals = quadric_hypotheses(frame, np.array([f]))
@@ -136,9 +136,3 @@ def test_given_focals_without_a_solution_are_named(focals, reported):
     with pytest.raises(StageFailure, match="near the given focal length") as failure:
         select_candidate(frame, estimate, RotationCriterion(), [], max_candidates=3, min_in_front_ratio=0.9)
     assert f"{reported} (+-" in failure.value.evidence
-
-
-def test_the_cost_of_the_scan_is_its_formula():
-    K = np.array([[[[2.0, 0.1, 0.3], [0.0, 1.6, -0.2], [0.0, 0.0, 1.0]], np.diag([0.8, 0.8, 1.0])]])
-    first = (np.array([0.1, 0.4, 0.3, 0.2]) @ SCAN_WEIGHTS / 1.6) ** 2
-    np.testing.assert_allclose(scan_cost(K), [first])

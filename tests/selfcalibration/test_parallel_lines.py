@@ -16,17 +16,18 @@ from tests.synthetic import TrueScene, make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Tracks
-from thesisrecon.selfcalibration.line_segments import LineSegments, _fit_segments
+from thesisrecon.selfcalibration._frame import projective_scene
+from thesisrecon.selfcalibration._line_segments import LineSegments, _fit_segments
 from thesisrecon.selfcalibration.parallel_lines import (
     ParallelLines,
     VanishingPoints,
+    _find_parallel_directions,
     _normalize_segments,
+    _propose_vanishing_points,
     _refine_plane,
     _triangulate_directions,
-    find_parallel_directions,
-    propose_vanishing_points,
 )
-from thesisrecon.selfcalibration.stratified import Stratified, projective_scene
+from thesisrecon.selfcalibration.stratified import Stratified
 from validation.scenes.real import load_fixture_scene
 
 TURN = np.array([[0.8, 0.36, 0.48], [-0.6, 0.48, 0.64], [0.0, -0.8, 0.6]])
@@ -61,7 +62,7 @@ def drawn_segments(scene, *, sigma_px, stray, seed):
 @pytest.mark.parametrize("views", [[0, 1], [2, 5, 7]])
 def test_three_given_directions_fix_the_plane(seed, views):
     scene = make_scene(seed=seed)
-    found, plane, _ = setup(scene, seed=seed)
+    found, plane = setup(scene, seed=seed)
     way = ParallelLines(vanishing_points(scene, TURN, views))
     located = way.locate(found, np.random.default_rng(0))
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
@@ -73,7 +74,7 @@ def test_more_directions_and_points_at_infinity_do_no_harm():
     level = np.array([R0[0], R0[1], R0[2], [0.3, -0.2, 0.9]])
     given = vanishing_points(scene, level, [0, 3, 6])
     assert abs(given.xyh[0, 2]) < 1e-12
-    found, plane, _ = setup(scene, seed=1)
+    found, plane = setup(scene, seed=1)
     located = ParallelLines(given).locate(found, np.random.default_rng(0))
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
 
@@ -91,7 +92,7 @@ def test_directions_at_right_angles_give_the_calibration_too():
 
 def test_directions_in_one_plane_are_refused():
     scene = make_scene(seed=3)
-    found, _, _ = setup(scene, seed=3)
+    found, _ = setup(scene, seed=3)
     flat = np.array([TURN[0], TURN[1], TURN[0] + TURN[1]])
     with pytest.raises(StageFailure, match="lie in one plane"):
         ParallelLines(vanishing_points(scene, flat, [0, 1])).locate(found, np.random.default_rng(0))
@@ -99,7 +100,7 @@ def test_directions_in_one_plane_are_refused():
 
 def test_two_directions_are_refused_with_their_number():
     scene = make_scene(seed=3)
-    found, _, _ = setup(scene, seed=3)
+    found, _ = setup(scene, seed=3)
     given = vanishing_points(scene, TURN, [0, 1])
     one_view = replace(given, view=np.where(given.direction == 2, 0, given.view))
     one_view = VanishingPoints(*(part[:5] for part in (one_view.view, one_view.direction, one_view.xyh)))
@@ -119,17 +120,17 @@ def test_triangulated_points_are_seen_where_they_were():
 @pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])
 def test_directions_are_found_among_strays(sigma, stray, limit):
     scene = make_scene(seed=5, views=6)
-    found, plane, _ = setup(scene, seed=5)
+    found, plane = setup(scene, seed=5)
     frame = found.frame
     segments = _normalize_segments(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
     rng = np.random.default_rng(1)
     proposals = [
-        propose_vanishing_points(
+        _propose_vanishing_points(
             segments.subset(segments.camera == k), max_points=5, samples=300, tolerance_px=1.5, rng=rng
         )
         for k in range(6)
     ]
-    X, direction = find_parallel_directions(frame, segments, proposals, max_directions=3, tolerance_px=1.5)
+    X, direction = _find_parallel_directions(frame, segments, proposals, max_directions=3, tolerance_px=1.5)
     truth = np.tile(np.concatenate([np.repeat([0, 1, 2], 40), np.full(stray, -1)]), 6)
     for d in range(3):
         mine = truth[direction == d]

@@ -9,6 +9,7 @@ from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CO
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralityRegion, CheiralitySearch, _local_minima
 from thesisrecon.selfcalibration.modulus import (
@@ -18,7 +19,6 @@ from thesisrecon.selfcalibration.modulus import (
     modulus_quartic,
     modulus_residuals,
 )
-from thesisrecon.selfcalibration.refinement import minimize_batch
 from thesisrecon.selfcalibration.stratified import Stratified
 
 PAIRS = [
@@ -43,7 +43,7 @@ def test_the_coefficients_are_those_of_the_characteristic_polynomial():
 @pytest.mark.parametrize("seed", range(4))
 def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed):
     scene = make_scene(seed=seed, principal_shift=(80.0, -60.0))
-    found, plane, _ = setup(scene, NOTHING_BUT_CONSTANT, seed=seed)
+    found, plane = setup(scene, NOTHING_BUT_CONSTANT, seed=seed)
     pairs = _pairs_of_constant_cameras(found.constraints.first)
     assert len(pairs) == 28
     c = modulus_coefficients(found.frame.A, found.frame.a, pairs)
@@ -57,7 +57,7 @@ def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_cheirality_bounds_hold_the_true_plane(seed):
-    found, plane, _ = setup(make_scene(seed=seed, sigma_px=0.0), seed=seed)
+    found, plane = setup(make_scene(seed=seed, sigma_px=0.0), seed=seed)
     region = CheiralityRegion.of(
         found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
     )
@@ -71,7 +71,7 @@ def test_the_cheirality_bounds_hold_the_true_plane(seed):
 
 
 def test_samples_of_the_bounds_are_inside_them():
-    found, _, _ = setup(make_scene(seed=2))
+    found, _ = setup(make_scene(seed=2))
     region = CheiralityRegion.of(
         found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
     )
@@ -108,7 +108,7 @@ def test_an_unknown_constant_calibration_comes_out_whole():
 @pytest.mark.parametrize("seed", range(3))
 def test_three_views_of_a_constant_camera_suffice(seed):
     scene = make_scene(views=3, seed=seed, seen_share=1.0)
-    found, plane, _ = setup(scene, seed=seed)
+    found, plane = setup(scene, seed=seed)
     candidates = ModulusConstraint().locate(found, np.random.default_rng(0))
     nearest = np.linalg.norm(candidates.planes - plane, axis=1).min()
     assert nearest < 1e-6
@@ -141,7 +141,7 @@ def test_noise_moves_the_focal_by_little(plane, way):
 
 
 def test_the_modulus_descent_lowers_every_start():
-    found, plane, _ = setup(make_scene(seed=8))
+    found, plane = setup(make_scene(seed=8))
     c = modulus_coefficients(
         found.frame.A, found.frame.a, _pairs_of_constant_cameras(found.constraints.first)
     )

@@ -68,11 +68,11 @@ def test_the_bound_grows_with_noise_and_shrinks_with_cameras_and_priors():
 
 def test_a_cell_measures_every_method_on_the_same_draws(tmp_path):
     cell = Cell("cloud", "constant", 0.0, 5)
-    trials = run_cell(cell, ("scanned-quadric", "focal-scan", BOUND), range(2))
-    assert [t.method for t in trials] == ["scanned-quadric", "focal-scan", BOUND] * 2
+    trials = run_cell(cell, ("nonlinear-quadric", "kruppa-equations", BOUND), range(2))
+    assert [t.method for t in trials] == ["nonlinear-quadric", "kruppa-equations", BOUND] * 2
     assert all(t.median_pct < 3.0 for t in trials)
     text = report(trials)
-    assert "| scanned-quadric |" in text
+    assert "| nonlinear-quadric |" in text
     assert "| cloud, constant | 5 cameras, 0 px |" in text
     assert "| draws of the others | 2 |" in text
     file = tmp_path / "trials.jsonl"
@@ -104,7 +104,7 @@ def test_cells_cross_at_one_pixel_and_the_most_cameras():
 
 def test_the_report_crosses_at_one_pixel_and_adds_other_noises_over_cameras():
     places = [(1.0, 3), (1.0, 27), (0.5, 3), (0.5, 27), (2.0, 27)]
-    text = report([Trial("cloud", "zooming", s, v, 0, "focal-scan", 0.2, 6.0, True, 1.0) for s, v in places])
+    text = report([Trial("cloud", "zooming", s, v, 0, "linear-quadric", 0.2, 6.0, True, 1.0) for s, v in places])
     cross, other = text.split("\n\n")
     assert "| 3 cameras, 1 px | 27 cameras, 1 px | 27 cameras, 0.5 px | 27 cameras, 2 px |" in cross
     assert other.startswith("| cloud, zooming, 0.5 px | 3 cameras, 0.5 px | 27 cameras, 0.5 px |")

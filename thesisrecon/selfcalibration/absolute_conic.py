@@ -1,13 +1,8 @@
 """Calibration from the plane at infinity by the image of the absolute conic (chapter 7; HZ 19.5).
 
-A plane at infinity gives the infinite homographies H_j from the reference view to the others (3.29), K_j R
-K_r^-1 up to scale (3.31). With det H_j = 1 they transfer the image of the absolute conic exactly, w_j =
-H_j^-T w H_j^-1, so prior knowledge of w_j is linear in w:
-
-* constant K: w_j = w, six equations (R. Hartley, "Self-calibration from multiple views with a rotating
-camera", ECCV 1994, for the dual w* = H w* H'); * no skew: w_12 = 0; known principal point: w_13 = w_23 = 0;
-known aspect: w_11 = w_22, in coordinates normalized by these values (L. de Agapito, R. Hartley, E. Hayman,
-CVPR 1999).
+The infinite homographies H_j (3.29) with det H_j = 1 transfer the conic exactly, w_j = H_j^-T w H_j^-1, so
+prior knowledge of w_j is linear in w: constant K: w_j = w (R. Hartley, ECCV 1994); no skew: w_12 = 0; known
+principal point: w_13 = w_23 = 0; known aspect: w_11 = w_22 (L. de Agapito, R. Hartley, E. Hayman, CVPR 1999).
 """
 
 from __future__ import annotations
@@ -19,10 +14,15 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conics import calibration_from_image
-from thesisrecon.selfcalibration.frame import ReferenceFrame
+from thesisrecon.selfcalibration._frame import (
+    HOMOGRAPHY_NOISE,
+    ConicConstraints,
+    ProjectiveScene,
+    ReferenceFrame,
+    SolverUnknowns,
+)
+from thesisrecon.selfcalibration._refinement import minimize_batch, numerical_jacobian
 from thesisrecon.selfcalibration.quadric import dual_image_residuals, quadratic_rows
-from thesisrecon.selfcalibration.refinement import minimize_batch, numerical_jacobian
-from thesisrecon.selfcalibration.unknowns import HOMOGRAPHY_NOISE, ConicConstraints, SolverUnknowns
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ENTRY_WEIGHT = np.array([1.0 if a == b else np.sqrt(2.0) for a, b in _PAIRS])
@@ -48,11 +48,10 @@ def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> frame, p = _example_frame(f=1.2)
+    >>> from thesisrecon.selfcalibration._frame import example_frame
+    >>> frame, p = example_frame(f=1.2)
     >>> H = infinite_homographies(frame, p[None])[0]
-    >>> K = np.diag([1.2, 1.2, 1.0])
-    >>> R = np.linalg.inv(K) @ H @ K
+    >>> R = np.diag([1 / 1.2, 1 / 1.2, 1.0]) @ H @ np.diag([1.2, 1.2, 1.0])
     >>> bool(np.allclose(R @ R.swapaxes(1, 2), np.eye(3)))
     True
     """
@@ -64,7 +63,7 @@ def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
 
 
 def dual_conic_of_constant_camera(H: F64) -> tuple[F64, F64]:
-    """Solve w* = H w* H' for the dual image of the absolute conic of a constant K.
+    """Solve w* = H w* H' for the dual image of the absolute conic of a constant K (R. Hartley, ECCV 1994).
 
     Parameters
     ----------
@@ -76,25 +75,21 @@ def dual_conic_of_constant_camera(H: F64) -> tuple[F64, F64]:
     w : ndarray (3, 3)
         w* ~ K K'.
     s : ndarray (6,)
-        Singular values, largest first: the last is 0 for exact homographies; if the fifth is 0 too, w* is one
-        of a family.
-
-    References
-    ----------
-    R. Hartley, ECCV 1994.
+        Singular values: the last is 0 for exact homographies; if the fifth is 0 too, w* is one of a family.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> frame, p = _example_frame(f=1.2)
+    >>> from thesisrecon.selfcalibration._frame import example_frame
+    >>> frame, p = example_frame(f=1.2)
     >>> w, s = dual_conic_of_constant_camera(infinite_homographies(frame, p[None])[0])
     >>> np.round(np.diag(w / w[2, 2]) ** 0.5, 6)
     array([1.2, 1.2, 1. ])
     """
     equations = _transfer_matrix(H.swapaxes(-1, -2)) - np.eye(6)
     _, s, Vt = np.linalg.svd((_ENTRY_WEIGHT[:, None] * equations).reshape(-1, 6), full_matrices=False)
-    return _positive(Vt[5][_PLACE]), s
+    w = Vt[5][_PLACE]
+    return (w if np.trace(w) > 0 else -w), s
 
 
 def _transfer_matrix(M: F64) -> F64:
@@ -106,9 +101,8 @@ def _transfer_matrix(M: F64) -> F64:
 def _conic_equations(H: F64, constraints: ConicConstraints, focals: F64) -> F64:
     """Return rows (B, M, 6) in the entries 11, 12, 13, 22, 23, 33 of w in the reference view.
 
-    H (B, R, 3, 3) of determinant 1 or NaN (no row); ``focals`` (B, R) are unit-free estimates: w is expressed
-    in coordinates divided by the reference focal length, which balances its entries and weights. Views of a
-    constant camera take the focal length of the first.
+    H (B, R, 3, 3) of determinant 1 or NaN (no row); ``focals`` (B, R) are unit-free estimates: dividing the
+    coordinates by the reference focal length balances entries and weights.
     """
     focals = focals[:, constraints.first]
     scale = np.stack([focals, focals, np.ones_like(focals)], axis=-1)
@@ -134,14 +128,14 @@ def _conic_equations(H: F64, constraints: ConicConstraints, focals: F64) -> F64:
 
 @dataclass(frozen=True)
 class ConicBatch:
-    """Linear solutions for B planes.
+    """Linear solutions for B planes, NaN if no real camera fits.
 
-    Attributes
+    Parameters
     ----------
     f2 : ndarray (B,)
-        Squared focal lengths of the reference view, NaN if no real camera fits.
+        Squared focal lengths of the reference view.
     residuals : ndarray (B, M)
-        Residuals of the equations over their second smallest singular value, NaN likewise.
+        Residuals of the equations over their second smallest singular value.
     """
 
     f2: F64
@@ -179,16 +173,8 @@ def solve_conic_batch(H: F64, constraints: ConicConstraints) -> ConicBatch:
 
 
 @dataclass(frozen=True)
-class ImageConic:
-    """Image of the absolute conic in the reference view.
-
-    Attributes
-    ----------
-    w : ndarray (3, 3)
-        Conic of norm 1 and positive trace.
-    singular_values : ndarray (6,)
-        Singular values of its equations, largest first.
-    """
+class _ImageConic:
+    """Image w (3, 3) of the absolute conic, with the singular values (6,) of its equations."""
 
     w: F64
     singular_values: F64
@@ -208,7 +194,7 @@ class ImageConic:
 
 def solve_conic(
     H: F64, constraints: ConicConstraints, *, orthogonal: F64 | None = None, iterations: int = 4
-) -> ImageConic:
+) -> _ImageConic:
     """Solve for the image of the absolute conic by SVD, reweighted by the estimated focal lengths.
 
     Parameters
@@ -224,25 +210,20 @@ def solve_conic(
 
     Returns
     -------
-    ImageConic
+    _ImageConic
         The conic with its singular values.
-
-    References
-    ----------
-    L. de Agapito, R. Hartley, E. Hayman, CVPR 1999; HZ 19.5.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> from thesisrecon.selfcalibration.unknowns import square_pixel_constraints
-    >>> frame, p = _example_frame(f=1.2)
+    >>> from thesisrecon.selfcalibration._frame import example_frame, square_pixel_constraints
+    >>> frame, p = example_frame(f=1.2)
     >>> conic = solve_conic(infinite_homographies(frame, p[None])[0], square_pixel_constraints(frame))
     >>> np.round(np.sqrt(conic.w[2, 2] / np.diag(conic.w)), 6)
     array([1.2, 1.2, 1. ])
     """
     focals = np.ones((1, len(H)))
-    conic = ImageConic(np.eye(3), np.zeros(6))
+    conic = _ImageConic(np.eye(3), np.zeros(6))
     for _ in range(iterations):
         rows = _conic_equations(H[None], constraints, focals)[0]
         back = np.array([focals[0, constraints.first[constraints.reference]]] * 2 + [1.0])
@@ -251,20 +232,13 @@ def solve_conic(
             x, y = np.swapaxes(pairs / np.linalg.norm(pairs, axis=-1, keepdims=True), 0, 1)
             rows = np.concatenate([rows, quadratic_rows(x, y)])
         _, s, Vt = np.linalg.svd(rows, full_matrices=False)
-        scaled = _positive(Vt[5][_PLACE])
-        conic = ImageConic(_unit(scaled / np.outer(back, back)), s)
+        w = Vt[5][_PLACE]
+        w = (w if np.trace(w) > 0 else -w) / np.outer(back, back)
+        conic = _ImageConic(np.asarray(w / np.linalg.norm(w)), s)
         if not conic.definite:
             break
         focals = np.clip(_focals(H, conic.w), 0.02, 200.0)[None]
     return conic
-
-
-def _positive(w: F64) -> F64:
-    return w if np.trace(w) > 0 else -w
-
-
-def _unit(w: F64) -> F64:
-    return np.asarray(w / np.linalg.norm(w))
 
 
 def _transferred_conics(H: F64, w: F64) -> F64:
@@ -283,59 +257,23 @@ def _focals(H: F64, w: F64) -> F64:
 
 
 @dataclass(frozen=True)
-class CalibrationProblem:
-    """Input of the calibration from a plane at infinity.
-
-    Attributes
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    constraints : ConicConstraints
-        Linear constraints from the prior.
-    unknown : SolverUnknowns
-        Unknown intrinsics.
-    orthogonal : ndarray (M, 2, 3)
-        Pairs of vanishing points in the reference view of orthogonal directions.
-    """
-
-    frame: ReferenceFrame
-    constraints: ConicConstraints
-    unknown: SolverUnknowns
-    orthogonal: F64
-
-
-@dataclass(frozen=True)
 class LinearAbsoluteConic:
     """Hartley's method: the image of the absolute conic by linear equations, K by Cholesky factorization.
 
     With a constant K and no other prior the equations are w* = H w* H', else those of :func:`solve_conic`.
-
-    References
-    ----------
-    R. Hartley, ECCV 1994; L. de Agapito, R. Hartley, E. Hayman, CVPR 1999.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.selfcalibration import frame, unknowns
-    >>> cameras, p = frame._example_frame(n=5, f=1.2)
-    >>> index, zero = np.tile([0, -1, -1, -1, -1], (5, 1)), np.zeros((5, 5))
-    >>> focal = unknowns.SolverUnknowns(index, zero, np.zeros(1), np.ones(1))
-    >>> square = unknowns.square_pixel_constraints(cameras)
-    >>> problem = CalibrationProblem(cameras, square, focal, np.zeros((0, 2, 3)))
-    >>> np.round(LinearAbsoluteConic().calibrations(problem, p)[:, 0, 0], 6)
-    array([1.2, 1.2, 1.2, 1.2, 1.2])
     """
 
-    def calibrations(self, problem: CalibrationProblem, plane: F64) -> F64:
+    def calibrations(self, scene: ProjectiveScene, plane: F64, orthogonal: F64 | None = None) -> F64:
         """Compute the calibrations for a plane at infinity.
 
         Parameters
         ----------
-        problem : CalibrationProblem
+        scene : ProjectiveScene
             Cameras and prior.
         plane : ndarray (3,)
             Plane p.
+        orthogonal : ndarray (M, 2, 3), optional
+            Pairs of vanishing points in the reference view of orthogonal directions.
 
         Returns
         -------
@@ -345,56 +283,60 @@ class LinearAbsoluteConic:
         Raises
         ------
         StageFailure
-            If the conic is not positive definite, or the motion leaves a family of conics (rotations about
-            one axis).
+            If the conic is not positive definite, or the motion leaves a family of conics.
         """
-        frame, constraints = problem.frame, problem.constraints
+        frame, constraints = scene.frame, scene.constraints
         H = _homographies(frame, plane)
         one_camera = bool((constraints.first == constraints.first[0]).all())
-        if one_camera and np.isinf(constraints.std).all() and not len(problem.orthogonal):
+        given = orthogonal is not None and len(orthogonal) > 0
+        if one_camera and np.isinf(constraints.std).all() and not given:
             dual, s = dual_conic_of_constant_camera(H)
-            definite = bool((np.linalg.eigvalsh(dual) > 0).all())
-            conic = ImageConic(np.asarray(np.linalg.inv(dual)) if definite else dual, s)
+            definite = (np.linalg.eigvalsh(dual) > 0).all()
+            conic = _ImageConic(np.asarray(np.linalg.inv(dual)) if definite else dual, s)
         else:
-            conic = solve_conic(H, constraints, orthogonal=problem.orthogonal)
+            conic = solve_conic(H, constraints, orthogonal=orthogonal)
         if not conic.determined:
             raise _undetermined_failure(frame, H, conic)
         if not conic.definite:
-            raise _not_positive_failure(conic)
+            values = np.linalg.eigvalsh(conic.w)
+            raise StageFailure(
+                "the image of the absolute conic is not that of a real camera",
+                f"its eigenvalues are {values[0]:.2e}, {values[1]:.2e} and {values[2]:.2e}, not all positive",
+                "the plane at infinity or the prior of the intrinsics is wrong",
+            )
         K = np.array([calibration_from_image(w) for w in _transferred_conics(H, conic.w)])
-        return _apply_known_values(problem.unknown, K)
+        return _apply_known_values(scene.unknown, K)
 
 
 @dataclass(frozen=True)
 class FixedPlaneQuadric:
-    """Pollefeys' method: the nonlinear quadric criterion with the plane held fixed.
-
-    min sum |K_i K_i' / |.| - H_i w* H_i' / |.||^2 over all unknown intrinsics.
+    """Pollefeys' method: the nonlinear quadric with a fixed plane, over all unknown intrinsics.
 
     Parameters
     ----------
-    focal_range : (float, float)
-        Starting focal lengths in long sides.
-    starts : int
-        Number of starting focal lengths.
-
-    References
-    ----------
-    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
+    focal_range, starts : (float, float), int
+        Range of the starting focal lengths in long sides, and their number.
     """
 
     focal_range: tuple[float, float] = (0.3, 10.0)
     starts: int = 9
 
-    def calibrations(self, problem: CalibrationProblem, plane: F64) -> F64:
+    def calibrations(
+        self,
+        scene: ProjectiveScene,
+        plane: F64,
+        orthogonal: F64 | None = None,  # noqa: ARG002 - one signature for both methods
+    ) -> F64:
         """Compute the calibrations for a plane at infinity.
 
         Parameters
         ----------
-        problem : CalibrationProblem
+        scene : ProjectiveScene
             Cameras and prior.
         plane : ndarray (3,)
             Plane p.
+        orthogonal : ndarray (M, 2, 3), optional
+            Not used.
 
         Returns
         -------
@@ -406,7 +348,7 @@ class FixedPlaneQuadric:
         StageFailure
             If the criterion does not determine the calibrations.
         """
-        unknown, frame = problem.unknown, problem.frame
+        unknown, frame = scene.unknown, scene.frame
         H = _homographies(frame, plane)
         focals = np.log(np.geomspace(*self.focal_range, self.starts))
         starts = unknown.from_log_focals(np.repeat(focals[:, None], len(H), axis=1))
@@ -450,31 +392,11 @@ def _apply_known_values(unknown: SolverUnknowns, K: F64) -> F64:
     return np.asarray(unknown.calibrations((total / np.maximum(count, 1))[None])[0])
 
 
-def largest_rotation(H: F64) -> tuple[float, F64]:
-    """Return the largest rotation between the reference view and the others, and its axis.
+def _largest_rotation(H: F64) -> tuple[float, F64]:
+    """Return the largest rotation (degrees) between the reference view and the others, and its axis.
 
     An infinite homography of a constant K is conjugate to a rotation: its trace is 1 + 2 cos(angle), its real
     eigenvector the vanishing point of the axis.
-
-    Parameters
-    ----------
-    H : ndarray (R, 3, 3)
-        Infinite homographies of determinant 1.
-
-    Returns
-    -------
-    angle : float
-        Degrees.
-    axis : ndarray (3,)
-        Vanishing point of the rotation axis, unit norm.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> H = np.array([np.eye(3), [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
-    >>> angle, axis = largest_rotation(H)
-    >>> round(angle, 6), np.abs(axis)
-    (90.0, array([0., 0., 1.]))
     """
     cosine = (np.trace(H, axis1=1, axis2=2) - 1.0) / 2.0
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -483,8 +405,8 @@ def largest_rotation(H: F64) -> tuple[float, F64]:
     return float(angle.max()), np.asarray(axis / np.linalg.norm(axis))
 
 
-def _undetermined_failure(frame: ReferenceFrame, H: F64, conic: ImageConic | None) -> StageFailure:
-    angle, axis = largest_rotation(H)
+def _undetermined_failure(frame: ReferenceFrame, H: F64, conic: _ImageConic | None) -> StageFailure:
+    angle, axis = _largest_rotation(H)
     found = "the criterion has a flat direction"
     if conic is not None:
         s = conic.singular_values
@@ -502,13 +424,4 @@ def _undetermined_failure(frame: ReferenceFrame, H: F64, conic: ImageConic | Non
         "a one-parameter family of calibrations fits the plane at infinity: all rotations have one axis",
         f"{found}; largest rotation {angle:.1f} deg with its axis at ({place[0]:.0f}, {place[1]:.0f}) px",
         "rotate the camera about a second axis, or assume square pixels without skew",
-    )
-
-
-def _not_positive_failure(conic: ImageConic) -> StageFailure:
-    values = np.linalg.eigvalsh(conic.w)
-    return StageFailure(
-        "the image of the absolute conic is not that of a real camera",
-        f"its eigenvalues are {values[0]:.2e}, {values[1]:.2e} and {values[2]:.2e}, not all positive",
-        "the plane at infinity or the prior of the intrinsics is wrong",
     )

@@ -2,68 +2,32 @@
 
 R. Hartley, "Chirality", IJCV 26(1), 1998; R. Hartley, E. Hayman, L. de Agapito, I. Reid, "Camera calibration
 and the search for infinity", ICCV 1999. The inequalities X'v > 0, delta C'v > 0 form a polytope, bounded in a
-quasi-affine frame. The orientation delta is unknown: of the two polytopes one is usually empty. Each plane of
-a grid gives infinite homographies and, linearly, the image of the absolute conic; planes whose equations have
-exactly one solution are the candidates.
+quasi-affine frame. The orientation delta is unknown: of the two polytopes one is usually empty.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs
 from thesisrecon.records import Reconstruction
+from thesisrecon.selfcalibration._frame import (
+    ConicConstraints,
+    PlaneCandidates,
+    ProjectiveScene,
+    ReferenceFrame,
+    square_pixel_constraints,
+)
+from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import ConicBatch, infinite_homographies, solve_conic_batch
-from thesisrecon.selfcalibration.frame import ReferenceFrame
-from thesisrecon.selfcalibration.refinement import minimize_batch
-from thesisrecon.selfcalibration.unknowns import ConicConstraints, square_pixel_constraints
 
 # Planes closer than this, relative to 1 + |p|, are the same.
 _SAME_PLANE = 1e-3
-
-
-@dataclass(frozen=True)
-class ProjectiveScene:
-    """Input of the methods for the plane at infinity.
-
-    Attributes
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    frame : ReferenceFrame
-        Its registered cameras in a reference frame.
-    constraints : ConicConstraints
-        Prior knowledge of the cameras.
-    """
-
-    reconstruction: Reconstruction
-    frame: ReferenceFrame
-    constraints: ConicConstraints
-
-
-@dataclass(frozen=True)
-class PlaneCandidates:
-    """Candidate planes at infinity, best first.
-
-    Attributes
-    ----------
-    planes : ndarray (B, 3)
-        Planes (p, 1) in the reference frame.
-    scores : ndarray (B,)
-        Scores, smaller is better.
-    orthogonal : ndarray (M, 2, 3)
-        Pairs of unit-free vanishing points in the reference view of orthogonal directions.
-    """
-
-    planes: F64
-    scores: F64
-    orthogonal: F64 = field(default_factory=lambda: np.zeros((0, 2, 3)))
 
 
 @dataclass(frozen=True)
@@ -107,7 +71,7 @@ class _Polytope:
 class CheiralityRegion:
     """Planes that keep all points and camera centres on one side.
 
-    Attributes
+    Parameters
     ----------
     points, centres : ndarray (M, 4), (R, 4)
         Inequalities of the points and centres in the reference frame.
@@ -132,14 +96,10 @@ class CheiralityRegion:
 
         Parameters
         ----------
-        frame : ReferenceFrame
-            Cameras.
-        reconstruction : Reconstruction
-            Projective reconstruction.
-        max_points : int
-            Maximum number of points in the linear programs.
-        rng : numpy.random.Generator
-            Selects the points.
+        frame, reconstruction : ReferenceFrame, Reconstruction
+            Cameras, and the projective reconstruction.
+        max_points, rng : int, numpy.random.Generator
+            Maximum number of points in the linear programs, and their random selection.
 
         Returns
         -------
@@ -155,10 +115,8 @@ class CheiralityRegion:
 
         Parameters
         ----------
-        n : int
-            Number of planes.
-        rng : numpy.random.Generator
-            Source of randomness.
+        n, rng : int, numpy.random.Generator
+            Number of planes, and source of randomness.
 
         Returns
         -------
@@ -206,21 +164,13 @@ def distinct_planes(planes: F64, cost: F64) -> list[int]:
 
     Parameters
     ----------
-    planes : ndarray (B, 3)
-        Planes p.
-    cost : ndarray (B,)
-        Costs; non-finite ones are rejected.
+    planes, cost : ndarray (B, 3), (B,)
+        Planes p with their costs; non-finite costs are rejected.
 
     Returns
     -------
     list of int
         Indices of the selected planes.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> distinct_planes(np.array([[1.0, 0, 0], [1.0001, 0, 0], [0, 2, 0]]), np.array([0.3, 0.1, 0.2]))
-    [1, 2]
     """
     kept: list[int] = []
     for k in np.argsort(cost, kind="stable"):
@@ -305,7 +255,10 @@ def _plane_box(X: F64, C: F64) -> F64 | None:
 
 @dataclass(frozen=True)
 class CheiralitySearch:
-    """Grid search for the plane at infinity within the cheirality bounds (Hartley).
+    """Grid search for the plane at infinity within the cheirality bounds (Hartley et al., ICCV 1999; HZ 21).
+
+    Each plane of the grid gives infinite homographies and, linearly, the image of the absolute conic; planes
+    whose equations have exactly one solution are the candidates.
 
     Parameters
     ----------
@@ -317,10 +270,6 @@ class CheiralitySearch:
         Descent steps from each of them; 0 for the grid alone.
     max_points : int
         Maximum number of points in the linear programs.
-
-    References
-    ----------
-    R. Hartley, E. Hayman, L. de Agapito, I. Reid, ICCV 1999; HZ 21.
     """
 
     steps: int = 16
@@ -329,7 +278,7 @@ class CheiralitySearch:
     max_points: int = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Find candidate planes at infinity.
+        """Find candidate planes at infinity, best first.
 
         Parameters
         ----------
@@ -341,60 +290,54 @@ class CheiralitySearch:
         Returns
         -------
         PlaneCandidates
-            Candidates, best first.
+            The planes.
 
         Raises
         ------
         StageFailure
             If no plane within the bounds gives a real image of the absolute conic.
         """
-        planes, _, scores = self._search(scene.frame, scene.reconstruction, scene.constraints, rng)
+        planes, _ = self.search(scene.frame, scene.reconstruction, rng, scene.constraints)
         if not len(planes):
             raise StageFailure(
                 "the cheirality search found no plane at infinity",
                 "no plane keeps points and cameras on one side and gives a real image of the absolute conic",
                 "use the default preset, which tolerates wrong points",
             )
-        return PlaneCandidates(planes, scores)
+        return PlaneCandidates(planes)
 
     def search(
-        self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
-    ) -> tuple[F64, F64]:
-        """Find planes and focal lengths for square pixels.
-
-        Parameters
-        ----------
-        frame : ReferenceFrame
-            Cameras.
-        reconstruction : Reconstruction
-            Projective reconstruction.
-        rng : numpy.random.Generator
-            Selects the points.
-
-        Returns
-        -------
-        planes : ndarray (B, 3)
-            Planes p, best first; possibly none.
-        focals : ndarray (B,)
-            Unit-free focal lengths of the reference camera.
-        """
-        planes, focals, _ = self._search(frame, reconstruction, square_pixel_constraints(frame), rng)
-        return planes, focals
-
-    def _search(
         self,
         frame: ReferenceFrame,
         reconstruction: Reconstruction,
-        constraints: ConicConstraints,
         rng: np.random.Generator,
-    ) -> tuple[F64, F64, F64]:
+        constraints: ConicConstraints | None = None,
+    ) -> tuple[F64, F64]:
+        """Find planes and focal lengths.
+
+        Parameters
+        ----------
+        frame, reconstruction : ReferenceFrame, Reconstruction
+            Cameras, and the projective reconstruction.
+        rng : numpy.random.Generator
+            Selects the points.
+        constraints : ConicConstraints, optional
+            Prior knowledge of the cameras; by default square pixels and a central principal point.
+
+        Returns
+        -------
+        planes, focals : ndarray (B, 3), (B,)
+            Planes p, best first, possibly none, and unit-free focal lengths of the reference camera.
+        """
+        if constraints is None:
+            constraints = square_pixel_constraints(frame)
         region = CheiralityRegion.of(frame, reconstruction, max_points=self.max_points, rng=rng)
         parts = [self._minima(frame, constraints, polytope) for polytope in region.polytopes]
         if not parts:
-            return np.zeros((0, 3)), np.zeros(0), np.zeros(0)
+            return np.zeros((0, 3)), np.zeros(0)
         planes, f2, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
         kept = distinct_planes(planes, scores)[: self.max_candidates]
-        return planes[kept], np.sqrt(f2[kept]), scores[kept]
+        return planes[kept], np.sqrt(f2[kept])
 
     def _minima(
         self, frame: ReferenceFrame, constraints: ConicConstraints, polytope: _Polytope
@@ -417,7 +360,7 @@ class CheiralitySearch:
         return polytope.reference_planes(v), found.f2, found.score
 
 
-def _local_minima(score: F64) -> NDArray[np.int64]:
+def _local_minima(score: F64) -> I64:
     """Return flat indices of grid cells (S, S, S) not worse than their 6 neighbours, best first."""
     padded = np.pad(score, 1, constant_values=np.inf)
     core = padded[1:-1, 1:-1, 1:-1]

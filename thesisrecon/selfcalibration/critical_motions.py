@@ -1,11 +1,8 @@
 """Critical motions: how close cameras are to motions that self-calibration cannot resolve (HZ 19.8, 19.9).
 
-P. Sturm, "Critical motion sequences for monocular self-calibration and uncalibrated Euclidean
-reconstruction", CVPR 1997, and BMVC 1999 for varying focal lengths; F. Kahl, B. Triggs, K. Astrom, "Critical
-motions for auto-calibration when some intrinsic parameters can vary", J. Math. Imaging and Vision 13, 2000. A
+P. Sturm, CVPR 1997, and BMVC 1999 for varying focal lengths; F. Kahl, B. Triggs, K. Astrom, JMIV 13, 2000. A
 critical motion is invariant under the transforms that it leaves undetermined (a camera without rotation has
-none in any solution, parallel axes stay parallel, a plane stays a plane), so the measures here hold for any
-of these solutions.
+none in any solution), so the measures here hold for any of these solutions.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, I64
 
 PLANE = "planar scene"
 ROTATION = "pure rotation"
@@ -71,14 +68,12 @@ _ALTERNATIVE: Mapping[str, str] = {
 class UpgradedCameras:
     """Metric cameras of a calibration and points.
 
-    Attributes
+    Parameters
     ----------
     focal : ndarray (V,)
         Unit-free focal lengths.
-    R : ndarray (V, 3, 3)
-        Rotations, world to camera.
-    C : ndarray (V, 3)
-        Camera centres.
+    R, C : ndarray (V, 3, 3), (V, 3)
+        Rotations, world to camera, and camera centres.
     X : ndarray (N, 3)
         Points.
     """
@@ -126,16 +121,16 @@ def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
     axis, angle, spread = _common_rotation_axis(metric.R)
     H = metric.infinite_homographies()
     return {
-        "scene_planarity_ratio": planarity_ratio(metric.X),
-        "centre_spread_over_distance": centre_spread_rms(metric.C) / metric.distance,
-        "infinity_shift": infinite_homography_shift(H, roll=False),
-        "infinity_shift_beyond_roll": infinite_homography_shift(H, roll=True),
+        "scene_planarity_ratio": _planarity_ratio(metric.X),
+        "centre_spread_over_distance": _centre_spread_rms(metric.C) / metric.distance,
+        "infinity_shift": _infinite_homography_shift(H, roll=False),
+        "infinity_shift_beyond_roll": _infinite_homography_shift(H, roll=True),
         "largest_rotation_deg": angle,
         "rotation_rms_deg": _rotation_rms_deg(metric.R),
         "optical_axis_rms_deg": _optical_axis_rms_deg(metric.R),
         "rotation_axis_spread_deg": spread,
         "turntable_residual_over_distance": _turntable_residual(metric, axis) / metric.distance,
-        "axial_translation_over_distance": axial_translation_rms(metric.C, axis) / metric.distance,
+        "axial_translation_over_distance": _axial_translation_rms(metric.C, axis) / metric.distance,
     }
 
 
@@ -156,10 +151,6 @@ def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
         Name of the motion.
     distance : float
         Largest measure over its tolerance; below 1 the motion is critical.
-
-    References
-    ----------
-    P. Sturm, CVPR 1997; F. Kahl, B. Triggs, K. Astrom, JMIV 13, 2000.
 
     Examples
     --------
@@ -183,29 +174,11 @@ def _tolerance_ratio(measures: Mapping[str, float], key: str) -> float:
     return min(measures[k] / TOLERANCES[k] for k in keys)
 
 
-def infinite_homography_shift(H: F64, *, roll: bool) -> float:
-    """Compute the rms shift of points at infinity beyond zoom and, with ``roll``, in-plane rotation.
+def _infinite_homography_shift(H: F64, *, roll: bool) -> float:
+    """Return the rms shift (long sides) of points at infinity beyond zoom and, with ``roll``, roll.
 
-    Each homography is compared with the nearest diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]].
+    Each H (V, 3, 3) is compared with the nearest diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]].
     The shift is 0 without rotation (beyond roll), whatever the focal lengths.
-
-    Parameters
-    ----------
-    H : ndarray (V, 3, 3)
-        Infinite homographies from one view in unit-free pixels.
-    roll : bool
-        Ignore rotations about the optical axis.
-
-    Returns
-    -------
-    float
-        Shift in long sides, rms over views and image.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> infinite_homography_shift(np.array([np.eye(3), np.diag([2.0, 2.0, 1.0])]), roll=False)
-    0.0
     """
     template = np.zeros_like(H)
     template[:, 0, 0] = template[:, 1, 1] = (H[:, 0, 0] + H[:, 1, 1]) / 2.0
@@ -230,7 +203,7 @@ def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
 
     The plane at infinity is chosen such that the cameras come nearest to having no rotation: A_i - a_i p' =
     diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]], linear in p, g, k, h. Small shifts are
-    necessary but not sufficient for a camera without rotation: a short arc around one point gives them too.
+    necessary but not sufficient for a camera without rotation.
 
     Parameters
     ----------
@@ -253,7 +226,7 @@ def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
         for i in range(len(A)):
             rows[i, :, 3 + kinds * i : 3 + kinds * (i + 1)] = identity[:kinds].reshape(kinds, 9).T
         p = np.linalg.lstsq(rows.reshape(9 * len(A), -1), A.reshape(-1), rcond=None)[0][:3]
-        shifts[name] = infinite_homography_shift(A - a[:, :, None] * p, roll=kinds == 3)
+        shifts[name] = _infinite_homography_shift(A - a[:, :, None] * p, roll=kinds == 3)
     return shifts
 
 
@@ -286,49 +259,13 @@ def _optical_axis_rms_deg(R: F64) -> float:
     return float(np.degrees(np.sqrt(np.mean(np.arctan2(sine, cosine) ** 2))))
 
 
-def centre_spread_rms(C: F64) -> float:
-    """Compute the rms distance of the camera centres from their mean.
-
-    Parameters
-    ----------
-    C : ndarray (V, 3)
-        Camera centres.
-
-    Returns
-    -------
-    float
-        Spread in the unit of the centres.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> centre_spread_rms(np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
-    1.0
-    """
+def _centre_spread_rms(C: F64) -> float:
+    """Return the rms distance of the camera centres (V, 3) from their mean."""
     return float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
 
 
-def axial_translation_rms(C: F64, axis: F64) -> float:
-    """Compute the rms translation of the camera centres along an axis.
-
-    Parameters
-    ----------
-    C : ndarray (V, 3)
-        Camera centres.
-    axis : ndarray (3,)
-        Unit direction.
-
-    Returns
-    -------
-    float
-        Translation in the unit of the centres.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> axial_translation_rms(np.array([[5.0, -1.0, 0.0], [0.0, 1.0, 2.0]]), np.array([0.0, 1.0, 0.0]))
-    1.0
-    """
+def _axial_translation_rms(C: F64, axis: F64) -> float:
+    """Return the rms translation of the camera centres (V, 3) along a unit direction."""
     return float(np.sqrt(np.mean(((C - C.mean(axis=0)) @ axis) ** 2)))
 
 
@@ -345,42 +282,22 @@ def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
     return float(np.sqrt(np.mean(np.sum((right - coefficients @ c) ** 2, axis=1))))
 
 
-def planarity_ratio(X: F64, *, inlier_ratio: float = 0.95) -> float:
-    """Compute the rms thickness of points about their best plane over their rms extent in the plane.
+def _planarity_ratio(X: F64, *, inlier_ratio: float = 0.95) -> float:
+    """Return the rms thickness of points (N, 3) about their best plane over their rms extent in it.
 
-    Parameters
-    ----------
-    X : ndarray (N, 3)
-        Points.
-    inlier_ratio : float
-        Share of points kept, nearest to the centre and then to the plane.
-
-    Returns
-    -------
-    float
-        Ratio, 0 for a plane.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> X = np.random.default_rng(0).uniform(-1, 1, (100, 3)) * [1.0, 1.0, 0.0]
-    >>> planarity_ratio(X) < 1e-9
-    True
+    ``inlier_ratio`` of the points are kept, nearest to the centre and then to the plane.
     """
+
+    def nearest(distance: F64) -> I64:
+        return np.argsort(distance, kind="stable")[: max(int(inlier_ratio * len(distance)), 4)]
+
     for _ in range(3):
-        centred = X - np.median(X, axis=0)
-        near = np.argsort(np.linalg.norm(centred, axis=1), kind="stable")[
-            : max(int(inlier_ratio * len(X)), 4)
-        ]
-        X = X[near]
+        X = X[nearest(np.linalg.norm(X - np.median(X, axis=0), axis=1))]
         if len(X) < 50:
             break
     centred = X - X.mean(axis=0)
     for _ in range(3):
-        normal = np.linalg.svd(centred, full_matrices=False)[2][2]
-        order = np.argsort(np.abs(centred @ normal), kind="stable")[
-            : max(int(inlier_ratio * len(centred)), 4)
-        ]
+        order = nearest(np.abs(centred @ np.linalg.svd(centred, full_matrices=False)[2][2]))
         centred = centred[order] - centred[order].mean(axis=0)
     s = np.linalg.svd(centred, compute_uv=False)
     return float(s[2] / max(float(s[1]), 1e-300))

@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration.candidates import (
+from thesisrecon.selfcalibration._candidates import (
     Candidate,
     as_stage_failure,
     candidates_from_parameters,
@@ -22,12 +22,15 @@ from thesisrecon.selfcalibration.candidates import (
     group_focals_from_planes,
     select_candidate,
 )
+from thesisrecon.selfcalibration._frame import (
+    ReferenceFrame,
+    SolverUnknowns,
+    normalized_frame,
+    solver_unknowns,
+)
+from thesisrecon.selfcalibration._refinement import RotationCriterion, refine_hypotheses
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
-from thesisrecon.selfcalibration.focal_scan import focal_pairs, plane_from_focals
-from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
 from thesisrecon.selfcalibration.quadric import minimize_quadric, quadric_hypotheses
-from thesisrecon.selfcalibration.refinement import RotationCriterion, refine_hypotheses
-from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
 
 # Standard deviation of principal point (long sides), aspect or skew beyond which estimating focal lengths
 # alone is insufficient.
@@ -43,18 +46,14 @@ class HypothesesAndRefinement:
 
     Parameters
     ----------
-    focal_range : (float, float)
-        Scanned focal lengths in long sides.
-    focal_steps : int
-        Number of scanned focal lengths.
+    focal_range, focal_steps : (float, float), int
+        Range of the scanned focal lengths in long sides, and their number.
     camera_subsets : int
         Number of random camera subsets for the quadric.
-    max_refined : int
-        Number of hypotheses to refine.
+    max_refined, max_full_refined : int
+        Numbers of hypotheses to refine, and of distinct candidates to refine over all unknown intrinsics.
     max_candidates : int
         Maximum number of candidates for bundle adjustment.
-    max_full_refined : int
-        Number of distinct candidates to refine over all unknown intrinsics.
     min_in_front_ratio : float
         Required share of observations with positive depth.
     criterion : RotationCriterion
@@ -81,23 +80,7 @@ class HypothesesAndRefinement:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction.
-
-        Parameters
-        ----------
-        reconstruction, prior, rng
-            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
-
-        Returns
-        -------
-        SelfCalibration
-            The upgrade with its identifiability.
-
-        Raises
-        ------
-        StageFailure
-            Below three cameras, or if no candidate places the points in front of the cameras.
-        """
+        """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = normalized_frame(reconstruction, prior)
         planes, log_f = self._propose(frame, reconstruction, rng)
         cost = np.nan_to_num(self.criterion.cost(frame, planes, log_f), nan=np.inf)
@@ -109,26 +92,21 @@ class HypothesesAndRefinement:
         if unknown.max_nonfocal_std > _MAX_OFFSET_STD:
             candidates = self._with_all_intrinsics(frame, unknown, candidates)
         return select_candidate(
-            frame,
-            reconstruction,
-            self.criterion,
-            candidates,
-            max_candidates=self.max_candidates,
-            min_in_front_ratio=self.min_in_front_ratio,
-        )
+            frame, reconstruction, self.criterion, candidates,
+            max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
+        )  # fmt: skip
 
     def _with_all_intrinsics(
         self, frame: ReferenceFrame, unknown: SolverUnknowns, candidates: Sequence[Candidate]
     ) -> list[Candidate]:
         """Return the best distinct candidates, refined over all unknown intrinsics."""
-        found: list[Candidate] = []
-        for candidate in distinct_candidates(frame, candidates, self.max_full_refined):
-            log_f = candidate.log_focals(frame)[frame.group]
-            best = minimize_quadric(frame, unknown, candidate.plane, log_f, loss_scale=self.criterion.scale)
-            found.append(
-                Candidate(best.plane, best.K, best.cost, "hypotheses and nonlinear quadric", best.K_std)
+        return [
+            minimize_quadric(
+                frame, unknown, candidate.plane, candidate.log_focals(frame)[frame.group],
+                method="hypotheses and nonlinear quadric", loss_scale=self.criterion.scale,
             )
-        return found
+            for candidate in distinct_candidates(frame, candidates, self.max_full_refined)
+        ]  # fmt: skip
 
     def _propose(
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
@@ -142,7 +120,7 @@ class HypothesesAndRefinement:
             chosen = np.sort(np.append(rng.choice(others, size, replace=False), frame.reference))
             found.append(quadric_hypotheses(frame.subset(chosen), focals[::4]))
         for other in others:
-            f1, f2 = focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
+            f1, f2 = _focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
             found.append((plane_from_focals(frame, int(other), f1, f2), np.concatenate([f1, f1])))
         if self.search is not None:
             found.append(self.search.search(frame, reconstruction, rng))
@@ -150,3 +128,62 @@ class HypothesesAndRefinement:
         f = np.concatenate([part[1] for part in found])
         good = np.isfinite(p).all(axis=1) & np.isfinite(f)
         return p[good], group_focals_from_planes(frame, p[good], f[good])
+
+
+def _focal_pairs(focals: F64, same_camera: bool) -> tuple[F64, F64]:
+    """Return pairs to scan: equal focal lengths of one camera, else all pairs of every other value."""
+    if same_camera:
+        return focals, focals
+    first, second = np.meshgrid(focals[::2], focals[::2])
+    return first.ravel(), second.ravel()
+
+
+def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
+    """Compute planes at infinity from the focal lengths of the reference and another camera.
+
+    Parameters
+    ----------
+    frame, other : ReferenceFrame, int
+        Cameras, and the place of the other one.
+    f_reference, f_other : ndarray (B,)
+        Unit-free focal lengths.
+
+    Returns
+    -------
+    ndarray (2 B, 3)
+        Planes for both signs of the other camera, since a projective camera has none.
+
+    References
+    ----------
+    R. Gherardi, A. Fusiello, "Practical autocalibration", ECCV 2010.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.selfcalibration._frame import example_frame
+    >>> frame, p = example_frame(f=1.2)
+    >>> planes = plane_from_focals(frame, 1, np.array([1.2]), np.array([1.2]))
+    >>> bool(np.abs(planes - p).max(axis=1).min() < 1e-9)
+    True
+    """
+    K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
+    K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
+    t = frame.a[other] / K2
+    rotation = _rotation_to_first_axis(t)
+    W = rotation @ ((frame.A[other][None] / K2[:, :, None]) * K1[:, None, :])
+    planes = []
+    for sign in (1.0, -1.0):
+        w1, w2, w3 = sign * W[:, 0], sign * W[:, 1], sign * W[:, 2]
+        length = np.maximum(np.linalg.norm(w3, axis=1, keepdims=True), 1e-300)
+        baseline = sign * np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
+        planes.append(-(np.cross(w2, w3) / length - w1) / baseline / K1)
+    return np.concatenate(planes)
+
+
+def _rotation_to_first_axis(t: F64) -> F64:
+    """Return rotations R (B, 3, 3) with R t = (|t|, 0, 0)."""
+    first = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
+    helper = np.eye(3)[np.abs(first).argmin(axis=1)]
+    second = np.cross(first, helper)
+    second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-300)
+    return np.stack([first, second, np.cross(first, second)], axis=1)

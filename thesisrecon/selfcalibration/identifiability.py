@@ -1,10 +1,9 @@
 """Identifiability of the calibration from the images, checked before anything depends on it.
 
-Two questions are answered: which critical motion is nearest
-(:mod:`~thesisrecon.selfcalibration.critical_motions`), and is the calibration determined under the prior of
-the intrinsics? The second follows from the covariance of the focal lengths with free poses and points,
-because the prior may resolve a critical motion: a turntable leaves the scale along its axis and the aspect
-ratio undetermined; square pixels resolve both.
+Which critical motion is nearest, and is the calibration determined under the prior of the intrinsics? The
+second follows from the covariance of the focal lengths with free poses and points, because the prior may
+resolve a critical motion: a turntable leaves the scale along its axis and the aspect ratio undetermined;
+square pixels resolve both.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import IdentifiabilityReport, Reconstruction, Upgrade
+from thesisrecon.selfcalibration._frame import build_frame
 from thesisrecon.selfcalibration.critical_motions import (
     OPTICAL_AXIS,
     PARALLEL_AXES,
@@ -34,7 +34,6 @@ from thesisrecon.selfcalibration.critical_motions import (
     nearest_critical_motion,
     projective_infinity_shifts,
 )
-from thesisrecon.selfcalibration.frame import build_frame
 
 # A focal length with a larger relative standard deviation is undetermined.
 MAX_FOCAL_STD = 0.15
@@ -142,12 +141,11 @@ def check_identifiability(
         (long sides), ``rotation_significance``, ``excess_equations`` and ``noise_px``.
     """
     problem = _bundle_problem(reconstruction, upgrade, prior)
-    excess = excess_equations(prior, reconstruction.registered)
     if problem is None:
         return identifiability_without_calibration(reconstruction, prior)
     fit = problem.adjust(iterations=_MAX_ITERATIONS)
     free = problem.with_free_intrinsics(fit).adjust(iterations=0)
-    return _report(problem, fit, free, excess)
+    return _report(problem, fit, free, _excess_equations(prior, reconstruction.registered))
 
 
 def identifiability_without_calibration(
@@ -157,51 +155,30 @@ def identifiability_without_calibration(
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    prior : IntrinsicsPrior
-        Prior of the intrinsics of every view.
+    reconstruction, prior : Reconstruction, IntrinsicsPrior
+        Projective reconstruction, and the prior of the intrinsics of every view.
 
     Returns
     -------
     IdentifiabilityReport
         Not identifiable; with the nearest critical motion if there is one.
     """
-    frame = build_frame(reconstruction, prior.group)
+    frame = build_frame(reconstruction, prior)
     evidence = projective_infinity_shifts(frame.A, frame.a)
     motion, distance = nearest_critical_motion(evidence)
     motion = motion if distance < 1.0 else ""
-    evidence |= {
-        "critical_motion_distance": distance,
-        "excess_equations": float(excess_equations(prior, reconstruction.registered)),
-    }
-    focal_std = prior.std[reconstruction.registered, 0]
-    given = float(focal_std.max()) if len(focal_std) else float("inf")
+    evidence["critical_motion_distance"] = distance
+    evidence["excess_equations"] = float(_excess_equations(prior, reconstruction.registered))
+    given = float(prior.std[reconstruction.registered, 0].max())
     sentences = _sentences(motion, evidence, identifiable=False, focal_std=given)
     return IdentifiabilityReport(False, motion, distance < 1.0, evidence, sentences)
 
 
-def excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
+def _excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
     """Count the equations beyond the 8 that self-calibration needs: m n_known + (m - 1) n_constant - 8.
 
-    Written for any pattern of sharing: five intrinsics of each of m views minus the number of unknown values
-    (a standard deviation makes a value known).
-
-    Parameters
-    ----------
-    prior : IntrinsicsPrior
-        Prior of the intrinsics of V views.
-    registered : ndarray (V,) of bool
-        Registered views.
-
-    Returns
-    -------
-    int
-        Excess; negative if there are too few views.
-
-    References
-    ----------
-    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
+    Pollefeys et al. 1999, for any pattern of sharing: five intrinsics of each of m views minus the number of
+    unknown values (a standard deviation makes a value known).
     """
     unknown = 0
     for column in range(5):
@@ -361,22 +338,20 @@ def _report(
     motion, distance = nearest_critical_motion(evidence)
     evidence["critical_motion_distance"] = distance
     std = _focal_std(fit, problem)
-    own = _focal_std(free, problem)
-    centre = np.sqrt(
-        np.diagonal(free.intrinsics_covariance, axis1=1, axis2=2)[cameras.group, 3:5].max(axis=1)
-    )
+    variance = np.diagonal(free.intrinsics_covariance, axis1=1, axis2=2)[cameras.group, 3:5].max(axis=1)
+    centre = np.sqrt(variance) / problem.longest
+    root_share = float(np.sqrt(problem.share))
+    projective_px = max(problem.projective_px, _NOISE_FLOOR_REL * float(np.median(problem.longest)))
     evidence |= {
         "focal_long_sides": float(np.median(metric.focal)),
         "focal_std_rel": float(std.max()),
         "focal_std_rel_median": float(np.median(std)),
-        "focal_std_rel_free": float(np.median(own)),
-        "principal_point_std_free": float(np.median(centre / problem.longest) * np.sqrt(problem.share)),
-        "rotation_significance": rotation_significance(cameras.R, fit.pose_covariance)
-        / float(np.sqrt(problem.share)),
+        "focal_std_rel_free": float(np.median(_focal_std(free, problem))),
+        "principal_point_std_free": float(np.median(centre) * root_share),
+        "rotation_significance": _rotation_significance(cameras.R, fit.pose_covariance) / root_share,
         "excess_equations": float(excess),
         "noise_px": fit.sigma_px,
-        "noise_ratio_to_projective": fit.sigma_px
-        / max(problem.projective_px, _NOISE_FLOOR_REL * float(np.median(problem.longest))),
+        "noise_ratio_to_projective": fit.sigma_px / projective_px,
     }
     undetermined = views[std >= MAX_FOCAL_STD]
     # A prior that fixes the focal length does so for any motion.
@@ -406,30 +381,10 @@ def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
     return np.asarray(np.where(np.isfinite(std), std, np.inf), dtype=np.float64)
 
 
-def rotation_significance(R: F64, covariance: F64 | None) -> float:
-    """Compute the rms rotation of the optical axes in units of its standard deviation.
+def _rotation_significance(R: F64, covariance: F64 | None) -> float:
+    """Return the rms rotation of the optical axes in units of its standard deviation, 0 without covariances.
 
     Without such rotations (pure translation, or roll only) the focal length is undetermined.
-
-    Parameters
-    ----------
-    R : ndarray (V, 3, 3)
-        Rotations, world to camera.
-    covariance : ndarray (V, 6, 6) or None
-        Covariances of the poses.
-
-    Returns
-    -------
-    float
-        Significance, 0 without a covariance.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> R = Rotation.from_rotvec([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]).as_matrix()
-    >>> round(rotation_significance(R, np.tile(1e-4 * np.eye(6), (2, 1, 1))), 3)
-    7.059
     """
     if covariance is None:
         return 0.0
@@ -452,7 +407,7 @@ def _sentences(
     sentences = []
     if evidence["excess_equations"] < 0:
         sentences.append(
-            f"too few images for the unknown intrinsics: {-evidence['excess_equations']:.0f} equations are "
+            f"too few images for the unknown intrinsics: {-evidence['_excess_equations']:.0f} equations are "
             "missing; add images, or let them share one camera"
         )
     if is_critical:

@@ -1,11 +1,9 @@
 """Plane at infinity by the modulus constraint (chapter 7, stratified; HZ 19.5).
 
-M. Pollefeys, L. Van Gool, "Stratified self-calibration with the modulus constraint", PAMI 21(8), 1999.
-Between views of one constant K the infinite homography is conjugate to a rotation times c, so its eigenvalues
-have equal modulus. With det(lambda H_i - H_j) = l3 lambda^3 + l2 lambda^2 + l1 lambda + l0, each affine in
-the plane, this is the quartic l3 l1^3 = l2^3 l0. With c^3 = -l0 / l3 both -l2 / (l3 c) and l1 / (l3 c^2)
-equal 1 + 2 cos(angle); their difference is a residual of first degree near the solution, where the quartic is
-flat.
+M. Pollefeys, L. Van Gool, PAMI 21(8), 1999. Between views of one constant K the infinite homography is
+conjugate to a rotation times c: its eigenvalues have equal modulus. With det(lambda H_i - H_j) = l3 lambda^3
++ l2 lambda^2 + l1 lambda + l0, each affine in the plane, this is l3 l1^3 = l2^3 l0. With c^3 = -l0 / l3 both
+-l2 / (l3 c) and l1 / (l3 c^2) equal 1 + 2 cos(angle); their difference is of first degree near the solution.
 """
 
 from __future__ import annotations
@@ -16,13 +14,9 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.selfcalibration.cheirality import (
-    CheiralityRegion,
-    PlaneCandidates,
-    ProjectiveScene,
-    distinct_planes,
-)
-from thesisrecon.selfcalibration.refinement import minimize_batch
+from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene
+from thesisrecon.selfcalibration._refinement import minimize_batch
+from thesisrecon.selfcalibration.cheirality import CheiralityRegion, distinct_planes
 
 _SLACK = _LOSS_SCALE = 0.05
 
@@ -63,10 +57,8 @@ def modulus_quartic(coefficients: F64, planes: F64) -> F64:
 
     Parameters
     ----------
-    coefficients : ndarray (M, 4, 4)
-        Result of :func:`modulus_coefficients`.
-    planes : ndarray (B, 3)
-        Planes p.
+    coefficients, planes : ndarray (M, 4, 4), (B, 3)
+        Result of :func:`modulus_coefficients`, and planes p.
 
     Returns
     -------
@@ -87,27 +79,19 @@ def modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
 
     Parameters
     ----------
-    coefficients : ndarray (M, 4, 4)
-        Result of :func:`modulus_coefficients`.
-    planes : ndarray (B, 3)
-        Planes p.
+    coefficients, planes : ndarray (M, 4, 4), (B, 3)
+        Result of :func:`modulus_coefficients`, and planes p.
 
     Returns
     -------
-    residuals : ndarray (B, M)
-        Difference of the two sides.
-    trace : ndarray (B, M)
-        Their mean; 1 + 2 cos(angle) of the rotation at a solution, so at most 3 in size.
-
-    References
-    ----------
-    M. Pollefeys, L. Van Gool, PAMI 21(8), 1999.
+    residuals, trace : ndarray (B, M)
+        Difference of the two sides, and their mean: 1 + 2 cos(angle) at a solution, so at most 3 in size.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> frame, p = _example_frame(n=3)
+    >>> from thesisrecon.selfcalibration._frame import example_frame
+    >>> frame, p = example_frame(n=3)
     >>> coefficients = modulus_coefficients(frame.A, frame.a, np.array([[0, 1], [0, 2], [1, 2]]))
     >>> residuals, trace = modulus_residuals(coefficients, p[None])
     >>> bool(np.abs(residuals).max() < 1e-9 and (np.abs(trace) <= 3).all())
@@ -135,10 +119,6 @@ class ModulusConstraint:
         Largest accepted share of points and cameras on the wrong side of a plane.
     max_points : int
         Maximum number of points in the linear programs.
-
-    References
-    ----------
-    M. Pollefeys, L. Van Gool, PAMI 21(8), 1999.
     """
 
     starts: int = 300
@@ -147,7 +127,7 @@ class ModulusConstraint:
     max_points: int = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Find candidate planes at infinity.
+        """Find candidate planes at infinity, best first.
 
         Parameters
         ----------
@@ -159,7 +139,7 @@ class ModulusConstraint:
         Returns
         -------
         PlaneCandidates
-            Candidates, best first.
+            The planes.
 
         Raises
         ------
@@ -191,7 +171,7 @@ class ModulusConstraint:
                 f"{len(starts)} starts over {len(pairs)} pairs of views",
                 "use another method for the plane at infinity",
             )
-        return PlaneCandidates(planes[kept], cost[kept])
+        return PlaneCandidates(planes[kept])
 
 
 def _pairs_of_constant_cameras(first: I64) -> I64:

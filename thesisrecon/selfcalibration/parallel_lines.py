@@ -1,10 +1,8 @@
 """Plane at infinity from parallel lines, given or detected in the images (chapter 7, stratified).
 
-Parallel lines meet in a point at infinity, imaged as their vanishing point; three such points that are not
-collinear span the plane. Each image proposes vanishing points (pairs of segments, consensus of all).
-Proposals of two images triangulate to a point of projective space; its support are the segments of all images
-that point to it, without calibration. Orthogonal directions constrain the calibration too: v_a' w v_b = 0 (HZ
-8.6).
+Three vanishing points that are not collinear span the plane. Each image proposes vanishing points (pairs of
+segments, consensus of all). Proposals of two images triangulate to a point of projective space; its support
+are the segments of all images that point to it. Orthogonal directions constrain K: v_a' w v_b = 0 (HZ 8.6).
 """
 
 from __future__ import annotations
@@ -18,10 +16,10 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Image
-from thesisrecon.selfcalibration.cheirality import CheiralityRegion, PlaneCandidates, ProjectiveScene
-from thesisrecon.selfcalibration.frame import ReferenceFrame
-from thesisrecon.selfcalibration.line_segments import LineSegments
-from thesisrecon.selfcalibration.refinement import minimize_batch
+from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, ReferenceFrame
+from thesisrecon.selfcalibration._line_segments import LineSegments
+from thesisrecon.selfcalibration._refinement import minimize_batch
+from thesisrecon.selfcalibration.cheirality import CheiralityRegion
 
 # Segments within this many tolerances of a direction are not offered to another one.
 _NEAR_TOLERANCES = 4.0
@@ -34,59 +32,27 @@ _MIN_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)
-class SegmentSet:
-    """Line segments of all images in unit-free coordinates.
-
-    Attributes
-    ----------
-    camera : ndarray (S,) of int
-        Place in the frame.
-    middle, along : ndarray (S, 2)
-        Midpoint and unit direction.
-    half : ndarray (S,)
-        Half the length in pixels.
-    """
+class _SegmentSet:
+    """Segments: camera (S,), unit-free midpoint and direction (S, 2), half the length (S,) in pixels."""
 
     camera: I64
     middle: F64
     along: F64
     half: F64
 
-    def subset(self, keep: B8 | I64) -> SegmentSet:
-        """Return some of the segments.
-
-        Parameters
-        ----------
-        keep : ndarray of bool or int
-            Segments to keep.
-
-        Returns
-        -------
-        SegmentSet
-            The segments.
-        """
-        return SegmentSet(self.camera[keep], self.middle[keep], self.along[keep], self.half[keep])
+    def subset(self, keep: B8 | I64) -> _SegmentSet:
+        """Return some of the segments."""
+        return _SegmentSet(self.camera[keep], self.middle[keep], self.along[keep], self.half[keep])
 
     def endpoint_distances_px(self, v: F64) -> F64:
-        """Compute the endpoint distances of the segments from lines through their midpoints and given points.
-
-        Parameters
-        ----------
-        v : ndarray (..., S, 3)
-            Homogeneous points.
-
-        Returns
-        -------
-        ndarray (..., S)
-            Signed distances in pixels.
-        """
+        """Return distances (..., S) of the ends from lines through the midpoints and points v (..., S, 3)."""
         towards = v[..., :2] - v[..., 2:] * self.middle
         norm = np.maximum(np.linalg.norm(towards, axis=-1), 1e-300)
         across = towards[..., 0] * self.along[:, 1] - towards[..., 1] * self.along[:, 0]
         return np.asarray(across / norm * self.half)
 
 
-def _normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> SegmentSet:
+def _normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> _SegmentSet:
     """Return pixel segments (S_i, 4) of each registered camera in the coordinates of the frame."""
     parts = []
     for place, pixels in enumerate(segments):
@@ -97,37 +63,21 @@ def _normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> SegmentSe
         half = 0.5 * np.linalg.norm(pixels[:, 2:] - pixels[:, :2], axis=1)
         parts.append((np.full(len(pixels), place), ends.mean(axis=1), step / length[:, None], half))
     camera, middle, along, half = (np.concatenate([part[k] for part in parts]) for k in range(4))
-    return SegmentSet(camera.astype(np.int64), middle, along, half)
+    return _SegmentSet(camera.astype(np.int64), middle, along, half)
 
 
-def _support(segments: SegmentSet, v: F64, tolerance_px: float) -> F64:
+def _support(segments: _SegmentSet, v: F64, tolerance_px: float) -> F64:
     """Return the support (..., S) of points v (..., S, 3): length times fit, 0 beyond the tolerance."""
     miss = segments.endpoint_distances_px(v) / tolerance_px
     return np.asarray(segments.half * np.maximum(1.0 - miss**2, 0.0))
 
 
-def propose_vanishing_points(
-    segments: SegmentSet, *, max_points: int, samples: int, tolerance_px: float, rng: np.random.Generator
+def _propose_vanishing_points(
+    segments: _SegmentSet, *, max_points: int, samples: int, tolerance_px: float, rng: np.random.Generator
 ) -> F64:
-    """Find vanishing points of one image by consensus, best supported first.
+    """Return homogeneous vanishing points (K, 3) of one image by consensus, best supported first.
 
-    Parameters
-    ----------
-    segments : SegmentSet
-        Segments of one image; those of a point are removed before the next.
-    max_points : int
-        Maximum number of points.
-    samples : int
-        Number of segment pairs per point.
-    tolerance_px : float
-        Largest endpoint distance of a supporting segment.
-    rng : numpy.random.Generator
-        Draws the pairs.
-
-    Returns
-    -------
-    ndarray (K, 3)
-        Homogeneous unit-free points.
+    The segments of a point are removed before the next.
     """
     found: list[F64] = []
     left = segments
@@ -172,36 +122,18 @@ def _triangulate_directions(P: F64, v: F64) -> F64:
     return np.asarray(np.linalg.eigh(normal)[1][:, :, 0])
 
 
-def find_parallel_directions(
+def _find_parallel_directions(
     frame: ReferenceFrame,
-    segments: SegmentSet,
+    segments: _SegmentSet,
     proposals: list[F64],
     *,
     max_directions: int,
     tolerance_px: float,
 ) -> tuple[F64, I64]:
-    """Match vanishing points over all images through the cameras.
+    """Match vanishing points over all images; return points at infinity (D, 4), directions of segments (S,).
 
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    segments : SegmentSet
-        Segments of all images.
-    proposals : list of ndarray (K_i, 3)
-        Vanishing points of each camera.
-    max_directions : int
-        Maximum number of directions.
-    tolerance_px : float
-        Largest endpoint distance of a supporting segment.
-
-    Returns
-    -------
-    X : ndarray (D, 4)
-        Points at infinity in the reference frame, best supported first; each has support in three cameras,
-        since the third confirms the two that define it.
-    direction : ndarray (S,) of int
-        Direction of each segment, -1 for none.
+    Best supported first, -1 for no direction. Each has support in three cameras, since the third confirms the
+    two that define it.
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
     candidates = _triangulated_pairs(P, proposals)
@@ -245,7 +177,7 @@ def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
     return np.asarray(X[sine.max(axis=1) < 0.1])
 
 
-def _refined_point(P: F64, segments: SegmentSet, X: F64, tolerance_px: float) -> F64:
+def _refined_point(P: F64, segments: _SegmentSet, X: F64, tolerance_px: float) -> F64:
     """Return X (4,) refined to minimum distances of its segments, which are selected again each time."""
     for _ in range(3):
         mine = segments.subset(_support(segments, (P @ X)[segments.camera], tolerance_px) > 0)
@@ -253,7 +185,7 @@ def _refined_point(P: F64, segments: SegmentSet, X: F64, tolerance_px: float) ->
             break
         tangent = np.linalg.svd(X[None])[2][1:]
 
-        def residuals(step: F64, X: F64 = X, tangent: F64 = tangent, mine: SegmentSet = mine) -> F64:
+        def residuals(step: F64, X: F64 = X, tangent: F64 = tangent, mine: _SegmentSet = mine) -> F64:
             return mine.endpoint_distances_px(np.einsum("sij,bj->bsi", P[mine.camera], X + step @ tangent))
 
         step = minimize_batch(residuals, np.zeros((1, 3)), iterations=10, loss_scale=tolerance_px / 2.0)[0][0]
@@ -263,7 +195,7 @@ def _refined_point(P: F64, segments: SegmentSet, X: F64, tolerance_px: float) ->
 
 
 def _refine_plane(
-    frame: ReferenceFrame, segments: SegmentSet, direction: I64, plane: F64, v: F64
+    frame: ReferenceFrame, segments: _SegmentSet, direction: I64, plane: F64, v: F64
 ) -> tuple[F64, F64, float]:
     """Return plane p (3,) and vanishing points v (D, 3) fitted to all segments, and the noise (px).
 
@@ -286,7 +218,7 @@ def _refine_plane(
     return plane, v, noise
 
 
-def _plane_residuals(frame: ReferenceFrame, segments: SegmentSet, of: I64, plane: F64, v: F64) -> F64:
+def _plane_residuals(frame: ReferenceFrame, segments: _SegmentSet, of: I64, plane: F64, v: F64) -> F64:
     """Return endpoint distances (B, S) px: directions ``of`` (S,), planes (B, 3), points v (B, D, 3)."""
     w, camera = v[:, of], segments.camera
     depth = np.einsum("bsi,bi->bs", w, plane)
@@ -296,7 +228,7 @@ def _plane_residuals(frame: ReferenceFrame, segments: SegmentSet, of: I64, plane
 
 
 def _fit_plane(
-    frame: ReferenceFrame, segments: SegmentSet, of: I64, start: tuple[F64, F64], noise: float
+    frame: ReferenceFrame, segments: _SegmentSet, of: I64, start: tuple[F64, F64], noise: float
 ) -> tuple[F64, F64]:
     plane, v = start
     tangents = np.stack([np.linalg.svd(row[None])[2][1:] for row in v])
@@ -316,7 +248,7 @@ def _fit_plane(
 class VanishingPoints:
     """Given vanishing points.
 
-    Attributes
+    Parameters
     ----------
     view, direction : ndarray (M,) of int
         View number and number of the parallel lines.
@@ -382,7 +314,7 @@ class ParallelLines:
         return replace(self, images=tuple(images))
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Find candidate planes at infinity: one from given points, one or more from images.
+        """Find candidate planes at infinity, best supported first: one from given points, or several.
 
         Parameters
         ----------
@@ -394,7 +326,7 @@ class ParallelLines:
         Returns
         -------
         PlaneCandidates
-            Candidates, best supported first.
+            The planes.
 
         Raises
         ------
@@ -414,9 +346,9 @@ class ParallelLines:
 
     def _from_points(self, frame: ReferenceFrame, given: VanishingPoints) -> PlaneCandidates:
         X = _points_at_infinity(frame, given)
-        plane = plane_through_points(X)
+        plane = _plane_through_points(X)
         v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
-        return PlaneCandidates(plane[None], np.zeros(1), self._orthogonal(v))
+        return PlaneCandidates(plane[None], self._orthogonal(v))
 
     def _orthogonal(self, v: F64) -> F64:
         pairs = list(combinations(range(3), 2)) if self.orthogonal_directions else []
@@ -427,24 +359,20 @@ class ParallelLines:
         pixels = [self.detector.detect(self.images[view].gray) for view in frame.views]
         segments = _normalize_segments(frame, pixels)
         proposals = [
-            propose_vanishing_points(
+            _propose_vanishing_points(
                 segments.subset(segments.camera == place), samples=self.samples,
                 max_points=self.vanishing_points_per_image, tolerance_px=self.tolerance_px, rng=rng,
             )
             for place in range(len(frame.views))
         ]  # fmt: skip
-        X, direction = find_parallel_directions(
-            frame,
-            segments,
-            proposals,
-            max_directions=self.max_directions,
-            tolerance_px=self.tolerance_px,
+        X, direction = _find_parallel_directions(
+            frame, segments, proposals, max_directions=self.max_directions, tolerance_px=self.tolerance_px
         )
         region = CheiralityRegion.of(frame, scene.reconstruction, max_points=2000, rng=rng)
         return self._best_triples(frame, segments, region, X, direction)
 
     def _best_triples(
-        self, frame: ReferenceFrame, segments: SegmentSet, region: CheiralityRegion, X: F64, direction: I64
+        self, frame: ReferenceFrame, segments: _SegmentSet, region: CheiralityRegion, X: F64, direction: I64
     ) -> PlaneCandidates:
         """Return planes of triples of directions with the scene on one side, refined on their segments."""
         counts = np.bincount(direction[direction >= 0], minlength=len(X))
@@ -452,7 +380,7 @@ class ParallelLines:
         for triple in combinations(range(len(X)), 3):
             chosen = list(triple)
             try:
-                plane = plane_through_points(X[chosen])
+                plane = _plane_through_points(X[chosen])
             except StageFailure:
                 continue
             v = X[chosen, :3] / np.linalg.norm(X[chosen, :3], axis=1, keepdims=True)
@@ -472,9 +400,7 @@ class ParallelLines:
                 "give vanishing points, or use another method for the plane at infinity",
             )
         order = np.argsort(scores, kind="stable")[: 1 if self.orthogonal_directions else self.max_candidates]
-        return PlaneCandidates(
-            np.array(planes)[order], np.array(scores)[order], self._orthogonal(points[order[0]])
-        )
+        return PlaneCandidates(np.array(planes)[order], self._orthogonal(points[order[0]]))
 
 
 def _points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
@@ -499,30 +425,8 @@ def _points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
     return np.array(found)
 
 
-def plane_through_points(X: F64) -> F64:
-    """Fit a plane to points at infinity by SVD.
-
-    Parameters
-    ----------
-    X : ndarray (D, 4)
-        At least three points.
-
-    Returns
-    -------
-    ndarray (3,)
-        p of the plane (p, 1).
-
-    Raises
-    ------
-    StageFailure
-        If the points are collinear: directions parallel to one plane do not determine it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> plane_through_points(np.array([[1.0, 0, 0, -1], [0, 1, 0, -2], [0, 0, 1, 0]])).round(6) + 0.0
-    array([1., 2., 0.])
-    """
+def _plane_through_points(X: F64) -> F64:
+    """Return p (3,) of the plane (p, 1) through three or more points (D, 4), by SVD."""
     _, s, Vt = np.linalg.svd(X / np.linalg.norm(X, axis=1, keepdims=True))
     plane = Vt[-1]
     if not s[2] > _MIN_SPREAD * s[0] or abs(plane[3]) < 1e-9:

@@ -1,13 +1,8 @@
 """Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3).
 
 Linear: M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002. A camera with square pixels, no skew and a central
-principal point gives six equations linear in the quadric. Their weights assume a focal length near 1;
-scanning a normalizing focal length makes them right for one scanned value.
-
-Nonlinear: M. Pollefeys, R. Koch, L. Van Gool, "Self-calibration and metric reconstruction in spite of varying
-and unknown internal camera parameters", IJCV 32(1), 1999: min sum |K_i K_i' / |K_i K_i'| - P_i Q P_i' / |P_i
-Q P_i'||^2 over the plane at infinity and all unknown intrinsics. Q is parametrized by the plane and the
-reference K: rank 3 and positive by construction.
+principal point gives six equations linear in the quadric, whose weights assume a focal length near 1.
+Nonlinear: M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999, over the plane and all unknown intrinsics.
 """
 
 from __future__ import annotations
@@ -20,7 +15,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 from thesisrecon.records import Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration.candidates import (
+from thesisrecon.selfcalibration._candidates import (
     FOCAL_LIMITS,
     Candidate,
     as_stage_failure,
@@ -28,11 +23,14 @@ from thesisrecon.selfcalibration.candidates import (
     group_focals_from_planes,
     select_candidate,
 )
-from thesisrecon.selfcalibration.frame import ReferenceFrame, normalized_frame
-from thesisrecon.selfcalibration.refinement import RotationCriterion, central_differences, weighted_entries
-from thesisrecon.selfcalibration.unknowns import SolverUnknowns, solver_unknowns
+from thesisrecon.selfcalibration._frame import (
+    ReferenceFrame,
+    SolverUnknowns,
+    normalized_frame,
+    solver_unknowns,
+)
+from thesisrecon.selfcalibration._refinement import RotationCriterion, central_differences, weighted_entries
 
-_PAIRS = [(a, b) for a in range(4) for b in range(a, 4)]
 _MIN_NOISE = 1e-9
 # Maximum number of noise estimates.
 _NOISE_PASSES = 6
@@ -56,25 +54,17 @@ def quadratic_rows(x: F64, y: F64) -> F64:
     return np.stack(terms, axis=-1)
 
 
-def _symmetric(q: F64) -> F64:
-    Q = np.zeros((*q.shape[:-1], 4, 4))
-    for k, (a, b) in enumerate(_PAIRS):
-        Q[..., a, b] = Q[..., b, a] = q[..., k]
-    return Q
-
-
 def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -> F64:
     """Solve the weighted linear equations of the absolute dual quadric.
 
-    The uncertainties are 9 (focal length), 0.2 (aspect), 0.01 (skew) and 0.1 (principal point), and rows are
-    divided by w33 of the previous iterate. The first iterate divides by the norm of the row of w33 instead of
-    the paper's 1, which would depend on the scale of each camera.
+    Uncertainties: 9 (focal length), 0.2 (aspect), 0.01 (skew), 0.1 (principal point); rows are divided by w33
+    of the previous iterate, first by the norm of its row (the 1 of the paper depends on the camera scale).
 
     Parameters
     ----------
     frame : ReferenceFrame
         Cameras.
-    focals : ndarray (B,) or (B, R)
+    focals : ndarray (B,)
         Normalizing focal lengths.
     iterations : int
         Number of reweighted solutions.
@@ -82,24 +72,19 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
     Returns
     -------
     ndarray (B, 4, 4)
-        Quadrics of unit norm in the reference frame, of rank 4 under noise (see :func:`rank_three`); the
-        image in the reference camera has a positive trace.
-
-    References
-    ----------
-    M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002; HZ 19.3.
+        Quadrics of unit norm in the reference frame, of rank 4 under noise (see :func:`rank_three`).
 
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> frame, p = _example_frame(f=1.2)
+    >>> from thesisrecon.selfcalibration._frame import example_frame
+    >>> frame, p = example_frame(f=1.2)
     >>> Q = linear_quadric(frame, np.array([1.2]))[0]
     >>> bool(np.abs(Q @ np.append(p, 1.0)).max() < 1e-9)
     True
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
-    P[:, :, :2] /= (focals if focals.ndim == 2 else focals[:, None])[:, :, None, None]
+    P[:, :, :2] /= focals[:, None, None, None]
     p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
     w11, w22, w33 = (quadratic_rows(p, p) for p in (p1, p2, p3))
     rows = np.stack(
@@ -114,7 +99,8 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
         # SVD of A, since A'A would lose half the digits.
         q = np.linalg.svd(A, full_matrices=A.shape[1] < 10)[2][:, 9]
         nu = np.abs(np.einsum("bvk,bk->bv", w33, q))
-    Q = _symmetric(q)
+    upper, Q = np.triu_indices(4), np.zeros((len(q), 4, 4))
+    Q[:, upper[0], upper[1]] = Q[:, upper[1], upper[0]] = q
     Q *= np.where(np.trace(Q[:, :3, :3], axis1=1, axis2=2) < 0, -1.0, 1.0)[:, None, None]
     return Q
 
@@ -129,17 +115,8 @@ def rank_three(Q: F64) -> tuple[F64, F64]:
 
     Returns
     -------
-    Q : ndarray (B, 4, 4)
-        Nearest quadrics of rank 3.
-    null : ndarray (B, 4)
-        Their null vectors, the planes at infinity.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> Q, null = rank_three(np.diag([3.0, 2.0, 1.0, 0.1])[None])
-    >>> np.diag(Q[0]), null[0]
-    (array([3., 2., 1., 0.]), array([0., 0., 0., 1.]))
+    Q, null : ndarray (B, 4, 4), (B, 4)
+        Nearest quadrics of rank 3, and their null vectors, the planes at infinity.
     """
     value, vector = np.linalg.eigh(Q)
     smallest = np.abs(value).argmin(axis=1)
@@ -149,30 +126,19 @@ def rank_three(Q: F64) -> tuple[F64, F64]:
 
 
 def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
-    """Propose planes at infinity and reference focal lengths from scanned linear quadrics.
+    """Propose planes at infinity and reference focal lengths from linear quadrics.
 
     Parameters
     ----------
     frame : ReferenceFrame
         Cameras.
-    focals : ndarray (B,) or (B, R)
+    focals : ndarray (B,)
         Normalizing focal lengths.
 
     Returns
     -------
-    p : ndarray (B', 3)
-        Planes at infinity: null vectors of the nearest quadrics of rank 3.
-    f : ndarray (B',)
-        Focal lengths of the reference camera; the normalizing one if w* is not positive.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> frame, p = _example_frame(f=1.2)
-    >>> planes, f = quadric_hypotheses(frame, np.array([1.2]))
-    >>> np.round(planes, 6), np.round(f, 6)
-    (array([[ 0.1, -0.2,  0.3]]), array([1.2]))
+    p, f : ndarray (B', 3), (B',)
+        Finite planes, and focal lengths of the reference camera; the normalizing one if w* is not positive.
     """
     try:
         Q, null = rank_three(linear_quadric(frame, focals))
@@ -181,8 +147,7 @@ def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
     with np.errstate(divide="ignore", invalid="ignore"):
         p = null[:, :3] / null[:, 3:]
         f2 = (Q[:, 0, 0] + Q[:, 1, 1]) / (2.0 * Q[:, 2, 2])
-    supposed = focals if focals.ndim == 1 else focals[:, frame.reference]
-    f = np.sqrt(np.where(np.isfinite(f2) & (f2 > 0), f2, supposed**2))
+    f = np.sqrt(np.where(np.isfinite(f2) & (f2 > 0), f2, focals**2))
     good = np.isfinite(p).all(axis=1)
     return p[good], np.clip(f[good], *FOCAL_LIMITS)
 
@@ -191,21 +156,15 @@ def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
 class LinearQuadric:
     """Self-calibration by the linear quadric for one normalizing focal length, without refinement.
 
+    The equation that expects this focal length biases the result even without noise, by tens of percent for
+    another lens: the focal lengths have no standard deviation (NaN).
+
     Parameters
     ----------
     normalising_focal : float
         In long sides; 1.67 is the 60 mm lens of Pollefeys et al. on 36 mm film.
     criterion : RotationCriterion
         Criterion that orders the candidates.
-
-    Notes
-    -----
-    The equation that expects this focal length biases the result even without noise, by tens of percent for
-    another lens: the focal lengths have no standard deviation (NaN).
-
-    References
-    ----------
-    M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002.
     """
 
     normalising_focal: float = 1.67
@@ -219,138 +178,19 @@ class LinearQuadric:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction.
-
-        Parameters
-        ----------
-        reconstruction, prior, rng
-            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
-
-        Returns
-        -------
-        SelfCalibration
-            The upgrade with its identifiability.
-
-        Raises
-        ------
-        StageFailure
-            Below three cameras, or if no candidate places the points in front of the cameras.
-        """
+        """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = normalized_frame(reconstruction, prior)
         p, f = quadric_hypotheses(frame, np.array([self.normalising_focal]))
         log_f = group_focals_from_planes(frame, p, f)
-        found = _select(frame, reconstruction, self.criterion, p, log_f)
+        cost = self.criterion.cost(frame, p, log_f)
+        candidates = candidates_from_parameters(
+            frame, np.concatenate([p, log_f], axis=1), cost, "linear quadric"
+        )
+        found = select_candidate(frame, reconstruction, self.criterion, candidates)
         # The error is a bias, not noise: it has no standard deviation.
         K_std = found.K_std.copy()
         K_std[frame.views[:, None], (0, 1), (0, 1)] = np.nan
         return replace(found, K_std=K_std)
-
-
-@dataclass(frozen=True)
-class ScannedQuadric:
-    """Self-calibration by the linear quadric over a range of normalizing focal lengths.
-
-    The quadric whose cameras are nearest to rotations is solved again with every camera normalized by its own
-    focal length until the focal lengths converge: then no equation biases the result, and exact cameras give
-    the exact calibration.
-
-    Parameters
-    ----------
-    focal_range : (float, float)
-        Normalizing focal lengths in long sides.
-    focal_steps : int
-        Number of normalizing focal lengths.
-    repeats : int
-        Maximum number of further solutions.
-    criterion : RotationCriterion
-        Criterion that selects the quadric.
-    """
-
-    focal_range: tuple[float, float] = (0.2, 40.0)
-    focal_steps: int = 45
-    repeats: int = 30
-    criterion: RotationCriterion = field(default_factory=RotationCriterion)
-
-    @as_stage_failure
-    def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
-    ) -> SelfCalibration:
-        """Upgrade a projective reconstruction.
-
-        Parameters
-        ----------
-        reconstruction, prior, rng
-            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
-
-        Returns
-        -------
-        SelfCalibration
-            The upgrade with its identifiability.
-
-        Raises
-        ------
-        StageFailure
-            Below three cameras, or if no candidate places the points in front of the cameras.
-        """
-        frame = normalized_frame(reconstruction, prior)
-        focals = np.geomspace(*self.focal_range, self.focal_steps)
-        p, f = quadric_hypotheses(frame, focals)
-        log_f = group_focals_from_planes(frame, p, f)
-        best = int(np.nan_to_num(self.criterion.cost(frame, p, log_f), nan=np.inf).argmin()) if len(p) else 0
-        log_f = log_f[best : best + 1]
-        for _ in range(self.repeats if len(p) else 0):
-            before = log_f
-            again = quadric_hypotheses(frame, np.exp(log_f[:, frame.group]))
-            if not len(again[0]):
-                break
-            p, log_f = again[0], group_focals_from_planes(frame, *again)
-            if np.abs(log_f - before).max() < 1e-12:
-                break
-        return _select(frame, reconstruction, self.criterion, p, log_f)
-
-
-def _select(
-    frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion, p: F64, log_f: F64
-) -> SelfCalibration:
-    candidates = candidates_from_parameters(
-        frame, np.concatenate([p, log_f], axis=1), criterion.cost(frame, p, log_f), "linear quadric"
-    )
-    return select_candidate(frame, reconstruction, criterion, candidates)
-
-
-@dataclass(frozen=True)
-class QuadricFit:
-    """Minimum of the nonlinear quadric criterion.
-
-    Attributes
-    ----------
-    plane : ndarray (3,)
-        Plane at infinity.
-    unknowns : ndarray (D,)
-        Unknown intrinsics.
-    K : ndarray (R, 3, 3)
-        Unit-free calibrations.
-    cost : float
-        Mean squared residual of a camera.
-    noise : float
-        Noise of one residual entry.
-    covariance : ndarray (3 + D, 3 + D)
-        Covariance of plane and unknowns.
-    K_std : ndarray (R, 3, 3)
-        Standard deviations of the entries of K.
-    """
-
-    plane: F64
-    unknowns: F64
-    K: F64
-    cost: float
-    noise: float
-    covariance: F64
-    K_std: F64
 
 
 def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -> F64:
@@ -360,10 +200,8 @@ def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -
     ----------
     A, a : ndarray (R, 3, 3), (R, 3)
         Cameras [A | a] in a frame whose reference camera is [I | 0].
-    K : ndarray (B, R, 3, 3)
-        Calibrations.
-    K_reference : ndarray (B, 3, 3)
-        Calibrations of the reference camera.
+    K, K_reference : ndarray (B, R, 3, 3), (B, 3, 3)
+        Calibrations, and those of the reference camera.
     plane : ndarray (B, 3)
         Planes at infinity.
 
@@ -371,10 +209,6 @@ def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -
     -------
     ndarray (B, R, 6)
         Residuals; their squared sum over a camera is a squared Frobenius norm.
-
-    References
-    ----------
-    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
     """
     C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
     difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
@@ -387,34 +221,34 @@ def _unit(conic: F64) -> F64:
 
 
 def minimize_quadric(
-    frame: ReferenceFrame, unknown: SolverUnknowns, plane: F64, log_f: F64, *, loss_scale: float = 0.05
-) -> QuadricFit:
+    frame: ReferenceFrame,
+    unknown: SolverUnknowns,
+    plane: F64,
+    log_f: F64,
+    *,
+    method: str,
+    loss_scale: float = 0.05,
+) -> Candidate:
     """Minimize the nonlinear quadric criterion from one starting point.
 
-    The priors are weighed against the noise of the residuals, which is estimated from the residuals: the
-    first pass assumes 1 %, each further pass uses the previous estimate until it no longer falls.
+    The priors are weighed against the noise of the residuals: the first pass assumes 1 %, each further one
+    uses the previous estimate until it no longer falls.
 
     Parameters
     ----------
-    frame : ReferenceFrame
-        Cameras.
-    unknown : SolverUnknowns
-        Unknown intrinsics with their priors.
-    plane : ndarray (3,)
-        Starting plane at infinity.
-    log_f : ndarray (R,)
-        Starting log focal lengths.
+    frame, unknown : ReferenceFrame, SolverUnknowns
+        Cameras and their unknown intrinsics.
+    plane, log_f : ndarray (3,), (R,)
+        Starting plane at infinity and log focal lengths.
+    method : str
+        Name of the method in the result.
     loss_scale : float
         Residual beyond which Huber's loss is linear: bad cameras do not bias the rest.
 
     Returns
     -------
-    QuadricFit
-        The nearest minimum.
-
-    References
-    ----------
-    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
+    Candidate
+        The nearest minimum with its standard deviations.
     """
     # Both sides also agree as all focal lengths go to 0: the weak prior makes that cost more than noise.
     unknown = unknown.with_focal_prior()
@@ -426,7 +260,7 @@ def minimize_quadric(
             break
     K = unknown.calibrations(theta[None, 3:])[0]
     K_std = unknown.calibration_std(theta[3:], covariance[3:, 3:])
-    return QuadricFit(theta[:3], theta[3:], K, cost, noise, covariance, K_std)
+    return Candidate(theta[:3], K, cost, method, K_std)
 
 
 def _minimize(
@@ -460,20 +294,14 @@ class NonlinearQuadric:
 
     Parameters
     ----------
-    focal_range : (float, float)
-        Normalizing focal lengths of the linear quadrics in long sides.
-    focal_steps : int
-        Number of normalizing focal lengths.
+    focal_range, focal_steps : (float, float), int
+        Range and number of the normalizing focal lengths of the linear quadrics, in long sides.
     starts : int
         Number of hypotheses to refine over all unknown intrinsics.
     loss_scale : float
         Residual beyond which an entry counts linearly (Huber).
     criterion : RotationCriterion
         Criterion that selects the starts.
-
-    References
-    ----------
-    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
@@ -490,31 +318,18 @@ class NonlinearQuadric:
         prior: IntrinsicsPrior,
         rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction.
-
-        Parameters
-        ----------
-        reconstruction, prior, rng
-            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
-
-        Returns
-        -------
-        SelfCalibration
-            The upgrade with its identifiability.
-
-        Raises
-        ------
-        StageFailure
-            Below three cameras, or if no candidate places the points in front of the cameras.
-        """
+        """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = normalized_frame(reconstruction, prior)
         unknown = solver_unknowns(frame, prior)
         p, f = quadric_hypotheses(frame, np.geomspace(*self.focal_range, self.focal_steps))
         log_f = group_focals_from_planes(frame, p, f)
         cost = self.criterion.cost(frame, p, log_f)
         best = np.argsort(cost, kind="stable")[: self.starts]
-        candidates = []
-        for b in best[np.isfinite(cost[best])]:
-            found = minimize_quadric(frame, unknown, p[b], log_f[b][frame.group], loss_scale=self.loss_scale)
-            candidates.append(Candidate(found.plane, found.K, found.cost, "nonlinear quadric", found.K_std))
+        candidates = [
+            minimize_quadric(
+                frame, unknown, p[b], log_f[b][frame.group],
+                method="nonlinear quadric", loss_scale=self.loss_scale,
+            )
+            for b in best[np.isfinite(cost[best])]
+        ]  # fmt: skip
         return select_candidate(frame, reconstruction, self.criterion, candidates)

@@ -137,14 +137,14 @@ def test_metrics_a_scene_cannot_give_are_rejected_only_on_request(yard, tmp_path
 def test_a_reconstruction_in_a_study_is_the_one_outside(yard, tmp_path):
     config = replace(preset("thesis"), images=replace(CONFIG.images, max_size_px=400))
     study = Study(
-        {"selfcalibration": ["focal-scan"]},
+        {"selfcalibration": ["nonlinear-quadric"]},
         [str(yard)],
         seeds=[3],
         config=config,
         metrics=["focal_error_pct", "points", "verified"],
     )
     rows = ablate(study, tmp_path / "study", executor="local", threads=1)
-    assert [r.variant for r in rows] == ["unchanged", "focal-scan"]
+    assert [r.variant for r in rows] == ["unchanged", "nonlinear-quadric"]
     assert not any(r.failure for r in rows)
     result = thesisrecon.reconstruct(
         yard / "images", tmp_path / "run", config=config, seed=3, until="metric", threads=1

@@ -15,25 +15,14 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.numerics.losses import soft_l1
-from thesisrecon.selfcalibration.frame import ReferenceFrame
+from thesisrecon.selfcalibration._frame import ReferenceFrame
 
 _UPPER = np.triu_indices(3)
 _ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
 
 
 def weighted_entries(M: F64) -> F64:
-    """Return the upper triangles of symmetric matrices, off-diagonal entries times sqrt 2.
-
-    Parameters
-    ----------
-    M : ndarray (..., 3, 3)
-        Symmetric matrices.
-
-    Returns
-    -------
-    ndarray (..., 6)
-        Entries whose Euclidean norm is the Frobenius norm of M.
-    """
+    """Return the upper triangles (..., 6) of symmetric matrices, whose norm is the Frobenius norm."""
     return np.asarray(M[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT, dtype=np.float64)
 
 
@@ -46,23 +35,9 @@ class RotationCriterion:
     scale : float
         Residual norm of a camera beyond which it counts linearly (soft L1).
     focal_log_mean, focal_log_std, focal_weight : float
-        Weak prior of log focal lengths (in long sides) without one of their own; far below the noise of a
-        well-determined problem, it excludes absurd hypotheses.
+        Weak prior of log focal lengths (in long sides) without one of their own.
     noise : float
         Residual of a good camera, against which known focal lengths are weighted.
-
-    References
-    ----------
-    M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> frame, p = _example_frame(f=1.2)
-    >>> cost = RotationCriterion(focal_weight=0.0).cost(frame, np.array([p, 0 * p]), np.log([[1.2], [1.2]]))
-    >>> bool(cost[0] < 1e-12 < cost[1])
-    True
     """
 
     scale: float = 0.05
@@ -72,22 +47,7 @@ class RotationCriterion:
     noise: float = 0.01
 
     def camera_residuals(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
-        """Compute the weighted entries of 3 C C' / tr(C C') - I.
-
-        Parameters
-        ----------
-        frame : ReferenceFrame
-            Cameras.
-        p : ndarray (B, 3)
-            Planes at infinity.
-        log_f : ndarray (B, G)
-            Log focal lengths of the camera groups.
-
-        Returns
-        -------
-        ndarray (B, R, 6)
-            Residuals of each camera.
-        """
+        """Return the weighted entries (B, R, 6) of 3 C C' / tr(C C') - I for planes (B, 3), log_f (B, G)."""
         f = np.exp(log_f)[:, frame.group]
         C = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
         C[..., :2] *= f[:, frame.reference, None, None, None]
@@ -98,22 +58,7 @@ class RotationCriterion:
         return weighted_entries(E)
 
     def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
-        """Compute the robust cost per camera of each hypothesis.
-
-        Parameters
-        ----------
-        frame : ReferenceFrame
-            Cameras.
-        p : ndarray (B, 3)
-            Planes at infinity.
-        log_f : ndarray (B, G)
-            Log focal lengths of the camera groups.
-
-        Returns
-        -------
-        ndarray (B,)
-            Costs.
-        """
+        """Return the robust cost (B,) per camera of planes (B, 3) with log focal lengths (B, G)."""
         norm2 = np.sum(self.camera_residuals(frame, p, log_f) ** 2, axis=-1)
         robust = soft_l1(norm2, self.scale)[0]
         pull = self._focal_prior_residuals(frame, log_f)
@@ -121,8 +66,6 @@ class RotationCriterion:
 
     def _focal_prior_residuals(self, frame: ReferenceFrame, log_f: F64) -> F64:
         weak = self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
-        if frame.focal_mean is None or frame.focal_std is None:
-            return weak
         known = np.isfinite(frame.focal_std)
         scale = np.where(known, frame.focal_std, 1.0)
         return np.where(known, self.noise * (log_f - np.where(known, frame.focal_mean, 0.0)) / scale, weak)
@@ -200,28 +143,7 @@ def refine_hypotheses(
     iterations: int = 25,
     planes_only: bool = False,
 ) -> tuple[F64, F64]:
-    """Refine all hypotheses at once by Levenberg-Marquardt.
-
-    Parameters
-    ----------
-    criterion : RotationCriterion
-        Criterion to minimize.
-    frame : ReferenceFrame
-        Cameras.
-    theta : ndarray (B, 3 + G)
-        Hypotheses (p, log f).
-    iterations : int
-        Maximum number of steps.
-    planes_only : bool
-        Keep the focal lengths fixed.
-
-    Returns
-    -------
-    theta : ndarray (B, 3 + G)
-        Refined hypotheses.
-    cost : ndarray (B,)
-        Their costs.
-    """
+    """Refine hypotheses (p, log f) (B, 3 + G) at once; return them with their costs (B,)."""
 
     def normal_equations(x: F64) -> tuple[F64, F64]:
         weights = criterion._weights(frame, x)
@@ -242,22 +164,10 @@ def refine_hypotheses(
 
 
 def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> F64:
-    """Estimate the standard deviations of the log focal lengths from the residuals.
+    """Estimate the standard deviations (G,) of the log focal lengths at a minimum (p, log f) (3 + G,).
 
-    Parameters
-    ----------
-    criterion : RotationCriterion
-        Criterion that was minimized.
-    frame : ReferenceFrame
-        Cameras.
-    theta : ndarray (3 + G,)
-        Minimum (p, log f).
-
-    Returns
-    -------
-    ndarray (G,)
-        Standard deviations from (J'J)^-1 with the noise of the residuals (five independent entries per
-        camera, minus the unknowns); inf if J'J is singular to rounding.
+    From (J'J)^-1 with the noise of the residuals (five independent entries per camera, minus the unknowns);
+    inf if J'J is singular to rounding.
     """
     row = theta[None]
     weights = criterion._weights(frame, row)
@@ -275,32 +185,9 @@ def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -
 def minimize_batch(
     residuals: Callable[[F64], F64], starts: F64, *, iterations: int, loss_scale: float = np.inf
 ) -> tuple[F64, F64]:
-    """Minimize from many starts at once by Levenberg-Marquardt.
+    """Minimize residuals, (B, D) to (B, M) row by row, from many starts; return minima and mean losses (B,).
 
-    Parameters
-    ----------
-    residuals : callable
-        Maps (B, D) to residuals (B, M) row by row; a row with NaN is rejected.
-    starts : ndarray (B, D)
-        Starting points.
-    iterations : int
-        Maximum number of steps.
-    loss_scale : float
-        Residual beyond which the soft-L1 loss is linear; inf for least squares.
-
-    Returns
-    -------
-    x : ndarray (B, D)
-        Minima.
-    cost : ndarray (B,)
-        Mean loss of a residual; never above that of the start.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> x, cost = minimize_batch(lambda x: x**2 - 2.0, np.array([[1.0], [-3.0]]), iterations=20)
-    >>> np.round(x[:, 0], 6)
-    array([ 1.414214, -1.414214])
+    Rows with NaN are rejected. The soft-L1 loss is linear beyond ``loss_scale``; inf for least squares.
     """
 
     def normal_equations(x: F64) -> tuple[F64, F64]:
@@ -308,34 +195,18 @@ def minimize_batch(
         weight = (1.0 + (r / loss_scale) ** 2) ** -0.5
         return np.einsum("bmi,bm,bmj->bij", J, weight, J), np.einsum("bmi,bm->bi", J, weight * r)
 
+    def cost_of(x: F64) -> F64:
+        squares = residuals(x) ** 2
+        if np.isfinite(loss_scale):
+            squares = soft_l1(squares, loss_scale)[0]
+        return np.asarray(np.nan_to_num(squares.mean(axis=1), nan=np.inf))
+
     schedule = _Schedule(1e-2, 6.0, 1e10, 1e-14, skip_nonfinite=True)
-    return _descend(
-        normal_equations, lambda x: _cost(residuals(x), loss_scale), lambda x: x, starts, iterations, schedule
-    )
-
-
-def _cost(r: F64, loss_scale: float) -> F64:
-    squares = r**2
-    if np.isfinite(loss_scale):
-        squares = soft_l1(squares, loss_scale)[0]
-    return np.asarray(np.nan_to_num(squares.mean(axis=1), nan=np.inf))
+    return _descend(normal_equations, cost_of, lambda x: x, starts, iterations, schedule)
 
 
 def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
-    """Compute the Jacobian of a batch by central differences.
-
-    Parameters
-    ----------
-    residuals : callable
-        Maps (B, D) to (B, M).
-    x : ndarray (B, D)
-        Points.
-
-    Returns
-    -------
-    ndarray (B, M, D)
-        Derivatives.
-    """
+    """Return the derivatives (B, M, D) of a batch by central differences."""
     steps = 1e-6 * (1.0 + np.abs(x))
     columns = []
     for k in range(x.shape[1]):
@@ -345,21 +216,6 @@ def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
 
 
 def central_differences(residuals: Callable[[F64], F64], x: F64, steps: F64) -> F64:
-    """Compute the Jacobian at one point by central differences, in one call of the residuals.
-
-    Parameters
-    ----------
-    residuals : callable
-        Maps (B, D) to (B, M).
-    x : ndarray (D,)
-        Point.
-    steps : ndarray (D,)
-        Step of each coordinate.
-
-    Returns
-    -------
-    ndarray (M, D)
-        Derivatives.
-    """
+    """Return the derivatives (M, D) at one point (D,), in one call of the residuals for either side."""
     shifts = np.diag(steps)
     return np.asarray(((residuals(x + shifts) - residuals(x - shifts)) / (2.0 * steps[:, None])).T)

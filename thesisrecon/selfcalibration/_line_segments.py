@@ -1,9 +1,8 @@
 """Straight line segments of an image, for vanishing points.
 
 Burns, Hanson and Riseman, "Extracting straight lines", PAMI 8(4), 1986: connected pixels with similar
-gradient directions support one line. Two overlapping partitions of the directions are made, and each pixel
-votes for the longer of its two regions. The line is fitted to the subpixel edge points of its region, found
-on a parabola along the gradient (Devernay, INRIA RR-2724, 1995).
+gradient directions support one line. The line is fitted to the subpixel edge points of its region, found on a
+parabola along the gradient (Devernay, INRIA RR-2724, 1995).
 """
 
 from __future__ import annotations
@@ -33,10 +32,6 @@ class LineSegments:
         Minimum length as a share of the long side.
     max_rms_px : float
         Largest rms distance of the edge points from the line.
-
-    References
-    ----------
-    Burns, Hanson, Riseman, PAMI 8(4), 1986; Devernay, INRIA RR-2724, 1995.
     """
 
     sigma_px: float = 1.0
@@ -45,26 +40,7 @@ class LineSegments:
     max_rms_px: float = 0.5
 
     def detect(self, gray: F32) -> F64:
-        """Detect line segments.
-
-        Parameters
-        ----------
-        gray : ndarray (H, W) of float32
-            Grey image.
-
-        Returns
-        -------
-        ndarray (S, 4)
-            x1, y1, x2, y2 in pixels, longest first.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> image = np.zeros((40, 60), dtype=np.float32)
-        >>> image[:, 30:] = 100.0
-        >>> np.round(LineSegments().detect(image)[:, [0, 2]], 3)
-        array([[29.5, 29.5]])
-        """
+        """Return segments (S, 4) x1, y1, x2, y2 in pixels of a grey image (H, W), longest first."""
         gx, gy = (scipy.ndimage.gaussian_filter(gray, self.sigma_px, order=o) for o in ((0, 1), (1, 0)))
         size = np.hypot(gx, gy)
         region = _support_regions(np.arctan2(gy, gx), size > self.min_gradient)

@@ -1,8 +1,7 @@
-"""Candidates of self-calibration: from plane and calibrations to the selected upgrade.
+"""Candidates of self-calibration: from plane at infinity and calibrations to the selected upgrade.
 
-Every method of chapter 7 proposes planes at infinity with calibrations. Here each candidate becomes an
-upgrade with most points in front of the cameras, or is rejected; the best ones are kept, and the
-identifiability of the motion is checked.
+Each candidate becomes an upgrade with most points in front of the cameras, or is rejected; the best ones are
+kept, and the identifiability of the motion is checked.
 """
 
 from __future__ import annotations
@@ -17,60 +16,33 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.records import Reconstruction, SelfCalibration, Upgrade
-from thesisrecon.selfcalibration.frame import ReferenceFrame, metric_from_calibration
+from thesisrecon.selfcalibration._frame import ReferenceFrame, metric_from_calibration
+from thesisrecon.selfcalibration._refinement import RotationCriterion, focal_std
 from thesisrecon.selfcalibration.identifiability import (
     check_identifiability,
     identifiability_without_calibration,
 )
-from thesisrecon.selfcalibration.refinement import RotationCriterion, focal_std
 
 P = ParamSpec("P")
 
 # Candidates whose log focal lengths differ by less than this are the same.
-SAME_LOG_FOCAL = 0.03
+_SAME_LOG_FOCAL = 0.03
 
-MAX_LOG_STD = 1e3
+_MAX_LOG_STD = 1e3
 
 # Focal lengths in long sides of the image: fields of view from 178 to 0.3 degrees.
 FOCAL_LIMITS = (0.02, 200.0)
 
 
 def group_log_focals(frame: ReferenceFrame, K: F64) -> F64:
-    """Return the median log focal length of each camera group.
-
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    K : ndarray (R, 3, 3)
-        Unit-free calibrations.
-
-    Returns
-    -------
-    ndarray (G,)
-        Log focal lengths.
-    """
+    """Return the median log focal length (G,) of each camera group for unit-free K (R, 3, 3)."""
     log_f = 0.5 * np.log(K[:, 0, 0] * K[:, 1, 1])
     return np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One self-calibration in a reference frame.
-
-    Attributes
-    ----------
-    plane : ndarray (3,)
-        Plane at infinity.
-    K : ndarray (R, 3, 3)
-        Unit-free calibrations.
-    cost : float
-        Cost by which candidates are ordered.
-    method : str
-        Name of the method.
-    K_std : ndarray (R, 3, 3), optional
-        Standard deviations of the entries of K.
-    """
+    """One self-calibration: plane (3,), unit-free K (R, 3, 3) with standard deviations if known, and cost."""
 
     plane: F64
     K: F64
@@ -79,18 +51,7 @@ class Candidate:
     K_std: F64 | None = None
 
     def log_focals(self, frame: ReferenceFrame) -> F64:
-        """Return the median log focal length of each camera group.
-
-        Parameters
-        ----------
-        frame : ReferenceFrame
-            Cameras.
-
-        Returns
-        -------
-        ndarray (G,)
-            Log focal lengths.
-        """
+        """Return the median log focal length (G,) of each camera group."""
         return group_log_focals(frame, self.K)
 
 
@@ -98,16 +59,6 @@ def as_stage_failure(calibrate: Callable[P, SelfCalibration]) -> Callable[P, Sel
     """Wrap a ``calibrate`` method so that a failed decomposition raises ``StageFailure``.
 
     Overflow is silenced: it gives hypotheses of non-finite cost, which are never selected.
-
-    Parameters
-    ----------
-    calibrate : callable
-        Method of a self-calibrator.
-
-    Returns
-    -------
-    callable
-        Wrapped method.
     """
 
     @wraps(calibrate)
@@ -126,18 +77,7 @@ def as_stage_failure(calibrate: Callable[P, SelfCalibration]) -> Callable[P, Sel
 
 
 def square_pixel_calibrations(log_f: F64) -> F64:
-    """Return K = diag(f, f, 1).
-
-    Parameters
-    ----------
-    log_f : ndarray (...)
-        Log focal lengths.
-
-    Returns
-    -------
-    ndarray (..., 3, 3)
-        Unit-free calibrations.
-    """
+    """Return K = diag(f, f, 1) (..., 3, 3) of log focal lengths (...)."""
     K = np.zeros((*np.shape(log_f), 3, 3))
     K[..., 0, 0] = K[..., 1, 1] = np.exp(log_f)
     K[..., 2, 2] = 1.0
@@ -145,32 +85,10 @@ def square_pixel_calibrations(log_f: F64) -> F64:
 
 
 def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
-    """Compute the log focal lengths that planes at infinity imply.
+    """Return the log focal lengths (B, G) that planes (B, 3) imply, given those of the reference (B,).
 
     From w*_i = H_i K_r K_r' H_i': f_i^2 = (w11 + w22) / (2 w33); a group takes the median of its cameras, the
     group of the reference camera its own focal length.
-
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    p : ndarray (B, 3)
-        Planes at infinity.
-    f_reference : ndarray (B,)
-        Unit-free focal lengths of the reference camera.
-
-    Returns
-    -------
-    ndarray (B, G)
-        Log focal lengths.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.selfcalibration.frame import _example_frame
-    >>> frame, p = _example_frame(f=1.2)
-    >>> np.round(np.exp(group_focals_from_planes(frame, p[None], np.array([1.2]))), 6)
-    array([[1.2]])
     """
     f = np.clip(f_reference, *FOCAL_LIMITS)
     H = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
@@ -186,24 +104,7 @@ def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) ->
 
 
 def candidates_from_parameters(frame: ReferenceFrame, theta: F64, cost: F64, method: str) -> list[Candidate]:
-    """Build candidates with square pixels from parameter vectors.
-
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    theta : ndarray (B, 3 + G)
-        Planes and log focal lengths.
-    cost : ndarray (B,)
-        Costs.
-    method : str
-        Name of the method.
-
-    Returns
-    -------
-    list of Candidate
-        One candidate per row.
-    """
+    """Return one candidate with square pixels for each row (plane, log focal lengths) (B, 3 + G)."""
     K = square_pixel_calibrations(theta[:, 3:][:, frame.group])
     return [Candidate(t[:3], k, float(c), method) for t, k, c in zip(theta, K, cost, strict=True)]
 
@@ -211,26 +112,11 @@ def candidates_from_parameters(frame: ReferenceFrame, theta: F64, cost: F64, met
 def distinct_candidates(
     frame: ReferenceFrame, candidates: Sequence[Candidate], max_candidates: int
 ) -> list[Candidate]:
-    """Select the best candidates whose focal lengths or planes differ.
-
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    candidates : sequence of Candidate
-        Candidates in any order.
-    max_candidates : int
-        Maximum number to return.
-
-    Returns
-    -------
-    list of Candidate
-        Candidates of finite cost, best first.
-    """
+    """Return the best candidates of finite cost whose focal lengths or planes differ, best first."""
 
     def same(one: Candidate, other: Candidate) -> bool:
-        apart = np.linalg.norm(one.plane - other.plane) > SAME_LOG_FOCAL * np.linalg.norm(one.plane)
-        return not apart and np.abs(one.log_focals(frame) - other.log_focals(frame)).max() < SAME_LOG_FOCAL
+        apart = np.linalg.norm(one.plane - other.plane) > _SAME_LOG_FOCAL * np.linalg.norm(one.plane)
+        return not apart and np.abs(one.log_focals(frame) - other.log_focals(frame)).max() < _SAME_LOG_FOCAL
 
     chosen: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda a: a.cost):
@@ -252,33 +138,8 @@ def select_candidate(
 ) -> SelfCalibration:
     """Select the best candidates with enough points in front and check their identifiability.
 
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Frame of :func:`~thesisrecon.selfcalibration.frame.normalized_frame`.
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    criterion : RotationCriterion
-        Criterion for the standard deviations of the focal lengths.
-    candidates : sequence of Candidate
-        Candidates in any order.
-    max_candidates : int
-        Maximum number of upgrades to return.
-    min_in_front_ratio : float
-        Required share of observations with positive depth.
-
-    Returns
-    -------
-    SelfCalibration
-        Best upgrade, the others, and the identifiability report.
-
-    Raises
-    ------
-    StageFailure
-        If no candidate places enough points in front of the cameras.
+    ``StageFailure`` if no candidate places a share ``min_in_front_ratio`` of the observations in front.
     """
-    if frame.prior is None:
-        raise ValueError("select_candidate needs a frame with a prior (normalized_frame)")
     chosen = _distinct_upgrades(frame, reconstruction, candidates, max_candidates, min_in_front_ratio)
     if not chosen:
         raise _no_candidate_failure(frame, reconstruction, len(candidates))
@@ -286,7 +147,7 @@ def select_candidate(
     theta = np.concatenate([candidate.plane, candidate.log_focals(frame)])
     std_log_f = focal_std(criterion, frame, theta)
     report = check_identifiability(reconstruction, best, frame.prior)
-    K_std = _calibration_std(frame, best.K, candidate, np.minimum(std_log_f[frame.group], MAX_LOG_STD))
+    K_std = _calibration_std(frame, best.K, candidate, np.minimum(std_log_f[frame.group], _MAX_LOG_STD))
     return SelfCalibration(
         best.metric_from_projective, best.K, K_std, report.identifiable,
         () if report.identifiable else report.sentences, tuple(upgrade for _, upgrade in chosen), report,
@@ -295,7 +156,6 @@ def select_candidate(
 
 def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction, tried: int) -> StageFailure:
     """Return the failure of a method that has no acceptable candidate."""
-    assert frame.prior is not None
     evidence = (
         f"none of {counted(tried, 'candidate calibration')} of {counted(len(frame.views), 'view')} places "
         "the points in front of the cameras"
@@ -329,39 +189,14 @@ def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_
         # The last row of K is known, so rows only change their unit.
         K_std[frame.views] = np.diagonal(unit, axis1=1, axis2=2)[:, :, None] * candidate.K_std
         return K_std
-    K_std = focal_only_std(frame, K, focal_std)
-    focals_only = np.allclose(
-        candidate.K, square_pixel_calibrations(np.log(candidate.K[:, 0, 0])), atol=1e-12
-    )
-    if not focals_only:
-        K_std[frame.views[:, None], (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)] = np.nan
-    return K_std
-
-
-def focal_only_std(frame: ReferenceFrame, K: F64, focal_std: F64) -> F64:
-    """Return the standard deviations of calibrations whose focal lengths alone were estimated.
-
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Frame with a prior.
-    K : ndarray (V, 3, 3)
-        Calibrations in pixels.
-    focal_std : ndarray (R,)
-        Standard deviations of the log focal lengths.
-
-    Returns
-    -------
-    ndarray (V, 3, 3)
-        Standard deviations; entries other than focal lengths take those of the prior, NaN without one.
-    """
-    if frame.prior is None:
-        raise ValueError("focal_only_std needs a frame with a prior (normalized_frame)")
     K_std, rows = np.zeros_like(K), frame.views
     prior = np.where(np.isfinite(frame.prior.std), frame.prior.std, np.nan)[rows]
     K_std[rows, 0, 0] = K[rows, 0, 0] * focal_std
     K_std[rows, 1, 1] = K[rows, 1, 1] * np.hypot(focal_std, prior[:, 1] / frame.prior.mean[rows, 1])
     K_std[rows, 0, 1], K_std[rows, 0, 2], K_std[rows, 1, 2] = prior[:, 2:5].T
+    square = square_pixel_calibrations(np.log(candidate.K[:, 0, 0]))
+    if not np.allclose(candidate.K, square, atol=1e-12):
+        K_std[rows[:, None], (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)] = np.nan
     return K_std
 
 
@@ -378,7 +213,7 @@ def _distinct_upgrades(
         if len(chosen) == max_candidates or not np.isfinite(candidate.cost):
             break
         log_f = candidate.log_focals(frame)
-        if any(np.abs(log_f - other.log_focals(frame)).max() < SAME_LOG_FOCAL for other, _ in chosen):
+        if any(np.abs(log_f - other.log_focals(frame)).max() < _SAME_LOG_FOCAL for other, _ in chosen):
             continue
         upgrade = _upgrade_of_candidate(frame, reconstruction, candidate, min_in_front_ratio)
         if upgrade is not None:
