@@ -13,14 +13,13 @@ from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.matching._seeds import _scan_correlations as scan_correlations
-from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.pipeline.image_pair import detect_features, match_views
 from thesisrecon.records import Image
-from thesisrecon.stereo.epipolar_pair import pair_of_fundamental
-from thesisrecon.stereo.planar import PlanarRectification
-from thesisrecon.stereo.planar_rectifiers import HartleyRectifier
+from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
+from thesisrecon.stereo.planar import PlanarRectification, hartley
 from thesisrecon.stereo.rectification import rectify
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import PUBLISHED, PairMatcher, SemiGlobalMatching
+from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.references.corners import harris_corners
 from validation.references.pictures import warp_perspective
 from validation.references.rectification import opencv_uncalibrated
@@ -30,7 +29,7 @@ from validation.references.sift_front_end import sift_front_end
 from validation.scenes.two_views import make_two_views
 
 DISPARITIES = 64
-MATCHERS: dict[str, PairMatcher] = {
+MATCHERS: dict[str, SemiGlobalMatching | MaximumLikelihoodScanline] = {
     "ours": SemiGlobalMatching(),
     "ours (thesis)": MaximumLikelihoodScanline(),
     "ours (semi-global)": PUBLISHED,
@@ -74,7 +73,7 @@ def test_rectification(bench: Bench, method: str) -> None:
     scene = make_two_views(Configuration.GENERAL, 500, np.random.default_rng(1))
     F, size = fundamental_from_cameras(scene.P1, scene.P2), (1280, 960)
     calls: dict[str, Callable[[], object]] = {
-        "ours": lambda: HartleyRectifier().rectify(pair_of_fundamental(F, scene.xy1, scene.xy2, size, size)),
+        "ours": lambda: hartley(pair_of_fundamental(F, scene.xy1, scene.xy2, size, size)),
         "ours (least distorted)": lambda: rectify(pair_of_fundamental(F, scene.xy1, scene.xy2, size, size)),
         "OpenCV": lambda: opencv_uncalibrated(F, scene.xy1, scene.xy2, size),
     }

@@ -16,7 +16,7 @@ CHAPTERS_WITH_EXAMPLES = ("geometry", "epipolar", "selfcalibration")
 
 
 def test_most_public_functions_have_complete_docstrings():
-    public = [p for p in sorted(PACKAGE.rglob("*.py")) if p.stem == "__init__" or not p.name.startswith("_")]
+    public = [p for p in sorted(PACKAGE.rglob("*.py")) if not CHECK["is_internal"](p)]
     found = {p: CHECK["problems"](p) for p in public}
     every = [bool(faults) for names in found.values() for faults in names.values()]
     incomplete = [

@@ -19,8 +19,8 @@ from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions, camera_numbers, prior_warnings
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
+from thesisrecon.pipeline._state import name_images
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.pipeline.state import name_images
 from thesisrecon.records import Image
 from thesisrecon.runtime.executors import Workers
 from thesisrecon.runtime.run import stream

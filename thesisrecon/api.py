@@ -14,7 +14,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.io.images import read_image
-from thesisrecon.pipeline.features_to_tracks import ImageInput, match_pair
+from thesisrecon.pipeline.image_pair import ImageInput, match_pair
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import (
     DisparityMap,

@@ -14,7 +14,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io.images import read_image
-from thesisrecon.pipeline.features_to_tracks import match_pair
+from thesisrecon.pipeline.image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo.semi_global import match_both_sides
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right

@@ -7,16 +7,16 @@ from functools import cache
 import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw
+from thesisrecon.surface.mesh import simplify_mesh
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
 from tests.surface.sphere import K as SPHERE_K
 from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.records import HeldOut, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
-from thesisrecon.report.data import ReportData, ReportImage
+from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
+from thesisrecon.report.data import ReportData
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 SIZE = (480, 320)
@@ -109,9 +109,7 @@ def made_up_run(*, names=None, points=1500, seed=4):
     seen = [((p > 5) & (p < np.array(SIZE) - 6)).all(axis=1) & (rng.random(points) < 0.7) for p in xy]
     reconstruction = _reconstruction(X, cameras, xy, seen, rng)
     images = tuple(
-        ReportImage(
-            name, SIZE, (SIZE[0] * 4, SIZE[1] * 4), made_up_photograph(p[s][:200], colors[s][:200], rng)
-        )
+        Image(name, made_up_photograph(p[s][:200], colors[s][:200], rng), (SIZE[0] * 4, SIZE[1] * 4))
         for name, p, s in zip(names, xy, seen, strict=True)
     )
     interval = {
@@ -136,7 +134,7 @@ def made_up_run(*, names=None, points=1500, seed=4):
         config_text=CONFIG,
         summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5},
         version="0.1.0",
-        unread=(("notes.jpg", "it is no image that Pillow can read"),),
+        unread={"notes.jpg": "it is no image that Pillow can read"},
         pairs=pairs,
         metric=metric,
         affine=dataclasses.replace(metric.reconstruction, stratum="affine"),
@@ -258,10 +256,7 @@ def sphere_run():
     shifted = np.roll(rgb[2], 1, axis=1)
     return ReportData(
         title="Sphere",
-        images=tuple(
-            ReportImage(name, SPHERE_SIZE, SPHERE_SIZE, pixels)
-            for name, pixels in zip(SPHERE_NAMES, rgb, strict=True)
-        ),
+        images=tuple(map(Image, SPHERE_NAMES, rgb, [SPHERE_SIZE] * len(rgb))),
         reports=(StageReport("dense", 2.0), StageReport("model", 1.0)),
         config_text="",
         summary={},

@@ -5,7 +5,7 @@ import pytest
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DegeneracyReport, IntrinsicInterval
-from thesisrecon.report.assessment import (
+from thesisrecon.report._assessment import (
     _interval_text,
     _named_number,
     assess,

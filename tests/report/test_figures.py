@@ -11,8 +11,8 @@ from PIL import Image as PillowImage
 
 from tests.report.synthetic import SIZE, made_up_cameras, made_up_run
 from thesisrecon.records import HeldOut
-from thesisrecon.report import figures as figures_module
-from thesisrecon.report.drawing import (
+from thesisrecon.report import _figures as figures_module
+from thesisrecon.report._drawing import (
     DIFFERENCE_LIMIT,
     HUES,
     SCALE,
@@ -26,7 +26,7 @@ from thesisrecon.report.drawing import (
     draw_pair,
     thumbnail,
 )
-from thesisrecon.report.figures import (
+from thesisrecon.report._figures import (
     _histogram_path,
     build_scene,
     pair_matrix_figure,
@@ -94,11 +94,8 @@ def opened(uri):
 def test_a_thumbnail_keeps_the_aspect_and_shrinks_when_there_are_many():
     image = made_up_run(points=50).images[0]
     few, many = thumbnail(image, 10), thumbnail(image, 2000)
-    assert few is not None
-    assert many is not None
     assert opened(few.uri).size == (few.width, few.height) == (360, 240)
     assert many.width < few.width / 3
-    assert thumbnail(dataclasses.replace(image, rgb=None), 10) is None
 
 
 def test_the_lines_pass_through_the_numbered_matches():
@@ -122,11 +119,9 @@ def test_the_lines_pass_through_the_numbered_matches():
     assert (np.ptp(right, axis=2) > 40).any(axis=0).mean() > 0.95
 
 
-def test_a_pair_without_pixels_or_matches_is_no_error():
+def test_a_pair_without_matches_is_no_error():
     data = made_up_run(points=100)
     pair = data.pairs[0]
-    bare = dataclasses.replace(data.images[0], rgb=None)
-    assert draw_pair(pair, bare, data.images[1]) is None
     empty = dataclasses.replace(pair, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
     drawn = draw_pair(empty, data.images[0], data.images[1])
     assert drawn is not None

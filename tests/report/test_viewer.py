@@ -22,10 +22,10 @@ from tests.report.synthetic import (
 from tests.surface.sphere import SHAPE, K, photograph, ring_of
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
-from thesisrecon.report import viewer
-from thesisrecon.report.figures import upright_rotation
-from thesisrecon.report.page import write_report
-from thesisrecon.report.viewer import LEVELS, viewer_data
+from thesisrecon.report import _viewer
+from thesisrecon.report._figures import upright_rotation
+from thesisrecon.report._viewer import LEVELS, viewer_data
+from thesisrecon.report.page import render_report
 
 
 def unpacked(text, kind, columns):
@@ -79,7 +79,7 @@ def test_a_model_with_colours_or_none_needs_no_texture():
     assert "texture" not in coloured
     np.testing.assert_array_equal(unpacked(coloured["colors"], "u1", 3), colors)
     plain = unpacked(data_of(bare)["colors"], "u1", 3)
-    assert (plain == viewer._PLAIN).all()
+    assert (plain == _viewer._PLAIN).all()
     assert len(plain) == len(unpacked(data_of(bare)["positions"], "<u2", 3))
 
 
@@ -109,7 +109,7 @@ def test_views_without_a_camera_are_not_viewpoints():
 
 
 def test_a_texture_beyond_the_limit_is_reduced(monkeypatch):
-    monkeypatch.setattr(viewer, "MAX_TEXELS", 100 * 100)
+    monkeypatch.setattr(_viewer, "MAX_TEXELS", 100 * 100)
     data = data_of(sphere_model())
     picture = PillowImage.open(io.BytesIO(base64.b64decode(data["texture"].split(",")[1])))
     assert 0.9 * 100 * 100 < picture.width * picture.height <= 100 * 100
@@ -152,7 +152,8 @@ EVIL = [
 def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "report.html"
     title = "<img src=x onerror=alert(9)>"
-    write_report(path, dataclasses.replace(made_up_run(names=EVIL, points=3000), title=title))
+    run = dataclasses.replace(made_up_run(names=EVIL, points=3000), title=title)
+    path.write_text(render_report(run), "utf-8")
     return path
 
 
@@ -250,7 +251,7 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 @pytest.fixture(scope="module")
 def model_report(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "report.html"
-    write_report(path, sphere_run())
+    path.write_text(render_report(sphere_run()), "utf-8")
     return path
 
 

@@ -20,10 +20,10 @@ from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
-from thesisrecon.io.files import read_json
-from thesisrecon.pipeline import state as preparing
+from thesisrecon.io._files import read_json
+from thesisrecon.pipeline import _state as preparing
+from thesisrecon.pipeline._state import PreparedViews, batch_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.pipeline.state import PreparedViews, batch_pairs
 from thesisrecon.runtime import _dask_cluster as cluster
 from thesisrecon.runtime import executors as workers
 from thesisrecon.runtime.executors import Workers

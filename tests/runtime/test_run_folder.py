@@ -14,7 +14,7 @@ import pytest
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.errors import OutputError, UsageError
-from thesisrecon.io.files import read_json, write_atomically
+from thesisrecon.io._files import read_json, write_atomically
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import (
     Features,

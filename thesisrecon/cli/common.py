@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
-from thesisrecon.io.files import printable, shorten_middle, shortened
+from thesisrecon.io._files import printable, shorten_middle, shortened
 from thesisrecon.runtime.executors import available_threads
 from thesisrecon.runtime.signals import CODES, REASONS, with_resume_advice
 
@@ -42,23 +42,7 @@ _NO_KERNEL_CACHE = (
 
 
 def parse_folder(text: str | Path) -> Path:
-    """Parse a folder argument; an empty name would silently mean the current folder.
-
-    Parameters
-    ----------
-    text : str or Path
-        The argument.
-
-    Returns
-    -------
-    Path
-        The folder, which need not exist.
-
-    Raises
-    ------
-    typer.BadParameter
-        If the name is blank.
-    """
+    """Parse a folder argument; an empty name would silently mean the current folder."""
     if not str(text).strip():
         raise typer.BadParameter("the folder has no name; write . for the current one")
     return Path(text)
@@ -78,13 +62,7 @@ OutputFolder = Annotated[
 
 
 def cap_threads(threads: int) -> None:
-    """Limit every kind of thread; must run before NumPy and Pillow are imported.
-
-    Parameters
-    ----------
-    threads : int
-        Number of workers; 0 = one per processor.
-    """
+    """Limit every kind of thread (0 = one per processor); must run before NumPy and Pillow are imported."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
         os.environ[name] = "1"
     os.environ["NUMBA_NUM_THREADS"] = str(threads or available_threads())
@@ -94,13 +72,7 @@ def cap_threads(threads: int) -> None:
 
 @contextmanager
 def progress_bars() -> Iterator[Any]:
-    """Show one progress bar per stage on a terminal, nothing elsewhere.
-
-    Yields
-    ------
-    callable or None
-        Receives (stage, done, total).
-    """
+    """Show one progress bar per stage on a terminal, nothing elsewhere; yields the ``progress`` callable."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -125,18 +97,7 @@ class _Interrupted(Exception):
 
 @contextmanager
 def interruptible(advice: str) -> Iterator[None]:
-    """Print this advice if the block is interrupted.
-
-    Parameters
-    ----------
-    advice : str
-        How to continue after the interruption.
-
-    Yields
-    ------
-    None
-        Nothing.
-    """
+    """Print this advice on how to continue if the block is interrupted."""
     try:
         with with_resume_advice(advice):
             yield
@@ -147,15 +108,7 @@ def interruptible(advice: str) -> Iterator[None]:
 def exit_code_of(command: Callable[[], object]) -> int:
     """Run a command and turn errors into one sentence on stderr and an exit code.
 
-    Parameters
-    ----------
-    command : callable
-        Takes no arguments; an int that it returns is the exit code.
-
-    Returns
-    -------
-    int
-        0 = done, 1 = internal error, 2 = usage, 3 = data that cannot be reconstructed, 130 = interrupted.
+    0 = done, 1 = internal error, 2 = usage, 3 = data that cannot be reconstructed, 130 = interrupted.
     """
     try:
         code = command()

@@ -10,7 +10,7 @@ import typer
 
 from thesisrecon.cli.common import parse_folder
 from thesisrecon.errors import UsageError, counted
-from thesisrecon.io.files import printable, read_json
+from thesisrecon.io._files import printable, read_json
 
 
 def inspect(
@@ -28,25 +28,7 @@ def inspect(
 
 
 def summary_text(summary: Mapping[str, Any], out: Path) -> str:
-    """Format the summary of a run for a terminal, one fact per line.
-
-    Parameters
-    ----------
-    summary : mapping
-        Content of ``summary.json``.
-    out : Path
-        Folder of the run.
-
-    Returns
-    -------
-    str
-        Lines without control characters.
-
-    Raises
-    ------
-    KeyError, TypeError
-        If ``summary`` is not a summary.
-    """
+    """Format ``summary.json`` for a terminal, one fact per line, without control characters."""
     lines = [_result(summary)]
     if summary["reprojection_rms_px"] is not None:
         lines.append(

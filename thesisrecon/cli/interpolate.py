@@ -18,7 +18,7 @@ from thesisrecon.cli.common import (
     progress_bars,
 )
 from thesisrecon.errors import UsageError
-from thesisrecon.io.files import printable
+from thesisrecon.io._files import printable
 from thesisrecon.runtime.executors import available_threads
 
 

@@ -43,18 +43,7 @@ def _root(
 
 
 def run_command(arguments: list[str]) -> int:
-    """Run one command line; an error becomes one sentence on stderr.
-
-    Parameters
-    ----------
-    arguments : list of str
-        The command line without the program name.
-
-    Returns
-    -------
-    int
-        The exit code, see :func:`thesisrecon.cli.common.exit_code_of`.
-    """
+    """Run one command line (without the program name); an error becomes one sentence on stderr."""
     with warnings.catch_warnings():
         # Unreadable images are reported by this program, in one sentence.
         warnings.filterwarnings("ignore", module=r"PIL\.")

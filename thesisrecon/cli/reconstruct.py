@@ -22,7 +22,7 @@ from thesisrecon.cli.common import (
 )
 from thesisrecon.cli.inspect import summary_text
 from thesisrecon.errors import UsageError
-from thesisrecon.io.files import printable
+from thesisrecon.io._files import printable
 
 if TYPE_CHECKING:
     from thesisrecon.config import PipelineConfig
@@ -103,7 +103,7 @@ def reconstruct(
 def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0) -> None:
     """Reconstruct the courtyard images that come with the package."""
     cap_threads(threads)
-    from thesisrecon.io.pair_list import demo_images
+    from thesisrecon.io.images import demo_images
 
     # The folder may hold a demo of an older version with other settings.
     options = {"threads": threads or None, "overwrite": True}
@@ -137,7 +137,7 @@ def _pairs_table(value: str) -> dict[str, Any]:
         raise UsageError(
             f"--pairs takes all, overlap, window:N, or a file of pairs; there is no file {value!r}"
         )
-    from thesisrecon.io.pair_list import read_pairs
+    from thesisrecon.io._files import read_pairs
 
     return {"kind": "listed-pairs", "listed": read_pairs(Path(value))}
 
@@ -147,7 +147,7 @@ def _config(
 ) -> PipelineConfig:
     """Apply the preset (of the command, else of the file), the file, the options and --set, in this order."""
     from thesisrecon.config import preset as preset_of
-    from thesisrecon.io.files import read_text
+    from thesisrecon.io._files import read_text
     from thesisrecon.settings import config_from_toml, tables_from_settings
 
     text, base = "" if file is None else read_text(file), preset_of(preset or "default")

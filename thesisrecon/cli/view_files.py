@@ -13,9 +13,8 @@ from thesisrecon.camera import Camera
 from thesisrecon.cli._view_sequences import interpolated_sequence, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import OutputError, UsageError, counted, in_words, unknown_word
-from thesisrecon.io.exports import read_cameras
-from thesisrecon.io.files import is_partial, printable, read_json, write_json, write_text
-from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
+from thesisrecon.io._exports import animation_suffix, frame_name, read_cameras, write_animation, write_frame
+from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io.images import read_image
 from thesisrecon.io.meshes import read_mesh
 from thesisrecon.records import TexturedMesh
@@ -49,26 +48,7 @@ def _check_frames(frames: int) -> None:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options of ``render``.
-
-    Parameters
-    ----------
-    path : {"orbit", "interpolate"}
-        Around the model, or from camera to camera.
-    frames : int
-        Number of frames.
-    size : tuple of int, optional
-        (width, height); by default that of the first image, reduced to a long side of 1000 px.
-    light : {"none", "camera", "sun"}
-        "none" shows the colours of the model; a model without colours is lit by the camera headlight.
-    background : tuple of int
-        (red, green, blue), 0 to 255.
-
-    Raises
-    ------
-    UsageError
-        For any other value.
-    """
+    """Options of ``render``; ``size`` None is that of the first image, reduced to a long side of 1000 px."""
 
     path: str = "orbit"
     frames: int = 90
@@ -88,26 +68,7 @@ class RenderOptions:
 
 @dataclass(frozen=True)
 class InterpolateOptions:
-    """Options of ``interpolate``.
-
-    Parameters
-    ----------
-    images : tuple of Path
-        Two or three different files.
-    method : {"interpolation", "tensor"}
-        A key of :data:`METHODS`.
-    frames : int
-        Number of frames.
-    seed : int
-        Random seed.
-    max_size_px : int, optional
-        Long side to which larger images are reduced.
-
-    Raises
-    ------
-    UsageError
-        For any other value.
-    """
+    """Options of ``interpolate``."""
 
     images: tuple[Path, ...]
     method: str = "interpolation"
@@ -131,19 +92,7 @@ class InterpolateOptions:
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """Files that a command wrote.
-
-    Parameters
-    ----------
-    folder : Path
-        Output folder.
-    frames : tuple of Path
-        One PNG per frame.
-    animation : Path
-        Animated WebP or PNG of all frames.
-    size : tuple of int
-        (width, height) of a frame.
-    """
+    """Files that a command wrote, and the (width, height) of a frame."""
 
     folder: Path
     frames: tuple[Path, ...]
@@ -163,29 +112,6 @@ def render_run(
 
     Frames of an earlier call that this one does not replace are removed. The files do not depend on
     ``threads``.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of a finished run.
-    folder : Path
-        Output folder; new, empty or written by an earlier call.
-    options : RenderOptions
-        Camera path, size and lighting.
-    threads : int
-        Frames rendered at one time.
-    progress : callable, optional
-        Receives (stage, done, total).
-
-    Returns
-    -------
-    ViewFiles
-        The files.
-
-    Raises
-    ------
-    UsageError
-        If the run, its model or its cameras are missing, or ``folder`` holds other files or is not writable.
     """
     mesh, cameras = _read_run(out)
     _claim(folder)
@@ -218,31 +144,7 @@ def interpolate_images(
 ) -> ViewFiles:
     """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``.
 
-    Frames of an earlier call that this one does not replace are removed. Nothing is written before the images
-    have been matched. The files do not depend on ``threads``.
-
-    Parameters
-    ----------
-    folder : Path
-        Output folder; new, empty or written by an earlier call.
-    options : InterpolateOptions
-        Images, method and number of frames.
-    threads : int
-        Threads of one frame.
-    progress : callable, optional
-        Receives (stage, done, total).
-
-    Returns
-    -------
-    ViewFiles
-        The files.
-
-    Raises
-    ------
-    UsageError
-        If an image is missing, two are the same, or ``folder`` holds other files or is not writable.
-    StageFailure
-        If the images cannot be read, do not match or admit no view in between.
+    Nothing is written before the images have been matched. The files do not depend on ``threads``.
     """
     _claim(folder)
     config = PipelineConfig()

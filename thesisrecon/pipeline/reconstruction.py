@@ -9,11 +9,11 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
 from thesisrecon.io.images import ImageSet, ImageSource, list_images, read_images, scene_name
-from thesisrecon.pipeline.cameras import reconstruct_metric, reconstruct_projective
-from thesisrecon.pipeline.features_to_tracks import build_tracks, find_features, match_pairs, select_pairs
-from thesisrecon.pipeline.outputs import RESULT_FILES, write_outputs
-from thesisrecon.pipeline.state import PipelineState, name_images
-from thesisrecon.pipeline.surface import build_model, estimate_depth_maps
+from thesisrecon.pipeline._cameras import reconstruct_metric, reconstruct_projective
+from thesisrecon.pipeline._features_to_tracks import build_tracks, find_features, match_pairs, select_pairs
+from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
+from thesisrecon.pipeline._state import PipelineState, name_images
+from thesisrecon.pipeline._surface import build_model, estimate_depth_maps
 from thesisrecon.records import RunResult
 from thesisrecon.runtime._run_state import Run, start_run
 from thesisrecon.runtime.run import Progress, RunOptions

@@ -13,6 +13,7 @@ from thesisrecon.geometry.camera_matrix import distort, project
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import (
     HeldOut,
+    Image,
     IntrinsicInterval,
     MetricResult,
     PairChoice,
@@ -24,34 +25,6 @@ from thesisrecon.records import (
 
 
 @dataclass(frozen=True)
-class ReportImage:
-    """One view in the report.
-
-    Parameters
-    ----------
-    name : str
-        File name.
-    size, original_size : tuple of int
-        (width, height) at working size and of the file.
-    rgb : ndarray (H, W, 3) uint8, optional
-        Of any size with this aspect ratio; a long side of 800 px is enough.
-    reason : str
-        Why the view was refused before the reconstruction, else empty.
-    """
-
-    name: str
-    size: tuple[int, int]
-    original_size: tuple[int, int]
-    rgb: U8 | None = None
-    reason: str = ""
-
-    @property
-    def scale(self) -> float:
-        """Working pixels per original pixel."""
-        return max(self.size) / max(self.original_size)
-
-
-@dataclass(frozen=True)
 class ReportData:
     """Content of ``report.html``, for a run that succeeded, stopped early or failed.
 
@@ -59,55 +32,40 @@ class ReportData:
     ----------
     title : str
         Name of the run, usually of its image folder.
-    images : tuple of ReportImage
-        The V views.
-    reports : tuple of StageReport
-        One per stage, in order.
-    config_text : str
-        The configuration as TOML.
-    summary : mapping
-        Content of ``summary.json``.
-    version : str
-        Version of thesisrecon.
-    unread : tuple of (name, reason)
-        Files that are not views.
-    pairs : sequence of TwoView
-        Matched pairs, accepted or not.
-    pair_choice : PairChoice, optional
-        How the pairs were selected.
-    reconstruction : Reconstruction, optional
-        Projective reconstruction; ``metric`` takes precedence.
-    metric : MetricResult, optional
-        Result of the metric stage.
-    colors : ndarray (N, 3) uint8, optional
+    images, reports : tuple of Image, tuple of StageReport
+        The V views, and one report per stage, in order.
+    config_text, summary, version : str, mapping, str
+        The configuration as TOML, the content of ``summary.json`` and the version of thesisrecon.
+    unread : mapping
+        File name -> reason of files that are not views.
+    pairs, pair_choice : sequence of TwoView, PairChoice
+        Matched pairs, accepted or not, and how they were selected.
+    reconstruction, metric : Reconstruction, MetricResult
+        Projective reconstruction, and the result of the metric stage, which takes precedence.
+    colors : ndarray (N, 3) uint8
         Colours of the metric points, valid or not.
-    affine : Reconstruction, optional
+    affine : Reconstruction
         Affine stratum with the same points.
-    model : TexturedMesh, optional
+    model : TexturedMesh
         Surface in the coordinates of ``metric``; 150,000 faces with 2048 x 2048 texels add about 6 MB.
     depth_maps : mapping
         View -> depth (H, W) float32, NaN = unknown; a long side of 400 px is enough.
-    held_out : HeldOut, optional
+    held_out : HeldOut
         Comparison of the model with an image that did not texture it.
-    until : str, optional
+    until : str
         Last stage that was requested, None = all.
-    failure : StageFailure, optional
+    failure : StageFailure
         Why the run failed.
-
-    Raises
-    ------
-    ValueError
-        If the numbers of views or points differ.
     """
 
     title: str
-    images: tuple[ReportImage, ...]
+    images: tuple[Image, ...]
     reports: tuple[StageReport, ...]
     config_text: str
     summary: Mapping[str, object]
     version: str
-    unread: tuple[tuple[str, str], ...] = ()
-    pairs: Sequence[TwoView] = field(default=())
+    unread: Mapping[str, str] = field(default_factory=dict)
+    pairs: Sequence[TwoView] = ()
     pair_choice: PairChoice | None = None
     reconstruction: Reconstruction | None = None
     metric: MetricResult | None = None
@@ -118,33 +76,6 @@ class ReportData:
     held_out: HeldOut | None = None
     until: str | None = None
     failure: StageFailure | None = None
-
-    def __post_init__(self) -> None:
-        views = len(self.images)
-        best = self.best_reconstruction
-        if best is not None and len(best.registered) != views:
-            raise ValueError(
-                f"one camera per image is needed; got {len(best.registered)} cameras, {views} images"
-            )
-        if self.metric is not None and len(self.metric.intrinsics) != views:
-            raise ValueError(
-                f"intrinsics of each image are needed; got {len(self.metric.intrinsics)} for {views} images"
-            )
-        if any(not (0 <= pair.i < views and 0 <= pair.j < views) for pair in self.pairs):
-            raise ValueError(f"pairs must refer to views below {views}, the number of images")
-        if self.affine is not None and self.metric is not None:
-            points, own = len(self.metric.reconstruction.X), len(self.affine.X)
-            if own != points:
-                raise ValueError(f"affine must have the {points} points of the metric stratum; got {own}")
-        if self.colors is not None and self.metric is not None:
-            points = len(self.metric.reconstruction.X)
-            if self.colors.shape != (points, 3):
-                raise ValueError(f"colors must be ({points}, 3), one per point; got {self.colors.shape}")
-
-        if self.model is not None and not (self.metric and self.metric.reconstruction.registered.any()):
-            raise ValueError("a model needs its metric reconstruction")
-        if any(not 0 <= view < views for view in self.depth_maps):
-            raise ValueError(f"depth_maps must refer to views below {views}, the number of images")
 
     @property
     def original_intrinsics(self) -> tuple[Mapping[str, IntrinsicInterval], ...]:
@@ -168,17 +99,14 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
 
     Parameters
     ----------
-    name : str
-        Its key; only names that end in ``_px`` are converted.
-    interval : IntrinsicInterval
-        Value and standard deviation at working size.
+    name, interval : str, IntrinsicInterval
+        Its key (only names that end in ``_px`` are converted) and its value at working size.
     scale : float
         Working over original size.
 
     Returns
     -------
     IntrinsicInterval
-        In original pixels.
     """
     if not name.endswith("_px"):
         return interval
@@ -188,15 +116,7 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """Statistics of reprojection distances.
-
-    Parameters
-    ----------
-    count : int
-        Number of observations.
-    median_px, rms_px, q95_px : float
-        Median, RMS and 95 % quantile (px).
-    """
+    """Number, median, RMS and 95 % quantile of reprojection distances."""
 
     count: int
     median_px: float
@@ -217,12 +137,8 @@ def used_observations(reconstruction: Reconstruction) -> I64:
     ndarray (U,)
         Numbers of the inliers of registered views and valid points.
     """
-    tracks = reconstruction.tracks
-    used = (
-        reconstruction.inlier
-        & reconstruction.registered[tracks.view_index]
-        & reconstruction.valid[tracks.point_index]
-    )
+    r, tracks = reconstruction, reconstruction.tracks
+    used = r.inlier & r.registered[tracks.view_index] & r.valid[tracks.point_index]
     return np.flatnonzero(used).astype(np.int64)
 
 
@@ -267,7 +183,7 @@ def _predicted_pixels(reconstruction: Reconstruction, i: int, X: F64) -> F64:
 
 
 def summarize_distances(distances: F64) -> ResidualSummary | None:
-    """Summarize distances.
+    """Summarize distances; None without any.
 
     Parameters
     ----------
@@ -277,7 +193,6 @@ def summarize_distances(distances: F64) -> ResidualSummary | None:
     Returns
     -------
     ResidualSummary or None
-        None without distances.
     """
     if len(distances) == 0:
         return None

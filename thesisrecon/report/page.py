@@ -10,11 +10,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,9 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F64
-from thesisrecon.io.files import write_text
 from thesisrecon.records import IntrinsicInterval, StageReport, TwoView
-from thesisrecon.report.assessment import (
+from thesisrecon.report._assessment import (
     assess,
     count_of,
     decimals,
@@ -37,13 +34,7 @@ from thesisrecon.report.assessment import (
     plus_minus,
     significant,
 )
-from thesisrecon.report.data import (
-    ReportData,
-    ResidualSummary,
-    reprojection_distances,
-    summarize_distances,
-)
-from thesisrecon.report.drawing import (
+from thesisrecon.report._drawing import (
     DIFFERENCE_LIMIT,
     SCALE,
     DepthImage,
@@ -55,14 +46,20 @@ from thesisrecon.report.drawing import (
     embed_jpeg,
     thumbnail,
 )
-from thesisrecon.report.figures import (
+from thesisrecon.report._figures import (
     MAX_POINTS,
     build_scene,
     histograms,
     pair_matrix_figure,
     scene_figure,
 )
-from thesisrecon.report.viewer import viewer_data
+from thesisrecon.report._viewer import viewer_data
+from thesisrecon.report.data import (
+    ReportData,
+    ResidualSummary,
+    reprojection_distances,
+    summarize_distances,
+)
 
 if TYPE_CHECKING:
     import jinja2
@@ -91,7 +88,6 @@ def template_environment() -> jinja2.Environment:
     Returns
     -------
     jinja2.Environment
-        For the pages of reports.
     """
     import jinja2
 
@@ -114,7 +110,6 @@ def page_resource(name: str) -> str:
     Returns
     -------
     str
-        Its text.
     """
     return files("thesisrecon.report").joinpath(name).read_text(encoding="utf-8")
 
@@ -125,7 +120,6 @@ def plotly_script() -> str:
     Returns
     -------
     str
-        The script.
     """
     from plotly.offline import get_plotlyjs
 
@@ -168,11 +162,6 @@ def strip_page(
     -------
     str
         HTML.
-
-    Raises
-    ------
-    ValueError
-        Without frames.
     """
     if not frames:
         raise ValueError("a strip page needs at least one frame")
@@ -205,7 +194,7 @@ class _Card:
     level: str
     reason: str
     size: str
-    picture: EmbeddedImage | None
+    picture: EmbeddedImage
     residuals: ResidualSummary | None
     bars: str
     intrinsics: Mapping[str, str]
@@ -220,24 +209,6 @@ class _DrawnPair:
     numbers: tuple[int, int]
     facts: str
     picture: EmbeddedImage
-
-
-def write_report(path: str | os.PathLike[str], data: ReportData) -> None:
-    """Write the page of a run.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The file.
-    data : ReportData
-        The run.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    write_text(Path(path), render_report(data))
 
 
 def render_report(data: ReportData) -> str:
@@ -380,13 +351,13 @@ def _intrinsic_columns(data: ReportData) -> list[tuple[str, str]]:
 
 def _state(data: ReportData, i: int) -> tuple[str, str, str]:
     """Return (word, level, reason) of a view."""
-    best, own = data.best_reconstruction, data.images[i].reason
+    best = data.best_reconstruction
     if best is None:
-        return ("not registered", "bad", own) if own else ("read", "open", "")
+        return "read", "open", ""
     if best.registered[i]:
         # A projective camera has no calibration.
         return ("registered", "good", "") if data.metric is not None else ("projective camera", "open", "")
-    return "not registered", "bad", own or best.reasons[i] or "no reason was recorded"
+    return "not registered", "bad", best.reasons[i] or "no reason was recorded"
 
 
 def _interval_text(interval: IntrinsicInterval) -> str:
@@ -412,9 +383,8 @@ def _drawn_pairs(data: ReportData) -> list[_DrawnPair]:
     for title, pair in titles:
         first, second = data.images[pair.i], data.images[pair.j]
         picture = draw_pair(pair, first, second)
-        if picture is not None:
-            numbers = (pair.i + 1, pair.j + 1)
-            drawn.append(_DrawnPair(title, (first.name, second.name), numbers, _pair_text(pair), picture))
+        numbers = (pair.i + 1, pair.j + 1)
+        drawn.append(_DrawnPair(title, (first.name, second.name), numbers, _pair_text(pair), picture))
     return drawn
 
 

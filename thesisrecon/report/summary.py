@@ -35,7 +35,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
     return {
         "failure": result.failure or None,
         "stratum": best.stratum if best is not None else None,
-        "images": len(result.images) + len(result.refused),
+        "images": len(result.images) + len(result.unread),
         "registered": int(best.registered.sum()) if best is not None else 0,
         "points": int(best.valid.sum()) if best is not None else 0,
         "observations": len(used_observations(best)) if best is not None else 0,
@@ -59,7 +59,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "depth_maps": _depth_maps(result),
         "model": _model(result),
         "cameras": views,
-        "refused": _refused(result, views),
+        "refused": [{"name": name, "reason": reason} for name, reason in result.refused.items()],
         "warnings": list(result.warnings),
     }
 
@@ -124,7 +124,7 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
     view: dict[str, Any] = {
         "name": image.name,
         "registered": registered,
-        "reason": _reason(best, i),
+        "reason": result.refused.get(image.name, ""),
         "camera": int(result.groups[i]),
         "width_px": image.original_size[0],
         "height_px": image.original_size[1],
@@ -140,17 +140,6 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
     return view
 
 
-def _reason(best: Reconstruction | None, i: int) -> str:
-    if best is None or best.registered[i]:
-        return ""
-    return best.reasons[i] or "no reason was recorded"
-
-
-def _refused(result: RunResult, views: list[dict[str, Any]]) -> list[dict[str, str]]:
-    unread = [{"name": name, "reason": reason} for name, reason in result.refused.items()]
-    return unread + [{"name": v["name"], "reason": v["reason"]} for v in views if v["reason"]]
-
-
 def _rms(distances: F64) -> float | None:
     return float(np.sqrt(np.mean(distances**2))) if len(distances) else None
 
@@ -164,10 +153,8 @@ def point_colors(reconstruction: Reconstruction, images: tuple[Image, ...]) -> N
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        With N points.
-    images : tuple of Image
-        The V views.
+    reconstruction, images : Reconstruction, tuple of Image
+        N points in V views.
 
     Returns
     -------

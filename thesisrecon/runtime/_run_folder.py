@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.errors import OutputError, UsageError
-from thesisrecon.io.files import as_read, is_partial, link, read_json, write_atomically, write_json
+from thesisrecon.io._files import as_read, is_partial, link, read_json, write_atomically, write_json
 from thesisrecon.records import StageReport
 from thesisrecon.runtime._record_files import ChangedRecord, bytes_from_record, read_record
 

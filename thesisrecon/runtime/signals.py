@@ -3,7 +3,7 @@
 Python handles signals in the main thread between two bytecodes, not during a kernel, an image decoder or a
 wait for a thread pool. The signal therefore writes its number to a pipe, and a watching thread prints a
 message, kills the child processes and exits. Nothing is lost: files are written atomically
-(:mod:`thesisrecon.io.files`), and a run resumes from its cache.
+(:mod:`thesisrecon.io._files`), and a run resumes from its cache.
 """
 
 from __future__ import annotations

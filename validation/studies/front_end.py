@@ -31,7 +31,7 @@ from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io.images import list_images, read_images
-from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.pipeline.image_pair import detect_features, match_views
 from thesisrecon.records import Features, Image, Reconstruction, RunResult, TwoView
 from thesisrecon.runtime.executors import Workers
 from validation.harness.process import own_cores, run_process

@@ -15,7 +15,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.io.images import read_images
-from thesisrecon.pipeline.features_to_tracks import detect_features, match_views
+from thesisrecon.pipeline.image_pair import detect_features, match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance

@@ -14,8 +14,8 @@ from PIL import Image as PillowImage
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import Reconstruction, TexturedMesh
-from thesisrecon.report.drawing import embed_jpeg
-from thesisrecon.report.figures import upright_rotation
+from thesisrecon.report._drawing import embed_jpeg
+from thesisrecon.report._figures import upright_rotation
 
 LEVELS = 65535
 """Quantization levels along each axis of the bounding box and of the texture."""
@@ -41,22 +41,10 @@ _DIRECTIONS = (
 def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Sequence[str]) -> dict[str, Any]:
     """Build the JSON data of the 3D viewer; z is up.
 
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        Surface with texture, vertex colours or neither.
-    reconstruction : Reconstruction
-        Its metric cameras.
-    names : sequence of str
-        File names of the V views.
-
-    Returns
-    -------
-    dict
-        ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
-        uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints``
-        of the images, the most central one as ``start``; ``directions``.
-        Faces farther from the median than 8 times the 95 % quantile are left out.
+    ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
+    uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints`` of the
+    images, the most central one as ``start``; ``directions``. Faces farther from the median than 8 times the
+    95 % quantile are left out.
     """
     mesh = _without_outliers(mesh)
     views = np.flatnonzero(reconstruction.registered).tolist()

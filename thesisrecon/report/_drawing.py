@@ -12,11 +12,10 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.records import HeldOut, TwoView
-from thesisrecon.report.data import ReportImage
+from thesisrecon.records import HeldOut, Image, TwoView
 
 _THUMBNAIL_BYTES = 2_000_000
-_PANEL_LONG_SIDE = 640
+_SAMPLES_PX, _PANEL_LONG_SIDE = 800, 640
 _GAP = 8
 # Distinct hues of similar lightness; the drawn numbers serve colour-blind readers.
 HUES = (
@@ -41,43 +40,20 @@ UNKNOWN = (201, 208, 214)
 
 @dataclass(frozen=True)
 class EmbeddedImage:
-    """A JPEG as a ``data:`` address.
-
-    Parameters
-    ----------
-    uri : str
-        The address.
-    width, height : int
-        Size (px), so that the page does not jump while loading.
-    """
+    """A JPEG as a ``data:`` address, with its size (px), so that the page does not jump while loading."""
 
     uri: str
     width: int
     height: int
 
 
-def thumbnail(image: ReportImage, how_many: int) -> EmbeddedImage | None:
-    """Make a small JPEG of an image; all of them together take about 2 MB.
-
-    Parameters
-    ----------
-    image : ReportImage
-        The view.
-    how_many : int
-        Number of thumbnails of the page.
-
-    Returns
-    -------
-    EmbeddedImage or None
-        None without pixels.
-    """
-    if image.rgb is None or 0 in image.rgb.shape:
-        return None
+def thumbnail(image: Image, how_many: int) -> EmbeddedImage:
+    """A small JPEG of an image; all ``how_many`` of the page together take about 2 MB."""
     share = _THUMBNAIL_BYTES / max(how_many, 1)
     # A JPEG of this quality takes about 0.25 bytes per pixel, 0.33 in base64, more for noise.
     side = float(np.clip(np.sqrt(1.5 * share / 0.33), 64, 360))
     while True:
-        picture = PillowImage.fromarray(image.rgb)
+        picture = _sampled(image)
         picture.thumbnail((round(side), round(side)), PillowImage.Resampling.LANCZOS)
         embedded = embed_jpeg(picture, quality=80)
         if len(embedded.uri) <= 1.5 * share or side < 64:
@@ -86,46 +62,25 @@ def thumbnail(image: ReportImage, how_many: int) -> EmbeddedImage | None:
 
 
 def embed_jpeg(picture: PillowImage.Image, *, quality: int) -> EmbeddedImage:
-    """Encode an image as JPEG in a ``data:`` address.
-
-    Parameters
-    ----------
-    picture : PIL.Image.Image
-        Any mode.
-    quality : int
-        JPEG quality.
-
-    Returns
-    -------
-    EmbeddedImage
-        The address.
-    """
+    """Encode an image as JPEG in a ``data:`` address."""
     buffer = io.BytesIO()
     picture.convert("RGB").save(buffer, format="JPEG", quality=quality, optimize=True)
     text = base64.b64encode(buffer.getvalue()).decode("ascii")
     return EmbeddedImage(f"data:image/jpeg;base64,{text}", picture.width, picture.height)
 
 
-def draw_pair(pair: TwoView, first: ReportImage, second: ReportImage) -> EmbeddedImage | None:
+def _sampled(image: Image) -> PillowImage.Image:
+    """Every n-th pixel of an image."""
+    step = max(1, max(image.size) // _SAMPLES_PX)
+    return PillowImage.fromarray(image.rgb[::step, ::step])
+
+
+def draw_pair(pair: TwoView, first: Image, second: Image) -> EmbeddedImage:
     """Draw two images side by side with their verified matches and epipolar lines.
 
     Every match is a dot; a few well-spread ones are numbered and shown with the epipolar line of their
     partner, F x1 in the second image and F' x2 in the first.
-
-    Parameters
-    ----------
-    pair : TwoView
-        Matches and F at working size.
-    first, second : ReportImage
-        The views.
-
-    Returns
-    -------
-    EmbeddedImage or None
-        None without the pixels of both.
     """
-    if first.rgb is None or second.rgb is None:
-        return None
     chosen = _spread_matches(pair.xy1, len(HUES))
     left = _draw_half(first, pair.xy1, chosen, pair.xy2[chosen] @ pair.F[:2] + pair.F[2])
     right = _draw_half(second, pair.xy2, chosen, pair.xy1[chosen] @ pair.F[:, :2].T + pair.F[:, 2])
@@ -167,9 +122,8 @@ def _clip_line(
     return min(inside), max(inside)
 
 
-def _draw_half(image: ReportImage, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
+def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
     """Draw dots, numbers and lines on one image; at twice the size, then reduced for smooth edges."""
-    assert image.rgb is not None
     picture, s = _faded(image)
     draw = ImageDraw.Draw(picture)
     width, height = image.size
@@ -183,30 +137,18 @@ def _draw_half(image: ReportImage, xy: F64, chosen: I64, lines: F64) -> PillowIm
     font = ImageFont.load_default(size=30)
     for n, (x, y) in enumerate(_to_drawing(xy[chosen], s)):
         draw.ellipse((x - 10, y - 10, x + 10, y + 10), fill=HUES[n], outline="#101418", width=3)
-        _write_number(draw, n + 1, (x, y), picture.size, font)
+        # Beside the dot, inside the image.
+        at = (x + 15 if x < picture.width - 64 else x - 50, min(max(y - 34, 2), picture.height - 38))
+        draw.text(at, str(n + 1), font=font, fill="white", stroke_width=3, stroke_fill="#101418")
     return picture.resize((picture.width // 2, picture.height // 2), PillowImage.Resampling.LANCZOS)
 
 
-def _write_number(
-    draw: ImageDraw.ImageDraw,
-    number: int,
-    at: tuple[float, float],
-    size: tuple[int, int],
-    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
-) -> None:
-    """Write a number beside a dot, inside the image."""
-    x = at[0] + 15 if at[0] < size[0] - 64 else at[0] - 50
-    y = min(max(at[1] - 34, 2), size[1] - 38)
-    draw.text((x, y), str(number), font=font, fill="white", stroke_width=3, stroke_fill="#101418")
-
-
-def _faded(image: ReportImage) -> tuple[PillowImage.Image, float]:
+def _faded(image: Image) -> tuple[PillowImage.Image, float]:
     """Return the dimmed image at twice the panel size, and its scale from working pixels."""
-    assert image.rgb is not None
     width, height = image.size
     s = 2.0 * _PANEL_LONG_SIDE / max(width, height)
     even = (max(2, 2 * round(s * width / 2)), max(2, 2 * round(s * height / 2)))
-    colour = PillowImage.fromarray(image.rgb).resize(even, PillowImage.Resampling.BILINEAR)
+    colour = _sampled(image).resize(even, PillowImage.Resampling.BILINEAR)
     grey = colour.convert("L").convert("RGB")
     return PillowImage.blend(grey, colour, 0.45).point(lambda v: 0.78 * v), s
 
@@ -218,16 +160,10 @@ def _to_drawing(xy: F64, s: float) -> list[tuple[float, float]]:
 
 @dataclass(frozen=True)
 class DepthImage:
-    """A coloured depth map.
+    """A coloured depth map; near is bright, far is dark, unknown is grey.
 
-    Parameters
-    ----------
-    picture : EmbeddedImage
-        Near is bright, far is dark, unknown is grey.
-    near, far : float
-        Ends of the colour scale in scene units, NaN without depths.
-    share : float
-        Fraction of the pixels with a depth.
+    ``near`` and ``far`` are the ends of the colour scale in scene units, NaN without depths; ``share`` is the
+    fraction of the pixels with a depth.
     """
 
     picture: EmbeddedImage
@@ -236,21 +172,8 @@ class DepthImage:
     share: float
 
 
-def draw_depth(depth: F32, *, side: int = _DEPTH_SIDE) -> DepthImage:
-    """Colour a depth map; the scale covers the 1 % to 99 % quantiles.
-
-    Parameters
-    ----------
-    depth : ndarray (H, W) float32
-        NaN = unknown.
-    side : int
-        Long side of the result (px).
-
-    Returns
-    -------
-    DepthImage
-        The drawing and its scale.
-    """
+def draw_depth(depth: F32, *, side: int) -> DepthImage:
+    """Colour a depth map (H, W), NaN = unknown; the scale covers the 1 % to 99 % quantiles."""
     known = np.isfinite(depth)
     near, far = np.quantile(depth[known], (0.01, 0.99)).tolist() if known.any() else (np.nan, np.nan)
     closeness = (far - depth.astype(np.float64)) / max(far - near, 1e-12 * abs(far), 1e-300)
@@ -270,33 +193,14 @@ def _paint_scale(values: F64) -> NDArray[np.uint8]:
 
 
 def depth_side(how_many: int) -> int:
-    """Choose the size of the depth images, which together take about 1.5 MB.
-
-    Parameters
-    ----------
-    how_many : int
-        Number of depth maps.
-
-    Returns
-    -------
-    int
-        Long side (px).
-    """
+    """Long side (px) of the depth images, which together take about 1.5 MB."""
     return int(np.clip(np.sqrt(_DEPTH_BYTES / max(how_many, 1) / 0.33), 96, _DEPTH_SIDE))
 
 
 def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedImage, EmbeddedImage, EmbeddedImage]:
-    """Draw the held-out image, the model in its place and their mean difference.
+    """Draw the held-out image, the model in its place and their mean difference (dark = equal).
 
-    Parameters
-    ----------
-    held_out : HeldOut
-        The comparison.
-
-    Returns
-    -------
-    tuple of EmbeddedImage
-        Image, model, difference (dark = equal); pixels that are not compared are grey in the last two.
+    Pixels that are not compared are grey in the last two.
     """
     difference = np.abs(held_out.real.astype(np.float64) - held_out.rendered).mean(axis=2)
     difference = np.where(held_out.compared, difference / DIFFERENCE_LIMIT, np.nan)

@@ -11,7 +11,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.pipeline.state import PipelineState
+from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import DepthMap, HeldOut, Image, PinholeView, Reconstruction, TexturedMesh
 from thesisrecon.runtime._run_folder import code_key
 from thesisrecon.stereo.depth import MultiViewScene
@@ -77,18 +77,7 @@ def _confirmed(
 
 
 def estimate_depth_maps(state: PipelineState) -> None:
-    """Estimate and cross-check the depth maps of all registered views (2.5).
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.views`` and ``result.depth_maps`` are set.
-
-    Raises
-    ------
-    StageFailure
-        If no view has any depth.
-    """
+    """Estimate and cross-check the depth maps of all registered views (2.5)."""
     run, result = state.run, state.result
     assert result.metric is not None
     reconstruction = result.metric.reconstruction
@@ -144,13 +133,7 @@ def _depth_inputs(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
 
 
 def build_model(state: PipelineState) -> None:
-    """Fuse the depth maps to a textured mesh (2.6) and compare it with a held-out view.
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.mesh`` and ``result.held_out`` are set.
-    """
+    """Fuse the depth maps to a textured mesh (2.6) and compare it with a held-out view."""
     run, result = state.run, state.result
     key = run.key("model", run.variant_key("model"), list(run.logs["dense"].keys.values()))
     run.progress("model", 0, 1)

@@ -13,15 +13,15 @@ import numpy as np
 from thesisrecon import __version__
 from thesisrecon.arrays import F32, U8
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.io._exports import cameras_table, write_point_cloud
+from thesisrecon.io._files import read_json, write_json, write_text
 from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views
 from thesisrecon.io.colmap_model import write_colmap_model
-from thesisrecon.io.exports import cameras_table, write_point_cloud
-from thesisrecon.io.files import read_json, write_json, write_text
 from thesisrecon.io.meshes import write_mesh
-from thesisrecon.pipeline.state import name_images
-from thesisrecon.records import Image, Reconstruction, RunResult, TexturedMesh
-from thesisrecon.report.data import ReportData, ReportImage
-from thesisrecon.report.page import write_report
+from thesisrecon.pipeline._state import name_images
+from thesisrecon.records import Reconstruction, RunResult, TexturedMesh
+from thesisrecon.report.data import ReportData
+from thesisrecon.report.page import render_report
 from thesisrecon.report.summary import point_colors, summarize
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.runtime._run_state import Run
@@ -31,7 +31,6 @@ from thesisrecon.settings import toml_from_config
 from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
-THUMBNAIL_PX = 800
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 150_000, 2048 * 2048
 SUMMARY, PAGE = "summary.json", "report.html"
@@ -53,17 +52,7 @@ def _affine_stratum(result: RunResult) -> Reconstruction | None:
 
 
 def write_affine(path: Path, affine: Reconstruction | None, colors: U8) -> None:
-    """Write the affine points and the camera centres (red) as a PLY file.
-
-    Parameters
-    ----------
-    path : Path
-        Output file.
-    affine : Reconstruction or None
-        Affine reconstruction; None: write nothing. Points beyond ``MAX_AFFINE`` are left out.
-    colors : ndarray (N, 3) uint8
-        Colors of the points.
-    """
+    """Write the affine points within ``MAX_AFFINE`` and the camera centres (red) as a PLY file."""
     if affine is None:
         return
     X = affine.X[:, :3]
@@ -75,29 +64,9 @@ def write_affine(path: Path, affine: Reconstruction | None, colors: U8) -> None:
 
 
 def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFailure | None) -> RunResult:
-    """Write all results of a run.
+    """Write all results of a run; return it with warnings, reports and summary.
 
     A run with an earlier last stage keeps the files of a longer one in the folder.
-
-    Parameters
-    ----------
-    run : Run
-    result : RunResult
-        Its results.
-    until : str
-        Last stage.
-    failure : StageFailure or None
-        The failure that ended the run.
-
-    Returns
-    -------
-    RunResult
-        The result with warnings, reports and summary; sentences name images by file name.
-
-    Raises
-    ------
-    OutputError
-        If the output folder cannot be written.
     """
     result = _with_image_names(result)
     later = _later_end(run.directory.path, until) if failure is None else None
@@ -165,7 +134,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         result = _described(run, result, until, failure)
         write_text(out / "config.toml", toml_from_config(run.config))
         page = _report_data(run, result, colors, failure)
-        write_report(out / PAGE, replace(page, until=None if until == "model" else until))
+        write_text(out / PAGE, render_report(replace(page, until=None if until == "model" else until)))
     run.finish("outputs", counts={})
     result = replace(
         result, reports=tuple(run.reports.values()), summary={**result.summary, **_run_facts(run, until)}
@@ -239,17 +208,14 @@ def _peak_memory_mb() -> float:
 
 
 def _report_data(run: Run, result: RunResult, colors: U8 | None, failure: StageFailure | None) -> ReportData:
-    images = tuple(
-        ReportImage(image.name, image.size, image.original_size, _thumbnail(image)) for image in result.images
-    )
     return ReportData(
         title=run.title,
-        images=images,
+        images=result.images,
         reports=result.reports,
         config_text=toml_from_config(run.config),
         summary=result.summary,
         version=__version__,
-        unread=tuple(result.unread.items()),
+        unread=result.unread,
         pairs=result.pairs,
         pair_choice=result.pair_choice,
         reconstruction=result.projective,
@@ -275,9 +241,3 @@ def _thinned(depth: F32) -> F32:
     """Every n-th pixel, for the report."""
     step = max(1, -(-max(depth.shape) // DEPTH_PX))
     return depth[::step, ::step]
-
-
-def _thumbnail(image: Image) -> U8:
-    """Every n-th pixel; the report resamples it further."""
-    step = max(1, max(image.size) // THUMBNAIL_PX)
-    return image.rgb[::step, ::step]

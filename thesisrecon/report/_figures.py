@@ -33,19 +33,7 @@ _MAX_ANNOTATED = 14
 
 @dataclass(frozen=True)
 class Scene:
-    """Content of the 3D view, z up.
-
-    Parameters
-    ----------
-    points, index : ndarray (M, 3) and (M,)
-        Drawn points and their numbers in X.
-    views : ndarray (C,)
-        Registered views.
-    centres, corners : ndarray (C, 3) and (C, 4, 3)
-        Camera pyramids; the first two corners are on the upper image edge.
-    low, high : ndarray (3,)
-        Bounding box.
-    """
+    """Content of the 3D view, z up."""
 
     points: F64
     index: I64
@@ -57,20 +45,9 @@ class Scene:
 
 
 def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS) -> Scene | None:
-    """Build the 3D view of a metric or affine reconstruction, in its own unit of length.
+    """3D view of a metric or affine reconstruction, in its own unit of length; None without a camera.
 
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Metric or affine.
-    max_points : int
-        Points are thinned evenly to this number, without those beyond four times the 80 % distance from the
-        median.
-
-    Returns
-    -------
-    Scene or None
-        None without a registered camera.
+    Points beyond four times the 80 % distance from the median are left out, the others thinned evenly.
     """
     views = np.flatnonzero(reconstruction.registered).astype(np.int64)
     if len(views) == 0:
@@ -94,20 +71,10 @@ def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS)
 
 
 def upright_rotation(rotations: F64) -> F64:
-    """Estimate the rotation of the world that puts z up and the mean viewing direction along +y.
+    """Rotation (3, 3) of the world that puts z up and the mean viewing direction along +y.
 
     Cameras are assumed to be held level: up is orthogonal to their x axes. A small weight on the optical axes
     decides if all x axes are parallel; the sign is that of the mean upward image direction.
-
-    Parameters
-    ----------
-    rotations : ndarray (C, 3, 3)
-        World-to-camera.
-
-    Returns
-    -------
-    ndarray (3, 3)
-        Rotation.
     """
     x_axes, y_axes, z_axes = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     _, vectors = np.linalg.eigh(x_axes.T @ x_axes + 0.1 * z_axes.T @ z_axes)
@@ -163,22 +130,7 @@ Figure = dict[str, Any]
 
 
 def scene_figure(scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | None) -> Figure:
-    """Draw cameras and coloured points.
-
-    Parameters
-    ----------
-    scene : Scene
-        Of :func:`build_scene`.
-    names : sequence of str
-        File names of the V views.
-    colors : ndarray (N, 3) uint8, optional
-        Colours of the points X.
-
-    Returns
-    -------
-    dict
-        plotly.js figure.
-    """
+    """Cameras and coloured points as a plotly.js figure; ``colors`` are those of the points X."""
     digits = _useful_digits(scene)
     paint = "#9fb4c7" if colors is None else [_hex(rgb) for rgb in colors[scene.index]]
     points = {
@@ -244,21 +196,9 @@ def _camera_marks(scene: Scene, names: Sequence[str], digits: int) -> Figure:
 
 
 def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:
-    """Draw the matrix of verified matches on a logarithmic scale, rejected pairs in red.
+    """Matrix of verified matches on a logarithmic scale, rejected pairs in red.
 
     More than 200 views are grouped into blocks of neighbours, each with its strongest pair.
-
-    Parameters
-    ----------
-    pairs : sequence of TwoView
-        Matched pairs.
-    names : sequence of str
-        File names of the V views.
-
-    Returns
-    -------
-    dict
-        plotly.js figure.
     """
     block = max(1, -(-len(names) // MAX_MATRIX))
     labels = [_block_label(first, block, names) for first in range(0, len(names), block)]
@@ -352,19 +292,10 @@ def _count_bar() -> Figure:
 
 
 def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
-    """Draw histograms of distances on one scale as SVG paths.
+    """Draw histograms of distances (px) on one scale as SVG paths in boxes of this size.
 
-    Parameters
-    ----------
-    distances : sequence of ndarray (N,)
-        Pixels; the last bin of each histogram includes all larger distances.
-    width, height : float
-        Size of the box of each path.
-
-    Returns
-    -------
-    tuple of float and list of str
-        Upper end (px), which contains 98 % of all distances, and the path data.
+    Returns the upper end (px), which contains 98 % of all distances, and the path data; the last bin of each
+    histogram includes all larger distances.
     """
     limit_px = _common_limit_px(np.concatenate([np.zeros(0), *distances]))
     shares = [_histogram_shares(d, limit_px) for d in distances]

@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon.config import with_images
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline.state import PipelineState, name_images
+from thesisrecon.pipeline._state import PipelineState, name_images
 from thesisrecon.records import RunResult, SelfCalibration
 from thesisrecon.runtime.run import stream
 
@@ -17,15 +17,7 @@ ATTEMPTS = 3
 
 
 def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
-    """Reconstruct cameras and points up to a projective transform (chapter 6).
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.projective`` is set.
-    attempt : int
-        Rank of the initial pair.
-    """
+    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
     run, result = state.run, state.result
     assert result.tracks is not None
     tracks, sizes = result.tracks, np.array([image.size for image in result.images], dtype=np.int64)
@@ -109,16 +101,6 @@ def reconstruct_metric(state: PipelineState) -> None:
     """Reconstruct, calibrate and refine; try other initial pairs if the self-check fails.
 
     The first trusted result is used, else the one with most cameras, then most points.
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.projective``, ``result.calibration`` and ``result.metric`` are set.
-
-    Raises
-    ------
-    StageFailure
-        If no attempt gives a metric model.
     """
     tried: list[RunResult] = []
     failures: list[StageFailure] = []

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.io.images import read_image
-from thesisrecon.pipeline.state import PipelineState, PreparedViews, batch_pairs, cache_friendly_order
+from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, cache_friendly_order
+from thesisrecon.pipeline.image_pair import detect_features, match_views
 from thesisrecon.records import Features, Image, PairChoice, TwoView
 from thesisrecon.runtime._run_state import Batch
 from thesisrecon.runtime.run import stream
@@ -24,13 +23,7 @@ MIN_CORNERS = 16
 
 
 def find_features(state: PipelineState) -> None:
-    """Detect the features of all images (4.2.1).
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.features`` is set.
-    """
+    """Detect the features of all images (4.2.1); sets ``result.features``."""
     run, images = state.run, state.result.images
     variant = run.variant_key("features")
     keys = {
@@ -57,33 +50,11 @@ def _detect_all(config: PipelineConfig, images: Sequence[Image]) -> list[Feature
     return [detect_features(config, image) for image in images]
 
 
-def detect_features(config: PipelineConfig, image: Image) -> Features:
-    """Detect the features of one image (4.2.1).
-
-    Parameters
-    ----------
-    config : PipelineConfig
-    image : Image
-
-    Returns
-    -------
-    Features
-        Corners and patches.
-    """
-    return config.features.detect(image)
-
-
 # ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
 
 
 def select_pairs(state: PipelineState) -> None:
-    """Select the pairs of images to match.
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.pair_choice`` is set.
-    """
+    """Select the pairs of images to match; sets ``result.pair_choice``."""
     run, images, features = state.run, state.result.images, state.result.features
     names = [image.name for image in images]
     key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
@@ -104,13 +75,7 @@ def select_pairs(state: PipelineState) -> None:
 
 
 def match_pairs(state: PipelineState) -> None:
-    """Match the selected pairs and estimate their epipolar geometry (4.2.2 and chapter 5).
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.pairs`` is set.
-    """
+    """Match the pairs and estimate their epipolar geometry (4.2.2, chapter 5); sets ``result.pairs``."""
     run, result = state.run, state.result
     assert result.pair_choice is not None
     pairs = [(int(i), int(j)) for i, j in result.pair_choice.pairs]
@@ -171,121 +136,8 @@ def _match_all(
     return [match_views(config, views[i], views[j], (i, j), seed) for i, j in pairs]
 
 
-ImageInput = str | Path | np.ndarray | Image
-"""A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
-
-
-def match_pair(
-    image1: ImageInput, image2: ImageInput, *, config: PipelineConfig | None = None, seed: int = 0
-) -> TwoView:
-    """Match two images and estimate their fundamental matrix (4.2 and chapter 5).
-
-    Parameters
-    ----------
-    image1, image2 : path, ndarray (H, W) or (H, W, 3) uint8, or Image
-        The two images.
-    config : PipelineConfig, optional
-        Settings; None: the preset ``default``.
-    seed : int
-
-    Returns
-    -------
-    TwoView
-        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels at working size
-        (``config.images.max_size_px``).
-
-    Raises
-    ------
-    UsageError
-        If a file does not exist.
-    ValueError
-        If the seed is not a whole number of at least 0.
-    StageFailure
-        If an image cannot be read or the images do not match.
-
-    Examples
-    --------
-    >>> from thesisrecon import PipelineConfig, match_pair
-    >>> from thesisrecon.config import ImageOptions
-    >>> from thesisrecon.io.pair_list import demo_images
-    >>> first, second = demo_images()[:2]
-    >>> pair = match_pair(first, second, config=PipelineConfig(images=ImageOptions(max_size_px=640)))
-    >>> pair.F.shape, len(pair.xy1) > 60
-    ((3, 3), True)
-    """
-    config = config or PipelineConfig()
-    images = [
-        read_image(image, max_size_px=config.images.max_size_px).images[0] for image in (image1, image2)
-    ]
-    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
-    pair = match_views(config, views[0], views[1], (0, 1), seed)
-    if not pair.accepted:
-        raise StageFailure("the two images do not match", pair.reason)
-    return pair
-
-
-def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
-    """Match two prepared views, estimate F and verify it.
-
-    Parameters
-    ----------
-    config : PipelineConfig
-    view1, view2 : object
-        Views prepared by ``config.matching``.
-    pair : tuple of int
-        Their numbers.
-    seed : int
-
-    Returns
-    -------
-    TwoView
-        The pair, rejected with a reason if no F can be estimated.
-    """
-    rng = stream(seed, "matches", *pair)
-    candidates = 0
-    try:
-        matches = config.matching.match(
-            view1, view2, pair=pair, estimate_fundamental=config.epipolar.estimate, rng=rng
-        )
-        candidates = len(matches.xy1)
-        fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
-        return config.verification.verify(matches, fit, rng)
-    except StageFailure as failure:
-        return _rejected_pair(pair, candidates, str(failure))
-
-
-def _rejected_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:
-    nothing = np.zeros(0, dtype=np.int64)
-    return TwoView(
-        i=pair[0],
-        j=pair[1],
-        F=np.zeros((3, 3)),
-        sigma_px=float("nan"),
-        index1=nothing,
-        index2=nothing,
-        xy1=np.zeros((0, 2)),
-        xy2=np.zeros((0, 2)),
-        affine=np.zeros((0, 2, 2)),
-        candidates=candidates,
-        homography_inlier_ratio=float("nan"),
-        accepted=False,
-        reason=reason,
-    )
-
-
 def build_tracks(state: PipelineState) -> None:
-    """Build tracks from the accepted pairs.
-
-    Parameters
-    ----------
-    state : PipelineState
-        ``result.tracks`` is set.
-
-    Raises
-    ------
-    StageFailure
-        If no pair was accepted.
-    """
+    """Build tracks from the accepted pairs; sets ``result.tracks``."""
     run, result = state.run, state.result
     accepted = [pair for pair in result.pairs if pair.accepted]
     if not accepted:

@@ -26,19 +26,7 @@ _UNITS = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB"}
 
 @dataclass(frozen=True)
 class Assessment:
-    """How far the run got and whether its result is trusted.
-
-    Parameters
-    ----------
-    level : {"good", "doubt", "open", "bad"}
-        Colour of the page.
-    word, sentence : str
-        The result.
-    reasons : tuple of str
-        Evidence.
-    advice : str
-        What to try.
-    """
+    """How far the run got and whether its result is trusted; ``level`` is the colour of the page."""
 
     level: Level
     word: str
@@ -49,13 +37,7 @@ class Assessment:
 
 @dataclass(frozen=True)
 class Fact:
-    """One key number.
-
-    Parameters
-    ----------
-    label, value, note : str
-        Name, number with unit, and explanation.
-    """
+    """One key number with its explanation."""
 
     label: str
     value: str
@@ -63,18 +45,7 @@ class Fact:
 
 
 def assess(data: ReportData) -> Assessment:
-    """Assess a run: trusted, not trusted, stopped early or failed.
-
-    Parameters
-    ----------
-    data : ReportData
-        The run.
-
-    Returns
-    -------
-    Assessment
-        The first section of the page.
-    """
+    """Assess a run: trusted, not trusted, stopped early or failed."""
     total = len(data.images)
     if data.failure is not None:
         last = (
@@ -108,20 +79,7 @@ def assess(data: ReportData) -> Assessment:
 
 
 def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
-    """List the key facts of a run: cameras, intrinsics, residuals, points and time.
-
-    Parameters
-    ----------
-    data : ReportData
-        The run.
-    overall : ResidualSummary or None
-        Residuals in original pixels.
-
-    Returns
-    -------
-    list of Fact
-        Facts that are available.
-    """
+    """Key facts of a run, as far as available: cameras, intrinsics, residuals, points and time."""
     facts = [_registered(data)]
     if data.metric is not None:
         facts += _intrinsic_facts(data)
@@ -171,18 +129,7 @@ def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
 
 
 def pair_selection_text(data: ReportData) -> str:
-    """Describe how many of the possible pairs were matched and how they were selected.
-
-    Parameters
-    ----------
-    data : ReportData
-        The run.
-
-    Returns
-    -------
-    str
-        A sentence, or empty if unknown.
-    """
+    """How many of the possible pairs were matched and how they were selected; empty if unknown."""
     if data.pair_choice is None:
         return ""
     views = len(data.images)
@@ -192,18 +139,7 @@ def pair_selection_text(data: ReportData) -> str:
 
 
 def model_text(mesh: TexturedMesh) -> str:
-    """Describe the size of the displayed model and its untextured part.
-
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        The model on the page.
-
-    Returns
-    -------
-    str
-        A clause.
-    """
+    """Size of the displayed model and its untextured part."""
     words = count_of(len(mesh.faces), "triangle")
     if mesh.texture is not None and mesh.uv is not None:
         words += f" with a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]} texels"
@@ -268,18 +204,7 @@ def _source_of(intervals: Sequence[IntrinsicInterval]) -> str:
 
 
 def plus_minus(value: float, std: float) -> str:
-    """Format a value with as many decimals as its standard deviation justifies.
-
-    Parameters
-    ----------
-    value, std : float
-        Value and standard deviation; 0 = fixed, not finite = undetermined.
-
-    Returns
-    -------
-    str
-        As "1520.3 ± 1.8".
-    """
+    """Format a value with the decimals that its standard deviation (0 = fixed) justifies: "1520.3 ± 1.8"."""
     if not np.isfinite(std):
         return f"{value:.4g} (not determined)"
     if std == 0:
@@ -312,18 +237,7 @@ def significant(value: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a duration.
-
-    Parameters
-    ----------
-    seconds : float
-        Not negative.
-
-    Returns
-    -------
-    str
-        As "7.3 s", "4 min 05 s" or "1 h 02 min".
-    """
+    """Format a duration: "7.3 s", "4 min 05 s" or "1 h 02 min"."""
     if seconds < 60:
         return f"{seconds:.1f}{_THIN}s"
     minutes, rest = divmod(round(seconds), 60)
@@ -348,36 +262,12 @@ def _short(value: float) -> str:
 
 
 def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tuple[str, str]]:
-    """Format the keys and values of a mapping with the units of their suffixes.
-
-    Parameters
-    ----------
-    numbers : mapping
-        Key -> number.
-
-    Returns
-    -------
-    list of tuple of str
-        In the order of the mapping.
-    """
+    """Format the keys and values of a mapping with the units of their suffixes."""
     return [_named_number(name, float(value)) for name, value in numbers.items()]
 
 
 def count_of(number: int, noun: str) -> str:
-    """Format a count with its noun.
-
-    Parameters
-    ----------
-    number : int
-        The count.
-    noun : str
-        Singular noun.
-
-    Returns
-    -------
-    str
-        As "1 file" or "2 files".
-    """
+    """Format a count with its noun: "1 file" or "2 files"."""
     return counted(number, noun, grouped(number))
 
 

@@ -29,13 +29,6 @@ class PreparedViews(Sequence[Any]):
     """Views prepared for matching on demand, in a least-recently-used cache of ``CACHE_BYTES``.
 
     Pickled without the cache; :meth:`subset` reduces what is sent to a worker.
-
-    Parameters
-    ----------
-    matching : Matcher
-        Its ``prepare`` makes the views.
-    given : mapping
-        View -> (image, features).
     """
 
     def __init__(self, matching: Matcher, given: Mapping[int, tuple[Image, Features]]) -> None:
@@ -83,16 +76,7 @@ class PreparedViews(Sequence[Any]):
         return made
 
     def subset(self, views: Iterable[int]) -> PreparedViews:
-        """Return the same for some views, with an empty cache.
-
-        Parameters
-        ----------
-        views : iterable of int
-
-        Returns
-        -------
-        PreparedViews
-        """
+        """The same for some views, with an empty cache."""
         return PreparedViews(self._matching, {view: self._given[view] for view in views})
 
 
@@ -106,39 +90,13 @@ def _size_of(value: Any) -> int:
 
 
 def cache_friendly_order(pairs: Sequence[tuple[int, int]], numbers: Sequence[int]) -> list[int]:
-    """Sort pairs so that consecutive pairs share views (Morton order).
-
-    Parameters
-    ----------
-    pairs : sequence of (i, j)
-        All pairs.
-    numbers : sequence of int
-        Which of them.
-
-    Returns
-    -------
-    list of int
-        The numbers, sorted.
-    """
+    """Sort the numbers of pairs so that consecutive pairs share views (Morton order)."""
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
     return [numbers[k] for k in morton_pair_order(first, second)]
 
 
 def batch_pairs(pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int) -> list[list[int]]:
-    """Divide pairs into batches that share views, several per worker.
-
-    Parameters
-    ----------
-    pairs, numbers
-        As for :func:`cache_friendly_order`.
-    workers : int
-        Number of workers.
-
-    Returns
-    -------
-    list of list of int
-        The batches.
-    """
+    """Divide the numbers of pairs into batches that share views, several per worker."""
     size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
     ordered = cache_friendly_order(pairs, numbers)
     return [ordered[k : k + size] for k in range(0, len(ordered), size)]
@@ -146,21 +104,7 @@ def batch_pairs(pairs: Sequence[tuple[int, int]], numbers: Sequence[int], worker
 
 @dataclass
 class PipelineState:
-    """What the steps of one run pass on.
-
-    Parameters
-    ----------
-    run : Run
-        Settings, workers, cache and reports.
-    inputs : ImageSet
-        The images as read.
-    result : RunResult
-        Grows with each step.
-    until : str
-        The last stage.
-    prepared : PreparedViews, optional
-        Views prepared for matching.
-    """
+    """What the steps of one run pass on; ``result`` grows with each step."""
 
     run: Run
     inputs: ImageSet
@@ -186,13 +130,7 @@ class PipelineState:
         return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
 
     def require_images(self) -> None:
-        """Check the number of images before anything is computed.
-
-        Raises
-        ------
-        StageFailure
-            If there are fewer than two (one, if only features are detected).
-        """
+        """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""
         found, needed = len(self.result.images), 1 if self.until == "features" else 2
         if found < needed:
             refused = [f"{name} {reason}" for name, reason in self.result.unread.items()]
@@ -206,25 +144,7 @@ class PipelineState:
 
 
 def name_images(text: str, names: Sequence[str]) -> str:
-    """Replace the image numbers in a sentence of a stage by file names.
-
-    Parameters
-    ----------
-    text : str
-        Sentence with images as ``#number``.
-    names : sequence of str
-        File names.
-
-    Returns
-    -------
-    str
-        The sentence for the user.
-
-    Examples
-    --------
-    >>> name_images("Images #0 and #2: too few inliers", ["a.jpg", "b.jpg", "c.jpg"])
-    'Images a.jpg and c.jpg: too few inliers'
-    """
+    """Replace the image numbers (``#number``) in a sentence of a stage by file names."""
     # A file name such as "a #1.jpg" in the sentence is left alone.
     return re.sub(
         r"(?<![^\s(])#(\d+)(?!\.?\w)", lambda m: names[int(m[1])] if int(m[1]) < len(names) else m[0], text

@@ -1,0 +1,112 @@
+"""Features, matches and epipolar geometry of two images: 4.2.1, 4.2.2 and chapter 5."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.images import read_image
+from thesisrecon.records import Features, Image, TwoView
+from thesisrecon.runtime.run import stream
+
+ImageInput = str | Path | np.ndarray | Image
+"""A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
+
+
+def match_pair(
+    image1: ImageInput, image2: ImageInput, *, config: PipelineConfig | None = None, seed: int = 0
+) -> TwoView:
+    """Match two images and estimate their fundamental matrix (4.2 and chapter 5).
+
+    Parameters
+    ----------
+    image1, image2 : path, ndarray (H, W) or (H, W, 3) uint8, or Image
+        The two images.
+    config : PipelineConfig, optional
+        Settings; None: the preset ``default``.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    TwoView
+        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels at working size
+        (``config.images.max_size_px``).
+
+    Raises
+    ------
+    UsageError, StageFailure
+        If a file does not exist, an image cannot be read or the images do not match.
+
+    Examples
+    --------
+    >>> from thesisrecon import PipelineConfig, match_pair
+    >>> from thesisrecon.config import ImageOptions
+    >>> from thesisrecon.io.images import demo_images
+    >>> first, second = demo_images()[:2]
+    >>> pair = match_pair(first, second, config=PipelineConfig(images=ImageOptions(max_size_px=640)))
+    >>> pair.F.shape, len(pair.xy1) > 60
+    ((3, 3), True)
+    """
+    config = config or PipelineConfig()
+    size = config.images.max_size_px
+    images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
+    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+    pair = match_views(config, views[0], views[1], (0, 1), seed)
+    if not pair.accepted:
+        raise StageFailure("the two images do not match", pair.reason)
+    return pair
+
+
+def detect_features(config: PipelineConfig, image: Image) -> Features:
+    """Detect the corners and patches of one image (4.2.1).
+
+    Parameters
+    ----------
+    config, image : PipelineConfig, Image
+        Settings and image.
+
+    Returns
+    -------
+    Features
+    """
+    return config.features.detect(image)
+
+
+def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
+    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason.
+
+    Parameters
+    ----------
+    config : PipelineConfig
+        Settings.
+    view1, view2 : object
+        Views prepared by ``config.matching``.
+    pair, seed : tuple of int, int
+        Their numbers, and the random seed.
+
+    Returns
+    -------
+    TwoView
+    """
+    rng = stream(seed, "matches", *pair)
+    candidates = 0
+    try:
+        matches = config.matching.match(
+            view1, view2, pair=pair, estimate_fundamental=config.epipolar.estimate, rng=rng
+        )
+        candidates = len(matches.xy1)
+        fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
+        return config.verification.verify(matches, fit, rng)
+    except StageFailure as failure:
+        return _rejected_pair(pair, candidates, str(failure))
+
+
+def _rejected_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:
+    index, xy, nan = np.zeros(0, dtype=np.int64), np.zeros((0, 2)), float("nan")
+    F, affine = np.zeros((3, 3)), np.zeros((0, 2, 2))
+    return TwoView(*pair, F, nan, index, index, xy, xy, affine, candidates, nan, False, reason)
