@@ -13,7 +13,7 @@ from tests.synthetic import reconstruction_of
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
-from thesisrecon.io.exports import _original_from_working
+from thesisrecon.io._exports import _original_from_working
 from thesisrecon.records import Image, TexturedMesh, Tracks
 from thesisrecon.report.summary import point_colors
 from thesisrecon.runtime.run import stream

@@ -14,8 +14,8 @@ from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import RenderOptions, render_run
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import decompose_camera
-from thesisrecon.io.exports import cameras_table
-from thesisrecon.io.files import write_json
+from thesisrecon.io._exports import cameras_table
+from thesisrecon.io._files import write_json
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.surface.fusion import VolumetricFusion

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
-from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints, write_colmap_model
-from thesisrecon.io.exports import read_cameras, write_point_cloud
-from thesisrecon.io.files import (
+from thesisrecon.io._exports import read_cameras, write_point_cloud
+from thesisrecon.io._files import (
     is_partial,
     link,
     printable,
     read_bytes,
     read_json,
+    read_pairs,
     read_text,
     shorten_middle,
     shortened,
@@ -28,7 +28,7 @@ from thesisrecon.io.files import (
     write_json,
     write_text,
 )
-from thesisrecon.io.pair_list import read_pairs
+from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints, write_colmap_model
 from validation.studies.robustness import disk_ends, remount, small_disk
 
 MANY = np.zeros((20_000, 3))

@@ -9,6 +9,7 @@ import PIL.Image
 import pytest
 
 from thesisrecon.errors import UsageError
+from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io._pixels import (
     EXIF_TRANSFORMS,
     STORED,
@@ -17,7 +18,6 @@ from thesisrecon.io._pixels import (
     decoding_bytes,
     resized_to,
 )
-from thesisrecon.io.frames import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io.images import MAX_DECODED_BYTES, list_images, read_images, scene_name
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.files import shortened, write_atomically
+from thesisrecon.io._files import shortened, write_atomically
 
 # Camera model -> number of its parameters; the models are numbered in this order.
 PARAMETER_COUNTS = {

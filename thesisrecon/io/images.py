@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.resources import files
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io._files import SPECIAL_FILE, printable
 from thesisrecon.io._pixels import (
     EXIF_TRANSFORMS,
     STORED,
@@ -34,7 +36,6 @@ from thesisrecon.io._pixels import (
     image_from_array,
     resized_to,
 )
-from thesisrecon.io.files import SPECIAL_FILE, printable
 from thesisrecon.records import Image
 
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
@@ -45,6 +46,8 @@ SUFFIXES = (
     *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
 )
 _GENERIC_FOLDERS = ("images", "photographs", "photos", "pictures", "dcim")
+DEMO_IMAGES = 6
+"""Enough neighbouring views for self-calibration, and a small wheel."""
 MAX_FILE_BYTES = 2**31
 """Uncompressed images of the largest sensors take less than half of it."""
 MAX_DECODED_BYTES = 3 * 2**29
@@ -137,6 +140,30 @@ def list_images(folder: Path) -> list[Path]:
     return [
         p for p in entries if p.suffix.lower() in SUFFIXES and not p.name.startswith(".") and not p.is_dir()
     ]
+
+
+def demo_images() -> list[Path]:
+    """Locate the demo images, in the installed package or in the source tree around it.
+
+    Returns
+    -------
+    list of Path
+        ``DEMO_IMAGES`` files, sorted by name.
+
+    Raises
+    ------
+    UsageError
+        If they are in neither place.
+    """
+    package = Path(str(files("thesisrecon")))
+    for home in (package, package.parent / "fixtures"):
+        found = sorted((home / "courtyard" / "images").glob("*.jpg"))[:DEMO_IMAGES]
+        if len(found) == DEMO_IMAGES:
+            return found
+    raise UsageError(
+        f"the demo images are neither in {package / 'courtyard'} nor in fixtures/courtyard of the source "
+        "tree; reinstall the package, or reconstruct a folder of your own"
+    )
 
 
 def scene_name(folder: Path) -> str:

@@ -18,7 +18,7 @@ import PIL.Image
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
-from thesisrecon.io.files import read_bytes, write_atomically
+from thesisrecon.io._files import read_bytes, write_atomically
 from thesisrecon.records import TexturedMesh
 
 _TEXTURE_FORMATS = ("JPEG", "PNG")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon import __version__
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from thesisrecon.report.page import page_resource, plotly_script, script_hashes, template_environment
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, overload
 
 from thesisrecon.errors import WorkersLost
-from thesisrecon.io.files import write_json
+from thesisrecon.io._files import write_json
 from thesisrecon.runtime.executors import CHECK_S
 from thesisrecon.settings import table_from_dataclass, tables_from_config
 from validation.ablation.plan import Plan, PlannedRow, plan_study

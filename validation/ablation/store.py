@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import OutputError
-from thesisrecon.io.files import read_json, write_json
+from thesisrecon.io._files import read_json, write_json
 
 ROWS, STEPS, SHARED, WORK = "rows", "steps", "shared", "work"
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.io.files import write_atomically, write_text
+from thesisrecon.io._files import write_atomically, write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.study import Measure
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.io.files import read_bytes
+from thesisrecon.io._files import read_bytes
 from thesisrecon.settings import config_from_tables, dataclass_from_table
 from validation.ablation.own import is_own, load_own
 from validation.ablation.study import Measure, Study

@@ -10,7 +10,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from validation.harness.process import failure_of, last_words, own_cores, run_process
 from validation.harness.records import ReportOptions
 from validation.references.libraries import NAMES

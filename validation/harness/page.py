@@ -13,7 +13,7 @@ import PIL.Image
 
 from thesisrecon import __version__
 from thesisrecon.errors import counted
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from thesisrecon.report.page import page_resource, plotly_script, script_hashes, template_environment
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, key_of, slug
 from validation.harness.results import Change, Results, Row

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.io.files import read_bytes, write_text
+from thesisrecon.io._files import read_bytes, write_text
 from validation.harness.canaries import read_refused
 from validation.harness.gates import Gate
 from validation.harness.records import Judgement, Outcome, ReportOptions, key_of

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from validation.harness.forks import Template
 from validation.harness.process import Process, failure_of, last_words, own_cores
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from validation.harness.canaries import read_refused
 from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
 from validation.references.libraries import refuse

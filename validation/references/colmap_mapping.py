@@ -15,9 +15,9 @@ from typing import Literal
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
+from thesisrecon.io._files import write_text
 from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_model import read_colmap_model
-from thesisrecon.io.files import write_text
 from thesisrecon.records import Reconstruction
 from validation.references.colmap_matching import DEFAULT_FOCAL_REL, forget_focal_priors
 from validation.references.libraries import pycolmap

@@ -10,7 +10,7 @@ import shutil
 import time
 from pathlib import Path
 
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from validation.references.libraries import pycolmap
 
 DEFAULT_FOCAL_REL = 1.2

@@ -17,7 +17,7 @@ from PIL import Image as PillowImage
 from PIL import features
 
 from thesisrecon.arrays import F64, U16
-from thesisrecon.io.files import write_atomically, write_text
+from thesisrecon.io._files import write_atomically, write_text
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import make_cube
 from validation.scenes.photograph import Sensor, encode_jpeg, expose, integrate_pixels

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import U8
-from thesisrecon.io.files import write_atomically
+from thesisrecon.io._files import write_atomically
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import Pose
 from validation.scenes.photograph import Sensor, expose, integrate_pixels

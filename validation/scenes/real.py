@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.io.files import read_json
+from thesisrecon.io._files import read_json
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL_SCENES = {

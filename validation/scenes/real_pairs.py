@@ -19,7 +19,7 @@ from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
-from thesisrecon.io.files import write_atomically
+from thesisrecon.io._files import write_atomically
 from validation.references.sift import SiftKeypoints, detect_sift, match_sift
 from validation.scenes.real import Scene, data_root
 

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F64, U8
-from thesisrecon.io.files import write_atomically
+from thesisrecon.io._files import write_atomically
 from validation.scenes.real import Scene
 
 FEATHER_PX = 24.0

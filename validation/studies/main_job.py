@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import StageFailure
+from thesisrecon.io._files import write_text
 from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_model import read_colmap_model
-from thesisrecon.io.files import write_text
 from thesisrecon.records import Reconstruction
 from validation.harness.process import Process, own_cores, run_process
 from validation.metrics.cameras import (

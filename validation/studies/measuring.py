@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from validation.harness.process import Process, own_cores, run_process
 
 ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1"}

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_scene, load_real_scene
 

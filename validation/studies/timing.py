@@ -26,7 +26,7 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import prior_from_options
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult, RunResult
 from thesisrecon.runtime.run import stream

@@ -13,9 +13,9 @@ import numpy as np
 import thesisrecon
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import StageFailure
+from thesisrecon.io._files import read_json
 from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_model import read_colmap_model
-from thesisrecon.io.files import read_json
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
 from thesisrecon.runtime.run import FOLDERS

@@ -12,7 +12,7 @@ import PIL.Image
 
 from thesisrecon.arrays import F32
 from thesisrecon.config import preset
-from thesisrecon.io.files import write_text
+from thesisrecon.io._files import write_text
 from thesisrecon.io.images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo.depth import MultiViewStereo

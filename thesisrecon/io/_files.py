@@ -1,4 +1,4 @@
-"""Text, JSON and atomic file output: a file appears under its name only when it is complete.
+"""Text, JSON, pair lists and atomic file output: a file appears under its name only when it is complete.
 
 If the program is killed at any moment, the old file or the new one is there.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import shutil
 import stat
 import unicodedata
@@ -20,6 +21,8 @@ from thesisrecon.errors import OutputError, UsageError
 
 MAX_TEXT_BYTES = 2**26
 """Far above any list of pairs, far below the memory of a computer."""
+_MAX_LINE = 2**14
+"""Characters of a line of a pair list; two file names with folders are shorter on every system."""
 SPECIAL_FILE = "a pipe, a device or a socket"
 
 _CONTROL_CATEGORIES = ("Cc", "Zl", "Zp")
@@ -30,18 +33,7 @@ _PARTIAL = ".partial"
 
 
 def printable(name: str) -> str:
-    """Escape a file name for display in one line.
-
-    Parameters
-    ----------
-    name : str
-        File name, possibly with surrogate escapes.
-
-    Returns
-    -------
-    str
-        Valid Unicode: invalid UTF-8, line ends, other control characters and direction marks become codes.
-    """
+    """Escape a file name for one line: invalid UTF-8, control characters and direction marks become codes."""
     from_bytes = all("\udc80" <= c <= "\udcff" for c in name if "\ud800" <= c <= "\udfff")
     text = name.encode("utf-8", "surrogateescape" if from_bytes else "backslashreplace")
     return "".join(_escaped(c) for c in text.decode("utf-8", "backslashreplace"))
@@ -54,64 +46,21 @@ def _escaped(c: str) -> str:
 
 
 def shortened(text: str, longest: int = 60) -> str:
-    """Cut the end of a long text.
-
-    Parameters
-    ----------
-    text : str
-        Any text.
-    longest : int
-        Characters to keep.
-
-    Returns
-    -------
-    str
-        At most ``longest`` characters.
-    """
+    """Cut the end of a long text."""
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
 def shorten_middle(text: str, longest: int = 600) -> str:
-    """Cut the middle of a long text; its end often states the rule.
-
-    Parameters
-    ----------
-    text : str
-        Any text.
-    longest : int
-        Characters to keep.
-
-    Returns
-    -------
-    str
-        At most ``longest`` characters.
-    """
+    """Cut the middle of a long text; its end often states the rule."""
     if len(text) <= longest:
         return text
     return f"{text[: longest - longest // 4 - 5]} ... {text[-(longest // 4) :]}"
 
 
 def read_bytes(path: Path, *, largest: int = MAX_TEXT_BYTES) -> bytes:
-    """Read a regular file; reading a pipe or a device may never end, so they are refused.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    largest : int
-        Limit in bytes.
-
-    Returns
-    -------
-    bytes
-        The content.
-
-    Raises
-    ------
-    OSError
-        With the reason in ``strerror``.
-    """
+    """Read a regular file of at most ``largest`` bytes; OSError with the reason in ``strerror``."""
     found = path.stat()
+    # Reading a pipe or a device may never end.
     if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
         raise OSError(0, f"it is {SPECIAL_FILE}, not a file", str(path))
     if found.st_size > largest:
@@ -122,23 +71,7 @@ def read_bytes(path: Path, *, largest: int = MAX_TEXT_BYTES) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Read a UTF-8 text, without a byte order mark.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    str
-        The text.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be read or is not UTF-8.
-    """
+    """Read a UTF-8 text, without a byte order mark; UsageError if that fails."""
     try:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -148,36 +81,12 @@ def read_text(path: Path) -> str:
 
 
 def is_partial(name: str) -> bool:
-    """Return whether a file is the remainder of an interrupted write.
-
-    Parameters
-    ----------
-    name : str
-        File name without folder.
-
-    Returns
-    -------
-    bool
-        True for the names of unfinished files of this module.
-    """
+    """Whether a file is the remainder of an interrupted write."""
     return name.startswith(".") and name.endswith(_PARTIAL)
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all, and flush it to the disk.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its folder is created if necessary.
-    content : bytes
-        The content.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written; an existing file stays.
-    """
+    """Write a file completely or not at all, flushed to the disk; OutputError, and the old file stays."""
     partial = path.with_name(f".{path.name}{_PARTIAL}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -195,44 +104,17 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text as UTF-8; surrogates become question marks.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    text : str
-        The text.
-    """
+    """Write a text as UTF-8; surrogates become question marks."""
     write_atomically(path, text.encode("utf-8", "replace"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write indented JSON; NaN and infinity become null.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    value : Any
-        Mappings, sequences, numbers, text and NumPy arrays.
-    """
+    """Write mappings, sequences, numbers, text and arrays as indented JSON; NaN and infinity become null."""
     write_text(path, json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n")
 
 
 def as_read(value: Any) -> Any:
-    """Convert a value to the one that :func:`read_json` returns after :func:`write_json`.
-
-    Parameters
-    ----------
-    value : Any
-        As in :func:`write_json`.
-
-    Returns
-    -------
-    Any
-        Dicts, lists, numbers, text and None.
-    """
+    """The value that :func:`read_json` returns after :func:`write_json`."""
     return json.loads(json.dumps(_plain(value)))
 
 
@@ -247,18 +129,7 @@ def _plain(value: Any) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Any
-        The content; None if the file is absent, damaged, too large or not regular.
-    """
+    """Read a JSON file; None if it is absent, damaged, too large or not regular."""
     try:
         return json.loads(read_bytes(path).decode("utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -269,18 +140,6 @@ def link(source: Path, target: Path) -> None:
     """Give a file a second name, by a hard link if possible, else by a copy.
 
     Files of a run are only replaced, never changed in place, so that sharing them is safe.
-
-    Parameters
-    ----------
-    source : Path
-        An existing file.
-    target : Path
-        The second name.
-
-    Raises
-    ------
-    OutputError
-        If the target cannot be written.
     """
     # Several programs may link the same target in a shared folder at one time.
     partial = target.with_name(f".{target.name}.{os.getpid()}{_PARTIAL}")
@@ -298,3 +157,34 @@ def link(source: Path, target: Path) -> None:
         # POSIX rename does nothing if both names are links to one file.
         with suppress(OSError):
             partial.unlink()
+
+
+def read_pairs(path: Path) -> list[tuple[str, str]]:
+    """Read image pairs: two file names per line, as in COLMAP's pair lists; UsageError names a wrong line.
+
+    A name with blanks is quoted, or the names are separated by a tab. Empty lines and lines that begin with #
+    are ignored.
+    """
+    pairs = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        names = _names(line)
+        if len(names) != 2:
+            raise UsageError(
+                f"line {number} of {path} must hold two file names, quoted if they contain blanks; "
+                f"got {shortened(line.strip())!r}"
+            )
+        pairs.append((names[0], names[1]))
+    return pairs
+
+
+def _names(line: str) -> list[str]:
+    if len(line) > _MAX_LINE:
+        return []
+    if "\t" in line and '"' not in line:
+        return [name.strip() for name in line.strip().split("\t")]
+    try:
+        return shlex.split(line)
+    except ValueError:  # No closing quote.
+        return []
