@@ -211,5 +211,3 @@ def test_there_and_back_is_where_one_was(courtyard):
     again = back[y, x] + forth[inside] - at[inside]
     off = np.linalg.norm(again - np.indices((384, 512))[::-1].transpose(1, 2, 0)[inside], axis=1)
     assert np.nanmedian(off) < 0.3
-    with pytest.raises(ValueError, match="side"):
-        pair.correspondences(2, SIZE)

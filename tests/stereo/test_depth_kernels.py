@@ -3,7 +3,7 @@
 import numpy as np
 
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.stereo.depth_kernels import (
+from thesisrecon.stereo._depth_kernels import (
     DepthStd,
     count_agreement,
     fuse_inverse_depths,
@@ -12,7 +12,7 @@ from thesisrecon.stereo.depth_kernels import (
     surface_continuation,
     update_kalman,
 )
-from thesisrecon.stereo.plane_kernels import fit_planes
+from thesisrecon.stereo._plane_kernels import fit_planes
 
 SHAPE = (23, 31)
 

@@ -7,14 +7,16 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.synthetic import texture
-from thesisrecon.stereo.cost import CensusAndColour, estimate_noise, prepare_stereo_images, row_strips
-from thesisrecon.stereo.postprocessing import DisparityPostprocessing
+from thesisrecon.stereo._cost import estimate_noise, prepare_stereo_images, row_strips
+from thesisrecon.stereo.correspondence import PairMatching
+from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import (
     PUBLISHED,
+    CensusAndColour,
+    DisparityPostprocessing,
     PathPenalties,
     SemiGlobalMatching,
-    match_rectified_arrays,
 )
 
 VARIANTS = [SemiGlobalMatching(), PUBLISHED, MaximumLikelihoodScanline()]
@@ -168,18 +170,20 @@ def test_wrong_calls_are_refused(variant):
         variant.match(image, image, disparity_range=(4, 0))
 
 
-def test_the_front_door():
+def test_rectified_images_are_matched_by_the_matcher_of_the_stage():
     left, right, truth, both = pair_with_truth()
     color = [np.repeat(np.clip(image, 0, 255)[..., None], 3, axis=2) for image in (left, right)]
-    found = match_rectified_arrays(*[image.astype(np.uint8) for image in color], max_disparity_px=23.2)
+    stereo = MultiViewStereo()
+    found = stereo.match_rectified(*[image.astype(np.uint8) for image in color], max_disparity_px=23.2)
     known = np.isfinite(found.disparity) & both
     assert known.mean() > 0.8
     assert np.mean(np.abs(found.disparity - truth)[known] > 1.0) < 0.02
-    thesis = match_rectified_arrays(left, right, max_disparity_px=24, matcher=MaximumLikelihoodScanline())
-    assert set(np.unique(thesis.disparity[np.isfinite(thesis.disparity)] % 1.0)) == {0.0}
+    thesis = MultiViewStereo(pairs=PairMatching(matcher=MaximumLikelihoodScanline()))
+    disparity = thesis.match_rectified(left, right, max_disparity_px=24).disparity
+    assert set(np.unique(disparity[np.isfinite(disparity)] % 1.0)) == {0.0}
     for wrong in (-1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="max_disparity_px"):
-            match_rectified_arrays(left, right, max_disparity_px=wrong)
+            stereo.match_rectified(left, right, max_disparity_px=wrong)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +207,7 @@ def test_parameters_are_checked(make, rule):
 
 def test_the_cost_of_a_hidden_pixel_is_that_of_the_paper():
     # ln(0.99 / 0.01 * 256 / sqrt(2 pi 4)), equation (9) with one grey level as measurement.
-    assert MaximumLikelihoodScanline().occlusion_cost(1, 4.0) == pytest.approx(8.528, abs=1e-3)
+    assert MaximumLikelihoodScanline()._occlusion_cost(1, 4.0) == pytest.approx(8.528, abs=1e-3)
 
 
 def test_cohesion_takes_the_solution_with_fewer_discontinuities():

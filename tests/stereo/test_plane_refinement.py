@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates
 
 from tests.stereo.twins import Setting, squares
 from tests.synthetic import texture
-from thesisrecon.stereo.plane_kernels import (
+from thesisrecon.stereo._plane_kernels import (
     UNKNOWN,
     PatchViews,
     PatchWindow,

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from thesisrecon.stereo.plane_kernels import (
+from thesisrecon.stereo._plane_kernels import (
     MAX_EXCESS_COST,
     MIN_WINDOW_COVERAGE,
     SAME_PLANE,
@@ -140,12 +140,6 @@ def census(grey):
     return bits.astype(np.int32)
 
 
-def bounds(channels):
-    padded = np.pad(channels.astype(np.int64), ((0, 0), (0, 0), (1, 1)), mode="edge")
-    three = np.stack([channels, (padded[..., :-2] + channels) >> 1, (padded[..., 2:] + channels) >> 1])
-    return three.min(axis=0), three.max(axis=0)
-
-
 def ones(words):
     """How many bits are set in each of (N,) words."""
     octets = np.ascontiguousarray(words).view(np.uint8).reshape(len(words), -1)
@@ -153,7 +147,7 @@ def ones(words):
 
 
 def costs(left, right, first, n, weights, outside):
-    """(H, D, W); each side is (census, channels, low, high, valid)."""
+    """(H, D, W); each side is (census, channels, valid)."""
     height, width = left[0].shape
     out = np.full((height, n, width), outside, np.int64)
     for q, x in itertools.product(range(n), range(width)):
@@ -163,12 +157,8 @@ def costs(left, right, first, n, weights, outside):
         differing = ones(left[0][:, x] ^ right[0][:, j])
         a, b = left[1][:, :, x].astype(np.int64), right[1][:, :, j].astype(np.int64)
         apart = np.abs(a - b)
-        if weights[3]:
-            one = np.maximum(a - right[3][:, :, j], right[2][:, :, j] - a)
-            two = np.maximum(b - left[3][:, :, x], left[2][:, :, x] - b)
-            apart = np.maximum(np.minimum(one, two), 0)
         colour = np.minimum(apart.sum(axis=0), weights[2])
-        known = (left[4][:, x] > 0) & (right[4][:, j] > 0)
+        known = (left[2][:, x] > 0) & (right[2][:, j] > 0)
         joined = (differing * weights[0] + colour * weights[1]) >> 8
         out[:, q, x] = np.where(known, joined, outside)
     return out

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from tests.synthetic import texture
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo.rectification import rectify_cameras
+from thesisrecon.stereo._epipolar_pair import pair_of_cameras
+from thesisrecon.stereo.planar import minimum_distortion
 from thesisrecon.views.interpolation import InterpolatedPair
 from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
 
@@ -22,7 +23,7 @@ def pair():
     centres = np.array([[-0.5, 0.1, 0.0], [0.5, 0.0, 0.1]])
     turns = [Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix() for _ in range(2)]
     first, second = (camera_from_centre(K, R, C) for R, C in zip(turns, centres, strict=True))
-    frame = rectify_cameras(first, second, SIZE, SIZE, method="least-distortion")
+    frame = minimum_distortion(pair_of_cameras(first, second, SIZE, SIZE))
     image, nothing = (
         np.zeros((SIZE[1], SIZE[0], 3), np.uint8),
         DisparityMap(np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32), 0.0),

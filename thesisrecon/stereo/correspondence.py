@@ -13,28 +13,15 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.two_view import canonical_cameras
 from thesisrecon.records import DisparityMap, PinholeView
-from thesisrecon.stereo.cost import MAX_DISPARITIES
-from thesisrecon.stereo.epipolar_pair import pair_of_fundamental
-from thesisrecon.stereo.planar_rectifiers import (
-    HartleyRectifier,
-    LoopZhangRectifier,
-    MinimumDistortionRectifier,
-)
-from thesisrecon.stereo.rectification import (
-    AnyRectification,
-    BestRectifier,
-    disparity_range,
-    rectify,
-    rectify_cameras,
-)
-from thesisrecon.stereo.resampling import require_side
+from thesisrecon.stereo._cost import MAX_DISPARITIES
+from thesisrecon.stereo.rectification import METHODS, PLANAR, disparity_range, rectify_cameras, rectify_pair
+from thesisrecon.stereo.resampling import Rectification
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
 
-Size = tuple[int, int]
-"""Width and height in pixels."""
+Shape = tuple[int, ...]
+"""Height and width in pixels."""
 STRIP_ROWS = 128
 """Rows of the reference view that are mapped at a time."""
 ONE_SURFACE_PX = 1.0
@@ -47,7 +34,7 @@ GAIN_PATCH = 2
 class Correspondence:
     """Positions of the pixels of a reference view in another view.
 
-    Attributes
+    Parameters
     ----------
     xy : ndarray (H, W, 2) float32
         Pixels of the other view, NaN = unknown.
@@ -60,11 +47,6 @@ class Correspondence:
     xy: F32
     sigma: F32
     confidence: F32
-
-    @property
-    def known(self) -> B8:
-        """(H, W) pixels with a known correspondence."""
-        return np.isfinite(self.sigma)
 
 
 @dataclass(frozen=True)
@@ -95,7 +77,7 @@ class PairMatching:
         xy1: F64,
         xy2: F64,
         *,
-        sizes: tuple[Size, Size] | None = None,
+        shapes: tuple[Shape, Shape],
     ) -> Correspondence:
         """Compute the positions of the pixels of ``reference`` in ``other``.
 
@@ -106,8 +88,8 @@ class PairMatching:
         xy1, xy2 : ndarray (N, 2)
             Projections of sparse points into both views in pixels. They determine the disparity range and the
             brightness gain.
-        sizes : tuple of (width, height), optional
-            Image sizes in which pixels are given and returned; default: the sizes of the views.
+        shapes : tuple of (height, width)
+            Image shapes in which the correspondence is returned.
 
         Returns
         -------
@@ -119,18 +101,18 @@ class PairMatching:
         StageFailure
             If the pair cannot be rectified or no point lies in the rectified frame.
         """
-        own = (size_of(reference), size_of(other))
-        frame = rectify_cameras(reference.P, other.P, *own, xy1=xy1, xy2=xy2)
+        own = reference.seen.shape, other.seen.shape
+        frame = rectify_cameras(reference.P, other.P, own[0][::-1], own[1][::-1], xy1=xy1, xy2=xy2)
         wanted = _searched_range(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
         left = frame.warp(_levels(reference), 0)
-        right = frame.warp(_levels(other) * _brightness_gain(reference, other, xy1, xy2), 1)
+        right = frame.warp(_levels(other) * _brightness_gain(reference.rgb, other.rgb, xy1, xy2), 1)
         found = self.matcher.match(left, right, disparity_range=wanted)
-        return self._back(frame, found, own, sizes or own)
+        return self._back(frame, found, own, shapes)
 
     def _back(
-        self, frame: AnyRectification, found: DisparityMap, own: tuple[Size, Size], wanted: tuple[Size, Size]
+        self, frame: Rectification, found: DisparityMap, own: tuple[Shape, Shape], wanted: tuple[Shape, Shape]
     ) -> Correspondence:
-        shape = wanted[0][::-1]
+        shape = wanted[0]
         enlarged = max(wanted[1]) / max(own[1])
         xy = np.full((*shape, 2), np.nan, dtype=np.float32)
         sigma = np.full(shape, np.nan, dtype=np.float32)
@@ -157,27 +139,12 @@ class PairMatching:
         return Correspondence(xy, sigma, confidence)
 
 
-def size_of(view: PinholeView) -> Size:
-    """Return the size of a view.
-
-    Parameters
-    ----------
-    view : PinholeView
-
-    Returns
-    -------
-    tuple of int
-        (width, height) in pixels.
-    """
-    return view.seen.shape[1], view.seen.shape[0]
+def _resized(xy: F64, shape: Shape, wanted: Shape) -> F64:
+    """Pixels (N, 2) of an image of ``shape`` in the image of ``wanted`` shape, (x + 0.5) s - 0.5."""
+    return np.asarray((xy + 0.5) * (np.array(wanted[::-1]) / np.array(shape[::-1])) - 0.5)
 
 
-def _resized(xy: F64, size: Size, wanted: Size) -> F64:
-    """Pixels (N, 2) of an image of ``size`` in the image of ``wanted`` size, (x + 0.5) s - 0.5."""
-    return np.asarray((xy + 0.5) * (np.array(wanted) / np.array(size)) - 0.5)
-
-
-def _searched_range(frame: AnyRectification, wanted: tuple[int, int]) -> tuple[int, int]:
+def _searched_range(frame: Rectification, wanted: tuple[int, int]) -> tuple[int, int]:
     """Disparity range within the frame width; ``StageFailure`` if it is empty or too large."""
     reach = frame.size[0] - 1
     first, last = max(wanted[0], -reach), min(wanted[1], reach)
@@ -214,12 +181,12 @@ def _sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
     return d, np.where(np.isfinite(d), found.confidence[nearest], 0.0)
 
 
-def _brightness_gain(reference: PinholeView, other: PinholeView, xy1: F64, xy2: F64) -> F32:
+def _brightness_gain(reference: U8, other: U8, xy1: F64, xy2: F64) -> F32:
     """Gain (3,) that makes ``other`` as bright as ``reference``: median ratio of patch means at matches.
 
     It compensates exposure and white balance; 1 with fewer than 8 usable points.
     """
-    levels = [_patch_means(view, xy) for view, xy in ((reference, xy1), (other, xy2))]
+    levels = [_patch_means(rgb, xy) for rgb, xy in ((reference, xy1), (other, xy2))]
     good = np.isfinite(levels[0]).all(axis=1) & np.isfinite(levels[1]).all(axis=1)
     good &= np.minimum(levels[0], levels[1]).min(axis=1) > 8.0
     good &= np.maximum(levels[0], levels[1]).max(axis=1) < 247.0
@@ -229,9 +196,9 @@ def _brightness_gain(reference: PinholeView, other: PinholeView, xy1: F64, xy2: 
     return np.asarray(np.exp(np.clip(ratio, -1.0, 1.0)), dtype=np.float32)
 
 
-def _patch_means(view: PinholeView, xy: F64) -> F64:
+def _patch_means(rgb: U8, xy: F64) -> F64:
     """Mean colours (N, 3) around pixels (N, 2), NaN where the patch leaves the image."""
-    height, width = view.seen.shape
+    height, width = rgb.shape[:2]
     at = np.rint(xy).astype(np.int64)
     reach = GAIN_PATCH
     inside = np.all((at >= reach) & (at < np.array([width, height]) - reach), axis=1)
@@ -239,7 +206,7 @@ def _patch_means(view: PinholeView, xy: F64) -> F64:
     total = np.zeros((len(xy), 3))
     for dy in range(-reach, reach + 1):
         for dx in range(-reach, reach + 1):
-            total += view.rgb[at[:, 1] + dy, at[:, 0] + dx]
+            total += rgb[at[:, 1] + dy, at[:, 0] + dx]
     return np.where(inside[:, None], total / (2 * reach + 1) ** 2, np.nan)
 
 
@@ -254,16 +221,13 @@ def _pixels(width: int, rows: slice) -> F64:
     return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
-PLANAR = BestRectifier((HartleyRectifier(), LoopZhangRectifier(), MinimumDistortionRectifier()))
-
-
 @dataclass(frozen=True)
 class RectifiedPair:
     """Two rectified images and their dense disparities.
 
-    Attributes
+    Parameters
     ----------
-    frame : PlanarRectification or PolarRectification
+    frame : Rectification
         Maps between the images and the rectified frame.
     images : tuple of ndarray (H, W, 3) float32
         Rectified images, NaN outside; the gain is applied to the second.
@@ -273,7 +237,7 @@ class RectifiedPair:
         Disparities of both images, x_right = x_left - d, larger for nearer points.
     """
 
-    frame: AnyRectification
+    frame: Rectification
     images: tuple[F32, F32]
     gain: F32
     left: DisparityMap
@@ -285,6 +249,7 @@ class RectifiedPair:
         Parameters
         ----------
         side : {0, 1}
+            The image.
         size : tuple of int
             (width, height) of that image.
 
@@ -294,7 +259,7 @@ class RectifiedPair:
             Pixels of the other image, NaN outside the frame; occluded pixels get the background disparity
             (:meth:`DisparityMap.filled`).
         """
-        found = self.right if require_side(side) else self.left
+        found = self.right if side else self.left
         complete = replace(found, disparity=found.filled())
         places = np.full((size[1], size[0], 2), np.nan, dtype=np.float32)
         for first in range(0, size[1], STRIP_ROWS):
@@ -318,6 +283,7 @@ def match_two_views(
     Parameters
     ----------
     rgb1, rgb2 : ndarray (H, W, 3) uint8
+        The images.
     F : ndarray (3, 3)
         Fundamental matrix, x2' F x1 = 0.
     xy1, xy2 : ndarray (N >= 8, 2)
@@ -334,21 +300,13 @@ def match_two_views(
 
     Raises
     ------
-    ValueError
-        If an array has the wrong shape.
     StageFailure
         If the pair cannot be rectified or the disparity range is too large.
     """
-    cameras = canonical_cameras(F)
-    views = [
-        PinholeView(k, P, rgb, np.ones(rgb.shape[:2], dtype=bool))
-        for k, (P, rgb) in enumerate(zip(cameras, (rgb1, rgb2), strict=True))
-    ]
-    sizes = [(rgb.shape[1], rgb.shape[0]) for rgb in (rgb1, rgb2)]
-    pair = pair_of_fundamental(F, xy1, xy2, sizes[0], sizes[1])
-    frame = PLANAR.rectify(pair) if planar else rectify(pair)
+    sizes = rgb1.shape[1::-1], rgb2.shape[1::-1]
+    frame = rectify_pair(F, xy1, xy2, sizes[0], sizes[1], methods=PLANAR if planar else METHODS)
     wanted = _searched_range(frame, disparity_range(frame, xy1, xy2, margin=pairs.range_margin))
-    gain = _brightness_gain(views[0], views[1], xy1, xy2)
+    gain = _brightness_gain(rgb1, rgb2, xy1, xy2)
     left = frame.warp(rgb1.astype(np.float32), 0)
     right = frame.warp(rgb2.astype(np.float32) * gain, 1)
     match = partial(pairs.matcher.match, disparity_range=wanted)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 import scipy
@@ -14,15 +13,14 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
+from thesisrecon.stereo._depth_kernels import DepthStd, count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo.correspondence import (
     Correspondence,
     PairMatching,
     RectifiedPair,
     match_two_views,
-    size_of,
 )
 from thesisrecon.stereo.depth_fusion import InverseDepth, RobustFusion, SequenceLinking, pixel_transfer
-from thesisrecon.stereo.depth_kernels import DepthStd, count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo.neighbours import (
     NeighbourSelection,
     SparsePoints,
@@ -31,9 +29,7 @@ from thesisrecon.stereo.neighbours import (
     sparse_points,
 )
 from thesisrecon.stereo.plane_refinement import ALIKE, PlaneRefinement
-from thesisrecon.stereo.semi_global import match_rectified_arrays
 
-Result = TypeVar("Result")
 SURE = 3.0
 """Standard deviations by which an inverse depth must exceed 0, that of infinity."""
 
@@ -82,7 +78,9 @@ class GeometricConsistency:
         Parameters
         ----------
         depth_map : DepthMap
+            Depths of a view.
         others : sequence of DepthMap
+            Depths of other views.
 
         Returns
         -------
@@ -104,7 +102,7 @@ class GeometricConsistency:
             )
         keep = (agree >= self.min_views) & (agree > contradict)
         keep |= (contradict == 0) & self._continues_surface(depth_map, keep)
-        return self.remove_small_regions(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
+        return self._remove_small_regions(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
 
     def _continues_surface(self, depth_map: DepthMap, sure: B8) -> B8:
         """(H, W) pixels that continue the surface of those that are ``sure``."""
@@ -115,18 +113,8 @@ class GeometricConsistency:
         surface_continuation(rho, std, sure.astype(np.uint8), self.radius, ALIKE, self.gate, joins)
         return joins > 0
 
-    def remove_small_regions(self, depth_map: DepthMap) -> DepthMap:
-        """Remove small connected regions.
-
-        Parameters
-        ----------
-        depth_map : DepthMap
-
-        Returns
-        -------
-        DepthMap
-            The other depths.
-        """
+    def _remove_small_regions(self, depth_map: DepthMap) -> DepthMap:
+        """Remove small connected regions."""
         least = self.min_region_ratio * depth_map.depth.size
         return _kept(depth_map, _region_sizes(depth_map.depth, self.step) >= least)
 
@@ -201,10 +189,13 @@ class DepthCompletion:
         Parameters
         ----------
         own : DepthMap
+            Depths of a view.
         others : sequence of DepthMap
+            Depths of other views.
         views : mapping of int to PinholeView
             Images of all views.
         refinement : PlaneRefinement
+            Plane search.
 
         Returns
         -------
@@ -218,42 +209,39 @@ class DepthCompletion:
             splat_depths(other.depth, _transfer(other.P, own.P), offer)
             offers.append(np.where(unknown, offer, np.float32(np.nan)))
         worth = [int(np.isfinite(offer).sum()) for offer in offers]
-        best = [k for k in sorted(range(len(offers)), key=lambda k: (-worth[k], k)) if worth[k]][
-            : self.max_sources
-        ]
+        order = sorted(range(len(offers)), key=lambda k: (-worth[k], k))
+        best = [k for k in order if worth[k]][: self.max_sources]
         if not best:
             return own
         nearest = np.fmin.reduce([offers[k] for k in best])
         wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), self.gap_px)
         rho = (np.float32(1.0) / np.where(unknown, nearest, own.depth)).astype(np.float32)
         images = [views[others[k].view] for k in best]
-        found = refinement.search(views[own.view], images, rho, wanted=wanted, sweeps=self.sweeps)
-        return _with(own, *found)
-
-
-def _with(own: DepthMap, rho: F32, std: F32, support: np.ndarray) -> DepthMap:
-    """The map with additional inverse depths."""
-    new = np.isfinite(rho)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.float32(1.0) / rho
-        std = std * depth * depth
-    return replace(
-        own,
-        depth=np.where(new, depth, own.depth),
-        std=np.where(new, std, own.std),
-        views=np.where(new, support, own.views).astype(np.uint8),
-    )
+        found, std, support = refinement.search(
+            views[own.view], images, rho, wanted=wanted, sweeps=self.sweeps
+        )
+        new = np.isfinite(found)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.float32(1.0) / found
+            std = std * depth * depth
+        return replace(
+            own,
+            depth=np.where(new, depth, own.depth),
+            std=np.where(new, std, own.std),
+            views=np.where(new, support, own.views).astype(np.uint8),
+        )
 
 
 @dataclass(frozen=True)
 class MultiViewScene:
     """Input of multi-view stereo.
 
-    Attributes
+    Parameters
     ----------
     views : mapping of int to PinholeView
         Undistorted views by number, in the size of their depth maps.
     points : SparsePoints
+        Points of the reconstruction.
     neighbours : mapping of int to tuple of int
         Neighbours of each view, the most useful first.
     matched : mapping of int to PinholeView
@@ -326,66 +314,19 @@ class MultiViewStereo:
     match_side: int = 640
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
-        """Compute the disparities of a rectified pair with the matcher of ``pairs``.
-
-        Parameters
-        ----------
-        left, right : array_like (H, W) or (H, W, 3)
-            Grey levels 0 .. 255; rows correspond.
-        max_disparity_px : float
-            Disparity of the nearest point.
-
-        Returns
-        -------
-        DisparityMap
-            x_right = x_left - d, NaN = unknown or occluded.
-        """
-        return match_rectified_arrays(
-            left, right, max_disparity_px=max_disparity_px, matcher=self.pairs.matcher
-        )
+        """See `thesisrecon.config.DepthEstimator.match_rectified`."""
+        if not 0.0 <= max_disparity_px < np.inf:
+            raise ValueError(f"max_disparity_px must be finite and not negative; got {max_disparity_px}")
+        return self.pairs.matcher.match(left, right, disparity_range=(0, int(np.ceil(max_disparity_px))))
 
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
     ) -> RectifiedPair:
-        """Compute dense correspondence of two images by :mod:`thesisrecon.stereo.correspondence`.
-
-        Parameters
-        ----------
-        image1, image2 : Image
-        F : ndarray (3, 3)
-            Fundamental matrix, x2' F x1 = 0.
-        xy1, xy2 : ndarray (N >= 8, 2)
-            Inlier matches in pixels.
-        planar : bool
-            Rectify by homographies only.
-
-        Returns
-        -------
-        RectifiedPair
-            Rectified images and disparities of both.
-        """
+        """See `thesisrecon.config.DepthEstimator.match_two_views`."""
         return match_two_views(image1.rgb, image2.rgb, F, xy1, xy2, pairs=self.pairs, planar=planar)
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
-        """Undistort the views and select their neighbours.
-
-        Parameters
-        ----------
-        images : sequence of Image
-            The V images.
-        reconstruction : Reconstruction
-            Metric reconstruction of these images.
-
-        Returns
-        -------
-        MultiViewScene
-            Input of :meth:`depth_map`.
-
-        Raises
-        ------
-        ValueError
-            If the reconstruction is not metric or belongs to other images.
-        """
+        """See `thesisrecon.config.DepthEstimator.prepare`."""
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
         points = sparse_points(reconstruction)
@@ -401,104 +342,58 @@ class MultiViewStereo:
         return MultiViewScene(views, points, chosen, matched)
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
-        """Compute the depth map of one view from its neighbours, before the consistency check.
-
-        Parameters
-        ----------
-        scene : MultiViewScene
-        view : int
-
-        Returns
-        -------
-        DepthMap
-            NaN = unknown, everywhere if the view has no neighbours or all pairs fail; ``views`` counts the
-            neighbours that agree.
-
-        Raises
-        ------
-        ValueError
-            If the view has no camera.
-        """
+        """See `thesisrecon.config.DepthEstimator.depth_map`."""
         if view not in scene.views:
             raise ValueError(f"view {view} has no camera; those with one are {sorted(scene.views)}")
 
         def correspond(i: int, j: int) -> Correspondence | None:
             a, b = (scene.matched.get(k, scene.views[k]) for k in (i, j))
-            sizes = size_of(scene.views[i]), size_of(scene.views[j])
+            shapes = scene.views[i].seen.shape, scene.views[j].seen.shape
             try:
-                return self.pairs.correspond(a, b, *shared_projections(scene.points, a, b), sizes=sizes)
+                return self.pairs.correspond(a, b, *shared_projections(scene.points, a, b), shapes=shapes)
             except StageFailure:
                 return None
 
         found = self.linker.link(view, scene.views, scene.neighbours[view], correspond)
+        keep = scene.views[view].seen
         if self.refinement is None:
-            found = found.where(~found.contradictory)
+            # Several contradictory measurements.
+            keep = keep & ~((found.views < 2) & (found.conflicts > 0))
         else:
             others = [scene.views[j] for j in scene.neighbours[view]]
             found = self.refinement.refine(scene.views[view], others, found)
-        return self.consistency.remove_small_regions(_depth_map(scene.views[view], found))
+        return self.consistency._remove_small_regions(_depth_map(scene.views[view], found, keep))
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
-        """Complete a depth map and keep what other depth maps confirm.
-
-        Parameters
-        ----------
-        scene : MultiViewScene
-        depth_maps : mapping of int to DepthMap
-        view : int
-
-        Returns
-        -------
-        DepthMap
-            Confirmed depths, see :class:`GeometricConsistency`.
-        """
-        others = [depth_maps[j] for j in self.comparison_views(scene, view) if j in depth_maps]
+        """See `thesisrecon.config.DepthEstimator.confirm`."""
+        others = [depth_maps[j] for j in self._comparison_views(scene, view) if j in depth_maps]
         own = depth_maps[view]
         if self.completion is not None and self.refinement is not None:
             own = self.completion.complete(own, others, scene.views, refinement=self.refinement)
         return self.consistency.confirm(own, others)
 
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
-        """Return the views whose images :meth:`depth_map` and :meth:`confirm` of a view use.
+        """See `thesisrecon.config.DepthEstimator.required_views`."""
+        order = sorted(scene.views)
+        place, reach = (
+            order.index(view),
+            self.linker.length if isinstance(self.linker, SequenceLinking) else 0,
+        )
+        linked = order[max(place - reach, 0) : place + reach + 1]
+        return frozenset({*linked, *scene.neighbours[view], *self._comparison_views(scene, view)})
 
-        Parameters
-        ----------
-        scene : MultiViewScene
-        view : int
+    def _comparison_views(self, scene: MultiViewScene, view: int) -> list[int]:
+        """Views whose depth maps are compared with that of a view.
 
-        Returns
-        -------
-        frozenset of int
-            Numbers of the views, the view among them.
-        """
-        near = scene.neighbours[view]
-        reached = self.linker.views_used(view, scene.views, near)
-        return frozenset({view, *near, *reached, *self.comparison_views(scene, view)})
-
-    def comparison_views(self, scene: MultiViewScene, view: int) -> tuple[int, ...]:
-        """Return the views whose depth maps are compared with that of a view.
-
-        Parameters
-        ----------
-        scene : MultiViewScene
-        view : int
-
-        Returns
-        -------
-        tuple of int
-            Its neighbours, the views it is a neighbour of, and up to ``min_comparison_views`` those with the
-            most common points.
+        Its neighbours, the views it is a neighbour of, and up to ``min_comparison_views`` those with the most
+        common points.
         """
         mutual = {j for j, chosen in scene.neighbours.items() if view in chosen}
-        comparison_views = (mutual | set(scene.neighbours[view])) - {view}
+        near = (mutual | set(scene.neighbours[view])) - {view}
         seen = scene.points.seen
-        common = {
-            j: int(np.sum(seen[view] & seen[j])) for j in scene.views if j not in comparison_views | {view}
-        }
+        common = {j: int(np.sum(seen[view] & seen[j])) for j in scene.views if j not in near | {view}}
         order = sorted((j for j in common if common[j]), key=lambda j: (-common[j], j))
-        return tuple(
-            sorted(comparison_views | set(order[: max(self.min_comparison_views - len(comparison_views), 0)]))
-        )
+        return sorted(near | set(order[: max(self.min_comparison_views - len(near), 0)]))
 
     def map_all(
         self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
@@ -521,21 +416,15 @@ class MultiViewStereo:
         """
         scene = self.prepare(images, reconstruction)
         order = sorted(scene.views)
-        found = dict(zip(order, _run(lambda i: self.depth_map(scene, i), order, threads), strict=True))
-        return dict(zip(order, _run(lambda i: self.confirm(scene, found, i), order, threads), strict=True))
+        with ThreadPoolExecutor(threads) as pool:
+            found = dict(zip(order, pool.map(lambda i: self.depth_map(scene, i), order), strict=True))
+            return dict(zip(order, pool.map(lambda i: self.confirm(scene, found, i), order), strict=True))
 
 
-def _depth_map(view: PinholeView, found: InverseDepth) -> DepthMap:
-    """Convert inverse depths to depths; those not significantly above 0 are unknown."""
+def _depth_map(view: PinholeView, found: InverseDepth, keep: B8) -> DepthMap:
+    """Convert inverse depths to depths; those not kept or not significantly above 0 are unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        known = (found.value > SURE * found.std) & view.seen
+        known = (found.value > SURE * found.std) & keep
         depth = np.where(known, 1.0 / found.value, np.nan).astype(np.float32)
         std = np.where(known, found.std * depth * depth, np.nan).astype(np.float32)
     return DepthMap(view.view, view.P, depth, std, np.where(known, found.views, 0).astype(np.uint8))
-
-
-def _run(work: Callable[[int], Result], items: Iterable[int], threads: int) -> list[Result]:
-    if threads < 2:
-        return [work(item) for item in items]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, items))

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.records import PinholeView
+from thesisrecon.stereo._depth_kernels import fuse_inverse_depths, inverse_depths, update_kalman
 from thesisrecon.stereo.correspondence import Correspondence
-from thesisrecon.stereo.depth_kernels import fuse_inverse_depths, inverse_depths, update_kalman
 
 Correspond = Callable[[int, int], Correspondence | None]
 """Returns the correspondence of view i in view j, None if the pair fails."""
@@ -22,42 +22,18 @@ Correspond = Callable[[int, int], Correspondence | None]
 class InverseDepth:
     """Inverse depth of the pixels of a view.
 
-    Attributes
+    Parameters
     ----------
     value, std : ndarray (H, W) float32
         Inverse depth and standard deviation, NaN = unknown.
-    views : ndarray (H, W) uint8
-        Number of other views that agree.
-    conflicts : ndarray (H, W) uint8
-        Number of other views that disagree.
+    views, conflicts : ndarray (H, W) uint8
+        Numbers of other views that agree and disagree.
     """
 
     value: F32
     std: F32
     views: U8
     conflicts: U8
-
-    @property
-    def contradictory(self) -> B8:
-        """(H, W) pixels with several contradictory measurements."""
-        return np.asarray((self.views < 2) & (self.conflicts > 0))
-
-    def where(self, keep: B8) -> InverseDepth:
-        """Keep some of the pixels.
-
-        Parameters
-        ----------
-        keep : ndarray (H, W) bool
-            Pixels to keep; the others become unknown.
-
-        Returns
-        -------
-        InverseDepth
-            The kept inverse depths.
-        """
-        value, std = (np.where(keep, part, np.float32(np.nan)) for part in (self.value, self.std))
-        views, conflicts = (np.where(keep, part, np.uint8(0)) for part in (self.views, self.conflicts))
-        return InverseDepth(value, std, views, conflicts)
 
 
 @dataclass(frozen=True)
@@ -82,13 +58,16 @@ class RobustFusion:
         neighbours: Sequence[int],
         correspond: Correspond,
     ) -> InverseDepth:
-        """Compute the inverse depths of the pixels of ``view`` from its neighbours.
+        """Compute the inverse depths of the pixels of a view from its neighbours.
 
         Parameters
         ----------
         view : int
+            Number of the view.
         views : mapping of int to PinholeView
+            All views.
         neighbours : sequence of int
+            Neighbours of the view.
         correspond : callable
             Returns the correspondence of view i in view j, None if the pair fails.
 
@@ -108,23 +87,6 @@ class RobustFusion:
             rho, std = (np.stack([one[k] for one in found]) for k in (0, 1))
             fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.conflicts)
         return result
-
-    def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
-        """Return the numbers of the neighbours.
-
-        Parameters
-        ----------
-        view : int
-        views : collection of int
-        neighbours : sequence of int
-
-        Returns
-        -------
-        set of int
-            The neighbours.
-        """
-        del view, views
-        return set(neighbours)
 
 
 @dataclass(frozen=True)
@@ -155,13 +117,16 @@ class SequenceLinking:
         neighbours: Sequence[int],  # noqa: ARG002 - one signature for all linkers
         correspond: Correspond,
     ) -> InverseDepth:
-        """Compute the inverse depths of the pixels of ``view``; views are ordered by number.
+        """Compute the inverse depths of the pixels of a view; views are ordered by number.
 
         Parameters
         ----------
         view : int
+            Number of the view.
         views : mapping of int to PinholeView
+            All views.
         neighbours : sequence of int
+            Not used.
         correspond : callable
             Returns the correspondence of view i in view j, None if the pair fails.
 
@@ -181,25 +146,6 @@ class SequenceLinking:
         fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.conflicts)
         result.views[:] = np.where(np.isfinite(result.value), np.maximum.reduce([e.views for e in ends]), 0)
         return result
-
-    def views_used(self, view: int, views: Collection[int], neighbours: Sequence[int]) -> set[int]:
-        """Return the numbers of the views within ``length`` of ``view``.
-
-        Parameters
-        ----------
-        view : int
-        views : collection of int
-        neighbours : sequence of int
-
-        Returns
-        -------
-        set of int
-            Numbers of the other views.
-        """
-        del neighbours
-        order = sorted(views)
-        place = order.index(view)
-        return set(order[max(place - self.length, 0) : place + self.length + 1]) - {view}
 
     def _chain(
         self, chain: Sequence[int], views: Mapping[int, PinholeView], correspond: Correspond
@@ -258,9 +204,10 @@ def _inverse_depth_of(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, 
 
 
 def pixel_transfer(P: F64, P_other: F64) -> tuple[F64, F64]:
-    """Return the transfer of pixels and inverse depths to another camera.
+    """Return H (3, 3) and e (3,) that transfer pixels and inverse depths to another camera.
 
-    A pixel (x, y, 1) of inverse depth rho is at H (x, y, 1) + rho e in the other view.
+    A pixel (x, y, 1) of inverse depth rho is at H (x, y, 1) + rho e in the other view: the homography of the
+    plane at infinity and the epipole.
 
     Parameters
     ----------
@@ -269,10 +216,7 @@ def pixel_transfer(P: F64, P_other: F64) -> tuple[F64, F64]:
 
     Returns
     -------
-    H : ndarray (3, 3)
-        Homography of the plane at infinity.
-    e : ndarray (3,)
-        Epipole of the other view.
+    tuple of ndarray
     """
     centre = camera_centre(P)
     return P_other[:, :3] @ np.linalg.inv(P[:, :3]), P_other @ (centre / centre[3])

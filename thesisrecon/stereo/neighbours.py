@@ -18,9 +18,10 @@ from thesisrecon.stereo.resampling import warp_image
 class SparsePoints:
     """Points of a metric reconstruction.
 
-    Attributes
+    Parameters
     ----------
     X : ndarray (N, 3)
+        Points.
     seen : ndarray (V, N) bool
         Whether a view observes a point.
     """
@@ -41,11 +42,6 @@ def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
     -------
     SparsePoints
         Points and their visibility.
-
-    Raises
-    ------
-    ValueError
-        If the reconstruction is not metric.
     """
     if reconstruction.stratum != "metric":
         raise ValueError(f"depth maps need a metric reconstruction; got {reconstruction.stratum}")
@@ -67,7 +63,9 @@ def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> 
     Parameters
     ----------
     points : SparsePoints
+        Points of the scene.
     a, b : PinholeView
+        The views.
 
     Returns
     -------
@@ -119,8 +117,11 @@ class NeighbourSelection:
         Parameters
         ----------
         points : SparsePoints
+            Points of the scene.
         views : dict of int to PinholeView
+            All views.
         view : int
+            Number of the view.
 
         Returns
         -------
@@ -156,7 +157,9 @@ class NeighbourSelection:
         common = points.seen[view] & points.seen[other]
         if other == view or int(common.sum()) < self.min_points:
             return None
-        angle = _ray_angles_deg(points.X[common], centre, _centre(views[other].P))
+        a, b = points.X[common] - centre, points.X[common] - _centre(views[other].P)
+        sine = np.linalg.norm(np.cross(a, b), axis=1)
+        angle = np.degrees(np.arctan2(sine, np.sum(a * b, axis=1)))
         if int(np.sum(angle >= self.min_angle_deg)) < self.min_points:
             return None
         off = angle - self.best_deg
@@ -164,12 +167,6 @@ class NeighbourSelection:
         weights = np.zeros(len(points.X))
         weights[common] = np.where(angle >= self.min_angle_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
         return weights
-
-
-def _ray_angles_deg(X: F64, first: F64, second: F64) -> F64:
-    """Angles (N,) in degrees between the rays of points (N, 3) to two centres (3,)."""
-    a, b = X - first, X - second
-    return np.asarray(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))))
 
 
 def _centre(P: F64) -> F64:
@@ -189,6 +186,7 @@ def pinhole_view(
     reconstruction : Reconstruction
         Metric reconstruction with ``K`` and optional ``distortion``.
     view : int
+        Number of the image.
     max_side : int
         Longest side of the result in pixels; larger images are reduced without aliasing.
 
@@ -197,13 +195,6 @@ def pinhole_view(
     PinholeView
         Undistorted image with its camera, whose third coordinate is the depth. Pixels outside the original
         image are black and not ``seen``.
-
-    Raises
-    ------
-    ValueError
-        If the reconstruction is not metric or the image has another size.
-    StageFailure
-        If the view has no camera.
     """
     K = reconstruction.K
     if reconstruction.stratum != "metric" or K is None:
@@ -212,45 +203,27 @@ def pinhole_view(
         raise ValueError(
             f"image {image.name} must be {tuple(reconstruction.sizes[view])} px; got {image.size}"
         )
-    if max_side < 2:
-        raise ValueError(f"max_side must be at least 2 px; got {max_side}")
     if not reconstruction.registered[view]:
         raise StageFailure(f"image {image.name} has no camera", reconstruction.reasons[view], "")
     shrink = min(1.0, max_side / max(image.size))
     size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
-    S = _resizing(image.size, size)
+    sx, sy = np.array(size) / np.array(image.size)
+    # (x + 0.5) s - 0.5 along either side.
+    S = np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
     distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
-    P = S @ _depth_scaled(reconstruction.P[view])
+    P = reconstruction.P[view]
+    P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
     if not distortion.any() and size == image.size:
         return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
-    pixels = warp_image(_Lens(K[view], distortion, S, size), image.rgb.astype(np.float32), 0)
+    inverse = np.linalg.inv(S @ K[view])
+
+    def lookup(rows: range) -> F64:
+        x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(rows.start), float(rows.stop)))
+        rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ inverse.T
+        xy = distort(dehomogenize(rays), distortion) @ K[view, :2, :2].T + K[view, :2, 2]
+        return np.asarray(xy.reshape(*x.shape, 2))
+
+    pixels = warp_image(image.rgb.astype(np.float32), lookup, size)
     seen = np.asarray(np.isfinite(pixels).all(axis=2))
     rgb = np.clip(np.rint(np.where(seen[:, :, None], pixels, 0.0)), 0.0, 255.0).astype(np.uint8)
     return PinholeView(view, P, rgb, seen)
-
-
-@dataclass(frozen=True)
-class _Lens:
-    """Positions of the pixels of an undistorted frame in the original image."""
-
-    K: F64
-    distortion: F64
-    S: F64
-    size: tuple[int, int]
-
-    def lookup(self, side: int, rows: range) -> F64:  # noqa: ARG002 - there is only one image
-        """Return the positions (len(rows), width, 2) in the original image."""
-        x, y = np.meshgrid(np.arange(float(self.size[0])), np.arange(float(rows.start), float(rows.stop)))
-        rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ np.linalg.inv(self.S @ self.K).T
-        xy = distort(dehomogenize(rays), self.distortion) @ self.K[:2, :2].T + self.K[:2, 2]
-        return np.asarray(xy.reshape(*x.shape, 2))
-
-
-def _resizing(size: tuple[int, int], wanted: tuple[int, int]) -> F64:
-    """(3, 3): (x + 0.5) s - 0.5 along either side."""
-    sx, sy = wanted[0] / size[0], wanted[1] / size[1]
-    return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
-
-
-def _depth_scaled(P: F64) -> F64:
-    return np.asarray(P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))

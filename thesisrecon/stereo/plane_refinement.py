@@ -9,9 +9,8 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, U8
 from thesisrecon.records import PinholeView
-from thesisrecon.stereo.depth_fusion import InverseDepth, pixel_transfer
-from thesisrecon.stereo.depth_kernels import surface_continuation
-from thesisrecon.stereo.plane_kernels import (
+from thesisrecon.stereo._depth_kernels import surface_continuation
+from thesisrecon.stereo._plane_kernels import (
     UNKNOWN,
     PatchViews,
     PatchWindow,
@@ -21,6 +20,7 @@ from thesisrecon.stereo.plane_kernels import (
     rate_planes,
     sweep_planes,
 )
+from thesisrecon.stereo.depth_fusion import InverseDepth, pixel_transfer
 
 ALIKE = 0.03
 """Largest relative difference of inverse depths on one surface."""
@@ -82,8 +82,11 @@ class PlaneRefinement:
         Parameters
         ----------
         reference : PinholeView
+            The view.
         others : sequence of PinholeView
+            Its neighbours.
         found : InverseDepth
+            Fused correspondences.
 
         Returns
         -------
@@ -99,20 +102,16 @@ class PlaneRefinement:
         return self._kept(found, setting, planes)
 
     def search(
-        self,
-        reference: PinholeView,
-        others: Sequence[PinholeView],
-        rho: F32,
-        *,
-        wanted: B8,
-        sweeps: int,
+        self, reference: PinholeView, others: Sequence[PinholeView], rho: F32, *, wanted: B8, sweeps: int
     ) -> tuple[F32, F32, U8]:
         """Search planes of selected pixels from given inverse depths.
 
         Parameters
         ----------
         reference : PinholeView
+            The view.
         others : sequence of PinholeView
+            Its neighbours.
         rho : ndarray (H, W) float32
             Initial inverse depths.
         wanted : ndarray (H, W) bool

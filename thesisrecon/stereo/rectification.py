@@ -2,62 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from functools import partial
 
 import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.stereo.epipolar_pair import EpipolarPair, Size, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo.planar import (
-    FrameLimits,
-    PlanarRectification,
-    disparity_bounds,
-    disparity_gradients,
-    singular_values,
-)
-from thesisrecon.stereo.planar_rectifiers import (
-    CommonOrientationRectifier,
-    HartleyRectifier,
-    LoopZhangRectifier,
-    MinimumDistortionRectifier,
-)
-from thesisrecon.stereo.polar import PolarRectification, PolarRectifier
+from thesisrecon.stereo._epipolar_pair import EpipolarPair, Size, pair_of_cameras, pair_of_fundamental
+from thesisrecon.stereo._frames import disparity_bounds, disparity_gradients, singular_values
+from thesisrecon.stereo.planar import common_orientation, hartley, loop_zhang, minimum_distortion
+from thesisrecon.stereo.polar import PolarRectification, polar
+from thesisrecon.stereo.resampling import Rectification
 
 STEP_PX = 0.01
 """Half step of numerical derivatives."""
+MAX_TURN_DEG, MAX_ASPECT = 5.0, 0.1
+"""Limits of the midline angle's deviation from 90 degrees, and of the change of the aspect ratio."""
+BENDING = 0.03
+"""Penalty of polar frames, which bend straight lines."""
+SIZE_WEIGHT = 0.05
+"""Weight of the log of the relative frame size, which costs time."""
 
-
-class Rectification(Protocol):
-    """Maps between two images and a common frame."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the frame."""
-
-    def original_from_rectified(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Map positions (N, 2) of the frame to pixels of an image."""
-
-    def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Map pixels (N, 2) of an image to the frame."""
+Method = Callable[[EpipolarPair], Rectification]
+PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)
+"""Methods from F with homographies."""
+METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar, aligned=False))
+"""All methods; the common orientation needs cameras."""
 
 
 @dataclass(frozen=True)
 class RectificationQuality:
     """Distortion measures of a rectified pair; pairs of numbers refer to both images.
 
-    Attributes
+    Parameters
     ----------
-    rms_dy_px : float
-        RMS vertical disparity of the matches, NaN without matches.
     orthogonality_deg : tuple of float
         Angle of the mapped image midlines.
     aspect : tuple of float
         Ratio of their lengths relative to the original, NaN if not finite.
-    coverage : tuple of float
-        Share of each image inside the frame.
     size_ratio : float
         Pixels of the frame relative to the larger image.
     min_scale, max_scale : float
@@ -67,20 +51,15 @@ class RectificationQuality:
         similarities.
     disparity_slope : float
         RMS gradient of a quadratic polynomial fitted to the disparities: the difference between both images.
-    disparities : tuple of float
-        Disparity range of the matches.
     """
 
-    rms_dy_px: float
     orthogonality_deg: tuple[float, float]
     aspect: tuple[float, float]
-    coverage: tuple[float, float]
     size_ratio: float
     min_scale: float
     max_scale: float
     stretch: float
     disparity_slope: float
-    disparities: tuple[float, float]
 
     @property
     def distortion(self) -> float:
@@ -106,30 +85,24 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
     -------
     RectificationQuality
     """
-    values, coverage, midlines = [], [], []
+    values, midlines = [], []
     for side in (0, 1):
         samples = pair.regions[side]
         inside = np.isfinite(rectification.rectified_from_original(side, samples)).all(axis=1)
         J = jacobians(rectification, side, samples[inside])
         values.append(singular_values(J[np.isfinite(J).all(axis=(1, 2))]))
-        coverage.append(_share_inside(rectification, side, pair.sizes[side]))
         midlines.append(_midlines(rectification, side, pair.sizes[side]))
     found = np.concatenate(values)
     found = found if len(found) else np.full((1, 2), np.nan)
-    logs = np.log(np.maximum(found, 1e-12))
-    dy, disparity_slope, disparities = _matches(rectification, pair)
     width, height = rectification.size
     return RectificationQuality(
-        rms_dy_px=dy,
         orthogonality_deg=(midlines[0][0], midlines[1][0]),
         aspect=(midlines[0][1], midlines[1][1]),
-        coverage=(coverage[0], coverage[1]),
         size_ratio=width * height / max(w * h for w, h in pair.sizes),
         min_scale=float(found[:, 1].min()),
         max_scale=float(found[:, 0].max()),
-        stretch=float(np.exp(np.std(logs))),
-        disparity_slope=disparity_slope,
-        disparities=disparities,
+        stretch=float(np.exp(np.std(np.log(np.maximum(found, 1e-12))))),
+        disparity_slope=_disparity_slope(rectification, pair),
     )
 
 
@@ -139,8 +112,11 @@ def jacobians(rectification: Rectification, side: int, xy: F64) -> F64:
     Parameters
     ----------
     rectification : Rectification
+        The maps.
     side : {0, 1}
+        The image.
     xy : ndarray (N, 2)
+        Pixels of the image.
 
     Returns
     -------
@@ -158,13 +134,7 @@ def jacobians(rectification: Rectification, side: int, xy: F64) -> F64:
     return np.stack(columns, axis=-1)
 
 
-def _share_inside(rectification: Rectification, side: int, size: tuple[int, int]) -> float:
-    x, y = ((np.arange(48) + 0.5) / 48 * length - 0.5 for length in size)
-    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return float(np.isfinite(rectification.rectified_from_original(side, grid)).all(axis=1).mean())
-
-
-def _midlines(rectification: Rectification, side: int, size: tuple[int, int]) -> tuple[float, float]:
+def _midlines(rectification: Rectification, side: int, size: Size) -> tuple[float, float]:
     """Angle in degrees of the mapped midlines, and the ratio of their lengths relative to the original."""
     w, h = size[0] - 1.0, size[1] - 1.0
     ends = np.array([[0.0, h / 2.0], [w, h / 2.0], [w / 2.0, 0.0], [w / 2.0, h]])
@@ -176,142 +146,66 @@ def _midlines(rectification: Rectification, side: int, size: tuple[int, int]) ->
     return angle, lengths[0] / lengths[1] * h / w
 
 
-def _matches(rectification: Rectification, pair: EpipolarPair) -> tuple[float, float, tuple[float, float]]:
-    """RMS of y1 - y2, disparity slope, and disparity range of the matches inside the frame."""
+def _disparity_slope(rectification: Rectification, pair: EpipolarPair) -> float:
+    """RMS disparity gradient of the matches inside the frame, NaN with fewer than 3."""
     left, right = (rectification.rectified_from_original(s, xy) for s, xy in enumerate(pair.matches))
     seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
     if int(seen.sum()) < 3:
-        return float("nan"), float("nan"), (float("nan"), float("nan"))
-    left, right = left[seen], right[seen]
-    dy = float(np.sqrt(np.mean((left[:, 1] - right[:, 1]) ** 2)))
-    disparity_slope = float(np.sqrt(np.mean(np.sum(disparity_gradients(left, right) ** 2, axis=1))))
-    return dy, disparity_slope, disparity_bounds(left[:, 0] - right[:, 0], margin=0.0)
+        return float("nan")
+    return float(np.sqrt(np.mean(np.sum(disparity_gradients(left[seen], right[seen]) ** 2, axis=1))))
 
 
-AnyRectification = PlanarRectification | PolarRectification
-Method = Literal["best", "hartley", "loop-zhang", "least-distortion", "polar", "metric"]
+def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:
+    """Return the rectification of least distortion among several methods.
 
-
-class Rectifier(Protocol):
-    """A rectification method."""
-
-    def rectify(self, pair: EpipolarPair) -> AnyRectification:
-        """Compute both maps; raise ``StageFailure`` if the pair cannot be rectified by this method."""
-
-
-@dataclass(frozen=True)
-class BestRectifier:
-    """Selection of the rectification of least ``RectificationQuality.distortion`` among several methods.
-
-    Methods within the angle and aspect limits take precedence; methods that fail are skipped.
-
-    Parameters
-    ----------
-    methods : tuple of Rectifier
-        Methods to choose from.
-    angle_deg : float
-        Limit of the midline angle's deviation from 90 degrees.
-    aspect : float
-        Limit of the relative change of the aspect ratio.
-    bending : float
-        Penalty of polar frames, which bend straight lines.
-    size : float
-        Weight of the log of the relative frame size, which costs time.
-    """
-
-    methods: tuple[Rectifier, ...]
-    angle_deg: float = 5.0
-    aspect: float = 0.1
-    bending: float = 0.03
-    size: float = 0.05
-
-    def rectify(self, pair: EpipolarPair) -> AnyRectification:
-        """Apply all methods and return the best result.
-
-        Parameters
-        ----------
-        pair : EpipolarPair
-
-        Returns
-        -------
-        PlanarRectification or PolarRectification
-            The rectification of least distortion.
-
-        Raises
-        ------
-        StageFailure
-            If all methods fail (the failure of the last).
-        """
-        best: AnyRectification | None = None
-        least, failure = (True, np.inf), None
-        for method in self.methods:
-            try:
-                found = method.rectify(pair)
-            except StageFailure as reason:
-                failure = reason
-                continue
-            cost = self._cost(found, measure_quality(found, pair))
-            if best is None or cost < least:
-                best, least = found, cost
-        if best is None:
-            raise failure if failure is not None else ValueError("BestRectifier needs at least one method")
-        return best
-
-    def _cost(self, found: AnyRectification, quality: RectificationQuality) -> tuple[bool, float]:
-        # A midline through the epipole of a polar frame has no angle.
-        turned = max((abs(a - 90.0) for a in quality.orthogonality_deg if np.isfinite(a)), default=0.0)
-        aspect = max((abs(a - 1.0) for a in quality.aspect if np.isfinite(a)), default=0.0)
-        bent = self.bending if isinstance(found, PolarRectification) else 0.0
-        cost = quality.distortion + bent + self.size * np.log(quality.size_ratio)
-        return turned > self.angle_deg or aspect > self.aspect, float(cost)
-
-
-def _methods(limits: FrameLimits) -> Mapping[Method, Rectifier]:
-    return {
-        "hartley": HartleyRectifier(limits),
-        "loop-zhang": LoopZhangRectifier(limits),
-        "least-distortion": MinimumDistortionRectifier(limits),
-        "polar": PolarRectifier(limits),
-        "metric": CommonOrientationRectifier(limits),
-    }
-
-
-def rectify(
-    pair: EpipolarPair, *, method: Method = "best", limits: FrameLimits | None = None
-) -> AnyRectification:
-    """Rectify a prepared pair.
+    Those within the angle and aspect limits take precedence; methods that fail are skipped.
 
     Parameters
     ----------
     pair : EpipolarPair
-    method : {"best", "hartley", "loop-zhang", "least-distortion", "polar", "metric"}
-        Method, or the best of all for which the data suffice.
-    limits : FrameLimits, optional
+        The prepared pair.
+    methods : sequence of callable
+        Methods to choose from.
 
     Returns
     -------
-    PlanarRectification or PolarRectification
+    Rectification
+        The rectification of least distortion.
 
     Raises
     ------
-    ValueError
-        If the method is unknown.
     StageFailure
-        If the pair cannot be rectified.
+        If all methods fail (the failure of the last).
     """
-    limits = FrameLimits() if limits is None else limits
-    methods = _methods(limits)
-    if method == "best":
-        bare = PolarRectifier(limits, max_scale=0.0, max_shear=0.0)
-        return BestRectifier((*methods.values(), bare)).rectify(pair)
-    if method not in methods:
-        raise ValueError(f"method must be one of {['best', *methods]}; got {method!r}")
-    return methods[method].rectify(pair)
+    best: Rectification | None = None
+    least, failure = (True, np.inf), None
+    for method in methods:
+        try:
+            found = method(pair)
+        except StageFailure as reason:
+            failure = reason
+            continue
+        cost = _cost(found, measure_quality(found, pair))
+        if best is None or cost < least:
+            best, least = found, cost
+    if best is None:
+        assert failure is not None
+        raise failure
+    return best
+
+
+def _cost(found: Rectification, quality: RectificationQuality) -> tuple[bool, float]:
+    # A midline through the epipole of a polar frame has no angle.
+    turned = max((abs(a - 90.0) for a in quality.orthogonality_deg if np.isfinite(a)), default=0.0)
+    aspect = max((abs(a - 1.0) for a in quality.aspect if np.isfinite(a)), default=0.0)
+    bent = BENDING if isinstance(found, PolarRectification) else 0.0
+    cost = quality.distortion + bent + SIZE_WEIGHT * np.log(quality.size_ratio)
+    return turned > MAX_TURN_DEG or aspect > MAX_ASPECT, float(cost)
 
 
 def rectify_pair(
-    F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size, *, method: Method = "best"
-) -> AnyRectification:
+    F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size, *, methods: Sequence[Method] = METHODS
+) -> Rectification:
     """Rectify two images with known fundamental matrix (thesis, section 2.5).
 
     Parameters
@@ -322,14 +216,13 @@ def rectify_pair(
         Inlier matches in pixels.
     size1, size2 : tuple of int
         (width, height) in pixels.
-    method : {"best", "hartley", "loop-zhang", "least-distortion", "polar"}
-        Method, or the best of them.
+    methods : sequence of callable
+        Methods to choose from.
 
     Returns
     -------
-    PlanarRectification or PolarRectification
-        Maps to a frame whose rows are epipolar lines; x_right = x_left - d, larger d for nearer points. With
-        unknown focal lengths, "nearer" is judged with usual ones.
+    Rectification
+        With unknown focal lengths, "nearer" is judged with usual ones.
 
     Raises
     ------
@@ -339,36 +232,26 @@ def rectify_pair(
         If the pair has no parallax, too few or contradictory matches, or, for planar methods, an epipole
         inside an image.
     """
-    return rectify(pair_of_fundamental(F, xy1, xy2, size1, size2), method=method)
+    return rectify(pair_of_fundamental(F, xy1, xy2, size1, size2), methods)
 
 
 def rectify_cameras(
-    P1: F64,
-    P2: F64,
-    size1: Size,
-    size2: Size,
-    *,
-    xy1: F64 | None = None,
-    xy2: F64 | None = None,
-    method: Method = "best",
-) -> AnyRectification:
+    P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
+) -> Rectification:
     """Rectify two undistorted images with known metric cameras.
 
     Parameters
     ----------
     P1, P2 : ndarray (3, 4)
-        Cameras P = K [R t].
+        Cameras P = K [R t] with P[2] X > 0 for points in front.
     size1, size2 : tuple of int
         (width, height) in pixels.
     xy1, xy2 : ndarray (N, 2), optional
-        Matches in pixels; they crop the frame to the common field of view, and "hartley" needs them.
-    method : {"best", "hartley", "loop-zhang", "least-distortion", "polar", "metric"}
-        Method, or the best of them; "metric" is the common orientation.
+        Matches in pixels; they crop the frame to the common field of view, and :func:`hartley` needs them.
 
     Returns
     -------
-    PlanarRectification or PolarRectification
-        See :func:`rectify_pair`.
+    Rectification
 
     Raises
     ------
@@ -377,17 +260,18 @@ def rectify_cameras(
     StageFailure
         If the pair cannot be rectified.
     """
-    return rectify(pair_of_cameras(P1, P2, size1, size2, xy1=xy1, xy2=xy2), method=method)
+    return rectify(pair_of_cameras(P1, P2, size1, size2, xy1=xy1, xy2=xy2))
 
 
 def disparity_range(
-    rectification: AnyRectification, xy1: F64, xy2: F64, *, margin: float = 0.15
+    rectification: Rectification, xy1: F64, xy2: F64, *, margin: float = 0.15
 ) -> tuple[int, int]:
     """Return the disparity range to search from matches.
 
     Parameters
     ----------
-    rectification : PlanarRectification or PolarRectification
+    rectification : Rectification
+        The maps.
     xy1, xy2 : ndarray (N, 2)
         Matches in pixels of the images.
     margin : float

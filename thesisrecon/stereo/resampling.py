@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -117,72 +119,112 @@ def _sample_image(image: F32, xy: F64, out: F32) -> None:
                 out[i, j, c] = total[c] / weight
 
 
-class Lookup(Protocol):
-    """Maps the pixels of a frame to original images."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the frame."""
-
-    def lookup(self, side: int, rows: range) -> F64:
-        """Return the positions (len(rows), width, 2) in the original image of ``side``."""
-
-
-def warp_image(source: Lookup, image: F32, side: int) -> F32:
+def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]) -> F32:
     """Resample an image into a frame by cubic convolution.
 
     Parameters
     ----------
-    source : Lookup
-        Maps pixels of the frame to the image.
     image : ndarray (H, W) or (H, W, C)
-    side : {0, 1}
+        The original image.
+    lookup : callable
+        Returns the positions (len(rows), width, 2) in the image of a range of rows of the frame.
+    size : tuple of int
+        (width, height) of the frame.
 
     Returns
     -------
     ndarray float32
         The frame, NaN outside the image.
-
-    Raises
-    ------
-    ValueError
-        If the image has another number of dimensions or is empty.
     """
-    if image.ndim not in (2, 3) or image.size == 0:
-        raise ValueError(f"an image must be (H, W) or (H, W, C) and not empty; got shape {image.shape}")
     pixels = np.ascontiguousarray(image, dtype=np.float32)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
-    width, height = source.size
+    width, height = size
     out = np.empty((height, width, pixels.shape[2]), np.float32)
     for first in range(0, height, STRIP_ROWS):
         last = min(first + STRIP_ROWS, height)
         # One row more, if available: neighbour distances determine the filter width.
         start = first - 1 if last == height and last - first == 1 and first > 0 else first
-        places = source.lookup(side, range(start, min(last + 1, height)))
+        places = lookup(range(start, min(last + 1, height)))
         strip = out[start:last] if start == first else np.empty((last - start, *out.shape[1:]), np.float32)
         _sample_image(pixels, places, strip)
         out[first:last] = strip[first - start :]
     return out[:, :, 0] if image.ndim == 2 else out
 
 
-def require_side(side: int) -> int:
-    """Check the index of an image of a pair.
+class Rectification(ABC):
+    """Maps between two images (side 0 is the left one) and a common frame whose rows are epipolar lines.
 
-    Parameters
-    ----------
-    side : int
-        The index.
-
-    Returns
-    -------
-    int
-        The index, 0 or 1.
-
-    Raises
-    ------
-    ValueError
-        If it is neither 0 nor 1.
+    x_right = x_left - d with larger d for nearer points.
     """
-    if side not in (0, 1):
-        raise ValueError(f"side must be 0 or 1; got {side}")
-    return side
+
+    size: tuple[int, int]
+
+    @abstractmethod
+    def _original(self, side: int, xy: F64) -> F64: ...
+
+    @abstractmethod
+    def _rectified(self, side: int, xy: F64) -> F64: ...
+
+    @abstractmethod
+    def _lookup(self, side: int, rows: range) -> F64:
+        """Positions (len(rows), width, 2) of rows of the frame in an image."""
+
+    def original_from_rectified(self, side: int, xy: F64, *, within: bool = True) -> F64:
+        """Map positions of the frame to pixels of an image.
+
+        Parameters
+        ----------
+        side : {0, 1}
+            The image.
+        xy : ndarray (N, 2)
+            Positions in the frame.
+        within : bool
+            Return NaN outside the frame too.
+
+        Returns
+        -------
+        ndarray (N, 2)
+            Pixels, NaN beyond the epipole or the line sent to infinity.
+        """
+        return self._original(side, self._within(xy) if within else xy)
+
+    def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:
+        """Map pixels of an image to the frame.
+
+        Parameters
+        ----------
+        side : {0, 1}
+            The image.
+        xy : ndarray (N, 2)
+            Pixels.
+        within : bool
+            Return NaN outside the frame too.
+
+        Returns
+        -------
+        ndarray (N, 2)
+            Positions in the frame, NaN beyond the line sent to infinity.
+        """
+        moved = self._rectified(side, xy)
+        return self._within(moved) if within else moved
+
+    def _within(self, xy: F64) -> F64:
+        inside = np.all((xy >= -0.5) & (xy <= np.array(self.size) - 0.5), axis=1)
+        return np.where(inside[:, None], xy, np.nan)
+
+    def warp(self, image: F32, side: int) -> F32:
+        """Resample an image into the frame.
+
+        Parameters
+        ----------
+        image : ndarray (H, W) or (H, W, C)
+            The image.
+        side : {0, 1}
+            Its side.
+
+        Returns
+        -------
+        ndarray float32
+            The rectified image, NaN outside.
+        """
+        return warp_image(image, partial(self._lookup, side), self.size)

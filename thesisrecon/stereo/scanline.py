@@ -15,9 +15,16 @@ from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo.cost import Strip, checked_range, estimate_noise, prepare_stereo_images, run_strips
-from thesisrecon.stereo.cost_kernels import LEVELS, add_squares
-from thesisrecon.stereo.postprocessing import final_confidence, texture_of
+from thesisrecon.stereo._cost import (
+    LEVELS,
+    Strip,
+    add_squares,
+    checked_range,
+    estimate_noise,
+    prepare_stereo_images,
+    run_strips,
+)
+from thesisrecon.stereo._postprocessing import final_confidence, texture_of
 
 OCCLUDED = -32768
 """Disparity of an occluded pixel."""
@@ -137,7 +144,7 @@ def _enter_column(
 
 
 @njit(cache=True, nogil=True)
-def solve_row(
+def _solve_row(
     costs: I32,
     first: int,
     penalties: tuple[int, int, int, int],
@@ -145,25 +152,14 @@ def solve_row(
     left: I32,
     right: I32,
 ) -> None:
-    """Find the maximum-likelihood correspondences of one row.
+    """Find the maximum-likelihood correspondences of one row from costs (D, W), ``NO_MATCH`` without a match.
 
-    Among solutions of equal likelihood the one with the fewest discontinuities is taken.
-    A node (i, j) has passed i left and j right pixels, i - j = d. It is entered by a match, by an occluded
-    left pixel or by an occluded right pixel, which are its three states.
-
-    Parameters
-    ----------
-    costs : ndarray (D, W) int32
-        Cost of left pixel x at disparity first + q in integer steps, ``NO_MATCH`` without a match.
-    first : int
-        First disparity.
-    penalties : tuple of int
-        Cost of an occluded pixel and of one outside the other image, in steps; count of a discontinuity along
-        the row and against the previous row, 0 or 1.
-    above : tuple of ndarray (W,) int32
-        Disparities of the previous row in the left and right image.
-    left, right : ndarray (W,) int32
-        Receive the disparities, ``OCCLUDED`` where occluded.
+    Among solutions of equal likelihood the one with the fewest discontinuities is taken. A node (i, j) has
+    passed i left and j right pixels, i - j = d. It is entered by a match, by an occluded left pixel or by an
+    occluded right pixel, which are its three states. ``penalties``: cost of an occluded pixel and of one
+    outside the other image, in steps; count of a discontinuity along the row and against the previous row, 0
+    or 1. ``above`` are the disparities (W,) of the previous row in both images; ``left`` and ``right`` (W,)
+    receive the new ones, ``OCCLUDED`` where occluded.
     """
     n, width = costs.shape
     occluded, border, along, across = penalties
@@ -241,7 +237,7 @@ def _solve_rows(
     """Solve the rows of a pair from the top, each with cohesion to the previous one.
 
     ``left``, ``right``: (channels (K, H, W), valid (H, W)). ``disparities`` first and last. ``model``: window
-    radius, steps per squared channel unit, and the penalties of :func:`solve_row`. ``out`` receives the
+    radius, steps per squared channel unit, and the penalties of :func:`_solve_row`. ``out`` receives the
     disparities (H, W), ``OCCLUDED`` where occluded, and their probabilities.
     """
     first, last = disparities
@@ -266,7 +262,7 @@ def _solve_rows(
                 _window_costs(total, lo, hi, radius, scale, costs[q])
         _forbid(left[1][y], right[1][y], first, costs)
         now, before = found[y & 1], found[1 - (y & 1)]
-        solve_row(costs, first, penalties, (before[0], before[1]), now[0], now[1])
+        _solve_row(costs, first, penalties, (before[0], before[1]), now[0], now[1])
         out[0][y] = now[0]
         _posterior(costs, first, now[0], likelihood, out[1][y])
 
@@ -340,18 +336,13 @@ class MaximumLikelihoodScanline:
         -------
         DisparityMap
             NaN where the pixel is occluded.
-
-        Raises
-        ------
-        ValueError
-            If the image shapes are invalid or differ, or the range is empty.
         """
         first, last = checked_range(disparity_range)
         sides = prepare_stereo_images(left, right)
         noise = float(np.mean([estimate_noise(side) for side in sides]))
         variance = self.min_variance + noise**2
         components = len(sides[0].channels) * (2 * self.radius + 1) ** 2
-        occluded = self.occlusion_cost(components, variance)
+        occluded = self._occlusion_cost(components, variance)
         model = (
             self.radius,
             self.steps_per_nat / (4.0 * variance * LEVELS**2),
@@ -375,31 +366,14 @@ class MaximumLikelihoodScanline:
             disparity[start:stop] = np.where(found[own] == OCCLUDED, np.float32(np.nan), found[own])
             confidence[start:stop] = probable[own]
 
-        run_strips(work, self._strips(height), self.threads)
+        starts = range(0, height, ROWS)
+        strips = [(k, min(k + ROWS, height), k - WARM_UP, k + ROWS + self.radius) for k in starts]
+        strips = [(k, last, max(top, 0), min(bottom, height)) for k, last, top, bottom in strips]
+        run_strips(work, strips, self.threads)
         final_confidence(confidence, disparity, disparity, texture_of(sides[0], noise))
         return DisparityMap(disparity, confidence, ROUNDING_PX)
 
-    def occlusion_cost(self, components: int, variance: float) -> float:
-        """Compute the cost of an occluded pixel.
-
-        Parameters
-        ----------
-        components : int
-            Components m of a measurement.
-        variance : float
-            Variance s^2 of a component.
-
-        Returns
-        -------
-        float
-            Cost in nats.
-        """
+    def _occlusion_cost(self, components: int, variance: float) -> float:
+        """Cost of an occluded pixel in nats, with m components of one variance s^2."""
         odds = np.log(self.detection / (1.0 - self.detection))
         return float(odds + components * np.log(GREY_RANGE / np.sqrt(2.0 * np.pi * variance)))
-
-    def _strips(self, height: int) -> list[Strip]:
-        below = self.radius
-        return [
-            (start, min(start + ROWS, height), max(start - WARM_UP, 0), min(start + ROWS + below, height))
-            for start in range(0, height, ROWS)
-        ]

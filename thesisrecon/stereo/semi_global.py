@@ -9,31 +9,102 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thesisrecon.arrays import U8
+from thesisrecon.arrays import F32, I16, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo.cost import (
-    CensusAndColour,
+from thesisrecon.stereo._cost import (
+    ARM,
+    CENSUS_BITS,
+    LEVELS,
+    WEIGHT_SHIFT,
+    CostFeatures,
     StereoImage,
     Strip,
+    census,
     checked_range,
+    cost_volume,
     estimate_noise,
     prepare_stereo_images,
     row_strips,
     run_strips,
+    support_masks,
 )
-from thesisrecon.stereo.cost_kernels import LEVELS
-from thesisrecon.stereo.path_kernels import TOP, adaptive_P2, scratch_size, sum_paths
-from thesisrecon.stereo.postprocessing import DisparityPostprocessing, best_disparities, texture_of
+from thesisrecon.stereo._path_kernels import TOP, adaptive_P2, scratch_size, sum_paths
+from thesisrecon.stereo._postprocessing import (
+    MIN_NEIGHBOURS,
+    STEP_PX,
+    TEXTURED,
+    best_disparities,
+    check_left_right,
+    disparity_noise,
+    edge_preserving_mean,
+    fill_pinholes,
+    final_confidence,
+    remove_speckles,
+    texture_of,
+)
 
 MIN_NOISE = 1.0
 """Standard deviation in grey levels of quantisation and viewpoint change, added to the image noise."""
 MAX_P2 = 15.0
 """Upper limit of P2 in maximal matching costs: both share one byte, and costs need a few levels."""
+
+
+@dataclass(frozen=True)
+class CensusAndColour:
+    """Hamming distance of census transforms plus truncated absolute colour difference.
+
+    The 5 x 5 census transform (Zabih and Woodfill 1994) is invariant to exposure; the colours distinguish
+    regions of equal pattern. Truncation limits the influence of occlusions and outliers.
+
+    Parameters
+    ----------
+    census_share : float
+        Share of the census in the maximal cost; the colours have the rest.
+    truncation : float
+        Truncation of the colour difference, in standard deviations of the noise.
+    support : bool
+        Average the costs over cross-shaped support regions (Zhang, Lu and Lafruit 2009) with arms of 2
+        pixels.
+    tolerance : float
+        Colour difference at which an arm ends, in standard deviations of the noise.
+    outside : float
+        Cost of a partner outside the image, as a share of the maximal cost.
+    """
+
+    census_share: float = 0.56
+    truncation: float = 10.0
+    support: bool = True
+    tolerance: float = 5.0
+    outside: float = 0.4
+
+    def __post_init__(self) -> None:
+        for name in ("census_share", "outside"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be between 0 and 1; got {getattr(self, name)}")
+        for name in ("truncation", "tolerance"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
+
+    def _arms(self, image: StereoImage, noise: float) -> U8:
+        """Support arms (4, ARM, H, W) of the pixels; the second axis is empty without ``support``."""
+        masks = np.empty((4, ARM if self.support else 0, *image.valid.shape), np.uint8)
+        if self.support:
+            tolerance = np.int16(min(round(self.tolerance * noise * LEVELS), 255 * LEVELS))
+            support_masks(image.channels, image.valid, tolerance, masks)
+        return masks
+
+    def _weights(self, channels: int, noise: float, max_cost: int) -> I16:
+        """Weights of a census bit and of a quarter level, and truncation, for noise in grey levels."""
+        one = max_cost << WEIGHT_SHIFT
+        cap = min(max(round(self.truncation * noise * LEVELS * channels), channels), 255 * LEVELS * channels)
+        of_bit = round(self.census_share * one / CENSUS_BITS)
+        of_level = max(round((1.0 - self.census_share) * one / cap), int(self.census_share < 1.0))
+        return np.array([of_bit, of_level, cap], np.int16)
 
 
 @dataclass(frozen=True)
@@ -70,30 +141,61 @@ class PathPenalties:
             raise ValueError(f"edge must be above 0; got {self.edge}")
 
     @property
-    def max_cost(self) -> int:
+    def _max_cost(self) -> int:
         """The maximal matching cost as an integer: the largest for which cost and penalty fit one byte."""
         return int(TOP / (1.0 + self.P2))
 
-    def adapted_P2(self, image: StereoImage, noise: float) -> U8:
-        """Compute the intensity-adapted P2 between neighbouring pixels.
-
-        Parameters
-        ----------
-        image : StereoImage
-            The left image.
-        noise : float
-            Standard deviation of its noise in grey levels.
-
-        Returns
-        -------
-        ndarray (4, H, W) uint8
-            Penalties from the left, upper, upper left and upper right neighbour.
-        """
+    def _adapted_P2(self, image: StereoImage, noise: float) -> U8:
+        """P2 (4, H, W) between neighbouring pixels, see :func:`adaptive_P2`."""
         out = np.empty((4, *image.valid.shape), np.uint8)
         scale = np.float32(self.edge * noise * LEVELS * len(image.channels))
-        largest, least = np.float32(self.P2 * self.max_cost), np.float32(self.min_P2 * self.max_cost)
+        largest, least = np.float32(self.P2 * self._max_cost), np.float32(self.min_P2 * self._max_cost)
         adaptive_P2(image.grey, largest, least, scale, out)
         return out
+
+
+@dataclass(frozen=True)
+class DisparityPostprocessing:
+    """Left-right check, speckle filter and smoothing of disparities.
+
+    Parameters
+    ----------
+    left_right_px : float
+        Largest difference in the left-right check.
+    min_region_px : int
+        Connected regions of fewer pixels are removed, as are larger ones without texture.
+    min_confidence : float
+        Disparities of less confidence are unknown.
+    radius : int
+        Radius of the edge-preserving mean over disparities within 1 px of the centre; 0 = none.
+    """
+
+    left_right_px: float = 1.0
+    min_region_px: int = 60
+    min_confidence: float = 0.02
+    radius: int = 2
+
+    def __post_init__(self) -> None:
+        if not (self.left_right_px >= 0.0 and self.min_region_px >= 0 and self.radius >= 0):
+            raise ValueError("left_right_px, min_region_px and radius must not be negative")
+        if not 0.0 <= self.min_confidence < 1.0:
+            raise ValueError(f"min_confidence must be in [0, 1); got {self.min_confidence}")
+
+    def _apply(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
+        """Check, filter and smooth the disparities (H, W) of the left image; ``left`` is overwritten.
+
+        Values propagated into regions without ``texture`` get low ``confidence``, which is overwritten.
+        """
+        limits = np.array([self.left_right_px, self.min_confidence], np.float32)
+        check_left_right(left, right, confidence, limits)
+        remove_speckles(left, texture > TEXTURED, STEP_PX, self.min_region_px)
+        closed = np.empty_like(left)
+        fill_pinholes(left, MIN_NEIGHBOURS, closed)
+        closed[np.isnan(texture)] = np.nan
+        smooth = np.empty_like(left)
+        edge_preserving_mean(closed, STEP_PX, self.radius, smooth)
+        final_confidence(confidence, left, smooth, texture)
+        return DisparityMap(smooth, confidence, disparity_noise(closed, smooth))
 
 
 @dataclass(frozen=True)
@@ -144,62 +246,51 @@ class SemiGlobalMatching:
         DisparityMap
             NaN where the pixel is occluded, fails the left-right check or is ambiguous. The result does not
             depend on the number of threads.
-
-        Raises
-        ------
-        ValueError
-            If the image shapes are invalid or differ, or the range is empty.
         """
         first, last = checked_range(disparity_range)
         images = prepare_stereo_images(left, right)
         measured = float(np.mean([estimate_noise(image) for image in images]))
         noise = float(np.hypot(MIN_NOISE, measured))
-        height, width = images[0].valid.shape
-        features = [self.costs.features(image) for image in images]
-        support = self.costs.support_arms(images[0], noise)
-        P2 = self.penalties.adapted_P2(images[0], noise)
-        P1 = np.uint8(round(self.penalties.P1 * self.penalties.max_cost))
+        (height, width), n = images[0].valid.shape, last - first + 1
+        bits = np.empty((2, height, width), np.int32)
+        for image, out in zip(images, bits, strict=True):
+            census(image.grey, out)
+        max_cost, pairs = self.penalties._max_cost, self.paths // 2
+        arms = self.costs._arms(images[0], noise)
+        weights = self.costs._weights(len(images[0].channels), noise, max_cost)
+        outside = np.uint8(round(self.costs.outside * max_cost))
+        P1, P2 = self.penalties.P1, self.penalties._adapted_P2(images[0], noise)
         found = np.empty((3, height, width), np.float32)
-        # Confidence 1/2 if the second best disparity costs P1 more on every path.
-        half = float(2 * self._pairs * self.penalties.P1 * self.penalties.max_cost)
+
+        def rows_of(side: int, rows: slice) -> CostFeatures:
+            image = images[side]
+            return bits[side, rows], np.ascontiguousarray(image.channels[:, rows]), image.valid[rows]
 
         def work(strip: Strip) -> None:
             start, stop, top, bottom = strip
-            volume, sums, scratch = self._workspace(bottom - top, last - first + 1, width)
-            self.costs.fill_volume(
-                volume,
-                features[0],
-                features[1],
-                support,
-                rows=(top, bottom),
-                first=first,
-                noise=noise,
-                max_cost=self.penalties.max_cost,
-            )
-            sum_paths(volume, np.ascontiguousarray(P2[:, top:bottom]), P1, sums, scratch)
+            rows = slice(top, bottom)
+            # One allocation gets large memory pages.
+            cells, transposed = (bottom - top) * n * width, scratch_size(bottom - top, n, width)
+            whole = np.empty((1 + pairs) * cells + 2 * transposed, np.uint8)
+            volume, sums, scratch = np.split(whole, [cells, (1 + pairs) * cells])
+            volume, sums = volume.reshape(-1, n, width), sums.reshape(pairs, -1, n, width)
+            support = np.ascontiguousarray(arms[:, :, rows])
+            cost_volume(rows_of(0, rows), rows_of(1, rows), support, first, weights, outside, volume)
+            penalties = np.ascontiguousarray(P2[:, rows])
+            sum_paths(volume, penalties, np.uint8(round(P1 * max_cost)), sums, scratch.reshape(2, transposed))
             own = found[:, start:stop]
-            best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
+            # Confidence 1/2 if the second best disparity costs P1 more on every path.
+            best_disparities(
+                sums, start - top, first, (own[0], own[1], own[2]), float(2 * pairs * P1 * max_cost)
+            )
 
         # One byte per pixel and disparity for the cost, and one for each pair of opposite paths.
-        per_row = (1 + self._pairs) * width * (last - first + 1)
         memory = 1e6 * self.memory_mb
-        room = max(memory - 2 * scratch_size(height, last - first + 1, width), 0.5 * memory)
-        run_strips(work, row_strips(height, per_row, room), self.threads)
+        room = max(memory - 2 * scratch_size(height, n, width), 0.5 * memory)
+        run_strips(work, row_strips(height, (1 + pairs) * width * n, room), self.threads)
         left_px, right_px, confidence = found
         left_px[images[0].valid == 0] = np.nan
-        return self.postprocessing.apply(left_px, right_px, confidence, texture_of(images[0], measured))
-
-    @property
-    def _pairs(self) -> int:
-        return self.paths // 2
-
-    def _workspace(self, height: int, disparities: int, width: int) -> tuple[U8, U8, U8]:
-        """Costs, path sums and scratch of a strip in one allocation, which gets large memory pages."""
-        cells, transposed = height * disparities * width, scratch_size(height, disparities, width)
-        whole = np.empty((1 + self._pairs) * cells + 2 * transposed, np.uint8)
-        costs, sums, scratch = np.split(whole, [cells, (1 + self._pairs) * cells])
-        shape = (height, disparities, width)
-        return costs.reshape(shape), sums.reshape(self._pairs, *shape), scratch.reshape(2, transposed)
+        return self.postprocessing._apply(left_px, right_px, confidence, texture_of(images[0], measured))
 
 
 PUBLISHED = SemiGlobalMatching(
@@ -208,52 +299,6 @@ PUBLISHED = SemiGlobalMatching(
     postprocessing=DisparityPostprocessing(radius=0),
 )
 """Semi-global matching as published: eight paths over census costs of single pixels."""
-
-
-class PairMatcher(Protocol):
-    """A dense matcher: :class:`SemiGlobalMatching` or that of :mod:`thesisrecon.stereo.scanline`."""
-
-    def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
-        """Compute the disparities of the left image within the range, both ends included."""
-        ...
-
-
-def match_rectified_arrays(
-    left: ArrayLike, right: ArrayLike, *, max_disparity_px: float, matcher: PairMatcher | None = None
-) -> DisparityMap:
-    """Compute the disparities of a rectified pair of parallel cameras.
-
-    Parameters
-    ----------
-    left, right : array_like (H, W) or (H, W, 3)
-        Grey levels 0 .. 255, integer or floating point, NaN = no pixel; rows correspond.
-    max_disparity_px : float
-        Disparity of the nearest point; 0 .. ceil(max_disparity_px) are searched.
-    matcher : PairMatcher, optional
-        Default: :class:`SemiGlobalMatching` with 4 paths.
-
-    Returns
-    -------
-    DisparityMap
-        x_right = x_left - d, NaN = unknown or occluded.
-
-    Raises
-    ------
-    ValueError
-        If the image shapes are invalid or differ, or max_disparity_px is negative or not finite.
-
-    Examples
-    --------
-    >>> blocks = np.random.default_rng(0).uniform(0.0, 255.0, (10, 20))
-    >>> right = np.kron(blocks, np.ones((4, 4)))
-    >>> found = match_rectified_arrays(np.roll(right, 5, axis=1), right, max_disparity_px=8)
-    >>> round(float(np.nanmedian(found.disparity)), 1)
-    5.0
-    """
-    if not 0.0 <= max_disparity_px < np.inf:
-        raise ValueError(f"max_disparity_px must be finite and not negative; got {max_disparity_px}")
-    matcher = SemiGlobalMatching() if matcher is None else matcher
-    return matcher.match(left, right, disparity_range=(0, int(np.ceil(max_disparity_px))))
 
 
 def match_both_sides(

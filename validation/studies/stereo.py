@@ -17,7 +17,7 @@ from PIL import Image
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import PUBLISHED, PairMatcher, SemiGlobalMatching
+from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.metrics.record import Metric, summary_table
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
@@ -26,7 +26,7 @@ from validation.studies.measuring import least_seconds
 from validation.studies.runner import Part, Rows, pick
 
 DEFAULT, THESIS, LETTER, SEMI_GLOBAL = "default", "thesis", "thesis, to the letter", "semi-global"
-OURS: dict[str, PairMatcher] = {
+OURS: dict[str, SemiGlobalMatching | MaximumLikelihoodScanline] = {
     DEFAULT: SemiGlobalMatching(),
     THESIS: MaximumLikelihoodScanline(),
     LETTER: MaximumLikelihoodScanline(radius=0, out_of_view=False),
@@ -48,7 +48,7 @@ SEEN_PCT = {"Tsukuba": 3.5, "Teddy": 10.2, "Cones": 4.8}
 def match_pair_with(pair: StereoPair) -> dict[str, Callable[[], F32]]:
     """Return a call for every method that gives its disparities."""
 
-    def ours(matcher: PairMatcher) -> Callable[[], F32]:
+    def ours(matcher: SemiGlobalMatching | MaximumLikelihoodScanline) -> Callable[[], F32]:
         limits = (0, pair.disparities - 1)
         return lambda: matcher.match(pair.left, pair.right, disparity_range=limits).disparity
 

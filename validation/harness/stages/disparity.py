@@ -11,7 +11,7 @@ import PIL.Image
 
 from thesisrecon.arrays import F32
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import PUBLISHED, PairMatcher, SemiGlobalMatching
+from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
@@ -20,7 +20,7 @@ from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 from validation.studies.stereo import bad_pixels, picture
 
 OURS, THESIS, SEMI_GLOBAL = "ours", "ours (thesis)", "ours (semi-global)"
-MATCHERS: dict[str, PairMatcher] = {
+MATCHERS: dict[str, SemiGlobalMatching | MaximumLikelihoodScanline] = {
     OURS: SemiGlobalMatching(),
     THESIS: MaximumLikelihoodScanline(),
     SEMI_GLOBAL: PUBLISHED,

@@ -1,13 +1,20 @@
-"""Compiled matching costs of image rows for all disparities.
+"""Integer images of rectified pairs, their noise, and matching costs of rows for all disparities.
 
-The inner loops run over the columns and take row slices without index arithmetic, so that the compiler
+Costs are computed strip by strip, which bounds the memory and gives the threads independent work. The inner
+loops of the kernels run over the columns and take row slices without index arithmetic, so that the compiler
 vectorises them for any number of disparities.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.arrays import F32, I16, I32, U8, U16
 
@@ -17,8 +24,112 @@ REACH = 2
 """Radius of the census window: 5 x 5 pixels, 24 comparisons."""
 ARM = 2
 """Maximal length of a support arm in pixels."""
+CENSUS_BITS = 24
 WEIGHT_SHIFT = 8
 """Weights are in units of 1 / 256."""
+MAX_DISPARITIES = 4096
+"""Upper limit of the number of disparities searched."""
+STRIP_MARGIN = 24
+"""Additional rows above and below a strip: pixels farther away hardly change a path cost."""
+MIN_STRIP_ROWS = 32
+ROWS_FOR_NOISE = 24
+"""Number of evenly spaced rows used for the median."""
+
+Strip = tuple[int, int, int, int]
+CostFeatures = tuple[I32, I16, U8]
+"""Census transform (H, W), channels (K, H, W) and valid pixels (H, W) of rows of an image."""
+
+
+def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
+    """Check that a disparity range is not empty or too large."""
+    first, last = (int(d) for d in disparity_range)
+    if not 0 <= last - first < MAX_DISPARITIES:
+        raise ValueError(
+            f"a disparity range must obey first <= last < first + {MAX_DISPARITIES}; got {disparity_range}"
+        )
+    return first, last
+
+
+def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[Strip]:
+    """Divide the rows of an image into the fewest strips that fit the memory, margins included.
+
+    A strip (first, last, from, to) computes rows [first, last) from rows [from, to).
+    """
+    fitting = int(memory_bytes // max(bytes_per_row, 1))
+    if height <= fitting:
+        return [(0, height, 0, height)]
+    own = max(fitting - 2 * STRIP_MARGIN, MIN_STRIP_ROWS)
+    count = -(-height // own)
+    edges = [height * k // count for k in range(count + 1)]
+    return [
+        (first, last, max(first - STRIP_MARGIN, 0), min(last + STRIP_MARGIN, height))
+        for first, last in pairwise(edges)
+    ]
+
+
+def run_strips(work: Callable[[Strip], None], strips: Sequence[Strip], threads: int) -> None:
+    """Call ``work`` for every strip."""
+    with ThreadPoolExecutor(max(min(threads, len(strips)), 1)) as pool:
+        list(pool.map(work, strips))
+
+
+@dataclass(frozen=True)
+class StereoImage:
+    """One image of a rectified pair.
+
+    ``channels`` (K, H, W) are in quarters of a grey level, 0 where there is no pixel, ``grey`` (H, W) is
+    their sum, and ``valid`` (H, W) is 255 where there is a pixel, else 0.
+    """
+
+    channels: I16
+    grey: I16
+    valid: U8
+
+
+def prepare_stereo_images(left: ArrayLike, right: ArrayLike) -> tuple[StereoImage, StereoImage]:
+    """Convert grey levels 0 .. 255, (H, W) or (H, W, K <= 4), NaN = no pixel, to integer channels."""
+    if np.shape(left) != np.shape(right):
+        raise ValueError(
+            f"rectified images must have the same shape; got {np.shape(left)} and {np.shape(right)}"
+        )
+    return _side(np.asarray(left)), _side(np.asarray(right))
+
+
+def _side(image: NDArray[np.generic]) -> StereoImage:
+    if image.ndim not in (2, 3) or 0 in image.shape or (image.ndim == 3 and image.shape[2] > 4):
+        raise ValueError(f"an image must be (H, W) or (H, W, K) with K <= 4; got {image.shape}")
+    height, width, n = (*image.shape, 1)[:3]
+    channels, grey = np.empty((n, height, width), np.int16), np.empty((height, width), np.int16)
+    valid = np.full((height, width), 255, np.uint8)
+    if image.dtype == np.uint8:
+        split_bytes(np.ascontiguousarray(image.reshape(height, width, n), dtype=np.uint8), channels, grey)
+    else:
+        levels = np.ascontiguousarray(image.reshape(height, width, n), dtype=np.float32)
+        split_channels(levels, channels, grey, valid)
+    return StereoImage(channels, grey, valid)
+
+
+def estimate_noise(image: StereoImage) -> float:
+    """Standard deviation in grey levels of the noise of one channel, 0 with fewer than 3 x 3 pixels.
+
+    The median absolute response to the difference of two Laplacians, which is insensitive to linear and
+    quadratic shading (Immerkaer 1996, with the median instead of the mean because texture is not noise).
+    """
+    if min(image.valid.shape) < 3:
+        return 0.0
+    step = max(image.valid.shape[0] // ROWS_FOR_NOISE, 1)
+    top = np.arange(0, image.valid.shape[0] - 2, step)
+    rows = [image.channels[:, top + k].copy() for k in range(3)]
+    mixed = rows[0] - 2 * rows[1] + rows[2]
+    response = mixed[..., :-2] - 2 * mixed[..., 1:-1] + mixed[..., 2:]
+    whole = np.minimum(np.minimum(image.valid[top], image.valid[top + 1]), image.valid[top + 2]) > 0
+    inimage = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
+    if not inimage.any():
+        return 0.0
+    # Median of integers by counting. The squared filter coefficients sum to 36.
+    below = np.cumsum(np.bincount(np.abs(response[:, inimage]).ravel()))
+    median = int(np.searchsorted(below, 0.5 * below[-1]))
+    return 1.4826 * median / 6.0 / LEVELS
 
 
 @njit(cache=True, nogil=True)
@@ -34,18 +145,9 @@ def _count_ones(word: np.int32) -> np.uint32:
 
 @njit(cache=True, nogil=True)
 def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
-    """Convert floating-point grey levels to integer channels.
+    """Convert grey levels (H, W, K), NaN = no pixel, to integer channels (K, H, W) and their sum (H, W).
 
-    Parameters
-    ----------
-    image : ndarray (H, W, K) float32
-        Grey levels, NaN = no pixel.
-    channels : ndarray (K, H, W) int16
-        Receives quarters of a grey level.
-    grey : ndarray (H, W) int16
-        Receives the sum of the channels.
-    valid : ndarray (H, W) uint8
-        Receives 255 where there is a pixel, else 0.
+    ``valid`` (H, W) receives 255 where there is a pixel, else 0.
     """
     height, width, n = image.shape
     top = np.float32(255.0 * LEVELS)
@@ -66,16 +168,7 @@ def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
 
 @njit(cache=True, nogil=True)
 def split_bytes(image: U8, channels: I16, grey: I16) -> None:
-    """Convert an 8-bit image to integer channels.
-
-    Parameters
-    ----------
-    image : ndarray (H, W, K) uint8
-    channels : ndarray (K, H, W) int16
-        Receives quarters of a grey level.
-    grey : ndarray (H, W) int16
-        Receives the sum of the channels.
-    """
+    """Convert an 8-bit image (H, W, K) to integer channels (K, H, W) and their sum (H, W)."""
     height, width, n = image.shape
     for y in range(height):
         total = grey[y]
@@ -96,15 +189,7 @@ def _compare(centre: I16, other: I16, bits: I32) -> None:
 
 @njit(cache=True, nogil=True)
 def census(grey: I16, bits: I32) -> None:
-    """Compute the census transform (Zabih and Woodfill 1994) of a 5 x 5 window.
-
-    Parameters
-    ----------
-    grey : ndarray (H, W) int16
-        Intensities; border pixels are repeated outside the image.
-    bits : ndarray (H, W) int32
-        Receives one bit per window pixel, 1 if it is darker than the centre.
-    """
+    """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre."""
     height, width = grey.shape
     padded = np.empty((2 * REACH + 1, width + 2 * REACH), np.int16)
     bits[:] = 0
@@ -122,42 +207,7 @@ def census(grey: I16, bits: I32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def sampled_bounds(channels: I16, low: I16, high: I16) -> None:
-    """Compute the range of the linearly interpolated image within half a pixel (Birchfield and Tomasi 1998).
-
-    Parameters
-    ----------
-    channels : ndarray (K, H, W) int16
-    low, high : ndarray (K, H, W) int16
-        Receive the minimum and maximum to the left and right.
-    """
-    n, height, width = channels.shape
-    for k in range(n):
-        for y in range(height):
-            row, below, above = channels[k, y], low[k, y], high[k, y]
-            for x in range(width):
-                here = row[x]
-                before = np.int16(np.int16(here + row[max(x - 1, 0)]) >> 1)
-                after = np.int16(np.int16(here + row[min(x + 1, width - 1)]) >> 1)
-                below[x] = min(here, min(before, after))
-                above[x] = max(here, max(before, after))
-
-
-@njit(cache=True, nogil=True)
-def _add_difference(a: I16, a_low: I16, a_high: I16, b: I16, b_low: I16, b_high: I16, total: I16) -> None:
-    """Add the sampling-insensitive difference: 0 where one value lies within the other's bounds."""
-    for x in range(len(total)):
-        one, other = np.int16(a[x] - b_high[x]), np.int16(b_low[x] - a[x])
-        one = other if other > one else one
-        two, other = np.int16(b[x] - a_high[x]), np.int16(a_low[x] - b[x])
-        two = other if other > two else two
-        one = two if two < one else one
-        one = np.int16(0) if one < 0 else one
-        total[x] = np.int16(total[x] + one)
-
-
-@njit(cache=True, nogil=True)
-def _add_plain_difference(a: I16, b: I16, total: I16) -> None:
+def _add_difference(a: I16, b: I16, total: I16) -> None:
     for x in range(len(total)):
         apart = np.int16(a[x] - b[x])
         apart = np.int16(-apart) if apart < 0 else apart
@@ -191,8 +241,8 @@ def _both(a: U8, b: U8, out: U8) -> None:
 @njit(cache=True, nogil=True)
 def _row_costs(
     y: int,
-    left: tuple[I32, I16, I16, I16, U8],
-    right: tuple[I32, I16, I16, I16, U8],
+    left: CostFeatures,
+    right: CostFeatures,
     first: int,
     weights: I16,
     outside: np.uint8,
@@ -200,12 +250,11 @@ def _row_costs(
 ) -> None:
     """Costs (D, W) of row y of the left image at the disparities first, first + 1, ...
 
-    Each side is (census (H, W), channels, low, high (K, H, W), valid (H, W)). ``weights``: of one bit, of a
-    quarter level, the truncation of the levels (sum over channels), whether the difference is
-    sampling-insensitive. ``outside`` is the cost of a pair with a missing pixel.
+    ``weights``: of a census bit, of a quarter level, and the truncation of the levels (sum over channels).
+    ``outside`` is the cost of a pair with a missing pixel.
     """
-    bits_l, a, a_low, a_high, valid_l = left
-    bits_r, b, b_low, b_high, valid_r = right
+    bits_l, a, valid_l = left
+    bits_r, b, valid_r = right
     width = bits_l.shape[1]
     total, differing = np.empty(width, np.int16), np.empty(width, np.int16)
     known = np.empty(width, np.uint8)
@@ -219,18 +268,7 @@ def _row_costs(
         n = hi - lo
         total[:n] = 0
         for k in range(len(a) if weights[1] != 0 else 0):
-            if weights[3] == 0:
-                _add_plain_difference(a[k, y, lo:hi], b[k, y, lo - d : hi - d], total[:n])
-            else:
-                _add_difference(
-                    a[k, y, lo:hi],
-                    a_low[k, y, lo:hi],
-                    a_high[k, y, lo:hi],
-                    b[k, y, lo - d : hi - d],
-                    b_low[k, y, lo - d : hi - d],
-                    b_high[k, y, lo - d : hi - d],
-                    total[:n],
-                )
+            _add_difference(a[k, y, lo:hi], b[k, y, lo - d : hi - d], total[:n])
         _hamming(bits_l[y, lo:hi], bits_r[y, lo - d : hi - d], differing[:n])
         _both(valid_l[y, lo:hi], valid_r[y, lo - d : hi - d], known[:n])
         _join(differing[:n], total[:n], known[:n], weights, outside, out[q, lo:hi])
@@ -247,18 +285,10 @@ def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
 
 @njit(cache=True, nogil=True)
 def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> None:
-    """Compute the cross-shaped support arms of all pixels (Zhang, Lu and Lafruit 2009).
+    """Cross-shaped support arms of all pixels (Zhang, Lu and Lafruit 2009).
 
-    Parameters
-    ----------
-    channels : ndarray (K, H, W) int16
-        Channels of the left image.
-    valid : ndarray (H, W) uint8
-        255 where there is a pixel, else 0.
-    tolerance : int16
-        Largest difference to the centre in every channel.
-    masks : ndarray (4, ARM, H, W) uint8
-        Receives 255 where the pixel s + 1 to the left, right, top or bottom belongs to the arm, else 0.
+    ``tolerance`` is the largest difference to the centre in every channel. ``masks`` (4, ARM, H, W) receive
+    255 where the pixel s + 1 to the left, right, top or bottom belongs to the arm, else 0.
     """
     height, width = valid.shape
     masks[:] = 0
@@ -347,33 +377,18 @@ def _shares(counts: U16, y: int, masks: U16, share: F32) -> None:
 
 @njit(cache=True, nogil=True)
 def cost_volume(
-    left: tuple[I32, I16, I16, I16, U8],
-    right: tuple[I32, I16, I16, I16, U8],
+    left: CostFeatures,
+    right: CostFeatures,
     masks: U8,
     first: int,
     weights: I16,
     outside: np.uint8,
     volume: U8,
 ) -> None:
-    """Compute the matching costs averaged over the support regions.
+    """Matching costs (H, D, W) averaged over the support arms ``masks``, unless these are empty.
 
-    A ring buffer holds the horizontal sums of 2 ARM + 1 rows, so only the volume itself is large.
-
-    Parameters
-    ----------
-    left, right : tuple of ndarray
-        (census (H, W), channels, low, high (K, H, W), valid (H, W)) of the rows of the volume.
-    masks : ndarray (4, ARM, H, W) uint8
-        Support arms; without averaging if the second axis is empty.
-    first : int
-        First disparity.
-    weights : ndarray (4,) int16
-        Weight of a census bit and of a quarter level, truncation, and whether the difference is
-        sampling-insensitive.
-    outside : uint8
-        Cost of a pair with a missing pixel.
-    volume : ndarray (H, D, W) uint8
-        Receives the costs.
+    A ring buffer holds the horizontal sums of 2 ARM + 1 rows, so only the volume itself is large. Other
+    arguments: see :func:`_row_costs`.
     """
     height, n, width = volume.shape
     if masks.shape[1] == 0:
@@ -401,17 +416,7 @@ def cost_volume(
 
 @njit(cache=True, nogil=True)
 def add_squares(a: I16, b: I16, sign: int, out: I32) -> None:
-    """Add the squared differences of two rows.
-
-    Parameters
-    ----------
-    a, b : ndarray (W,) int16
-        Rows.
-    sign : int
-        1 to add, -1 to subtract.
-    out : ndarray (W,) int32
-        Sums, changed in place.
-    """
+    """Add (``sign`` 1) or subtract (-1) the squared differences of two rows (W,)."""
     for x in range(len(out)):
         apart = np.int32(b[x]) - np.int32(a[x])
         out[x] = np.int32(out[x] + np.int32(sign) * apart * apart)

@@ -35,20 +35,10 @@ def _adapt_P2(a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
-    """Compute the penalty P2 between neighbouring pixels.
+    """Penalties P2 (4, H, W) from the left, upper, upper left and upper right neighbour of each pixel.
 
-    It decreases with the intensity step, ``largest`` / (1 + step / ``scale``), at least ``least``
+    They decrease with the intensity step, ``largest`` / (1 + step / ``scale``), at least ``least``
     (Hirschmüller 2008, section 2.2).
-
-    Parameters
-    ----------
-    grey : ndarray (H, W) int16
-    largest, least : float
-        Limits of the penalty.
-    scale : float
-        Intensity step that halves the penalty.
-    out : ndarray (4, H, W) uint8
-        Receives the penalties from the left, upper, upper left and upper right neighbour.
     """
     height, width = grey.shape
     out[:] = np.uint8(largest)
@@ -266,36 +256,16 @@ def _transpose_back(source: U8, out: U8) -> None:
 
 
 def scratch_size(height: int, disparities: int, width: int) -> int:
-    """Return the size of a block of transposed costs.
-
-    Parameters
-    ----------
-    height, disparities, width : int
-        Shape of the cost volume.
-
-    Returns
-    -------
-    int
-        Bytes.
-    """
+    """Bytes of a block of transposed costs."""
     return (width + 7) // 8 * 8 * disparities * ((min(height, BLOCK) + 7) // 8 * 8)
 
 
 @njit(cache=True, nogil=True)
 def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
-    """Sum the minimal costs of all paths that end in a pixel, two opposite paths at a time.
+    """Sum the minimal costs of all paths that end in a pixel of costs (H, D, W), two at a time.
 
-    Parameters
-    ----------
-    costs : ndarray (H, D, W) uint8
-    P2 : ndarray (4, H, W) uint8
-        Penalties of :func:`adaptive_P2`.
-    P1 : uint8
-        Penalty of a disparity change of 1.
-    total : ndarray (P, H, D, W) uint8
-        Receives the sums: P = 2 for rows and columns, P = 4 with the diagonals.
-    scratch : ndarray (2, scratch_size) uint8
-        Work space.
+    ``P2`` (4, H, W) from :func:`adaptive_P2`; ``total`` (P, H, D, W) receives the sums: P = 2 for rows and
+    columns, P = 4 with the diagonals. ``scratch`` (2, scratch_size) is work space.
     """
     height, n, width = costs.shape
     # Horizontal paths are sequential in x: transposed rows are vectorised over y.

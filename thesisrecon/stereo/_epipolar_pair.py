@@ -1,9 +1,9 @@
 """Epipolar pencils of image pairs, the common input of all rectification methods.
 
 An epipolar plane has an angle phi; p = (cos phi, sin phi) is imaged as the line L p with a 3 x 2 matrix L per
-view whose columns are two lines through the epipole. A pixel lies in a half-plane bounded by the baseline, so
-phi covers the full circle: half epipolar lines (Pollefeys, Koch and Van Gool, ICCV 1999), also for epipoles
-at infinity. Normalised coordinates are z = (x - centre) / unit with a unit of about one focal length.
+view. A pixel lies in a half-plane bounded by the baseline, so phi covers the full circle: half epipolar lines
+(Pollefeys, Koch and Van Gool, ICCV 1999), also for epipoles at infinity. Normalised coordinates are
+z = (x - centre) / unit with a unit of about one focal length.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
 from thesisrecon.geometry.homogeneous import require_finite
 from thesisrecon.geometry.homographies import infinite_homography
-from thesisrecon.geometry.triangulation import triangulate_linear
+from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
     fundamental_from_cameras,
@@ -25,6 +25,8 @@ from thesisrecon.geometry.two_view import (
     require_parallax_of_matches,
 )
 
+Size = tuple[int, int]
+"""Width and height in pixels."""
 FOCAL_PER_SIDE = 1.2
 """Unit of normalised coordinates relative to the longer image side: the focal length of a usual lens."""
 _J = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -37,169 +39,66 @@ SAMPLES = 16
 
 @dataclass(frozen=True)
 class EpipolarPencil:
-    """Epipolar lines of two views, parametrised by the angle of the epipolar plane.
+    """Epipolar lines of two views, parametrised by the angle phi of the epipolar plane.
 
-    Attributes
-    ----------
-    lines : ndarray (2, 3, 2)
-        L of each view in normalised coordinates, oriented so that matches have equal phi.
-    centres : ndarray (2, 2)
-        Image centres in pixels.
-    units : ndarray (2,)
-        Units of the normalised coordinates in pixels.
-    sizes : tuple of (width, height)
-        Image sizes in pixels.
-    flipped : bool
-        Rows run against phi and columns against the half-lines, so that larger disparities are nearer.
+    ``lines`` (2, 3, 2) are L of each view in normalised coordinates, oriented so that matches have equal phi;
+    ``centres`` (2, 2) and ``units`` (2,) are in pixels. If ``flipped``, rows run against phi and columns
+    against the half-lines, so that larger disparities are nearer.
     """
 
     lines: F64
     centres: F64
     units: F64
-    sizes: tuple[tuple[int, int], tuple[int, int]]
+    sizes: tuple[Size, Size]
     flipped: bool = False
 
     def normalized(self, side: int, xy: F64) -> F64:
-        """Convert pixels to normalised coordinates.
-
-        Parameters
-        ----------
-        side : {0, 1}
-        xy : ndarray (..., 2)
-
-        Returns
-        -------
-        ndarray (..., 2)
-            Normalised coordinates z.
-        """
+        """Convert pixels (..., 2) to normalised coordinates."""
         return np.asarray((xy - self.centres[side]) / self.units[side])
 
     def pixels(self, side: int, z: F64) -> F64:
-        """Convert normalised coordinates to pixels.
-
-        Parameters
-        ----------
-        side : {0, 1}
-        z : ndarray (..., 2)
-            Normalised coordinates.
-
-        Returns
-        -------
-        ndarray (..., 2)
-        """
+        """Convert normalised coordinates (..., 2) to pixels."""
         return np.asarray(z * self.units[side] + self.centres[side])
 
     def epipole(self, side: int) -> F64:
-        """Return the epipole of a view.
-
-        Parameters
-        ----------
-        side : {0, 1}
-
-        Returns
-        -------
-        ndarray (3,)
-            Homogeneous normalised coordinates; the third is 0 at infinity.
-        """
+        """Homogeneous normalised coordinates (3,) of the epipole; the third is 0 at infinity."""
         return np.asarray(np.cross(self.lines[side, :, 0], self.lines[side, :, 1]))
 
     def planes(self, side: int, xy: F64) -> F64:
-        """Return the half-planes of pixels.
-
-        Parameters
-        ----------
-        side : {0, 1}
-        xy : ndarray (..., 2)
-
-        Returns
-        -------
-        ndarray (..., 2)
-            Vectors p of any positive length.
-        """
-        z = self.normalized(side, xy)
+        """Half-planes of pixels (..., 2): vectors p of any positive length."""
         L = self.lines[side]
-        q = z @ L[:2] + L[2]
+        q = self.normalized(side, xy) @ L[:2] + L[2]
         return np.stack([q[..., 1], -q[..., 0]], axis=-1)
 
     def angles(self, side: int, xy: F64, *, about: float = 0.0) -> F64:
-        """Return the angles of the half-planes of pixels.
-
-        Parameters
-        ----------
-        side : {0, 1}
-        xy : ndarray (..., 2)
-        about : float
-            Centre of the interval of length 2 pi in which angles are returned.
-
-        Returns
-        -------
-        ndarray (...)
-            Angles phi.
-        """
+        """Angles phi (...) of the half-planes of pixels (..., 2) within pi of ``about``."""
         p = self.planes(side, xy)
         c, s = np.cos(about), np.sin(about)
         return np.asarray(about + np.arctan2(c * p[..., 1] - s * p[..., 0], c * p[..., 0] + s * p[..., 1]))
 
     def half_lines(self, side: int, phi: F64) -> HalfLines:
-        """Return the half epipolar lines of a view.
-
-        Parameters
-        ----------
-        side : {0, 1}
-        phi : ndarray (N,)
-
-        Returns
-        -------
-        HalfLines
-            The half-lines in normalised coordinates.
-        """
+        """Half epipolar lines of angles (N,)."""
         l = plane_from_angle(phi) @ self.lines[side].T
         norm = np.linalg.norm(l[:, :2], axis=1)
         n, offset = l[:, :2] / norm[:, None], l[:, 2] / norm
-        d = np.stack([-n[:, 1], n[:, 0]], axis=1)
         e = self.epipole(side)
-        away = np.hypot(e[0], e[1])
-        e = e / max(away, abs(e[2]))
-        return HalfLines(-offset[:, None] * n, d, offset, e)
+        e = e / max(np.hypot(e[0], e[1]), abs(e[2]))
+        return HalfLines(-offset[:, None] * n, np.stack([-n[:, 1], n[:, 0]], axis=1), offset, e)
 
     def sweep_rate(self, side: int, phi: F64, z: F64) -> F64:
-        """Return the motion of epipolar lines across their points per radian.
-
-        Parameters
-        ----------
-        side : {0, 1}
-        phi : ndarray (N,)
-        z : ndarray (N, 2)
-            A point of each line.
-
-        Returns
-        -------
-        ndarray (N,)
-            Normalised distance per radian.
-        """
+        """Motion (N,) of epipolar lines across their points z (N, 2) per radian, normalised."""
         p = plane_from_angle(phi)
         l, moving = p @ self.lines[side].T, p @ (self.lines[side] @ _J).T
-        return np.asarray(
-            np.abs(np.sum(moving[:, :2] * z, axis=1) + moving[:, 2]) / np.linalg.norm(l[:, :2], axis=1)
-        )
+        motion = np.abs(np.sum(moving[:, :2] * z, axis=1) + moving[:, 2])
+        return np.asarray(motion / np.linalg.norm(l[:, :2], axis=1))
 
 
 @dataclass(frozen=True)
 class HalfLines:
-    """Half epipolar lines of a view.
+    """Half epipolar lines of a view in normalised coordinates.
 
-    Along the direction d(z - e) grows, or falls if the epipole's third coordinate is negative.
-
-    Attributes
-    ----------
-    foot : ndarray (N, 2)
-        Points nearest to the image centre.
-    direction : ndarray (N, 2)
-        Unit directions.
-    distance : ndarray (N,)
-        Signed distance of the image centre.
-    epipole : ndarray (3,)
-        Epipole with a largest entry of about 1.
+    ``foot`` (N, 2) is nearest to the image centre, ``distance`` (N,) from it. Along the unit ``direction``
+    (N, 2) d(z - e) grows, or falls if the third coordinate of the ``epipole`` (3,) is negative.
     """
 
     foot: F64
@@ -236,34 +135,11 @@ class HalfLines:
         return np.asarray(self.direction @ (e[:2] / e[2]))
 
     def on_half(self, t: F64) -> F64:
-        """Test whether positions lie on the half-lines.
-
-        Parameters
-        ----------
-        t : ndarray (N, ...)
-            Positions along the directions.
-
-        Returns
-        -------
-        ndarray (N, ...) bool
-            False beyond the epipole.
-        """
-        first = self.start.reshape(-1, *([1] * (t.ndim - 1)))
-        return np.asarray(t < first if self.epipole[2] < 0.0 else t > first)
+        """Whether positions (N,) along the directions lie on the half-lines, not beyond the epipole."""
+        return np.asarray(t < self.start if self.epipole[2] < 0.0 else t > self.start)
 
     def chord(self, low: F64, high: F64) -> tuple[F64, F64]:
-        """Intersect the half-lines with a box.
-
-        Parameters
-        ----------
-        low, high : ndarray (2,)
-            Corners of the box.
-
-        Returns
-        -------
-        tuple of ndarray (N,)
-            Positions of entry and exit; entry >= exit if the box is missed.
-        """
+        """Positions (N,) of entry into and exit from a box with corners (2,); entry >= exit if missed."""
         with np.errstate(divide="ignore", invalid="ignore"):
             one, two = (low - self.foot) / self.direction, (high - self.foot) / self.direction
         inside = (self.foot >= low) & (self.foot <= high)
@@ -276,23 +152,104 @@ class HalfLines:
 
 
 def plane_from_angle(phi: F64) -> F64:
-    """Return the plane vectors of angles.
-
-    Parameters
-    ----------
-    phi : ndarray (N,)
-
-    Returns
-    -------
-    ndarray (N, 2)
-        (cos phi, sin phi).
-    """
+    """(cos phi, sin phi) of angles."""
     return np.stack([np.cos(phi), np.sin(phi)], axis=-1)
 
 
-def _pencil_of_fundamental(
-    F: F64, sizes: tuple[tuple[int, int], tuple[int, int]]
-) -> tuple[EpipolarPencil, float]:
+@dataclass(frozen=True)
+class EpipolarPair:
+    """An image pair prepared for rectification.
+
+    ``matches`` are two arrays (N, 2) of pixels, possibly empty; ``arc`` is the interval of phi that both
+    images see; ``regions`` are pixels (M, 2) of each image inside the arc, beginning with the corners of that
+    polygon; ``cameras`` (2, 3, 4) are metric, if known.
+    """
+
+    pencil: EpipolarPencil
+    matches: tuple[F64, F64]
+    arc: tuple[float, float]
+    regions: tuple[F64, F64]
+    cameras: F64 | None = None
+
+    @property
+    def sizes(self) -> tuple[Size, Size]:
+        """(width, height) of the images."""
+        return self.pencil.sizes
+
+
+def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
+    """Prepare a pair with known F and matches, see :func:`thesisrecon.stereo.rectification.rectify_pair`.
+
+    The direction of disparities follows from cameras with a usual focal length (quasi-Euclidean frame) with
+    the points in front.
+    """
+    matches = _checked_call(xy1, xy2, size1, size2)
+    F = np.asarray(F, dtype=np.float64)
+    if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
+        raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
+    if len(xy1) < MIN_MATCHES:
+        raise StageFailure(
+            "the pair has too few matches for rectification",
+            f"{counted(len(xy1), 'match')}, at least {MIN_MATCHES} are needed",
+            "match the images again, or rectify from cameras",
+        )
+    pencil, ratio = _pencil_of_fundamental(F, (size1, size2))
+    if not ratio > 1e-9:
+        raise StageFailure(
+            "the fundamental matrix has rank 1",
+            f"the ratio of its singular values is {ratio:.1g}",
+            "estimate it from more matches",
+        )
+    require_parallax_of_matches(F, *matches, advice=", or rectify from cameras if the scene is a plane")
+    return _complete(pencil, matches, None)
+
+
+def pair_of_cameras(
+    P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
+) -> EpipolarPair:
+    """Prepare a pair of metric cameras, see :func:`thesisrecon.stereo.rectification.rectify_cameras`."""
+    none = np.empty((0, 2))
+    matches = _checked_call(none if xy1 is None else xy1, none if xy2 is None else xy2, size1, size2)
+    P = np.stack([np.asarray(P1, dtype=np.float64), np.asarray(P2, dtype=np.float64)])
+    if P.shape != (2, 3, 4):
+        raise ValueError(f"rectification needs two cameras (3, 4); got {P.shape[1:]}")
+    require_finite("rectification", P)
+    det = np.linalg.det(P[:, :, :3])
+    if not (np.abs(det) > 1e-14 * np.linalg.norm(P[:, :, :3], axis=(1, 2)) ** 3).all():
+        raise ValueError("rectification needs finite cameras; the left part of one is singular")
+    P = P * np.sign(det)[:, None, None]
+    centres = _centres(P)
+    apart = float(np.linalg.norm(centres[1] - centres[0]))
+    if not apart > 1e-12 * (1.0 + float(np.abs(centres).max())):
+        raise StageFailure(
+            "both cameras have one centre",
+            f"the distance of the centres is {apart:.1g}",
+            "take images from different positions, or choose other views",
+        )
+    F = fundamental_from_cameras(P[0], P[1])
+    if len(matches[0]) >= MIN_MATCHES:
+        require_parallax_of_matches(F, *matches, at_infinity=infinite_homography(P[0], P[1]))
+    return _complete(_pencil_of_fundamental(F, (size1, size2))[0], matches, P)
+
+
+def _centres(P: F64) -> F64:
+    """Centres (2, 3) of two cameras."""
+    centres = np.stack([camera_centre(camera) for camera in P])
+    return np.asarray(centres[:, :3] / centres[:, 3:])
+
+
+def _checked_call(xy1: F64, xy2: F64, size1: Size, size2: Size) -> tuple[F64, F64]:
+    for size in (size1, size2):
+        if min(size) < 2:
+            raise ValueError(f"an image must have at least 2 x 2 px; got {size}")
+    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
+        raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
+    require_finite("rectification, for its matches,", xy1, xy2)
+    return xy1, xy2
+
+
+def _pencil_of_fundamental(F: F64, sizes: tuple[Size, Size]) -> tuple[EpipolarPencil, float]:
     """Unoriented pencil of F (3, 3), and the ratio of the singular values of the normalised F."""
     units = FOCAL_PER_SIDE * np.array([max(size) for size in sizes], dtype=np.float64)
     centres = (np.array(sizes, dtype=np.float64) - 1.0) / 2.0
@@ -307,208 +264,35 @@ def _pencil_of_fundamental(
     return EpipolarPencil(lines, centres, units, sizes), ratio
 
 
-def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> tuple[EpipolarPencil, float]:
-    """Pencil with the sign of the second view that most matches support, and their share."""
+def _complete(pencil: EpipolarPencil, matches: tuple[F64, F64], P: F64 | None) -> EpipolarPair:
+    """Determine orientation, direction of disparities, and common field of view."""
+    seen, P_z = (matches, None) if P is None else _virtual_matches(pencil, P)
+    pencil = _orient(pencil, *seen)
+    P_z = _quasi_euclidean(pencil, *matches) if P_z is None else P_z
+    pencil = replace(pencil, flipped=not _depth_increases_along_half_lines(pencil, P_z, *seen))
+    arc = _common_arc(pencil, matches[0])
+    return EpipolarPair(pencil, matches, arc, (_region(pencil, 0, arc), _region(pencil, 1, arc)), P)
+
+
+def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:
+    """Pencil with the sign of the second view that most matches support."""
     p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
     with np.errstate(invalid="ignore"):
-        same = np.sum(p1 * p2, axis=1) > 0.0
-    share = float(np.mean(same))
-    if share >= 0.5:
-        return pencil, share
-    lines = pencil.lines.copy()
-    lines[1] *= -1.0
-    return replace(pencil, lines=lines), 1.0 - share
-
-
-Size = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class EpipolarPair:
-    """An image pair prepared for rectification.
-
-    Attributes
-    ----------
-    pencil : EpipolarPencil
-        Oriented, and flipped so that larger disparities are nearer.
-    xy1, xy2 : ndarray (N, 2)
-        Matches in pixels, possibly none.
-    arc : tuple of float
-        Interval of phi that both images see.
-    regions : tuple of ndarray (M, 2)
-        Pixels of the part of each image inside the arc, beginning with the corners of that polygon.
-    cameras : ndarray (2, 3, 4), optional
-        Metric cameras.
-    """
-
-    pencil: EpipolarPencil
-    xy1: F64
-    xy2: F64
-    arc: tuple[float, float]
-    regions: tuple[F64, F64]
-    cameras: F64 | None = None
-
-    @property
-    def sizes(self) -> tuple[Size, Size]:
-        """(width, height) of the images."""
-        return self.pencil.sizes
-
-    @property
-    def matches(self) -> tuple[F64, F64]:
-        """Matches of both sides."""
-        return self.xy1, self.xy2
-
-
-def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
-    """Prepare a pair with known fundamental matrix.
-
-    The direction of disparities follows from cameras with a usual focal length (quasi-Euclidean frame) with
-    the points in front.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix, x2' F x1 = 0.
-    xy1, xy2 : ndarray (N >= 8, 2)
-        Inlier matches in pixels.
-    size1, size2 : tuple of int
-        (width, height) of the images.
-
-    Returns
-    -------
-    EpipolarPair
-
-    Raises
-    ------
-    ValueError
-        If an array has the wrong shape or non-finite values, or an image is smaller than 2 x 2 px.
-    StageFailure
-        If there are fewer than 8 matches, F has rank 1, a homography explains the matches, or matches lie on
-        opposite half-lines.
-    """
-    sizes = _checked_sizes(size1, size2)
-    xy1, xy2 = _checked_matches(xy1, xy2)
-    F = np.asarray(F, dtype=np.float64)
-    if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
-        raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
-    if len(xy1) < MIN_MATCHES:
-        raise StageFailure(
-            "the pair has too few matches for rectification",
-            f"{counted(len(xy1), 'match')}, at least {MIN_MATCHES} are needed",
-            "match the images again, or rectify from cameras",
-        )
-    pencil, ratio = _pencil_of_fundamental(F, sizes)
-    if not ratio > 1e-9:
-        raise StageFailure(
-            "the fundamental matrix has rank 1",
-            f"the ratio of its singular values is {ratio:.1g}",
-            "estimate it from more matches",
-        )
-    require_parallax_of_matches(F, xy1, xy2, advice=", or rectify from cameras if the scene is a plane")
-    return _complete(pencil, xy1, xy2, None)
-
-
-def pair_of_cameras(
-    P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
-) -> EpipolarPair:
-    """Prepare a pair with known metric cameras.
-
-    Parameters
-    ----------
-    P1, P2 : ndarray (3, 4)
-        Cameras P = K [R t] with P[2] X > 0 for points in front.
-    size1, size2 : tuple of int
-        (width, height) of the images.
-    xy1, xy2 : ndarray (N, 2), optional
-        Matches in pixels; they determine the disparity range.
-
-    Returns
-    -------
-    EpipolarPair
-
-    Raises
-    ------
-    ValueError
-        If an array has the wrong shape or non-finite values, or a camera is not finite.
-    StageFailure
-        If the camera centres coincide, the matches have no parallax, or no point is in front of both cameras.
-    """
-    sizes = _checked_sizes(size1, size2)
-    none = np.empty((0, 2))
-    xy1, xy2 = _checked_matches(none if xy1 is None else xy1, none if xy2 is None else xy2)
-    P = np.stack([np.asarray(P1, dtype=np.float64), np.asarray(P2, dtype=np.float64)])
-    if P.shape != (2, 3, 4):
-        raise ValueError(f"rectification needs two cameras (3, 4); got {P.shape[1:]}")
-    require_finite("rectification", P)
-    det = np.linalg.det(P[:, :, :3])
-    if not (np.abs(det) > 1e-14 * np.linalg.norm(P[:, :, :3], axis=(1, 2)) ** 3).all():
-        raise ValueError("rectification needs finite cameras; the left part of one is singular")
-    P = P * np.sign(det)[:, None, None]
-    F = _fundamental(P)
-    if len(xy1) >= MIN_MATCHES:
-        require_parallax_of_matches(F, xy1, xy2, at_infinity=infinite_homography(P[0], P[1]))
-    return _complete(_pencil_of_fundamental(F, sizes)[0], xy1, xy2, P)
-
-
-def _fundamental(P: F64) -> F64:
-    centres = np.stack([camera_centre(camera) for camera in P])
-    normalized = centres[:, :3] / centres[:, 3:]
-    apart = float(np.linalg.norm(normalized[1] - normalized[0]))
-    if not apart > 1e-12 * (1.0 + float(np.abs(normalized).max())):
-        raise StageFailure(
-            "both cameras have one centre",
-            f"the distance of the centres is {apart:.1g}",
-            "take images from different positions, or choose other views",
-        )
-    return fundamental_from_cameras(P[0], P[1])
-
-
-def _checked_sizes(size1: Size, size2: Size) -> tuple[Size, Size]:
-    sizes = []
-    for size in (size1, size2):
-        if len(size) != 2 or not all(float(side).is_integer() and side >= 2 for side in size):
-            raise ValueError(f"an image must have at least 2 x 2 px; got {tuple(size)}")
-        sizes.append((int(size[0]), int(size[1])))
-    return sizes[0], sizes[1]
-
-
-def _checked_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
-        raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
-    require_finite("rectification, for its matches,", xy1, xy2)
-    return xy1, xy2
-
-
-def _complete(pencil: EpipolarPencil, xy1: F64, xy2: F64, P: F64 | None) -> EpipolarPair:
-    """Determine orientation, direction of disparities, and common field of view."""
-    seen1, seen2, P_z = (xy1, xy2, None) if P is None else _virtual_matches(pencil, P)
-    pencil, share = _orient(pencil, seen1, seen2)
-    if share < MIN_SAME_HALF:
+        share = float(np.mean(np.sum(p1 * p2, axis=1) > 0.0))
+    if max(share, 1.0 - share) < MIN_SAME_HALF:
         raise StageFailure(
             "matches lie on opposite halves of their epipolar lines",
-            f"only {100.0 * share:.0f} % of {len(seen1)} lie on corresponding halves",
+            f"only {100.0 * max(share, 1.0 - share):.0f} % of {len(xy1)} lie on corresponding halves",
             "the fundamental matrix or the matches are wrong; estimate them again",
         )
-    P_z = _quasi_euclidean(pencil, xy1, xy2) if P_z is None else P_z
-    pencil = replace(pencil, flipped=not _depth_increases_along_half_lines(pencil, P_z, seen1, seen2))
-    arc = _common_arc(pencil, xy1)
-    regions = (_region(pencil, 0, arc), _region(pencil, 1, arc))
-    return EpipolarPair(pencil, xy1, xy2, arc, regions, P)
+    return pencil if share >= 0.5 else replace(pencil, lines=pencil.lines * [[[1.0]], [[-1.0]]])
 
 
-def _normalizing_transform(pencil: EpipolarPencil, side: int) -> F64:
-    s, c = 1.0 / pencil.units[side], pencil.centres[side]
-    return np.array([[s, 0.0, -s * c[0]], [0.0, s, -s * c[1]], [0.0, 0.0, 1.0]])
-
-
-def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[F64, F64, F64]:
+def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[tuple[F64, F64], F64]:
     """Pixels of points at many depths in front of both cameras, and the cameras in normalised coordinates."""
-    (width, height), centres = pencil.sizes[0], np.stack([camera_centre(camera) for camera in P])
-    C = centres[:, :3] / centres[:, 3:]
-    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7)), -1).reshape(
-        -1, 2
-    )
+    (width, height), C = pencil.sizes[0], _centres(P)
+    x, y = np.meshgrid(np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7))
+    grid = np.stack([x, y], axis=-1).reshape(-1, 2)
     rays = np.linalg.solve(P[0, :, :3], np.column_stack([grid, np.ones(len(grid))]).T).T
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     steps = np.linalg.norm(C[1] - C[0]) * np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0, 256.0])
@@ -520,8 +304,10 @@ def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[F64, F64, F64]:
             "their fields of view do not intersect",
             "choose another pair",
         )
-    z = np.stack([_normalizing_transform(pencil, side) @ P[side] for side in (0, 1)])
-    return project(P[0], X), project(P[1], X), z
+    z = []
+    for s, c, camera in zip(1.0 / pencil.units, pencil.centres, P, strict=True):
+        z.append(np.array([[s, 0.0, -s * c[0]], [0.0, s, -s * c[1]], [0.0, 0.0, 1.0]]) @ camera)
+    return (project(P[0], X), project(P[1], X)), np.stack(z)
 
 
 def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
@@ -533,7 +319,7 @@ def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
     for plane in quasi_euclidean_planes(F):
         for scale in (1.0, -1.0):
             P = np.stack(canonical_cameras(F, plane=plane, scale=scale))
-            X = triangulate_linear(P, z)
+            X = triangulate(P, z, method="linear")
             with np.errstate(divide="ignore", invalid="ignore"):
                 front = int(np.sum((depth(P[0], X) > 0.0) & (depth(P[1], X) > 0.0)))
             if front > most:
@@ -544,7 +330,7 @@ def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
 def _depth_increases_along_half_lines(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
     """Whether points that recede along their rays of view 1 move along the half-lines of view 2."""
     z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
-    X = triangulate_linear(P, z)
+    X = triangulate(P, z, method="linear")
     centre = camera_centre(P[0])
     with np.errstate(divide="ignore", invalid="ignore"):
         point, C = X[:, :3] / X[:, 3:], centre[:3] / centre[3]
@@ -556,14 +342,10 @@ def _depth_increases_along_half_lines(pencil: EpipolarPencil, P: F64, xy1: F64, 
 
 def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
     """Interval of phi that both images see."""
-    arcs = [_arc(pencil, side) for side in (0, 1)]
-    if arcs[0] is None and arcs[1] is None:
-        return _full_circle(pencil, xy1)
-    if arcs[0] is None or arcs[1] is None:
-        one = arcs[0] if arcs[0] is not None else arcs[1]
-        assert one is not None
-        return one
-    (a, b), (c, d) = arcs[0], arcs[1]
+    arcs = [arc for arc in (_arc(pencil, side) for side in (0, 1)) if arc is not None]
+    if len(arcs) < 2:
+        return arcs[0] if arcs else _full_circle(pencil, xy1)
+    (a, b), (c, d) = arcs
     turn = 2.0 * np.pi * np.round((0.5 * (a + b) - 0.5 * (c + d)) / (2.0 * np.pi))
     low, high = max(a, c + turn), min(b, d + turn)
     if not high > low:
@@ -601,6 +383,12 @@ def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
     return start, start + 2.0 * np.pi
 
 
+def chords(pencil: EpipolarPencil, side: int, phi: F64) -> tuple[HalfLines, F64, F64]:
+    """Half-lines of angles (N,), and where they enter and leave the image; entry > exit if they miss it."""
+    lines, last = pencil.half_lines(side, phi), np.array(pencil.sizes[side]) - 1.0
+    return lines, *lines.chord(pencil.normalized(side, np.zeros(2)), pencil.normalized(side, last))
+
+
 def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     """Samples of the part of an image within the arc: the corners of that polygon, then a grid."""
     width, height = pencil.sizes[side]
@@ -609,12 +397,9 @@ def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     middle, half = 0.5 * (arc[0] + arc[1]), 0.5 * (arc[1] - arc[0])
     # The tolerance keeps the corners that bound the arc despite rounding.
     inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half + 1e-9
-    low, high = (
-        pencil.normalized(side, np.array(corner)) for corner in ((0.0, 0.0), (width - 1.0, height - 1.0))
-    )
-    rim = pencil.half_lines(side, np.array(arc))
-    enter, leave = rim.chord(low, high)
+    rim, enter, leave = chords(pencil, side, np.array(arc))
     met = leave >= enter
     ends = [pencil.pixels(side, rim.foot + t[:, None] * rim.direction)[met] for t in (enter, leave)]
-    corners = grid[[0, SAMPLES - 1, -SAMPLES, -1]][inside[[0, SAMPLES - 1, -SAMPLES, -1]]]
+    corner = [0, SAMPLES - 1, -SAMPLES, -1]
+    corners = grid[corner][inside[corner]]
     return np.concatenate([*ends, corners, grid[inside]])

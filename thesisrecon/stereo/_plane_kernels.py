@@ -26,20 +26,9 @@ SUMS = {"reassoc", "contract", "arcp", "nsz"}
 class PatchViews(NamedTuple):
     """A reference view, its K neighbours, and the transfer of pixels to them.
 
-    A pixel (x, y, 1) of inverse depth rho is at ``H[k]`` (x, y, 1) + rho ``e[k]`` in neighbour k.
-
-    Attributes
-    ----------
-    gray : ndarray (H, W) float32
-        Grey levels of the reference view, NaN = no pixel.
-    squares : ndarray (S,) uint32
-        Packed pixels of all neighbours, see :func:`pack_squares`.
-    layout : ndarray (K, 3) int64
-        Offset into ``squares``, width and height of each neighbour.
-    H : ndarray (K, 3, 3)
-        Homographies of the plane at infinity.
-    e : ndarray (K, 3)
-        Epipoles.
+    A pixel (x, y, 1) of inverse depth rho is at ``H[k]`` (x, y, 1) + rho ``e[k]`` in neighbour k. ``gray``
+    (H, W) is NaN where there is no pixel; ``squares`` (S,) are the packed pixels of all neighbours, see
+    :func:`pack_squares`; ``layout`` (K, 3) has the offset into them, width and height of each neighbour.
     """
 
     gray: F32
@@ -52,12 +41,8 @@ class PatchViews(NamedTuple):
 class PatchWindow(NamedTuple):
     """Sampling of the matching window.
 
-    Attributes
-    ----------
-    offsets : ndarray (2, S) float32
-        Integer pixel offsets, opposite corners of the window first and last, (0, 0) among them.
-    weights : ndarray (256,) float32
-        Weight of a sample by its absolute grey level difference to the centre.
+    ``offsets`` (2, S) are whole pixels, opposite corners of the window first and last, (0, 0) among them;
+    ``weights`` (256,) belong to absolute grey level differences to the centre.
     """
 
     offsets: F32
@@ -68,13 +53,7 @@ class PatchWindow(NamedTuple):
 def pack_squares(gray: F32, squares: U32) -> None:
     """Pack the grey levels of 2 x 2 pixels into one word, so that an interpolation needs one load.
 
-    Parameters
-    ----------
-    gray : ndarray (H, W) float32
-        Grey levels, NaN = no pixel.
-    squares : ndarray (H, W) uint32
-        Receives the pixel, its right, lower and lower right neighbour from the lowest byte on; 0 if one is
-        missing.
+    The lowest byte is the pixel itself, then its right, lower and lower right neighbour; 0 if one is missing.
     """
     height, width = gray.shape
     for v in range(height):
@@ -93,17 +72,9 @@ def pack_squares(gray: F32, squares: U32) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
-    """Fit the gradient of the inverse depth around every known pixel.
+    """Fit the gradient of the inverse depth (H, W) around every known pixel.
 
-    Parameters
-    ----------
-    rho : ndarray (H, W) float32
-    radius : int
-        Radius of the window.
-    alike : float
-        Largest relative difference to the centre of the pixels used.
-    gx, gy : ndarray (H, W) float32
-        Receive the gradient, 0 with too few pixels, NaN where unknown.
+    Pixels that differ from the centre by at most the share ``alike`` are used; 0 with too few of them.
     """
     height, width = rho.shape
     for v in range(height):
@@ -281,7 +252,7 @@ def _plane_cost(
     variance: float,
     warp: F64,
 ) -> float:
-    """Mean of the two smallest costs, the second at most ``HIDDEN`` above the first.
+    """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first.
 
     A neighbour in which the pixel is occluded has limited influence. ``warp`` (8,) is work space.
     """
@@ -342,25 +313,12 @@ def sweep_planes(
     planes: F32,
     cost: F32,
 ) -> None:
-    """Propagate and perturb the planes of all pixels in one pass (PatchMatch stereo).
+    """Propagate and perturb the planes (H, W, 3) of all pixels in one pass (PatchMatch stereo).
 
-    Each pixel tries the planes of the two neighbours visited before and perturbations of its own plane:
-    shifted, and tilted by as much at the border of the window.
-
-    Parameters
-    ----------
-    views : PatchViews
-    window : PatchWindow
-    step_px : float
-        Size of the perturbation in pixels of the neighbours.
-    converged_cost : float
-        Planes up to this cost are not changed.
-    backward : bool
-        Pass from the last pixel to the first.
-    planes : ndarray (H, W, 3) float32
-        Inverse depth and its gradient, updated.
-    cost : ndarray (H, W) float32
-        Cost of the planes, updated.
+    Each pixel tries the planes of the two neighbours visited before and perturbations of its own plane by
+    ``step_px`` in the neighbours: shifted, and tilted by as much at the border of the window. Planes of a
+    cost up to ``converged_cost`` are not changed. ``planes`` (inverse depth and its gradient) and ``cost``
+    are updated.
     """
     gray, H, e, offsets = views.gray, views.H, views.e, window.offsets
     height, width = gray.shape
@@ -415,22 +373,10 @@ def rate_planes(
     support: U8,
     slope: F32,
 ) -> None:
-    """Compute quality measures of all planes.
+    """Compute the smallest cost of planes (H, W, 3), their support and slope (H, W).
 
-    Parameters
-    ----------
-    views : PatchViews
-    window : PatchWindow
-    planes : ndarray (H, W, 3) float32
-        Inverse depth and its gradient.
-    max_cost : float
-        Largest cost of a supporting neighbour.
-    least : ndarray (H, W) float32
-        Receives the smallest cost.
-    support : ndarray (H, W) uint8
-        Receives the number of supporting neighbours.
-    slope : ndarray (H, W) float32
-        Receives the root of the sum of squared pixels per unit of inverse depth over these.
+    ``support`` is the number of neighbours with a cost up to ``max_cost``, ``slope`` the root of the sum of
+    squared pixels per unit of inverse depth over these.
     """
     gray, squares, layout, H, e = views
     offsets = window.offsets
@@ -458,23 +404,8 @@ def rate_planes(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
-def begin_planes(
-    views: PatchViews,
-    window: PatchWindow,
-    planes: F32,
-    cost: F32,
-) -> None:
-    """Compute the cost of the initial planes.
-
-    Parameters
-    ----------
-    views : PatchViews
-    window : PatchWindow
-    planes : ndarray (H, W, 3) float32
-        Inverse depth and its gradient, NaN = none.
-    cost : ndarray (H, W) float32
-        Receives the cost, ``UNKNOWN`` without a plane.
-    """
+def begin_planes(views: PatchViews, window: PatchWindow, planes: F32, cost: F32) -> None:
+    """Compute the cost (H, W) of planes (H, W, 3), ``UNKNOWN`` without one."""
     gray, offsets = views.gray, window.offsets
     height, width = gray.shape
     samples, warp, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)

@@ -1,16 +1,12 @@
-"""Postprocessing of disparities: sub-pixel fit, left-right check, speckle filter, smoothing, confidence."""
+"""Compiled selection of disparities, left-right check, speckle filter, smoothing, and confidence."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import B8, F32, I16, U8, U16
-from thesisrecon.records import DisparityMap
-from thesisrecon.stereo.cost import StereoImage
-from thesisrecon.stereo.cost_kernels import LEVELS, add_squares
+from thesisrecon.stereo._cost import LEVELS, StereoImage, add_squares
 
 UNREACHED = np.uint16(65535)
 MIN_FACTOR = np.float32(0.05)
@@ -82,24 +78,12 @@ def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tupl
 
 @njit(cache=True, nogil=True)
 def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32], half: float) -> None:
-    """Select the best disparity of every pixel from the path sums.
+    """Select the best disparity of every pixel from path sums (P, N, D, W), rows from ``start`` on.
 
     The sub-pixel position is the vertex of two lines of opposite slope through the best three totals; there
-    is none at the ends of the range.
-
-    Parameters
-    ----------
-    sums : ndarray (P, N, D, W) uint8
-        Path sums.
-    start : int
-        First row used.
-    first : int
-        First disparity.
-    out : tuple of ndarray (H, W) float32
-        Receives the sub-pixel disparities of the left image, the integer disparities of the right image (NaN
-        if out of range) and the confidence m / (m + ``half``), m the margin to the second best disparity.
-    half : float
-        Margin of confidence 1/2.
+    is none at the ends of the range. ``out`` (3 of (H, W)) receives the sub-pixel disparities of the left
+    image, the integer disparities of the right image (NaN if out of range) and the confidence m / (m +
+    ``half``), m the margin to the second best disparity.
     """
     pairs, _, n, width = sums.shape
     left, right, confidence = out
@@ -128,7 +112,7 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
 
 
 @njit(cache=True, nogil=True)
-def _check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
+def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
     """Set disparities to NaN that differ from their partner's by more than ``limits[0]``.
 
     Also those whose confidence is less than ``limits[1]``.
@@ -147,19 +131,10 @@ def _check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> No
 
 @njit(cache=True, nogil=True)
 def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> None:
-    """Compute the final confidence in place.
+    """Set the confidence to 0 where no disparity is known; halve it where one was filled in.
 
-    Parameters
-    ----------
-    confidence : ndarray (H, W) float32
-        Confidence, 0 where no disparity is known, halved where it was filled in, reduced where texture is
-        weak.
-    confirmed : ndarray (H, W) float32
-        Disparities before filling, NaN = unknown.
-    disparity : ndarray (H, W) float32
-        Final disparities.
-    texture : ndarray (H, W) float32
-        Texture measure of :func:`texture_of`.
+    It is reduced where ``texture`` of :func:`texture_of` is weak. ``confirmed`` are the disparities before
+    filling, NaN = unknown; all arrays (H, W).
     """
     height, width = confidence.shape
     for y in range(height):
@@ -194,7 +169,7 @@ def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
+def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
     """Set connected regions to NaN that have fewer than ``smallest`` pixels, or too few ``textured`` ones.
 
     A region needs one textured pixel, in or next to it, in twenty. Neighbours are connected if their
@@ -238,7 +213,7 @@ def _remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: i
 
 
 @njit(cache=True, nogil=True)
-def _fill_pinholes(disparity: F32, least: int, out: F32) -> None:
+def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
     """Fill unknown pixels that have ``least`` known ones among 8 neighbours with their median, (H, W)."""
     height, width = disparity.shape
     around = np.empty(8, np.float32)
@@ -278,7 +253,7 @@ def _gather_similar(centre: F32, other: F32, step: np.float32, total: F32, count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
+def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
     """Mean of the disparities in a square window that differ from the centre by at most ``step``, (H, W)."""
     height, width = disparity.shape
     total, count = np.empty(width, np.float32), np.empty(width, np.float32)
@@ -303,76 +278,10 @@ QUANTISATION = float(1.0 / np.sqrt(12.0))
 """Quantisation noise of integer grey levels."""
 
 
-@dataclass(frozen=True)
-class DisparityPostprocessing:
-    """Parameters of the postprocessing of disparities.
-
-    Parameters
-    ----------
-    left_right_px : float
-        Largest difference in the left-right check.
-    min_region_px : int
-        Connected regions of fewer pixels are removed, as are larger ones without texture.
-    min_confidence : float
-        Disparities of less confidence are unknown.
-    radius : int
-        Radius of the edge-preserving mean over disparities within 1 px of the centre; 0 = none.
-    """
-
-    left_right_px: float = 1.0
-    min_region_px: int = 60
-    min_confidence: float = 0.02
-    radius: int = 2
-
-    def __post_init__(self) -> None:
-        if not (self.left_right_px >= 0.0 and self.min_region_px >= 0 and self.radius >= 0):
-            raise ValueError("left_right_px, smallest_piece and radius must not be negative")
-        if not 0.0 <= self.min_confidence < 1.0:
-            raise ValueError(f"min_confidence must be in [0, 1); got {self.min_confidence}")
-
-    def apply(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
-        """Check, filter and smooth the disparities of the left image.
-
-        Parameters
-        ----------
-        left, right : ndarray (H, W) float32
-            Disparities of both images, NaN = none; ``left`` is overwritten.
-        confidence : ndarray (H, W) float32
-            Confidence of the left disparities; overwritten.
-        texture : ndarray (H, W) float32
-            Texture measure of :func:`texture_of`. Values propagated into untextured regions get low
-            confidence.
-
-        Returns
-        -------
-        DisparityMap
-            Disparities of the left image.
-        """
-        limits = np.array([self.left_right_px, self.min_confidence], np.float32)
-        _check_left_right(left, right, confidence, limits)
-        _remove_speckles(left, texture > TEXTURED, STEP_PX, self.min_region_px)
-        closed = np.empty_like(left)
-        _fill_pinholes(left, MIN_NEIGHBOURS, closed)
-        closed[np.isnan(texture)] = np.nan
-        smooth = np.empty_like(left)
-        _edge_preserving_mean(closed, STEP_PX, self.radius, smooth)
-        final_confidence(confidence, left, smooth, texture)
-        return DisparityMap(smooth, confidence, _noise(closed, smooth))
-
-
 def texture_of(image: StereoImage, noise: float) -> F32:
-    """Measure the texture around each pixel.
+    """Squared horizontal gradient (H, W) relative to that of pure noise: 1 = no texture, NaN = no pixel.
 
-    Parameters
-    ----------
-    image : StereoImage
-    noise : float
-        Standard deviation of its noise in grey levels.
-
-    Returns
-    -------
-    ndarray (H, W) float32
-        Squared horizontal gradient relative to that of pure noise: 1 = no texture, NaN = no pixel.
+    ``noise`` is its standard deviation in grey levels.
     """
     out = np.empty(image.valid.shape, np.float32)
     _squared_gradient(image.channels, TEXTURE_RADIUS, out)
@@ -381,7 +290,7 @@ def texture_of(image: StereoImage, noise: float) -> F32:
     return out
 
 
-def _noise(raw: F32, smooth: F32) -> float:
+def disparity_noise(raw: F32, smooth: F32) -> float:
     """Standard deviation of the disparities: median deviation from the smoothed ones, plus pixel locking."""
     apart = np.abs(raw[::SUBSAMPLING, ::SUBSAMPLING] - smooth[::SUBSAMPLING, ::SUBSAMPLING])
     known = apart[np.isfinite(apart)]

@@ -19,23 +19,10 @@ class DepthStd(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> None:
-    """Compute inverse depths from correspondences, with standard deviations.
+    """Inverse depths and standard deviations (H, W) from correspondences (H, W, 2), ``sigma`` in pixels.
 
     A pixel of inverse depth rho is at H (x, y, 1) + rho e in the other view; rho minimises the distance to
     the correspondence. NaN if that is unknown or behind a camera.
-
-    Parameters
-    ----------
-    xy : ndarray (H, W, 2) float32
-        Correspondences in pixels of the other view.
-    sigma : ndarray (H, W) float32
-        Their standard deviation in pixels.
-    H : ndarray (3, 3)
-        Homography of the plane at infinity.
-    e : ndarray (3,)
-        Epipole of the other view.
-    rho, std : ndarray (H, W) float32
-        Receive inverse depth and standard deviation.
     """
     height, width = rho.shape
     for v in range(height):
@@ -61,21 +48,11 @@ def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> N
 def fuse_inverse_depths(
     rho: F32, std: F32, gate: float, out: F32, out_std: F32, support: U8, conflicts: U8
 ) -> None:
-    """Fuse several inverse depths per pixel into one.
+    """Fuse several inverse depths (K, H, W) per pixel into one.
 
     The estimate that most others agree with within ``gate`` standard deviations is averaged with these,
-    weighted by the inverse variances; among equals the more certain one.
-
-    Parameters
-    ----------
-    rho, std : ndarray (K, H, W) float32
-        Inverse depths and standard deviations, NaN = unknown.
-    gate : float
-        Standard deviations within which estimates agree.
-    out, out_std : ndarray (H, W) float32
-        Receive the fused inverse depth and its standard deviation.
-    support, conflicts : ndarray (H, W) uint8
-        Receive the numbers of estimates that agree and disagree.
+    weighted by the inverse variances; among equals the more certain one. ``support`` and ``conflicts`` (H, W)
+    receive the numbers of estimates that agree and disagree.
     """
     count, height, width = rho.shape
     for v in range(height):
@@ -119,23 +96,10 @@ def _agree(a: float, sa: float, b: float, sb: float, gate: float) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive: U8, support: U8) -> None:
-    """Update the one-dimensional Kalman filter of every pixel in place.
+    """Update the one-dimensional Kalman filter of every pixel (H, W) in place.
 
     The first measurement starts the chain of a pixel; a missing measurement, or one beyond ``gate`` standard
-    deviations of the innovation, ends it.
-
-    Parameters
-    ----------
-    rho, std : ndarray (H, W) float32
-        Filtered inverse depth and standard deviation.
-    new, new_std : ndarray (H, W) float32
-        Measurement and its standard deviation.
-    gate : float
-        Limit of the innovation in standard deviations.
-    alive : ndarray (H, W) uint8
-        1 while the chain continues.
-    support : ndarray (H, W) uint8
-        Number of measurements.
+    deviations of the innovation, ends it: ``alive`` becomes 0. ``support`` counts the measurements.
     """
     height, width = rho.shape
     for v in range(height):
@@ -170,23 +134,9 @@ def count_agreement(
     """Count pixels that another depth map confirms or contradicts.
 
     A pixel is confirmed if the reprojection of the other map's depth returns within ``limits[0]`` pixels and
-    the depths differ by less than the bound; it is contradicted if the other view sees through it.
-
-    Parameters
-    ----------
-    own : DepthStd
-        Depth map of the view.
-    to : ndarray (3, 4)
-        Transform of z (x, y, 1), 1 to z' (x', y', 1) of the other view.
-    other : DepthStd
-        Depth map of the other view.
-    back : ndarray (3, 4)
-        Transform from the other view back.
-    limits : ndarray (3,)
-        Pixels, relative depth difference, and standard deviations; the depth bound is the sum of the latter
-        two.
-    agree, contradict : ndarray (H, W) uint8
-        Counters, incremented.
+    the depths differ by less than ``limits[1]`` of the depth plus ``limits[2]`` standard deviations; it is
+    contradicted if the other view sees through it. ``to`` (3, 4) transforms z (x, y, 1), 1 to z' (x', y', 1)
+    of the other view, ``back`` the other way.
     """
     depth, std = own
     other_depth, other_std = other
@@ -222,15 +172,9 @@ def count_agreement(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def splat_depths(depth: F32, to: F64, out: F32) -> None:
-    """Project the depths of one view to the nearest pixels of another, keeping the smaller depth.
+    """Project depths to the nearest pixels of another view, keeping the smaller depth.
 
-    Parameters
-    ----------
-    depth : ndarray (H, W) float32
-    to : ndarray (3, 4)
-        Transform to the other view, see :func:`count_agreement`.
-    out : ndarray (H', W') float32
-        Depths of the other view, updated; NaN = unknown.
+    ``to`` as in :func:`count_agreement`; ``out`` is updated, NaN = unknown.
     """
     rows, columns = out.shape
     for v in range(depth.shape[0]):
@@ -252,25 +196,11 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
 def surface_continuation(
     rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8
 ) -> None:
-    """Find pixels that continue the surface of reliable neighbours.
+    """Set ``joins`` (H, W) to 1 for pixels that continue the surface of ``sure`` neighbours.
 
-    A plane is fitted to the reliable pixels of the window with similar inverse depth. They must be a quarter
-    of the window and surround the pixel, and the plane must pass within ``gate`` standard deviations.
-
-    Parameters
-    ----------
-    rho, std : ndarray (H, W) float32
-        Inverse depths and standard deviations.
-    sure : ndarray (H, W) uint8
-        Nonzero for reliable pixels.
-    radius : int
-        Radius of the window.
-    alike : float
-        Largest relative difference of inverse depths on one surface.
-    gate : float
-        Limit of the plane's distance in standard deviations.
-    joins : ndarray (H, W) uint8
-        Receives 1 for continuing pixels.
+    A plane is fitted to the sure pixels of the window with inverse depths that differ by at most the share
+    ``alike``. They must be a quarter of the window and surround the pixel, and the plane must pass within
+    ``gate`` standard deviations.
     """
     height, width = rho.shape
     least = (2 * radius + 1) ** 2 // 4
