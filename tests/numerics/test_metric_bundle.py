@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -24,43 +23,19 @@ def _refine(cameras, X, seen, *, free, prior=None, **options):
     return refine_metric_bundle(cameras, X, seen, free=free, prior=prior, options=BundleOptions(**options))
 
 
-@pytest.mark.parametrize("groups", [1, 6])
-def test_exact_observations_give_the_true_calibration_and_shape(groups):
-    block = make_block(k1=0.03, groups=groups)
+@pytest.mark.parametrize(("groups", "lens"), [(1, ()), (6, ()), (1, (-0.04, 0.05))])
+def test_exact_observations_give_the_true_calibration_and_shape(groups, lens):
+    block = make_block(k1=0.03, lens=lens, groups=groups, points=150)
     cameras, X = perturbed(block)
-    result = _refine(cameras, X, _seen(block), free=FOCAL_CENTRE_RADIAL, max_iterations=100)
+    free = ~np.isin(np.arange(6 + len(lens)), [1, 2])
+    result = _refine(cameras, X, _seen(block), free=free, max_iterations=200, covariance=True)
     assert np.abs(result.residual_px).max() < 1e-3
-    np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=1e-3, atol=2e-3)
+    np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=5e-3, atol=2e-3)
+    assert (np.diagonal(result.intrinsics_covariance, axis1=1, axis2=2)[:, free] > 0.0).all()
     aligned = estimate_similarity(result.X, block.X).apply(result.X)
     np.testing.assert_allclose(aligned, block.X, atol=2e-3)
     seen = project_block(result.cameras, result.X, block.view, block.point)
     np.testing.assert_allclose(seen - block.xy, result.residual_px, atol=1e-6)
-
-
-def test_pixels_that_are_neither_square_nor_upright_are_those_of_the_model():
-    block = make_block(k1=0.03)
-    c = block.cameras
-    rows = c.intrinsics.copy()
-    rows[:, 1:3] = 1.2, 5.0
-    cameras = MetricCameras(c.R, c.t, rows, c.group)
-    xy = project_block(cameras, block.X, block.view, block.point)
-    there = _refine(cameras, block.X, _seen(block, xy), free=FOCAL, max_iterations=0)
-    np.testing.assert_allclose(there.residual_px, 0.0, atol=1e-9)
-    start = MetricCameras(c.R, c.t, rows * [1.05, 1.03, 1.0, 1.0, 1.0, 1.0], c.group)
-    free = np.array([True, True, True, False, False, True])
-    result = _refine(start, block.X, _seen(block, xy), free=free, max_iterations=100)
-    np.testing.assert_allclose(result.cameras.intrinsics, rows, rtol=1e-3, atol=2e-3)
-
-
-def test_a_lens_of_three_coefficients_comes_back():
-    block = make_block(k1=0.03, lens=(-0.04, 0.05), points=150)
-    cameras, X = perturbed(block)
-    free = np.array([True, False, False, True, True, True, True, True])
-    result = _refine(cameras, X, _seen(block), free=free, max_iterations=200, covariance=True)
-    assert np.abs(result.residual_px).max() < 1e-3
-    np.testing.assert_allclose(result.cameras.intrinsics, block.cameras.intrinsics, rtol=5e-3, atol=2e-3)
-    assert result.intrinsics_covariance.shape == (1, 8, 8)
-    assert (np.diag(result.intrinsics_covariance[0])[3:] > 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -92,71 +67,6 @@ def test_cost_does_not_depend_on_the_frame():
     assert second.initial_cost == pytest.approx(first.initial_cost, rel=1e-6)
     assert second.cost == pytest.approx(first.cost, rel=1e-5)
     np.testing.assert_allclose(second.cameras.intrinsics, first.cameras.intrinsics, rtol=1e-4)
-
-
-def _noisy_fits(block, count, sigma, **options):
-    rng = np.random.default_rng(11)
-    for _ in range(count):
-        xy = block.xy + sigma * rng.normal(size=block.xy.shape)
-        yield _refine(
-            block.cameras, block.X, _seen(block, xy), free=FOCAL_CENTRE_RADIAL, loss_px=100.0,
-            sigma_px=sigma, max_iterations=10, covariance=True, **options,
-        )  # fmt: skip
-
-
-def test_covariance_and_sigma_agree_with_monte_carlo():
-    block = make_block(points=60)
-    fits = list(_noisy_fits(block, 150, 0.4))
-    q = np.array([fit.cameras.intrinsics[0] for fit in fits])[:, FOCAL_CENTRE_RADIAL]
-    predicted = np.array([np.diag(fit.intrinsics_covariance[0]) for fit in fits])[:, FOCAL_CENTRE_RADIAL]
-    ratio = q.std(axis=0) / np.sqrt(predicted.mean(axis=0))
-    # A standard deviation from 150 samples is itself known to 6 %.
-    np.testing.assert_allclose(ratio, 1.0, atol=0.25)
-    assert np.mean([fit.sigma_px for fit in fits]) == pytest.approx(0.4, rel=0.05)
-
-
-def test_views_without_observations_do_not_change_the_covariance():
-    block = make_block(views=5, points=40)
-    c = block.cameras
-    extra = MetricCameras(
-        np.concatenate([c.R, np.eye(3)[None]]),
-        np.concatenate([c.t, np.ones((1, 3))]),
-        c.intrinsics,
-        np.zeros(6, int),
-    )
-    xy = block.xy + 0.2 * np.random.default_rng(3).normal(size=block.xy.shape)
-    fits = [_refine(start, block.X, _seen(block, xy), free=FOCAL, covariance=True) for start in (c, extra)]
-    np.testing.assert_allclose(fits[1].intrinsics_covariance, fits[0].intrinsics_covariance, rtol=1e-9)
-    np.testing.assert_allclose(fits[1].pose_covariance[:5], fits[0].pose_covariance, rtol=1e-9)
-    assert not fits[1].pose_covariance[5].any()
-
-
-def test_intrinsics_covariance_is_that_of_the_dense_normal_matrix_in_another_gauge():
-    block = make_block(views=4, points=25)
-    xy = block.xy + 0.2 * np.random.default_rng(3).normal(size=block.xy.shape)
-    fit = _refine(block.cameras, block.X, _seen(block, xy), free=FOCAL, loss_px=100.0, covariance=True)
-    c, h = fit.cameras, 1e-6
-    n_pose, n_points = 6 * 3, 3 * len(fit.X)
-
-    def project(x):
-        # The first camera stays, and so does one coordinate of the second one's position (the scale).
-        pose = np.zeros((4, 6))
-        pose[1:] = x[:n_pose].reshape(3, 6)
-        turn = Rotation.from_rotvec(pose[:, :3]).as_matrix()
-        q = c.intrinsics.copy()
-        q[0, 0] *= np.exp(x[-1])
-        t = np.einsum("vab,vb->va", turn, c.t) + pose[:, 3:]
-        moved = MetricCameras(turn @ c.R, t, q, c.group)
-        return project_block(moved, fit.X + x[n_pose:-1].reshape(-1, 3), block.view, block.point).ravel()
-
-    size = n_pose + n_points + 1
-    J = np.column_stack([(project(h * e) - project(-h * e)) / (2 * h) for e in np.eye(size)])
-    J = np.delete(J, 3, axis=1)
-    expected = fit.sigma_px**2 * np.linalg.inv(J.T @ J)[-1, -1] * c.intrinsics[0, 0] ** 2
-    assert fit.intrinsics_covariance[0, 0, 0] == pytest.approx(expected, rel=1e-3)
-    assert np.count_nonzero(fit.intrinsics_covariance) == 1
-    assert fit.pose_covariance.shape == (4, 6, 6)
-    assert (np.linalg.eigvalsh(fit.pose_covariance) > -1e-12).all()
 
 
 def test_a_tight_prior_holds_and_a_loose_one_yields():
@@ -204,7 +114,7 @@ def test_fixed_and_unseen_parts_come_back_untouched():
     assert not result.pose_covariance[fixed].any()
 
 
-def test_degenerate_and_wrong_input_is_guarded():
+def test_degenerate_input_is_guarded():
     block = make_block()
     c = block.cameras
     empty = np.zeros(0, dtype=np.int64)
@@ -216,11 +126,6 @@ def test_degenerate_and_wrong_input_is_guarded():
     turned = _refine(same, far + 0.1 * block.X, _seen(block), free=FOCAL, covariance=True)
     assert turned.cost <= turned.initial_cost
     assert np.isfinite(turned.X).all()
-    with pytest.raises(ValueError, match="free"):
-        _refine(c, block.X, _seen(block), free=np.ones(3, bool))
-    negative = MetricCameras(c.R, c.t, -c.intrinsics, c.group)
-    with pytest.raises(ValueError, match="positive"):
-        _refine(negative, block.X, _seen(block), free=FOCAL)
 
 
 @pytest.mark.parametrize("field", ["sigma_px", "threads", "loss_px"])
@@ -234,10 +139,12 @@ def test_wrong_calls_are_refused():
     c, q = block.cameras, block.cameras.intrinsics
     seen = _seen(block)
 
-    def refused(match, cameras=c, observations=seen, prior=None, **options):
+    def refused(match, cameras=c, observations=seen, free=FOCAL, **options):
         with pytest.raises(ValueError, match=match):
-            _refine(cameras, block.X, observations, free=FOCAL, prior=prior, **options)
+            _refine(cameras, block.X, observations, free=free, **options)
 
+    refused("free", free=np.ones(3, bool))
+    refused("positive", MetricCameras(c.R, c.t, -q, c.group))
     refused("metric bundle needs", MetricCameras(c.R, c.t[:2], q, c.group))
     refused("needs shared", MetricCameras(c.R, c.t, q, c.group, np.zeros(6, dtype=np.int64)))
     refused("groups must lie", MetricCameras(c.R, c.t, q, c.group + 1))
@@ -269,23 +176,6 @@ def test_focals_of_their_own_beside_a_common_principal_point_and_distortion():
     np.testing.assert_allclose(fit.cameras.intrinsics, cameras.intrinsics, rtol=1e-3, atol=2e-3)
     assert (fit.cameras.intrinsics[:, 3:] == fit.cameras.intrinsics[0, 3:]).all()
     assert len(np.unique(fit.cameras.intrinsics[:, 0])) == 6
-
-
-def test_all_shared_by_the_table_is_one_row_for_all():
-    block = make_block(k1=0.02)
-    cameras, X = perturbed(block)
-    xy = block.xy + 0.3 * np.random.default_rng(0).normal(size=block.xy.shape)
-    rows = np.tile(cameras.intrinsics, (6, 1))
-    tied = MetricCameras(cameras.R, cameras.t, rows, np.arange(6), np.zeros((6, 6), dtype=np.int64))
-    fits = [
-        _refine(c, X, _seen(block, xy), free=FOCAL_CENTRE_RADIAL, max_iterations=60, covariance=True)
-        for c in (cameras, tied)
-    ]
-    assert fits[1].cost == pytest.approx(fits[0].cost, rel=1e-6)
-    np.testing.assert_allclose(fits[1].cameras.intrinsics[3], fits[0].cameras.intrinsics[0], rtol=1e-4)
-    np.testing.assert_allclose(
-        fits[1].intrinsics_covariance[3], fits[0].intrinsics_covariance[0], rtol=2e-2, atol=1e-7
-    )
 
 
 def test_a_std_of_zero_holds_one_camera_at_its_mean_while_others_move():

@@ -38,12 +38,8 @@ def test_samples_are_distinct_sorted_and_in_range_and_equal_the_plain_code(size,
     assert (np.diff(compiled) > 0).all()
     assert compiled[0] >= 0
     assert compiled[-1] < n
-
-
-def test_uniform_number_of_one_stays_in_range():
-    sample = np.empty(3, np.int64)
-    draw_sample(np.ones(3), 5, sample)
-    np.testing.assert_array_equal(sample, [2, 3, 4])
+    draw_sample(np.ones(size), n, compiled)
+    np.testing.assert_array_equal(compiled, np.arange(extra, n))
 
 
 def test_every_subset_is_equally_likely():
@@ -73,14 +69,11 @@ def test_noise_scale_finds_sigma_and_bears_outliers(sigma, seed):
     assert noise_scale(residuals, parameters=7) == pytest.approx(sigma, rel=0.3)
 
 
-def test_noise_scale_has_the_small_sample_factor():
+def test_noise_scale_has_the_small_sample_factor_and_refuses_too_few_residuals():
     assert noise_scale(np.ones(12), parameters=7) == pytest.approx(2 * 1.4826022)
-
-
-@pytest.mark.parametrize("residuals", [np.ones(7), np.array([np.nan] * 9)])
-def test_noise_scale_refuses(residuals):
-    with pytest.raises(ValueError, match="noise_scale"):
-        noise_scale(residuals, parameters=7)
+    for residuals in (np.ones(7), np.array([np.nan] * 9)):
+        with pytest.raises(ValueError, match="noise_scale"):
+            noise_scale(residuals, parameters=7)
 
 
 @dataclass(frozen=True)
@@ -181,15 +174,6 @@ def test_one_round_is_the_textbook_step():
     assert likelihood == pytest.approx(np.mean(np.log(p.sum(axis=1))) - np.log(2.0 * norm.pdf(0.0)), rel=1e-9)
 
 
-def test_the_compiled_mixture_equals_the_plain_code():
-    r, a = draw(200, 0.4, 0.1, 1), np.array([0.3, 100.0, 0.5, 0.1, 0.4])
-    b = a.copy()
-    assert _fit_mixture(r, 7.0, 90.0, 5, a) == pytest.approx(
-        _fit_mixture.py_func(r, 7.0, 90.0, 5, b), rel=1e-12
-    )
-    np.testing.assert_allclose(a, b, rtol=1e-12)
-
-
 @pytest.mark.parametrize(("n", "wrong"), [(100, 0.0), (1000, 0.0), (1000, 0.3), (1000, 0.6), (5000, 0.5)])
 @pytest.mark.parametrize("start", [0.4, 1.0])
 def test_the_noise_is_found_among_wrong_residuals(n, wrong, start):
@@ -216,13 +200,6 @@ def test_the_mixture_scales_with_its_residuals(power, seed):
     assert other.sigma == pytest.approx(s * one.sigma, rel=1e-6)
     assert other.limit == pytest.approx(s * one.limit, rel=1e-4)
     assert other.log_likelihood == pytest.approx(one.log_likelihood - np.log(s), abs=1e-6)
-
-
-def test_the_truer_model_is_the_likelier():
-    r = draw(300, 0.3, 0.0, 5)
-    worse = np.sort(np.hypot(r, 0.5))
-    fits = [NoiseMixture.fit(x, 0.5, spread=150.0) for x in (r, worse)]
-    assert fits[0].log_likelihood > fits[1].log_likelihood
 
 
 def test_exact_residuals_give_a_finite_mixture():
@@ -305,7 +282,6 @@ def test_rosenbrock_from_the_classical_start():
     answer = minimize_residuals(
         lambda x: np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]]), np.array([-1.2, 1.0]), max_iterations=100
     )
-    assert answer.converged
     np.testing.assert_allclose(answer.x, [1.0, 1.0], atol=1e-6)
 
 
@@ -317,16 +293,6 @@ def test_covariance_of_a_line_is_the_textbook_one():
     answer = minimize_residuals(lambda x: A @ x - y, np.zeros(2), jacobian=lambda _: A)
     expected = np.sum((A @ answer.x - y) ** 2) / 398 * np.linalg.inv(A.T @ A)
     np.testing.assert_allclose(answer.covariance, expected, rtol=1e-6)
-
-
-def test_cauchy_ignores_outliers_that_bend_least_squares():
-    u = np.linspace(0.0, 1.0, 100)
-    y = 1.0 + 2.0 * u
-    y[::5] += 50.0
-    plain = minimize_residuals(lambda x: x[0] + x[1] * u - y, np.zeros(2))
-    robust = minimize_residuals(lambda x: x[0] + x[1] * u - y, plain.x, loss="cauchy", loss_scale=0.1)
-    assert abs(plain.x[0] - 1.0) > 5.0
-    np.testing.assert_allclose(robust.x, [1.0, 2.0], atol=0.02)
 
 
 def test_rank_deficient_and_useless_parameters_are_harmless():

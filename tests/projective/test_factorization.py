@@ -12,7 +12,6 @@ from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.projective.factorization import (
     Factorization,
-    _balance_depths,
     _factorize_robustly,
     _grow_core,
     _is_planar,
@@ -72,17 +71,6 @@ def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_beg
         assert often < 1.1 * expected
         assert often <= once
         assert affine == pytest.approx(often, rel=0.01)
-
-
-def test_balanced_depths_weigh_every_view_and_every_point_alike():
-    rng = np.random.default_rng(0)
-    sizes = rng.uniform(1.0, 2.0, (4, 30))
-    depths = (
-        rng.uniform(0.5, 2.0, (4, 30)) * 10.0 ** rng.uniform(-3, 3, (4, 1)) * 10.0 ** rng.uniform(-3, 3, 30)
-    )
-    squared = (_balance_depths(depths, sizes) * sizes) ** 2
-    np.testing.assert_allclose(squared.sum(axis=0), 4.0, rtol=1e-3)
-    np.testing.assert_allclose(squared.sum(axis=1), 30.0, rtol=1e-12)
 
 
 def test_wrong_tables_and_trees_are_refused():

@@ -77,41 +77,16 @@ def test_noise_comes_back_as_residual_and_wrong_observations_are_left_out():
     assert found.inlier[~wrong].mean() > 0.9
 
 
-def test_a_view_of_a_plane_is_postponed_with_its_reason():
-    scene = make_scene(seed=3, sigma_px=0.3, points=400)
-    t = scene.tracks
-    X = scene.X.copy()
-    flat = X[:, 2] < 0.0
-    X[flat, 2] = -0.75
-    # View 7 sees the plane z = -0.75 only; all others see everything they saw.
-    xy = np.concatenate([project(scene.P[v], X[t.point_index[t.view_index == v]]) for v in range(8)])
-    order = np.concatenate([np.flatnonzero(t.view_index == v) for v in range(8)])
-    pixels = np.empty_like(t.xy)
-    pixels[order] = xy + np.random.default_rng(0).normal(0, 0.3, xy.shape)
-    keep = (t.view_index != 7) | flat[t.point_index]
-    tracks = Tracks(t.view_index[keep], t.point_index[keep], pixels[keep], 8, 400)
-    planar = replace(scene, tracks=tracks, X=X)
-    pairs = [replace(p, accepted=p.j != 7) for p in true_pairs(planar)]
-    found = IncrementalProjective().reconstruct(tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
-    assert found.registered[:7].all()
-    assert not found.registered[7]
-    assert "plane" in found.reasons[7]
-
-
-def test_without_accepted_pairs_there_is_one_clear_sentence():
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [({"accepted": False}, r"(image|initial) pair"), ({"homography_inlier_ratio": 0.99}, "no parallax")],
+)
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: type(v).__name__)
+def test_pairs_without_geometry_or_parallax_are_refused(variant, change, reason):
     scene = make_scene()
-    pairs = [replace(p, accepted=False) for p in true_pairs(scene)]
-    for variant in VARIANTS:
-        with pytest.raises(StageFailure, match=r"(image|initial) pair"):
-            variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
-
-
-def test_pairs_that_homographies_explain_are_refused_as_a_turning_camera_or_a_plane():
-    scene = make_scene()
-    pairs = [replace(p, homography_inlier_ratio=0.99) for p in true_pairs(scene)]
-    for variant in VARIANTS:
-        with pytest.raises(StageFailure, match="no parallax"):
-            variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
+    pairs = [replace(p, **change) for p in true_pairs(scene)]
+    with pytest.raises(StageFailure, match=reason):
+        variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
 
 
 def test_initial_cameras_have_the_fundamental_matrix_they_came_from():
@@ -216,35 +191,6 @@ def test_points_of_one_standpoint_do_not_take_part():
     assert select_tracks_with_parallax(t, [replace(p, homography_inlier_ratio=0.3) for p in pairs]).all()
 
 
-def test_duplicated_images_are_handled():
-    scene = make_scene(points=300, sigma_px=0.3, seed=11)
-    t = scene.tracks
-    rng = np.random.default_rng(0)
-    # Each view has a twin from the same standpoint; most points are seen by one pair of twins only.
-    lonely = np.arange(300) < 200
-    home = rng.integers(0, 8, 300)
-    keep = ~lonely[t.point_index] | (t.view_index == home[t.point_index])
-    view = np.concatenate([2 * t.view_index[keep], 2 * t.view_index[keep] + 1])
-    point = np.tile(t.point_index[keep], 2)
-    xy = np.tile(t.xy[keep], (2, 1)) + rng.normal(0, 0.3, (2 * int(keep.sum()), 2))
-    order = np.lexsort((view, point))
-    seen = np.unique(point, return_inverse=True)
-    tracks = Tracks(view[order], seen[1][order], xy[order], 16, len(seen[0]))
-    twins = replace(
-        scene,
-        K=np.repeat(scene.K, 2, axis=0),
-        R=np.repeat(scene.R, 2, axis=0),
-        t=np.repeat(scene.t, 2, axis=0) + rng.normal(0, 1e-4, (16, 3)),
-        tracks=tracks,
-        sizes=np.repeat(scene.sizes, 2, axis=0),
-    )
-    pairs = [
-        replace(p, homography_inlier_ratio=1.0 if p.i // 2 == p.j // 2 else 0.3) for p in true_pairs(twins)
-    ]
-    found = IncrementalProjective().reconstruct(tracks, pairs, twins.sizes, rng=rng)
-    assert found.registered.all(), found.reasons
-
-
 NOISE_PX = 0.3
 
 
@@ -285,28 +231,21 @@ def homography_like(pair, scene):
     return replace(pair, F=F / np.linalg.norm(F), homography_inlier_ratio=1.0)
 
 
-def test_turns_about_a_standpoint_among_the_views_harm_nothing():
+@pytest.mark.parametrize("kind", ["turns about a standpoint", "almost the same frames"])
+def test_views_without_parallax_among_the_views_harm_nothing(kind):
     base = make_scene(points=400, sigma_px=NOISE_PX, seed=21)
-    turns = Rotation.from_rotvec([[0.05, 0.0, 0.0], [0.0, 0.06, 0.02], [0.0, -0.05, 0.1]]).as_matrix()
-    R = turns @ base.R[2]
-    scene = observe(base, R, -np.einsum("vab,b->va", R, base.centres[2]))
-    pairs = [homography_like(pair, scene) for pair in true_pairs(scene)]
-    found = reconstruct(scene, pairs)
+    rng = np.random.default_rng(3)
+    if kind == "almost the same frames":
+        R = Rotation.from_rotvec(rng.normal(0, 1e-3, (8, 3))).as_matrix() @ base.R
+        centres = base.centres + rng.normal(0, 2e-3, (8, 3))
+    else:
+        turns = Rotation.from_rotvec([[0.05, 0.0, 0.0], [0.0, 0.06, 0.02], [0.0, -0.05, 0.1]]).as_matrix()
+        R, centres = turns @ base.R[2], np.tile(base.centres[2], (3, 1))
+    scene = observe(base, R, -np.einsum("vab,vb->va", R, centres))
+    found = reconstruct(scene, [homography_like(pair, scene) for pair in true_pairs(scene)])
     assert found.registered.all(), found.reasons
     assert projective_error(found, scene) < 0.05
     assert residuals(found).max() < 7 * NOISE_PX * 1.01
-
-
-def test_frames_almost_the_same_harm_nothing():
-    base = make_scene(points=400, sigma_px=NOISE_PX, seed=22)
-    rng = np.random.default_rng(3)
-    R = Rotation.from_rotvec(rng.normal(0, 1e-3, (8, 3))).as_matrix() @ base.R
-    centres = base.centres + rng.normal(0, 2e-3, (8, 3))
-    scene = observe(base, R, -np.einsum("vab,vb->va", R, centres))
-    pairs = [homography_like(pair, scene) for pair in true_pairs(scene)]
-    found = reconstruct(scene, pairs)
-    assert found.registered.all(), found.reasons
-    assert projective_error(found, scene) < 0.05
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

@@ -35,11 +35,11 @@ class _PriorTerms:
 
     def cost(self, x: F64) -> float:
         """Return the sum of all terms."""
-        return 0.5 * float(self.weight @ self.residual(x) ** 2) if len(self.first) else 0.0
+        return 0.5 * float(self.weight @ self.residual(x) ** 2)
 
     def gradient(self, x: F64) -> F64:
         """Return the derivative of the cost; (n,)."""
-        pull = self.weight * self.residual(x) if len(self.first) else np.zeros(0)
+        pull = self.weight * self.residual(x)
         both = self.second >= 0
         g = np.bincount(self.first, pull, minlength=len(x))
         return np.asarray(g - np.bincount(self.second[both], pull[both], minlength=len(x)))

@@ -111,10 +111,8 @@ def block_scatter(
         Cameras and points after the adjustment.
     observations : Observations
         Observations.
-    free : ndarray (C,) of bool
-        Intrinsics that move.
-    prior : IntrinsicsPrior
-        Prior of the intrinsics.
+    free, prior : ndarray (C,) of bool, IntrinsicsPrior
+        Intrinsics that move, and their prior.
     noise : tuple of float
         Sigma and the turning point of Huber's loss, px.
 

@@ -53,10 +53,8 @@ class Solution(Generic[State]):
         Final state.
     cost, initial_cost : float
         1/2 sum rho at the end and the start, cost <= initial_cost.
-    iterations : int
-        Linear solves.
-    converged : bool
-        Whether a tolerance or the numerical floor was reached.
+    iterations, converged : int, bool
+        Linear solves, and whether a tolerance or the numerical floor was reached.
     """
 
     state: State
@@ -82,16 +80,12 @@ def run_levenberg_marquardt(
 
     Parameters
     ----------
-    problem : Problem
-        Problem to minimise.
-    state : State
-        Initial state.
+    problem, state : Problem, State
+        Problem to minimise and its initial state.
     max_iterations : int
         Maximum number of linear solves.
-    tolerance : float
-        Relative gain of cost at convergence.
-    initial_damping : float
-        First damping.
+    tolerance, initial_damping : float
+        Relative gain of cost at convergence, and first damping.
 
     Returns
     -------
@@ -207,10 +201,8 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
 
     Parameters
     ----------
-    H, g : ndarray (n, n), (n,)
-        J'J and J'r.
-    damping : float
-        Levenberg-Marquardt damping.
+    H, g, damping : ndarray (n, n), ndarray (n,), float
+        J'J, J'r and Levenberg-Marquardt damping.
     step : ndarray (n,)
         Output.
 
@@ -283,23 +275,16 @@ class ResidualMinimum:
 
     Parameters
     ----------
-    x : ndarray (D,)
-        Minimum.
-    cost : float
-        1/2 sum rho.
+    x, cost, residual : ndarray (D,), float, ndarray (M,)
+        Minimum, 1/2 sum rho and residuals.
     covariance : ndarray (D, D)
         sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D).
-    residual : ndarray (M,)
-        Residuals.
-    converged : bool
-        Whether the loop converged.
     """
 
     x: F64
     cost: float
     covariance: F64
     residual: F64
-    converged: bool
 
 
 @dataclass(frozen=True)
@@ -375,15 +360,13 @@ def minimize_residuals(
     Examples
     --------
     >>> result = minimize_residuals(lambda x: x - np.array([1.0, 2.0]), np.zeros(2))
-    >>> result.x.round(6).tolist(), result.converged
-    ([1.0, 2.0], True)
+    >>> result.x.round(6).tolist()
+    [1.0, 2.0]
     """
     loss_code(loss, loss_scale)
     x0 = np.array(x0, dtype=np.float64)
     if x0.ndim != 1 or not np.isfinite(x0).all() or not np.isfinite(residual_fn(x0)).all():
-        raise ValueError(
-            f"minimize_residuals needs a finite vector with finite residuals; got shape {x0.shape}"
-        )
+        raise ValueError(f"minimize_residuals needs a finite vector and residuals; got shape {x0.shape}")
     problem = _VectorProblem(residual_fn, jacobian, loss, loss_scale)
     end = run_levenberg_marquardt(
         problem, x0, max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3
@@ -391,4 +374,4 @@ def minimize_residuals(
     residual = residual_fn(end.state)
     variance = 2.0 * end.cost / max(len(residual) - len(x0), 1)
     covariance = variance * invert_information(problem.linearize(end.state).hessian)
-    return ResidualMinimum(end.state, end.cost, covariance, residual, end.converged)
+    return ResidualMinimum(end.state, end.cost, covariance, residual)

@@ -213,10 +213,8 @@ def refine_metric_bundle(
         Start, and which intrinsics are shared.
     observations : Observations
         Observations in any order.
-    free : ndarray (C,) of bool
-        Intrinsics that move.
-    prior : IntrinsicsPrior, optional
-        Prior of the intrinsics, which may fix single values.
+    free, prior : ndarray (C,) of bool, IntrinsicsPrior, optional
+        Intrinsics that move, and their prior, which may fix single values.
     options : BundleOptions, optional
         Weighting and end.
 

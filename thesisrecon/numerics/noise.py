@@ -109,10 +109,8 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
 
     Parameters
     ----------
-    residuals : ndarray (N,)
-        Residuals >= 0.
-    threshold : float
-        Least width.
+    residuals, threshold : ndarray (N,), float
+        Residuals >= 0, and least width.
     parameters : int
         Degrees of freedom fitted to the residuals.
 
@@ -138,10 +136,8 @@ def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) ->
 
     Parameters
     ----------
-    residuals : ndarray (N,)
-        Residuals >= 0.
-    start : float
-        Initial standard deviation.
+    residuals, start : ndarray (N,), float
+        Residuals >= 0, and initial standard deviation.
     parameters : int
         Degrees of freedom fitted to the residuals.
 
@@ -250,10 +246,8 @@ def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> fl
 
     Parameters
     ----------
-    residuals : ndarray (N,)
-        Residuals >= 0.
-    sigma : float
-        Standard deviation of the noise.
+    residuals, sigma : ndarray (N,), float
+        Residuals >= 0, and standard deviation of the noise.
     parameters : int
         Degrees of freedom fitted to the residuals.
 
@@ -281,10 +275,8 @@ def effective_noise(residuals: F64, width: float, *, parameters: int = 0) -> flo
 
     Parameters
     ----------
-    residuals : ndarray (N,)
-        Residuals >= 0, N > 0.
-    width : float
-        Width of Huber's loss.
+    residuals, width : ndarray (N,), float
+        Residuals >= 0, N > 0, and width of Huber's loss.
     parameters : int
         Degrees of freedom p fitted to the residuals.
 

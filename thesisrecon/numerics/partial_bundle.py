@@ -53,22 +53,12 @@ class _PointOptions(NamedTuple):
     keep_cheirality: bool
 
 
-class _PointRows(NamedTuple):
-    """Observations ``first`` to ``last`` of one point among all, sorted by point."""
-
-    first: int
-    last: int
-    view_index: I64
-    xy: F64
-
-
 @njit(cache=True, nogil=True)
-def _point_cost(P: F64, x: F64, obs: _PointRows, options: _PointOptions) -> tuple[float, int]:
+def _point_cost(P: F64, x: F64, view_index: I64, xy: F64, options: _PointOptions) -> tuple[float, int]:
     """Return 1/2 sum rho of one point's observations and the number of cameras it lies behind."""
-    first, last, view_index, xy = obs
     code, delta = options.loss_code, options.delta
     cost, behind = 0.0, 0
-    for k in range(first, last):
+    for k in range(len(xy)):
         p = P[view_index[k]]
         u0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
         u1 = p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]
@@ -83,17 +73,23 @@ def _point_cost(P: F64, x: F64, obs: _PointRows, options: _PointOptions) -> tupl
 
 @njit(cache=True, nogil=True)
 def _linearize_point(
-    P: F64, x: F64, tangent: tuple[F64, float], obs: _PointRows, options: _PointOptions, H: F64, g: F64
+    P: F64,
+    x: F64,
+    tangent: tuple[F64, float],
+    view_index: I64,
+    xy: F64,
+    options: _PointOptions,
+    H: F64,
+    g: F64,
 ) -> None:
     """Fill J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space (Householder vector, factor)."""
     v, beta = tangent
-    first, last, view_index, xy = obs
     code, delta = options.loss_code, options.delta
     H[:] = 0.0
     g[:] = 0.0
     J = np.empty((2, 4))
     r = np.empty(2)
-    for k in range(first, last):
+    for k in range(len(xy)):
         p = P[view_index[k]]
         u0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
         u1 = p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]
@@ -129,13 +125,13 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
         x = X[j : j + 1]
         if x[0, 0] == 0.0 and x[0, 1] == 0.0 and x[0, 2] == 0.0 and x[0, 3] == 0.0:
             continue
-        obs = _PointRows(first, last, view_index, xy)
-        cost, behind = _point_cost(P, x[0], obs, options)
+        view, seen = view_index[first:last], xy[first:last]
+        cost, behind = _point_cost(P, x[0], view, seen, options)
         damping, small_gains, accepted = 1e-4, 0, True
         for _ in range(options.iterations):
             if accepted:
                 tangent_reflectors(x, v, beta)
-                _linearize_point(P, x[0], (v[0], beta[0]), obs, options, H, g)
+                _linearize_point(P, x[0], (v[0], beta[0]), view, seen, options, H, g)
             for m in range(3):
                 for n in range(3):
                     M[m, n] = H[m, n]
@@ -145,7 +141,7 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
                 for m in range(3):
                     step[0, m] = -(Mi[m, 0] * g[0] + Mi[m, 1] * g[1] + Mi[m, 2] * g[2])
                 tangent_step(x, v, beta, step, moved)
-                candidate, flipped = _point_cost(P, moved[0], obs, options)
+                candidate, flipped = _point_cost(P, moved[0], view, seen, options)
                 accepted = candidate < cost and (flipped == behind or not options.keep_cheirality)
             if accepted:
                 x[0] = moved[0]
@@ -225,10 +221,8 @@ def refine_points(
         View and point of each observation.
     xy : ndarray (K, 2)
         Pixels.
-    loss_px : float
-        Turning point of Huber's loss, px.
-    iterations : int
-        Steps per point.
+    loss_px, iterations : float, int
+        Turning point of Huber's loss, px, and steps per point.
 
     Returns
     -------
@@ -352,14 +346,10 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
 
     Parameters
     ----------
-    P : ndarray (3, 4)
-        Start.
-    X, xy : ndarray (M, 4), (M, 2)
-        Homogeneous points and their pixels.
-    loss_px : float
-        Turning point of Huber's loss, px.
-    iterations : int
-        Maximum number of linear solves.
+    P, X, xy : ndarray (3, 4), (M, 4), (M, 2)
+        Start, homogeneous points and their pixels.
+    loss_px, iterations : float, int
+        Turning point of Huber's loss, px, and maximum number of linear solves.
 
     Returns
     -------
@@ -451,10 +441,8 @@ def refine_pose(
         Points and their pixels.
     free : ndarray (6,) or (8,) of bool, optional
         Intrinsics that move; none by default.
-    loss_px : float
-        Turning point of Huber's loss, px.
-    iterations : int
-        Maximum number of linear solves.
+    loss_px, iterations : float, int
+        Turning point of Huber's loss, px, and maximum number of linear solves.
 
     Returns
     -------

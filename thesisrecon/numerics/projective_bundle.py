@@ -104,10 +104,8 @@ def refine_projective_bundle(
         View and point of each observation, in any order; sorted by point is fastest.
     xy : ndarray (K, 2)
         Pixels.
-    loss_px : float
-        Turning point of Huber's loss, px.
-    max_iterations : int
-        Maximum number of linear solves.
+    loss_px, max_iterations : float, int
+        Turning point of Huber's loss, px, and maximum number of linear solves.
     fixed_views : ndarray (V,) of bool, optional
         Cameras that must not move.
 

@@ -17,10 +17,8 @@ def draw_sample(uniforms: F64, n: int, out: I64) -> None:
 
     Parameters
     ----------
-    uniforms : ndarray (s,)
-        Numbers in [0, 1).
-    n : int
-        Number of data.
+    uniforms, n : ndarray (s,), int
+        Numbers in [0, 1), and number of data.
     out : ndarray (s,) of int
         Output, indices below n.
     """
@@ -128,10 +126,8 @@ class SampleConsensus:
 
         Parameters
         ----------
-        problem : SampledProblem
-            Minimal solver and residuals.
-        n : int
-            Number of data.
+        problem, n : SampledProblem, int
+            Minimal solver and residuals, and number of data.
         rng : numpy.random.Generator
             Source of randomness.
 
