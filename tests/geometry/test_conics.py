@@ -23,7 +23,8 @@ from thesisrecon.geometry.conics import (
     tangent,
 )
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.strata import PLANE_AT_INFINITY, random_transform, transform
+from thesisrecon.geometry.strata import PLANE_AT_INFINITY, transform
+from validation.scenes.transforms import random_transform
 
 dimensions = st.sampled_from([3, 4])
 

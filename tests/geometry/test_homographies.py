@@ -13,7 +13,7 @@ from thesisrecon.geometry.homographies import (
     infinite_homography,
     plane_homography,
 )
-from thesisrecon.geometry.strata import random_transform, transform
+from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
     epipolar_lines,
@@ -22,6 +22,7 @@ from thesisrecon.geometry.two_view import (
     homography_residuals,
     symmetric_residuals,
 )
+from validation.scenes.transforms import random_transform
 
 
 def compatibility_residual(H, F):

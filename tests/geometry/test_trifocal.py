@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.geometry.properties import gap, holds_for_every, random_camera
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
-from thesisrecon.geometry.strata import random_transform, transform
+from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.three_view import (
     cameras_from_tensor,
     fundamentals_from_tensor,
@@ -22,6 +22,7 @@ from thesisrecon.geometry.three_view import (
     unit_tensor,
 )
 from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals
+from validation.scenes.transforms import random_transform
 
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 

@@ -17,12 +17,6 @@ def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]
         Name of the public function, for the message.
     **arrays : (ndarray, tuple)
         Array and shape; equal letters are equal sizes.
-
-    Examples
-    --------
-    >>> require_shapes("f", xy1=(np.ones((5, 2)), ("N", 2)), xy2=(np.ones((4, 2)), ("N", 2)))
-    Traceback (most recent call last):
-    ValueError: f needs xy1 (N, 2), xy2 (N, 2); got (5, 2), (4, 2)
     """
     sizes: dict[str, int] = {}
     for array, shape in arrays.values():
@@ -64,11 +58,6 @@ def homogenize(x: F64) -> F64:
     Returns
     -------
     ndarray (..., d + 1)
-
-    Examples
-    --------
-    >>> homogenize(np.array([[2.0, 3.0]])).tolist()
-    [[2.0, 3.0, 1.0]]
     """
     return np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
 
@@ -117,12 +106,6 @@ def cross_matrix(a: F64) -> F64:
     Returns
     -------
     ndarray (..., 3, 3)
-
-    Examples
-    --------
-    >>> a, b = np.array([1.0, 2.0, 3.0]), np.array([0.0, 1.0, 0.0])
-    >>> (cross_matrix(a) @ b).tolist() == np.cross(a, b).tolist()
-    True
     """
     z = np.zeros(a.shape[:-1])
     rows = [z, -a[..., 2], a[..., 1], a[..., 2], z, -a[..., 0], -a[..., 1], a[..., 0], z]

@@ -76,13 +76,6 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
     Returns
     -------
     ndarray (3, 3)
-
-    Examples
-    --------
-    >>> P1, P2 = np.eye(3, 4), np.hstack([np.diag([2.0, 2.0, 1.0]), [[1.0], [2.0], [3.0]]])
-    >>> H = infinite_homography(P1, P2)
-    >>> (H / H[2, 2]).round(9).tolist()
-    [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]
     """
     require_finite("infinite_homography", P1, P2)
     if not np.linalg.cond(P1[:, :3]) < 1e14:

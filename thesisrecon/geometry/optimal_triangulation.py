@@ -389,13 +389,6 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
     ndarray (N, 4)
         Points of unit norm; zeros if not observed twice. A match whose nearest exact pair has one point on an
         epipole gives the centre of the other camera; with both there, some point of the baseline.
-
-    Examples
-    --------
-    >>> P = np.stack([np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])])
-    >>> X = triangulate_polynomial(P, np.array([[[0.0, 0.01]], [[-0.5, -0.01]]]))
-    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
-    True
     """
     if P.shape != (2, 3, 4):
         raise ValueError(f"the polynomial method needs exactly two cameras; got P of shape {P.shape}")

@@ -14,11 +14,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry._checks import checked_inverse
-from thesisrecon.geometry.homogeneous import dehomogenize
 
 Group = Literal["projective", "affine", "metric", "euclidean"]
 Entity = Literal["points", "planes", "cameras", "conics", "dual conics"]
@@ -63,42 +61,6 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
         return np.asarray(G @ entity @ G.T)
     inverse = checked_inverse(G, "transform")
     return np.asarray(inverse.T @ entity @ inverse if kind == "conics" else entity @ inverse)
-
-
-def _affine_transform(A: F64, t: F64) -> F64:
-    """Return the transform X -> A X + t; s R makes it metric, R Euclidean."""
-    G = np.eye(4)
-    G[:3, :3], G[:3, 3] = A, t
-    return G
-
-
-def random_transform(group: Group, rng: np.random.Generator) -> F64:
-    """Draw a well-conditioned transform that belongs to no smaller group.
-
-    Parameters
-    ----------
-    group : {"projective", "affine", "metric", "euclidean"}
-        Group of the transform.
-    rng : numpy.random.Generator
-        Source of randomness.
-
-    Returns
-    -------
-    ndarray (4, 4)
-    """
-    if group == "projective":
-        return np.eye(4) + _shift_of_norm(rng, (4, 4), 0.5)
-    t, scale = rng.normal(size=3), float(np.exp(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 1.0)))
-    if group == "affine":
-        return _affine_transform(scale * (np.eye(3) + _shift_of_norm(rng, (3, 3), 0.5)), t)
-    R = scipy.spatial.transform.Rotation.random(random_state=rng).as_matrix()
-    return _affine_transform(scale * R if group == "metric" else R, t)
-
-
-def _shift_of_norm(rng: np.random.Generator, shape: tuple[int, int], norm: float) -> F64:
-    """Noise whose norm below 1 keeps the identity plus it invertible."""
-    noise = rng.normal(size=shape)
-    return np.asarray(norm * noise / np.linalg.norm(noise))
 
 
 def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
@@ -151,12 +113,6 @@ def affine_from_projective(plane: F64) -> F64:
     Returns
     -------
     ndarray (4, 4)
-
-    Examples
-    --------
-    >>> plane = np.array([0.5, 0.0, 0.0, 2.0])
-    >>> transform(affine_from_projective(plane), plane, "planes").tolist()
-    [0.0, 0.0, 0.0, 2.0]
     """
     norm = float(np.linalg.norm(plane))
     if plane.shape != (4,) or not np.isfinite(norm) or norm == 0.0:
@@ -190,7 +146,9 @@ def metric_from_affine(absolute_conic: F64) -> F64:
         lower = np.linalg.cholesky(sign * (absolute_conic + absolute_conic.T) / 2.0)
     except np.linalg.LinAlgError as error:
         raise ValueError("metric_from_affine needs a definite absolute conic") from error
-    return _affine_transform(lower.T / np.cbrt(np.linalg.det(lower)), np.zeros(3))
+    G = np.eye(4)
+    G[:3, :3] = lower.T / np.cbrt(np.linalg.det(lower))
+    return G
 
 
 def metric_from_projective(dual_quadric: F64) -> F64:
@@ -260,36 +218,3 @@ def cross_ratio(X: F64) -> float:
     if max(abs(above), abs(below)) < 1e-24:
         raise ValueError("cross_ratio does not exist if three of the four points are equal")
     return float(above / below) if below != 0.0 else np.inf
-
-
-def volume(X: F64) -> float:
-    """Return the signed volume of a tetrahedron; ratios of volumes are affine invariants (3.4.3).
-
-    Parameters
-    ----------
-    X : ndarray (4, 4)
-        Four finite homogeneous points.
-
-    Returns
-    -------
-    float
-    """
-    corners = dehomogenize(X)
-    return float(np.linalg.det(corners[1:] - corners[0])) / 6.0
-
-
-def length(X: F64, Y: F64) -> F64:
-    """Return the distance of points, a Euclidean invariant (3.4.5).
-
-    Ratios of lengths are metric invariants (3.4.4), those along a line affine ones.
-
-    Parameters
-    ----------
-    X, Y : ndarray (..., 4)
-        Finite homogeneous points.
-
-    Returns
-    -------
-    ndarray (...)
-    """
-    return np.asarray(np.linalg.norm(dehomogenize(X) - dehomogenize(Y), axis=-1))

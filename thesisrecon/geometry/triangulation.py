@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
@@ -43,22 +43,6 @@ class _WeightedObservations(NamedTuple):
     view: I64
     xy: F64
     weight: F64
-
-
-@njit(cache=True, nogil=True)
-def _list_observations(xy: F64, start: I64, view: I64, seen: F64) -> int:
-    """List the observations of xy (V, N, 2) that are not NaN, point by point; return their number."""
-    count = 0
-    for j in range(xy.shape[1]):
-        start[j] = count
-        for v in range(xy.shape[0]):
-            x, y = xy[v, j, 0], xy[v, j, 1]
-            if math.isnan(x) or math.isnan(y):
-                continue
-            view[count], seen[count, 0], seen[count, 1] = v, x, y
-            count += 1
-    start[xy.shape[1]] = count
-    return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -213,51 +197,6 @@ def _triangulate_each_linear(
             X[j] = y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _triangulate_each_midpoint(
-    inverses: F64, centres: F64, start: I64, view: I64, xy: F64, least_det: float, X: F64
-) -> None:
-    """Fill X (N, 4) with the points nearest to all rays; ``inverses`` (V, 3, 3) of M, ``centres`` (V, 3).
-
-    Zeros for parallel rays, a determinant of the sum of I - d d' below ``least_det``.
-    """
-    A, b, d, r = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    for j in range(len(start) - 1):
-        first, last = start[j], start[j + 1]
-        X[j] = 0.0
-        if last - first < 2:
-            continue
-        A[:] = 0.0
-        b[:] = 0.0
-        origin = centres[view[first]]
-        for k in range(first, last):
-            M = inverses[view[k]]
-            for i in range(3):
-                d[i] = M[i, 0] * xy[k, 0] + M[i, 1] * xy[k, 1] + M[i, 2]
-                r[i] = centres[view[k], i] - origin[i]
-            size = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-            along = (d[0] * r[0] + d[1] * r[1] + d[2] * r[2]) * size
-            for i in range(3):
-                b[i] += r[i] - along * d[i]
-                A[i, i] += 1.0
-                for m in range(3):
-                    A[i, m] -= d[i] * d[m] * size
-        c0 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
-        c1 = A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2]
-        c2 = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
-        det = A[0, 0] * c0 + A[0, 1] * c1 + A[0, 2] * c2
-        if not det > least_det:
-            continue
-        X[j, 0] = c0 * b[0] + c1 * b[1] + c2 * b[2]
-        X[j, 1] = c1 * b[0] + (A[0, 0] * A[2, 2] - A[0, 2] ** 2) * b[1]
-        X[j, 1] += (A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]) * b[2]
-        X[j, 2] = c2 * b[0] + (A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]) * b[1]
-        X[j, 2] += (A[0, 0] * A[1, 1] - A[0, 1] ** 2) * b[2]
-        for i in range(3):
-            X[j, i] = X[j, i] / det + origin[i]
-        X[j, 3] = 1.0
-
-
 Method = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
 _SortedPixels = tuple[I64, I64, F64]
 """Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
@@ -375,11 +314,10 @@ def _checked(P: F64, xy: F64) -> tuple[F64, F64]:
 
 
 def _listed(xy: F64) -> _SortedPixels:
-    views, points = xy.shape[:2]
-    start, view = np.empty(points + 1, dtype=np.int64), np.empty(views * points, dtype=np.int64)
-    seen = np.empty((views * points, 2))
-    count = _list_observations(xy, start, view, seen)
-    return start, view[:count], seen[:count]
+    """List the observations of xy (V, N, 2) that are not NaN, point by point."""
+    point, view = np.nonzero(~np.isnan(xy).any(axis=2).T)
+    start = np.searchsorted(point, np.arange(xy.shape[1] + 1))
+    return start, np.ascontiguousarray(view), xy[view, point]
 
 
 def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
@@ -403,13 +341,22 @@ def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
 
 def _midpoint(P: F64, listed: _SortedPixels) -> F64:
     """Point nearest to all rays (6.3.2), meaningful in a metric frame only; zeros for parallel rays."""
+    start, view, xy = listed
     M = P[:, :, :3]
     if not (np.abs(np.linalg.det(M)) > 1e-14 * np.linalg.norm(M, axis=(1, 2)) ** 3).all():
         raise ValueError("the mid-point method needs finite cameras; the left 3x3 part of one is singular")
-    inverses = np.linalg.inv(M)
-    centres = np.ascontiguousarray(-np.einsum("vab,vb->va", inverses, P[:, :, 3]))
-    X = np.empty((len(listed[0]) - 1, 4))
-    _triangulate_each_midpoint(np.ascontiguousarray(inverses), centres, *listed, _PARALLEL, X)
+    point = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    centres = -np.linalg.solve(M, P[:, :, 3:])[:, :, 0]
+    origin = centres.mean(axis=0)
+    r = (centres - origin)[view]
+    d = np.einsum("kab,kb->ka", np.linalg.inv(M)[view], homogenize(xy))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    A, b = np.zeros((len(start) - 1, 3, 3)), np.zeros((len(start) - 1, 3, 1))
+    np.add.at(A, point, np.eye(3) - d[:, :, None] * d[:, None])
+    np.add.at(b, point, (r - np.sum(d * r, axis=1, keepdims=True) * d)[:, :, None])
+    good = (np.diff(start) >= 2) & (np.linalg.det(A) > _PARALLEL)
+    X = np.zeros((len(start) - 1, 4))
+    X[good] = homogenize(np.linalg.solve(A[good], b[good])[:, :, 0] + origin)
     return X
 
 

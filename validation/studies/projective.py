@@ -26,7 +26,6 @@ from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.geometry.camera_matrix import compose_camera, project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, pixel_from_unit
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
-from thesisrecon.geometry.strata import random_transform
 from thesisrecon.geometry.triangulation import triangulate, triangulate_observations
 from thesisrecon.geometry.two_view import canonical_cameras, epipoles, unit_norm
 from thesisrecon.numerics.partial_bundle import refine_points
@@ -42,6 +41,7 @@ from validation.scenes.cloud import make_cloud
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks
 from validation.scenes.real import Scene
 from validation.scenes.rigs import Rig, noisy_tracks
+from validation.scenes.transforms import random_transform
 from validation.studies.runner import Part, Rows, scenes_here
 
 PLAIN, ITERATED, AFFINE, GROWN = (

@@ -16,13 +16,14 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
-from thesisrecon.geometry.strata import Group, random_transform
+from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.cloud import make_cloud
 from validation.scenes.rigs import Rig
+from validation.scenes.transforms import random_transform
 from validation.studies.measuring import least_seconds
 from validation.studies.runner import Part, Rows
 
