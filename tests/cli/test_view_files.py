@@ -12,7 +12,6 @@ from tests.surface.sphere import SHAPE, photograph, ring_of
 from tests.synthetic import reconstruction_of
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import RenderOptions, render_run
-from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.io._exports import cameras_table
 from thesisrecon.io._files import write_json
@@ -191,5 +190,3 @@ def test_progress_is_reported_to_the_end(run):
     written = render_run(run, run / "film", options, threads=2, progress=lambda *step: heard.append(step))
     assert heard == [("views", k, 4) for k in range(1, 5)]
     assert [path.is_file() for path in (*written.frames, written.animation)] == [True] * 4
-    with pytest.raises(UsageError, match="unknown path"):
-        RenderOptions(path="spiral")

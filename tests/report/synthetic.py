@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw
-from thesisrecon.surface.mesh import simplify_mesh
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
 from tests.surface.sphere import K as SPHERE_K
@@ -17,6 +16,7 @@ from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
 from thesisrecon.report.data import ReportData
 from thesisrecon.surface.fusion import VolumetricFusion
+from thesisrecon.surface.simplification import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 SIZE = (480, 320)

@@ -177,7 +177,7 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
     depth = np.tile(np.linspace(2.0, 6.0, 300, dtype=np.float32), (200, 1))
     depth[:, 200:250] = np.nan
     depth[0, 0] = 1e4  # a stray takes none of the scale
-    drawn = draw_depth(depth)
+    drawn = draw_depth(depth, side=360)
     assert (drawn.picture.width, drawn.picture.height) == (300, 200)
     assert drawn.near == pytest.approx(2.0, abs=0.06)
     assert drawn.far == pytest.approx(6.0, abs=0.06)
@@ -193,7 +193,7 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
 
 @pytest.mark.parametrize("value", [np.nan, 3.0])
 def test_depth_maps_without_depth_or_relief_are_accepted(value):
-    drawn = draw_depth(np.full((30, 40), value, dtype=np.float32))
+    drawn = draw_depth(np.full((30, 40), value, dtype=np.float32), side=360)
     assert drawn.share == float(np.isfinite(value))
     np.testing.assert_equal((drawn.near, drawn.far), (value, value))
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -22,20 +21,15 @@ from thesisrecon.io._files import printable
 from thesisrecon.runtime.executors import available_threads
 
 
-class _Method(StrEnum):
-    interpolation = "interpolation"
-    tensor = "tensor"
-
-
 def interpolate(
     images: Annotated[
         list[Path],
         typer.Argument(parser=parse_folder, metavar="IMAGE IMAGE [IMAGE]", help="Two or three image files."),
     ],
     method: Annotated[
-        _Method,
+        Literal["interpolation", "tensor"],
         typer.Option("--method", help="Image interpolation (section 1.2) or trilinear tensor (1.3)."),
-    ] = _Method.interpolation,
+    ] = "interpolation",
     frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 21,
     seed: Seed = 0,
     max_size: MaxSize = None,
@@ -53,13 +47,9 @@ def interpolate(
         raise UsageError(f"--max-size takes at least 64 px; got {max_size}")
     from thesisrecon.cli.view_files import STRIP, InterpolateOptions, interpolate_images
 
-    options = InterpolateOptions(tuple(images), method.value, frames, seed, max_size)
+    options = InterpolateOptions(tuple(images), method, frames, seed, max_size)
     with interruptible("repeat the command to compute all frames"), progress_bars() as progress:
-        written = interpolate_images(
-            folder or Path("views") / method.value,
-            options,
-            threads=threads or available_threads(),
-            progress=progress,
-        )
+        where, workers = folder or Path("views") / method, threads or available_threads()
+        written = interpolate_images(where, options, threads=workers, progress=progress)
     typer.echo(str(written))
     typer.echo(f"page: {printable(str(written.folder / STRIP))}")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -32,24 +31,16 @@ _DEMO_SETTINGS: dict[str, Any] = {"dense": {"max_side": 512, "match_side": 512}}
 """Small depth maps: the demo should show a model soon."""
 
 
-class _Preset(StrEnum):
-    default = "default"
-    thesis = "thesis"
-
-
-class _Cameras(StrEnum):
-    shared = "shared"
-    per_image = "per-image"
-
-
 def reconstruct(
     images: Annotated[Path, typer.Argument(parser=parse_folder, metavar="IMAGES", help="Folder of images.")],
     out: OutputFolder,
     preset: Annotated[
-        _Preset | None, typer.Option("--preset", help="Pipeline to start from (default: default).")
+        Literal["default", "thesis"] | None,
+        typer.Option("--preset", help="Pipeline to start from (default: default)."),
     ] = None,
     cameras: Annotated[
-        _Cameras | None, typer.Option("--cameras", help="One camera per image size, or one per image.")
+        Literal["shared", "per-image"] | None,
+        typer.Option("--cameras", help="One camera per image size, or one per image."),
     ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", help="TOML file of settings that override the preset.")
@@ -90,12 +81,8 @@ def reconstruct(
 ) -> None:
     """Reconstruct cameras, points and a textured model from images."""
     cap_threads(threads)
-    chosen = _config(
-        preset.value if preset else None,
-        config,
-        _option_tables(cameras.value if cameras else None, max_size, pairs),
-        settings or [],
-    )
+    tables = _option_tables(cameras, max_size, pairs)
+    chosen = _config(preset, config, tables, settings or [])
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
     _run(images, out, chosen, seed, options)
 

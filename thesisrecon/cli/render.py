@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -14,23 +13,12 @@ from thesisrecon.errors import UsageError
 from thesisrecon.runtime.executors import available_threads
 
 
-class _CameraPath(StrEnum):
-    orbit = "orbit"
-    interpolate = "interpolate"
-
-
-class _Lighting(StrEnum):
-    none = "none"
-    camera = "camera"
-    sun = "sun"
-
-
 def render(
     run: Annotated[Path, typer.Argument(parser=parse_folder, metavar="OUT", help="Output folder of a run.")],
     path: Annotated[
-        _CameraPath,
+        Literal["orbit", "interpolate"],
         typer.Option("--path", help="Camera path: orbit the model, or interpolate between the cameras."),
-    ] = _CameraPath.orbit,
+    ] = "orbit",
     frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 90,
     size: Annotated[
         str | None,
@@ -39,8 +27,9 @@ def render(
         ),
     ] = None,
     light: Annotated[
-        _Lighting, typer.Option("--light", help="Lighting: none, camera headlight or sun.")
-    ] = _Lighting.none,
+        Literal["none", "camera", "sun"],
+        typer.Option("--light", help="Lighting: none, camera headlight or sun."),
+    ] = "none",
     background: Annotated[
         str, typer.Option("--background", help="Background colour, such as white or #20304f.")
     ] = "black",
@@ -58,21 +47,11 @@ def render(
         raise UsageError(f"render takes the output folder of a run; {run} is a file")
     from thesisrecon.cli.view_files import RenderOptions, render_run
 
-    options = RenderOptions(
-        path.value,
-        frames,
-        None if size is None else _size(size),
-        light.value,
-        _color(background),
-    )
+    wanted = None if size is None else _size(size)
+    options = RenderOptions(path, frames, wanted, light, _color(background))
     with interruptible("repeat the command to render all frames"), progress_bars() as progress:
-        written = render_run(
-            run,
-            folder or run / "views" / path.value,
-            options,
-            threads=threads or available_threads(),
-            progress=progress,
-        )
+        where, workers = folder or run / "views" / path, threads or available_threads()
+        written = render_run(run, where, options, threads=workers, progress=progress)
     typer.echo(str(written))
 
 

@@ -12,7 +12,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.cli._view_sequences import interpolated_sequence, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import OutputError, UsageError, counted, in_words, unknown_word
+from thesisrecon.errors import OutputError, UsageError, counted, in_words
 from thesisrecon.io._exports import animation_suffix, frame_name, read_cameras, write_animation, write_frame
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io.images import read_image
@@ -24,7 +24,7 @@ from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sam
 from thesisrecon.views.render import Light, Shading, render
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
-PATHS, LIGHTS = ("orbit", "interpolate"), ("none", "camera", "sun")
+PATHS = ("orbit", "interpolate")
 METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
 """Method -> function that returns its :class:`ViewSequence`."""
 _FRAME_MS = 100
@@ -48,7 +48,7 @@ def _check_frames(frames: int) -> None:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options of ``render``; ``size`` None is that of the first image, reduced to a long side of 1000 px."""
+    """Options of ``render``; ``size`` None is that of the first image, of at most 1000 px."""
 
     path: str = "orbit"
     frames: int = 90
@@ -57,9 +57,6 @@ class RenderOptions:
     background: tuple[int, int, int] = (0, 0, 0)
 
     def __post_init__(self) -> None:
-        for kind, word, words in (("path", self.path, PATHS), ("light", self.light, LIGHTS)):
-            if word not in words:
-                raise UsageError(unknown_word(kind, word, list(words)))
         _check_frames(self.frames)
         if self.size is not None and not all(1 <= side <= _MAX_SIDE_PX for side in self.size):
             width, height = self.size
@@ -77,8 +74,6 @@ class InterpolateOptions:
     max_size_px: int | None = None
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise UsageError(unknown_word("method", self.method, list(METHODS)))
         _check_frames(self.frames)
         if len(self.images) not in (2, 3):
             raise UsageError(f"interpolate takes 2 or 3 images; got {len(self.images)}")

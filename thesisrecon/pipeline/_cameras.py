@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from thesisrecon.config import with_images
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline._state import PipelineState, name_images
-from thesisrecon.records import RunResult, SelfCalibration
+from thesisrecon.records import MetricResult, Reconstruction, RunResult, SelfCalibration
 from thesisrecon.runtime.run import stream
 
 ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""
+
+
+def _cached(
+    state: PipelineState, stage: str, attempt: int, inputs: Any, compute: Callable[[np.random.Generator], Any]
+) -> Any:
+    """The record of one attempt, which depends on ``inputs``."""
+    run = state.run
+    key = run.key(stage, run.variant_key(stage), inputs, run.seed, attempt)
+    run.progress(stage, 0, 1)
+    found = run.cached(stage, f"attempt-{attempt}", key, lambda: compute(stream(run.seed, stage, attempt)))
+    run.progress(stage, 1, 1)
+    return found
+
+
+def _sizes_of(reconstruction: Reconstruction) -> dict[str, int]:
+    return {
+        "registered": int(reconstruction.registered.sum()),
+        "points": int(reconstruction.valid.sum()),
+    }
 
 
 def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
@@ -21,45 +42,29 @@ def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
     run, result = state.run, state.result
     assert result.tracks is not None
     tracks, sizes = result.tracks, np.array([image.size for image in result.images], dtype=np.int64)
-    key = run.key("projective", run.variant_key("projective"), run.logs["tracks"].keys, run.seed, attempt)
-    run.progress("projective", 0, 1)
-    projective = run.cached(
-        "projective",
-        f"attempt-{attempt}",
-        key,
-        lambda: state.config.projective.reconstruct(
-            tracks, result.pairs, sizes, rng=stream(run.seed, "projective", attempt), attempt=attempt
-        ),
-    )
+    method = state.config.projective
+    projective: Reconstruction = _cached(
+        state, "projective", attempt, run.logs["tracks"].keys,
+        lambda rng: method.reconstruct(tracks, result.pairs, sizes, rng=rng, attempt=attempt),
+    )  # fmt: skip
     state.result = replace(result, projective=projective)
-    counts = {"registered": int(projective.registered.sum()), "points": int(projective.valid.sum())}
-    run.finish("projective", counts=counts, metrics={"sigma_px": projective.sigma_px})
-    run.progress("projective", 1, 1)
+    run.finish("projective", counts=_sizes_of(projective), metrics={"sigma_px": projective.sigma_px})
 
 
-def _calibrate(state: PipelineState, attempt: int) -> None:
-    run, prior = state.run, state.prior
-    projective = state.result.projective
+def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
+    run, prior, projective = state.run, state.prior, state.result.projective
     assert projective is not None
     upstream = run.logs["projective"].keys[f"attempt-{attempt}"]
-    prior_key = [prior.shared, prior.mean, prior.std, prior.kind]
-    key = run.key("selfcalibration", run.variant_key("selfcalibration"), upstream, prior_key, run.seed)
-    run.progress("selfcalibration", 0, 1)
-    calibration = run.cached(
-        "selfcalibration",
-        f"attempt-{attempt}",
-        key,
-        lambda: with_images(state.config.selfcalibration, state.result.images).calibrate(
-            projective,
-            prior=prior,
-            rng=stream(run.seed, "selfcalibration", attempt),
-        ),
-    )
+    method = state.config.selfcalibration
+    calibration: SelfCalibration = _cached(
+        state, "selfcalibration", attempt, [upstream, prior.shared, prior.mean, prior.std, prior.kind],
+        lambda rng: with_images(method, state.result.images).calibrate(projective, prior=prior, rng=rng),
+    )  # fmt: skip
     state.result = replace(state.result, calibration=calibration)
     counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
     warnings = [name_images(text, state.names) for text in _critical(calibration)]
     run.finish("selfcalibration", counts=counts, warnings=warnings)
-    run.progress("selfcalibration", 1, 1)
+    return calibration
 
 
 def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
@@ -70,31 +75,18 @@ def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
     return ("; ".join(identifiability.sentences),)
 
 
-def _refine(state: PipelineState, attempt: int) -> None:
-    run, prior = state.run, state.prior
-    projective, calibration = state.result.projective, state.result.calibration
+def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) -> MetricResult:
+    run, prior, projective = state.run, state.prior, state.result.projective
     assert projective is not None
-    assert calibration is not None
-    upstream = run.logs["selfcalibration"].keys[f"attempt-{attempt}"]
-    key = run.key("metric", run.variant_key("metric"), upstream, run.seed)
-    run.progress("metric", 0, 1)
-    metric = run.cached(
-        "metric",
-        f"attempt-{attempt}",
-        key,
-        lambda: state.config.metric.refine(
-            projective,
-            calibration,
-            prior=prior,
-            rng=stream(run.seed, "metric", attempt),
-        ),
-    )
+    metric: MetricResult = _cached(
+        state, "metric", attempt, run.logs["selfcalibration"].keys[f"attempt-{attempt}"],
+        lambda rng: state.config.metric.refine(projective, calibration, prior=prior, rng=rng),
+    )  # fmt: skip
     state.result = replace(state.result, metric=metric)
-    best = metric.reconstruction
-    counts = {"registered": int(best.registered.sum()), "points": int(best.valid.sum())}
     warnings = [name_images(text, state.names) for text in metric.warnings]
-    run.finish("metric", counts=counts, metrics={"sigma_px": best.sigma_px}, warnings=warnings)
-    run.progress("metric", 1, 1)
+    best = metric.reconstruction
+    run.finish("metric", counts=_sizes_of(best), metrics={"sigma_px": best.sigma_px}, warnings=warnings)
+    return metric
 
 
 def reconstruct_metric(state: PipelineState) -> None:
@@ -106,17 +98,14 @@ def reconstruct_metric(state: PipelineState) -> None:
     failures: list[StageFailure] = []
     start = state.result
     for attempt in range(ATTEMPTS):
-        state.result = start
+        state.result, trusted = start, False
         try:
             reconstruct_projective(state, attempt)
-            _calibrate(state, attempt)
-            _refine(state, attempt)
+            trusted = _refine(state, attempt, _calibrate(state, attempt)).trusted
         except StageFailure as failure:
             failures.append(failure)
-            tried.append(state.result)
-            continue
         tried.append(state.result)
-        if state.result.metric is not None and state.result.metric.trusted:
+        if trusted:
             break
     state.result = max(tried, key=_quality)
     if state.result.metric is None:

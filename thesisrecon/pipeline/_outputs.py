@@ -28,7 +28,7 @@ from thesisrecon.runtime._run_state import Run
 from thesisrecon.runtime.run import Until
 from thesisrecon.selfcalibration.stratified import affine_camera_centres, upgrade_to_affine
 from thesisrecon.settings import toml_from_config
-from thesisrecon.surface.mesh import simplify_mesh
+from thesisrecon.surface.simplification import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 DEPTH_PX = 400

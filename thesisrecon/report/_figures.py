@@ -35,11 +35,11 @@ _MAX_ANNOTATED = 14
 class Scene:
     """Content of the 3D view, z up."""
 
-    points: F64
-    index: I64
-    views: I64
-    centres: F64
-    corners: F64
+    points: F64  # (M, 3)
+    index: I64  # (M,) numbers of the points in X
+    views: I64  # (C,) registered views
+    centres: F64  # (C, 3)
+    corners: F64  # (C, 4, 3) of the pyramids; the first two are on the upper image edge
     low: F64
     high: F64
 
@@ -79,15 +79,13 @@ def upright_rotation(rotations: F64) -> F64:
     x_axes, y_axes, z_axes = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     _, vectors = np.linalg.eigh(x_axes.T @ x_axes + 0.1 * z_axes.T @ z_axes)
     up = vectors[:, 0] if vectors[:, 0] @ y_axes.sum(axis=0) <= 0 else -vectors[:, 0]
-    viewing_direction = z_axes.sum(axis=0)
-    viewing_direction = viewing_direction - (viewing_direction @ up) * up
-    if np.linalg.norm(viewing_direction) < 0.1 * len(
-        z_axes
-    ):  # cameras all around the object: use the first one
-        viewing_direction = z_axes[0] - (z_axes[0] @ up) * up
-    if np.linalg.norm(viewing_direction) < 1e-6:  # it looks straight down: use its upward image direction
-        viewing_direction = -y_axes[0] + (y_axes[0] @ up) * up
-    ahead = viewing_direction / np.linalg.norm(viewing_direction)
+    ahead = z_axes.sum(axis=0)
+    ahead = ahead - (ahead @ up) * up
+    if np.linalg.norm(ahead) < 0.1 * len(z_axes):  # cameras all around the object: use the first one
+        ahead = z_axes[0] - (z_axes[0] @ up) * up
+    if np.linalg.norm(ahead) < 1e-6:  # it looks straight down: use its upward image direction
+        ahead = -y_axes[0] + (y_axes[0] @ up) * up
+    ahead = ahead / np.linalg.norm(ahead)
     return np.stack([np.cross(ahead, up), ahead, up])
 
 
@@ -132,34 +130,31 @@ Figure = dict[str, Any]
 def scene_figure(scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | None) -> Figure:
     """Cameras and coloured points as a plotly.js figure; ``colors`` are those of the points X."""
     digits = _useful_digits(scene)
-    paint = "#9fb4c7" if colors is None else [_hex(rgb) for rgb in colors[scene.index]]
-    points = {
-        "type": "scatter3d",
-        "mode": "markers",
-        "name": "points",
-        "hoverinfo": "skip",
-        "marker": {"size": 2, "color": paint, "line": {"width": 0}},
-        **_xyz(scene.points, digits),
-    }
+    paint = "#9fb4c7" if colors is None else [f"#{bytes(rgb).hex()}" for rgb in colors[scene.index]]
+    marks = [f"{i + 1} · {escape(names[i])}" for i in scene.views]
+    hover = {"text": marks, "hovertemplate": "%{text}<extra></extra>"}
+    points = _markers("points", 2, paint, _xyz(scene.points, digits)) | {"hoverinfo": "skip"}
+    centres = _markers("centres", 4, _ACCENT, _xyz(scene.centres, digits)) | hover
     extent = scene.high - scene.low
     aspect = 1.7 * extent / max(float(extent.max()), 1e-12)
     axes = {
         f"{name}axis": {"visible": False, "range": [float(scene.low[d]), float(scene.high[d])]}
         for d, name in enumerate("xyz")
     }
+    ratio = dict(zip("xyz", aspect.tolist(), strict=True))
     layout = {
         "paper_bgcolor": _PANEL,
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "showlegend": False,
-        "scene": {
-            **axes,
-            "aspectmode": "manual",
-            "aspectratio": dict(zip("xyz", aspect.tolist(), strict=True)),
-            "dragmode": "turntable",
-        },
+        "scene": {**axes, "aspectmode": "manual", "aspectratio": ratio, "dragmode": "turntable"},
         "hoverlabel": {"font": {"family": "system-ui, sans-serif"}},
     }
-    return {"data": [points, _pyramids(scene, digits), _camera_marks(scene, names, digits)], "layout": layout}
+    return {"data": [points, _pyramids(scene, digits), centres], "layout": layout}
+
+
+def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
+    marker = {"size": size, "color": color, "line": {"width": 0}}
+    return {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, **xyz}
 
 
 def _pyramids(scene: Scene, digits: int) -> Figure:
@@ -173,26 +168,9 @@ def _pyramids(scene: Scene, digits: int) -> Figure:
             rows += [np.round(vertex, digits).tolist() for vertex in stroke]
             rows.append(None)
     columns = {name: [None if row is None else row[d] for row in rows] for d, name in enumerate("xyz")}
-    return {
-        "type": "scatter3d",
-        "mode": "lines",
-        "name": "cameras",
-        "hoverinfo": "skip",
-        "line": {"color": _ACCENT, "width": 2.5},
-        **columns,
-    }
-
-
-def _camera_marks(scene: Scene, names: Sequence[str], digits: int) -> Figure:
-    return {
-        "type": "scatter3d",
-        "mode": "markers",
-        "name": "centres",
-        "text": [f"{i + 1} · {escape(names[i])}" for i in scene.views],
-        "hovertemplate": "%{text}<extra></extra>",
-        "marker": {"size": 4, "color": _ACCENT, "line": {"width": 0}},
-        **_xyz(scene.centres, digits),
-    }
+    line = {"color": _ACCENT, "width": 2.5}
+    kind = {"type": "scatter3d", "mode": "lines", "name": "cameras", "hoverinfo": "skip", "line": line}
+    return {**kind, **columns}
 
 
 def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:
@@ -209,19 +187,11 @@ def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure
     high = max(1.0, float(np.log10(counts.max(initial=10))))
     low = max(0.0, min(float(np.log10(max(counts.min(initial=10**9), 1))), high - 1.0))
     scale = {"zmin": low, "zmax": high}
-    traces = [
-        {
-            **_heat(accepted, labels, "", "verified matches"),
-            "colorscale": _PAIR_SCALE,
-            "colorbar": _count_bar(),
-        },
-        {
-            **_heat(refused, labels, "× ", "verified matches, not accepted"),
-            "colorscale": _REFUSED_SCALE,
-            "showscale": False,
-        },
-    ]
-    return {"data": [trace | scale for trace in traces], "layout": _matrix_layout(labels, block)}
+    good = _heat(accepted, labels, "", "verified matches")
+    good |= {"colorscale": _PAIR_SCALE, "colorbar": _count_bar()}
+    bad = _heat(refused, labels, "× ", "verified matches, not accepted")
+    bad |= {"colorscale": _REFUSED_SCALE, "showscale": False}
+    return {"data": [good | scale, bad | scale], "layout": _matrix_layout(labels, block)}
 
 
 def _count_matrix(pairs: Sequence[TwoView], cells: int, block: int, accepted: bool) -> I64:
@@ -256,14 +226,18 @@ def _heat(counts: I64, labels: list[str], mark: str, words: str) -> Figure:
 
 def _matrix_layout(labels: list[str], block: int) -> Figure:
     step = max(1, -(-len(labels) // 20))
-    ticks = {
+    axis = {
         "type": "category",
-        "tickmode": "array",
-        "tickvals": labels[::step],
-        "ticktext": [str(first * block + 1) for first in range(0, len(labels), step)],
         "showgrid": False,
         "zeroline": False,
         "fixedrange": True,
+        "constrain": "domain",
+    }
+    numbers = [str(first * block + 1) for first in range(0, len(labels), step)]
+    ticks = {
+        "tickmode": "array",
+        "tickvals": labels[::step],
+        "ticktext": numbers,
         "tickangle": 0,
         "ticks": "",
     }
@@ -273,22 +247,16 @@ def _matrix_layout(labels: list[str], block: int) -> Figure:
         "margin": {"l": 34, "r": 8, "t": 30, "b": 8},
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": _INK},
         "showlegend": False,
-        "xaxis": {**ticks, "side": "top", "constrain": "domain"},
-        "yaxis": {**ticks, "autorange": "reversed", "scaleanchor": "x", "constrain": "domain"},
+        "xaxis": {**axis, **ticks, "side": "top"},
+        "yaxis": {**axis, **ticks, "autorange": "reversed", "scaleanchor": "x"},
     }
 
 
 def _count_bar() -> Figure:
     counts = [1, 3, 10, 30, 100, 200, 300, 500, 1000, 2000, 3000, 5000, 10_000, 30_000]
-    return {
-        "tickvals": [round(float(np.log10(n)), 3) for n in counts],
-        "ticktext": [str(n) for n in counts],
-        "thickness": 12,
-        "outlinewidth": 0,
-        "x": 1.01,
-        "xpad": 4,
-        "len": 1.0,
-    }
+    values = [round(float(np.log10(n)), 3) for n in counts]
+    size = {"thickness": 12, "outlinewidth": 0, "x": 1.01, "xpad": 4, "len": 1.0}
+    return {"tickvals": values, "ticktext": [str(n) for n in counts], **size}
 
 
 def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
@@ -338,7 +306,3 @@ def _useful_digits(scene: Scene) -> int:
 
 def _xyz(points: F64, digits: int) -> Figure:
     return {name: np.round(points[:, d], digits).tolist() for d, name in enumerate("xyz")}
-
-
-def _hex(rgb: NDArray[np.uint8]) -> str:
-    return f"#{int(rgb[0]):02x}{int(rgb[1]):02x}{int(rgb[2]):02x}"

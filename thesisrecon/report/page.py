@@ -10,8 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F64
-from thesisrecon.records import IntrinsicInterval, StageReport, TwoView
+from thesisrecon.records import StageReport, TwoView
 from thesisrecon.report._assessment import (
     assess,
     count_of,
@@ -38,7 +37,6 @@ from thesisrecon.report._drawing import (
     DIFFERENCE_LIMIT,
     SCALE,
     DepthImage,
-    EmbeddedImage,
     depth_side,
     draw_depth,
     draw_held_out,
@@ -56,7 +54,6 @@ from thesisrecon.report._figures import (
 from thesisrecon.report._viewer import viewer_data
 from thesisrecon.report.data import (
     ReportData,
-    ResidualSummary,
     reprojection_distances,
     summarize_distances,
 )
@@ -184,33 +181,6 @@ def _embedded(rgb: NDArray[np.uint8]) -> str:
     return embed_jpeg(picture, quality=_FRAME_QUALITY).uri
 
 
-@dataclass(frozen=True)
-class _Card:
-    """One image on the page: its state, the reason, and its residuals if it has a camera."""
-
-    number: int
-    name: str
-    state: str
-    level: str
-    reason: str
-    size: str
-    picture: EmbeddedImage
-    residuals: ResidualSummary | None
-    bars: str
-    intrinsics: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class _DrawnPair:
-    """A drawn image pair."""
-
-    title: str
-    names: tuple[str, str]
-    numbers: tuple[int, int]
-    facts: str
-    picture: EmbeddedImage
-
-
 def render_report(data: ReportData) -> str:
     """Render the page of a run; the same data gives the same text.
 
@@ -234,44 +204,37 @@ def render_report(data: ReportData) -> str:
     model = _model(data)
     figure_scripts = [plotly_script(), page_resource("page.js")] if figures else []
     model_scripts = [page_resource("viewer.js")] if model is not None else []
-    return (
-        _environment()
-        .from_string(page_resource("template.html.j2"))
-        .render(
-            data=data,
-            assessment=assess(data),
-            facts=key_facts(data, overall),
-            overall=overall,
-            cards=_cards(data, distances, bars),
-            intrinsic_columns=_intrinsic_columns(data),
-            limit_px=limit_px,
-            model=model,
-            **_model_drawings(data),
-            figures=figures,
-            shown_points=shown,
-            most_points=MAX_POINTS,
-            all_points=int(best.valid.sum()) if best is not None else 0,
-            pair_selection=pair_selection_text(data),
-            drawn_pairs=_drawn_pairs(data),
-            listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:_MAX_LISTED_PAIRS],
-            stages=_stages(data.reports),
-            warnings=_warnings(data),
-            self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
-            summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
-            style=page_resource("style.css"),
-            figure_scripts=figure_scripts,
-            model_scripts=model_scripts,
-            script_hashes=script_hashes((*figure_scripts, *model_scripts)),
-            histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
-        )
-    )
-
-
-def _environment() -> jinja2.Environment:
     environment = template_environment()
     environment.filters.update(grouped=grouped, decimals=decimals, significant=significant)
     environment.globals.update(count_of=count_of)
-    return environment
+    template = environment.from_string(page_resource("template.html.j2"))
+    return template.render(
+        data=data,
+        assessment=assess(data),
+        facts=key_facts(data, overall),
+        overall=overall,
+        cards=_cards(data, distances, bars),
+        intrinsic_columns=_intrinsic_columns(data),
+        limit_px=limit_px,
+        model=model,
+        **_model_drawings(data),
+        figures=figures,
+        shown_points=shown,
+        most_points=MAX_POINTS,
+        all_points=int(best.valid.sum()) if best is not None else 0,
+        pair_selection=pair_selection_text(data),
+        drawn_pairs=_drawn_pairs(data),
+        listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:_MAX_LISTED_PAIRS],
+        stages=_stages(data.reports),
+        warnings=_warnings(data),
+        self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
+        summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
+        style=page_resource("style.css"),
+        figure_scripts=figure_scripts,
+        model_scripts=model_scripts,
+        script_hashes=script_hashes((*figure_scripts, *model_scripts)),
+        histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
+    )
 
 
 def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
@@ -319,25 +282,26 @@ def _depths(data: ReportData) -> list[tuple[int, str, DepthImage]]:
     ]
 
 
-def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[_Card]:
-    intrinsics = data.original_intrinsics
-    cards = []
+def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict[str, Any]]:
+    """Each image on the page: its state, the reason, and its residuals if it has a camera."""
+    cards, intrinsics = [], data.original_intrinsics
     for i, image in enumerate(data.images):
         state, level, reason = _state(data, i)
-        cards.append(
-            _Card(
-                number=i + 1,
-                name=image.name,
-                state=state,
-                level=level,
-                reason=reason,
-                size=_size_text(image.original_size, image.size),
-                picture=thumbnail(image, len(data.images)),
-                residuals=summarize_distances(distances[i]),
-                bars=bars[i],
-                intrinsics={name: _interval_text(interval) for name, interval in intrinsics[i].items()},
-            )
-        )
+        (width, height), (w, h) = image.original_size, image.size
+        processed = "" if (width, height) == (w, h) else f", processed at {w} × {h}"
+        card = {
+            "number": i + 1,
+            "name": image.name,
+            "state": state,
+            "level": level,
+            "reason": reason,
+            "size": f"{width} × {height} px{processed}",
+            "picture": thumbnail(image, len(data.images)),
+            "residuals": summarize_distances(distances[i]),
+            "bars": bars[i],
+            "intrinsics": {name: plus_minus(v.value, v.std) for name, v in intrinsics[i].items()},
+        }
+        cards.append(card)
     return cards
 
 
@@ -360,31 +324,20 @@ def _state(data: ReportData, i: int) -> tuple[str, str, str]:
     return "not registered", "bad", best.reasons[i] or "no reason was recorded"
 
 
-def _interval_text(interval: IntrinsicInterval) -> str:
-    return plus_minus(interval.value, interval.std)
-
-
-def _size_text(original: tuple[int, int], working: tuple[int, int]) -> str:
-    text = f"{original[0]} × {original[1]} px"
-    return text if original == working else f"{text}, processed at {working[0]} × {working[1]}"
-
-
-def _drawn_pairs(data: ReportData) -> list[_DrawnPair]:
+def _drawn_pairs(data: ReportData) -> list[dict[str, Any]]:
     """Draw the accepted pairs with most and fewest verified matches, else the best rejected one."""
     accepted = [pair for pair in data.pairs if pair.accepted]
     drawable = accepted or [pair for pair in data.pairs if pair.inliers]
     ranked = sorted(drawable, key=lambda pair: (-pair.inliers, pair.i, pair.j))
-    if not ranked:
-        return []
-    titles = [("Best pair" if accepted else "Best pair (rejected)", ranked[0])]
+    titles = [("Best pair" if accepted else "Best pair (rejected)", ranked[0])] if ranked else []
     if len(accepted) > 1:
         titles.append(("Weakest accepted pair", ranked[-1]))
     drawn = []
     for title, pair in titles:
         first, second = data.images[pair.i], data.images[pair.j]
+        sides = {"names": (first.name, second.name), "numbers": (pair.i + 1, pair.j + 1)}
         picture = draw_pair(pair, first, second)
-        numbers = (pair.i + 1, pair.j + 1)
-        drawn.append(_DrawnPair(title, (first.name, second.name), numbers, _pair_text(pair), picture))
+        drawn.append({"title": title, **sides, "facts": _pair_text(pair), "picture": picture})
     return drawn
 
 
