@@ -658,7 +658,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
             pairs=PairMatching(matcher=MaximumLikelihoodScanline(), min_confidence=0.25),
             linker=SequenceLinking(),
             refinement=None,
-            completion=None,
+            completion=False,
         ),
         # "By fitting parametric surfaces through the points ... sampled in a fine scale triangular pattern".
         model=SurfaceModel(surface=BSplineSurface(), fusion=DepthSheets()),

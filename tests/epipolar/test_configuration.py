@@ -6,9 +6,9 @@ import pytest
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.configuration import (
     Configuration,
+    _rotation_homography,
+    _rotation_test,
     classify_configuration,
-    rotation_homography,
-    rotation_homography_test,
 )
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
@@ -31,7 +31,6 @@ def test_every_kind_is_named_at_every_noise(kind, sigma):
         found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
         right += found.kind is kind
         assert found.sigma_px == pytest.approx(sigma, rel=0.35)
-        assert kind.value in str(found) or found.kind is not kind
     assert right >= 24
 
 
@@ -106,7 +105,7 @@ def test_a_rotated_camera_is_distinguished_from_a_homography_with_rotation_eigen
     """H = A R A^-1 has those eigenvalues for every A; only for an A of square pixels is it a rotation's."""
     rng = np.random.default_rng(1)
     xy1 = rng.uniform(-1.2, 1.2, (100, 2))
-    turn = rotation_homography(np.array([np.log(focal), 0.1, -0.2, 0.02, 0.15, -0.05]))
+    turn = _rotation_homography(np.array([np.log(focal), 0.1, -0.2, 0.02, 0.15, -0.05]))
     skewed = np.diag([1.0, 2.5, 1.0])
     for H, is_turn in ((turn, True), (skewed @ turn @ np.linalg.inv(skewed), False)):
         xy2 = dehomogenize(homogenize(xy1) @ H.T)
@@ -117,7 +116,7 @@ def test_a_rotated_camera_is_distinguished_from_a_homography_with_rotation_eigen
                 lambda h, noisy=noisy: homography_sampson_residuals(h.reshape(3, 3), *noisy).ravel(),
                 H.ravel(),
             ).x.reshape(3, 3)
-            ratios.append(rotation_homography_test(fitted, *noisy, risk=0.001))
+            ratios.append(_rotation_test(fitted, *noisy))
         assert (np.array(ratios) <= 1.0).sum() == (20 if is_turn else 0)
         assert min(ratios) >= -1e-6
 

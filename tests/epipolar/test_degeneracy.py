@@ -4,24 +4,19 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar.degeneracy import (
-    NEIGHBOURS,
-    _contradicted_ratios,
-    assess_degeneracy,
-    log10_false_alarms,
-    multiplicity_weights,
-)
-from thesisrecon.epipolar.frame import PairFrame
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
-from thesisrecon.epipolar.planes import (
-    _count_transferred,
+from thesisrecon.epipolar._chance import log10_false_alarms, multiplicity_weights
+from thesisrecon.epipolar._frame import PairFrame
+from thesisrecon.epipolar._planes import (
     _plane_distances,
     _plane_normal_equations,
+    count_transferred,
     find_dominant_plane,
     fundamentals_of_plane,
     plane_covariance,
     refine_plane,
 )
+from thesisrecon.epipolar.degeneracy import NEIGHBOURS, _contradicted_ratios, assess_degeneracy
+from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import (
     epipoles,
@@ -212,7 +207,7 @@ def test_transfers_are_counted_as_by_numpy():
     pair = make_pair(60, np.random.default_rng(3))
     H = np.stack([estimate_homography(pair.xy1[k : k + 12], pair.xy2[k : k + 12]) for k in (0, 12, 24)])
     expected = [int(np.sum(homography_residuals(h, pair.xy1, pair.xy2) < 30.0)) for h in H]
-    np.testing.assert_array_equal(_count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
+    np.testing.assert_array_equal(count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
 
 
 def test_fundamentals_of_a_plane_keep_the_plane_and_the_two_matches():

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 
 from tests.epipolar.pairs import angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
+from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.configuration import Configuration, _refine_translation, classify_configuration
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
 from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, ThesisRansac, discard_outliers
-from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
-from thesisrecon.epipolar.sampling import sampson_distances
+from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
@@ -85,15 +85,15 @@ def test_seven_point_of_degenerate_matches_is_empty():
     assert estimate_seven_point(np.ones((7, 2)), pair.xy2).shape == (0, 3, 3)
 
 
-@pytest.mark.parametrize("refine", [refine_sampson, refine_epipolar_distance, refine_reprojection])
-def test_refinement_reaches_the_bound_of_the_noise(refine):
+@pytest.mark.parametrize("criterion", ["sampson", "epipolar-distance", "reprojection"])
+def test_refinement_reaches_the_bound_of_the_noise(criterion):
     """Sampson distances of a fit with 7 parameters have mean square sigma^2 (n - 7) / n (HZ 5.1)."""
     n, sigma, ratios = 60, 0.4, []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         pair = make_pair(n, rng)
         xy1, xy2, _ = spoil(pair, rng, sigma=sigma, outliers=0.0)
-        F = refine(estimate_eight_point(xy1, xy2), xy1, xy2)
+        F = refine_fundamental(estimate_eight_point(xy1, xy2), xy1, xy2, criterion)
         assert np.linalg.svd(F, compute_uv=False)[2] < 1e-12
         ratios.append(np.mean(sampson_residuals(F, xy1, xy2) ** 2) / (sigma**2 * (n - 7) / n))
     assert np.mean(ratios) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (n - 7) / 60))
@@ -107,7 +107,7 @@ def test_gradient_criterion_beats_the_linear_estimate():
         xy1, xy2, _ = spoil(pair, rng, sigma=0.5, outliers=0.0)
         F = estimate_eight_point(xy1, xy2)
         linear.append(error_px(F, pair))
-        refined.append(error_px(refine_sampson(F, xy1, xy2), pair))
+        refined.append(error_px(refine_fundamental(F, xy1, xy2), pair))
     assert np.mean(refined) < np.mean(linear)
 
 
@@ -292,9 +292,7 @@ def test_linear_estimate_of_a_plane_is_refused():
 def test_refinement_refuses_a_start_without_rank(F):
     pair = make_pair(10, np.random.default_rng(0))
     with pytest.raises(ValueError, match="rank 2"):
-        refine_sampson(F, pair.xy1, pair.xy2)
-    with pytest.raises(ValueError, match="loss_px"):
-        refine_sampson(pair.F, pair.xy1, pair.xy2, loss_px=0.0)
+        refine_fundamental(F, pair.xy1, pair.xy2)
 
 
 H = np.array([[1.02, 0.03, 12.0], [-0.02, 0.99, -7.0], [1e-5, -2e-5, 1.0]])
@@ -400,12 +398,9 @@ def test_algorithm_2_minimises_the_chosen_criterion():
     algorithm = ThesisRansac(threshold_px=3.0, epipolar_distance=True, rounds=10)
     fit = algorithm.estimate(xy1, xy2, np.random.default_rng(0))
     kept = fit.inliers
-    again = refine_epipolar_distance(fit.F, xy1[kept], xy2[kept])
-    other = refine_sampson(fit.F, xy1[kept], xy2[kept])
+    again = refine_fundamental(fit.F, xy1[kept], xy2[kept], "epipolar-distance")
+    other = refine_fundamental(fit.F, xy1[kept], xy2[kept])
     assert angle_between(fit.F, again) < 0.1 * angle_between(other, again)
-
-
-TESTS = list(INLIER_TESTS.values())
 
 
 @holds_for_every()
@@ -432,7 +427,7 @@ def test_5_3_the_residual_over_its_gradient_has_the_noise_of_a_coordinate():
     assert np.std(found) == pytest.approx(sigma, rel=0.03)
 
 
-@pytest.mark.parametrize(("test", "share"), [(TESTS[0], 0.95), (TESTS[1], 0.95), (TESTS[2], 0.916)])
+@pytest.mark.parametrize(("test", "share"), zip(INLIER_TESTS, (0.95, 0.95, 0.916), strict=True))
 def test_the_share_of_right_matches_that_pass(test, share):
     rng = np.random.default_rng(1)
     pair = make_pair(4000, rng)
@@ -479,7 +474,7 @@ def test_it_is_as_good_as_the_gold_standard_at_any_noise(n, sigma):
         xy1, xy2, _ = spoil(pair, rng, sigma=sigma, outliers=0.0)
         fit, everyone = estimate_fundamental(xy1, xy2, seed=seed), np.ones(n, dtype=bool)
         ours.append(squared_error(fit.F, pair, everyone))
-        gold.append(squared_error(refine_reprojection(pair.F, xy1, xy2), pair, everyone))
+        gold.append(squared_error(refine_fundamental(pair.F, xy1, xy2, "reprojection"), pair, everyone))
         sigmas.append(fit.sigma_px / sigma)
         assert fit.inliers.mean() > 0.9
     assert np.sqrt(np.mean(ours) / np.mean(gold)) < 1.15

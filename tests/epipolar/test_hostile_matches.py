@@ -11,8 +11,7 @@ from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_poi
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.precision import epipolar_distance_interval, epipoles_of
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
-from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_reprojection, refine_sampson
-from thesisrecon.epipolar.row_parameterization import refine_by_rows
+from thesisrecon.epipolar.refinement import refine_by_rows, refine_fundamental
 from thesisrecon.errors import StageFailure
 
 PAIR = make_pair(60, np.random.default_rng(0))
@@ -65,7 +64,7 @@ HOSTILE = {
     "of two sizes": (1e-8 * GOOD1, GOOD2),
     "one wild match": (np.r_[GOOD1, [[1e12, 5.0]]], np.r_[GOOD2, [[5.0, 1e12]]]),
 }
-NAN_BY_DEFINITION = ("rotation_deg", "rotation_camera_ratio")
+NAN_BY_DEFINITION = ("rotation_deg",)
 
 
 def rng():
@@ -91,9 +90,9 @@ FUNCTIONS = {
     "eight-point": estimate_eight_point,
     "eight-point raw": lambda a, b: estimate_eight_point(a, b, normalized=False),
     "seven-point": lambda a, b: estimate_seven_point(a[:7], b[:7]),
-    "gradient": lambda a, b: refine_sampson(PAIR.F, a, b),
-    "epipolar distance": lambda a, b: refine_epipolar_distance(PAIR.F, a, b),
-    "reprojection": lambda a, b: refine_reprojection(PAIR.F, a, b),
+    "gradient": lambda a, b: refine_fundamental(PAIR.F, a, b),
+    "epipolar distance": lambda a, b: refine_fundamental(PAIR.F, a, b, "epipolar-distance"),
+    "reprojection": lambda a, b: refine_fundamental(PAIR.F, a, b, "reprojection"),
     "rows": lambda a, b: refine_by_rows(PAIR.F, a, b),
     "configuration": lambda a, b: classify_configuration(PAIR.F, a, b),
     "noise": lambda a, b: discard_outliers(PAIR.F, a, b),

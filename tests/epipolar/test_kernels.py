@@ -6,14 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.epipolar.pairs import make_pair, oriented
+from thesisrecon.epipolar import _refinement as rank2
+from thesisrecon.epipolar import _sampling as kernels
 from thesisrecon.epipolar import linear
-from thesisrecon.epipolar import refinement as rank2
-from thesisrecon.epipolar import sampling as kernels
-from thesisrecon.epipolar.frame import PairFrame
+from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import algebraic_residuals, sampson_residuals, symmetric_residuals
+from thesisrecon.numerics.levenberg_marquardt import solve_damped
 from thesisrecon.numerics.ransac import draw_sample
-from thesisrecon.numerics.small_solvers import solve_damped
 
 seeds = st.integers(0, 2**31)
 
@@ -89,7 +89,7 @@ def test_no_singular_member_is_lost_at_infinity(turn):
     basis = np.linalg.qr(np.stack([first, second]).T)[0].T
     c, s = np.cos(turn), np.sin(turn)
     F = np.empty((3, 9))
-    count = linear.singular_members(np.array([[c, s], [-s, c]]) @ basis, F)
+    count = linear._singular_members(np.array([[c, s], [-s, c]]) @ basis, F)
     found = [np.diag(f.reshape(3, 3)) for f in F[:count]]
     assert count == 3
     for expected in (np.array([1.0, 2.0, 0.0]), np.array([0.0, 3.0, -1.0]), np.array([3.0, 0.0, 2.0])):
@@ -100,7 +100,7 @@ def test_no_singular_member_is_lost_at_infinity(turn):
 def test_a_pencil_of_singular_matrices_has_no_answer():
     pencil = np.zeros((2, 9))
     pencil[0, 0] = pencil[1, 4] = 1.0
-    assert linear.singular_members(pencil, np.empty((3, 9))) == 0
+    assert linear._singular_members(pencil, np.empty((3, 9))) == 0
 
 
 @settings(max_examples=30, deadline=None)
@@ -263,11 +263,11 @@ def test_reprojection_distances_are_those_of_the_optimal_correction(seed):
 
 def batch_of(points, rng):
     """The samples (LANES, 7) of one batch and the solved batch."""
-    uniforms = rng.random((linear.LANES, 7))
-    X, Y = np.ones((28, linear.LANES)), np.empty((linear.ROWS, linear.LANES))
+    uniforms = rng.random((kernels.LANES, 7))
+    X, Y = np.ones((28, kernels.LANES)), np.empty((kernels.ROWS, kernels.LANES))
     kernels._draw_batch(points, uniforms, X)
-    linear.solve_seven_point_batch(X, Y)
-    samples = np.empty((linear.LANES, 7), dtype=np.int64)
+    kernels.solve_seven_point_batch(X, Y)
+    samples = np.empty((kernels.LANES, 7), dtype=np.int64)
     for u, sample in zip(uniforms, samples, strict=True):
         draw_sample(u, len(points), sample)
     return samples, Y
@@ -296,7 +296,7 @@ def test_every_oriented_solution_of_the_exact_solver_is_found_and_no_other(seed)
             for f in exact[: linear.seven_point(points, sample, exact)].copy()
             if oriented(f, points, sample)
         ]
-        count = linear.seven_point_batch_solutions(Y, lane, np.empty(9), found)
+        count = kernels.seven_point_batch_solutions(Y, lane, np.empty(9), found)
         counts += count != len(expected)
         for f in expected[: count if count == len(expected) else 0]:
             differences.append(min(min(np.linalg.norm(f - g), np.linalg.norm(f + g)) for g in found[:count]))
@@ -312,7 +312,7 @@ def test_solutions_satisfy_the_seven_equations_and_are_singular():
     F = np.empty((3, 9))
     for lane, sample in enumerate(samples):
         x1, x2 = np.c_[points[sample, :2], np.ones(7)], np.c_[points[sample, 2:], np.ones(7)]
-        for f in F[: linear.seven_point_batch_solutions(Y, lane, np.empty(9), F)]:
+        for f in F[: kernels.seven_point_batch_solutions(Y, lane, np.empty(9), F)]:
             M = f.reshape(3, 3)
             assert np.linalg.norm(f) == pytest.approx(1.0)
             assert np.abs(np.einsum("na,ab,nb->n", x2, M, x1)).max() < 1e-6
@@ -326,8 +326,8 @@ def test_degenerate_samples_never_give_numbers_that_are_not_finite():
     for points in (line, one, np.zeros((30, 4)), np.r_[line[:15], points_with_outliers(rng)[:15]]):
         _, Y = batch_of(np.ascontiguousarray(points), rng)
         F = np.empty((3, 9))
-        for lane in range(linear.LANES):
-            assert np.isfinite(F[: linear.seven_point_batch_solutions(Y, lane, np.empty(9), F)]).all()
+        for lane in range(kernels.LANES):
+            assert np.isfinite(F[: kernels.seven_point_batch_solutions(Y, lane, np.empty(9), F)]).all()
 
 
 @settings(max_examples=200, deadline=None)
@@ -338,7 +338,7 @@ def test_newton_cubic_with_three_real_roots(expected):
         return
     _, a, b, c = np.poly(expected)
     roots = np.empty(3)
-    assert linear._newton_cubic_roots(a, b, c, roots) == 3
+    assert kernels._newton_cubic_roots(a, b, c, roots) == 3
     np.testing.assert_allclose(np.sort(roots), expected, atol=1e-8)
 
 
@@ -347,11 +347,11 @@ def test_newton_cubic_with_three_real_roots(expected):
 def test_newton_cubic_with_one_real_root(x, re, im):
     _, a, b, c = np.real(np.poly([x, re + 1j * im, re - 1j * im]))
     roots = np.empty(3)
-    assert linear._newton_cubic_roots(a, b, c, roots) == 1
+    assert kernels._newton_cubic_roots(a, b, c, roots) == 1
     assert roots[0] == pytest.approx(x, abs=1e-8)
 
 
 def test_cubic_without_numbers_has_no_root():
     for bad in (np.nan, np.inf):
-        assert linear._newton_cubic_roots(bad, 1.0, 1.0, np.empty(3)) == 0
-        assert linear._newton_cubic_roots(1.0, 1.0, bad, np.empty(3)) == 0
+        assert kernels._newton_cubic_roots(bad, 1.0, 1.0, np.empty(3)) == 0
+        assert kernels._newton_cubic_roots(1.0, 1.0, bad, np.empty(3)) == 0

@@ -8,9 +8,12 @@ import pytest
 
 from tests.epipolar.pairs import SIZE, Pair, make_pair, spoil
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
-from thesisrecon.epipolar.planes import _plane_homographies, homography_inlier_ratio
 from thesisrecon.epipolar.ransac import ThesisRansac
-from thesisrecon.epipolar.verification import PairVerification
+from thesisrecon.epipolar.verification import (
+    PairVerification,
+    _plane_homographies,
+    homography_inlier_ratio,
+)
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.two_view import fundamental_from_cameras, homography_residuals, sampson_residuals
 from thesisrecon.records import FundamentalFit, Matches

@@ -3,7 +3,7 @@ import pytest
 from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordinates, maximum_filter
 
 from tests.synthetic import texture
-from thesisrecon.features.kernels import (
+from thesisrecon.features._kernels import (
     corner_response,
     enforce_spacing,
     fit_maxima,

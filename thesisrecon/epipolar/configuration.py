@@ -5,9 +5,6 @@ for a camera that moves without rotation F is [e]x with two degrees of freedom i
 model is accepted unless its residuals exceed the noise, or more of the matches that it does not explain agree
 with F than expected by chance. A homography is a pure rotation if it is K R K^-1 with square pixels (HZ 13.2,
 19.6).
-
-:mod:`thesisrecon.epipolar.degeneracy` answers a different question: whether another F explains the matches as
-well.
 """
 
 from __future__ import annotations
@@ -19,20 +16,16 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.epipolar.degeneracy import (
-    chance_of_agreement,
-    log10_false_alarms,
-    multiplicity_weights,
-)
-from thesisrecon.epipolar.frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar.planes import (
+from thesisrecon.epipolar._chance import chance_of_agreement, log10_false_alarms, multiplicity_weights
+from thesisrecon.epipolar._frame import PairFrame, check_matches, check_start
+from thesisrecon.epipolar._planes import (
     find_dominant_plane,
     fundamentals_of_plane,
     plane_covariance,
     refine_plane,
 )
-from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
-from thesisrecon.epipolar.sampling import sampson_distances
+from thesisrecon.epipolar._refinement import SAMPSON, UNBOUNDED, refine
+from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.geometry.two_view import homography_sampson_residuals
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
@@ -70,19 +63,8 @@ TRANSLATED = 3.3
 CORRECTIONS, EXACT = 10, 1e-12
 
 
-def rotation_homography(parameters: F64) -> F64:
-    """Compute the homography K R K^-1 of a rotating camera with square pixels.
-
-    Parameters
-    ----------
-    parameters : ndarray (6,)
-        log f, principal point (2), rotation vector (3).
-
-    Returns
-    -------
-    ndarray (3, 3)
-        The homography.
-    """
+def _rotation_homography(parameters: F64) -> F64:
+    """K R K^-1 of a camera with square pixels: log f, principal point (2), rotation vector (3)."""
     f, (x, y) = float(np.exp(np.clip(parameters[0], -20.0, 20.0))), parameters[1:3]
     K = np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
     back = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, f]]) / f
@@ -90,38 +72,21 @@ def rotation_homography(parameters: F64) -> F64:
     return H
 
 
-def rotation_homography_test(H: F64, xy1: F64, xy2: F64, *, risk: float) -> float:
-    """Test whether a homography is that of a rotating camera, K R K^-1, by an F-test.
+def _rotation_test(H: F64, xy1: F64, xy2: F64) -> float:
+    """Squared residuals of the best K R K^-1 minus those of H, relative to their limit by an F-test.
 
-    2 and 2 N - 8 degrees of freedom: a homography has eight, a rotation with focal length and principal point
-    six.
-
-    Parameters
-    ----------
-    H : ndarray (3, 3)
-        Least-squares homography of the matches.
-    xy1, xy2 : ndarray (N, 2)
-        Matches, N > 4, relative to one centre for both images and with unit spread.
-    risk : float
-        Probability to reject a rotation.
-
-    Returns
-    -------
-    float
-        Increase of the squared residuals from H to the best K R K^-1, relative to its limit; at most 1 for a
-        rotation.
+    At most 1 for a rotation. ``H`` is the least-squares homography of the matches.
     """
 
     def residuals(parameters: F64) -> F64:
-        return homography_sampson_residuals(rotation_homography(parameters), xy1, xy2).ravel()
+        return homography_sampson_residuals(_rotation_homography(parameters), xy1, xy2).ravel()
 
     starts = [_start(H, f) for f in FOCALS]
     costs = [float(np.sum(residuals(start) ** 2)) for start in starts]
     rss = float(np.sum(homography_sampson_residuals(H, xy1, xy2) ** 2))
     degrees = 2 * len(xy1) - 8
-    limit = (
-        CONSTRAINTS * float(scipy.special.fdtri(CONSTRAINTS, degrees, 1.0 - risk)) * max(rss, 1e-24) / degrees
-    )
+    quantile = float(scipy.special.fdtri(CONSTRAINTS, degrees, 1.0 - ROTATION_RISK))
+    limit = CONSTRAINTS * quantile * max(rss, 1e-24) / degrees
     ratio = np.inf
     for k in np.argsort(costs, kind="stable")[:REFINED]:
         if np.isfinite(costs[k]):
@@ -159,42 +124,21 @@ class ConfigurationReport:
     kind : Configuration
         The result.
     sigma_px : float
-        Standard deviation of one coordinate from the residuals of the general F.
+        Standard deviation of one coordinate from the residuals of the general F, or of the homography.
     homography_errors : float
         Log ratio of the squared parallax of matches within 3.3 sigma of the homography to their squared
         distances from F, in standard errors; above 4 it shows relief.
     off_homography : float
         Fraction of the inliers more than 4 sigma off the homography.
-    off_homography_chance : float
-        log10 of the false alarms of the matches off the homography; below -3 they show relief.
-    rotation_errors : float
-        abs(trace H - trace H^-1) for det H = 1 in standard errors, 0 for a rotation.
-    rotation_camera_ratio : float
-        Result of :func:`rotation_homography_test`; NaN if the eigenvalues exclude a rotation.
     rotation_deg : float
-        Rotation angle; NaN if the eigenvalues exclude a rotation.
-    translation_ratio : float
-        Increase of the squared residuals from F to [e]x relative to its limit: at most 1 for a translation,
-        inf if more matches leave [e]x than expected by chance.
+        Rotation angle; NaN if the eigenvalues of the homography exclude a rotation.
     """
 
     kind: Configuration
     sigma_px: float
     homography_errors: float
     off_homography: float
-    off_homography_chance: float
-    rotation_errors: float
-    rotation_camera_ratio: float
     rotation_deg: float
-    translation_ratio: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.kind.value}: noise {self.sigma_px:.2g} px, homography off by "
-            f"{self.homography_errors:.1f} standard errors with {100.0 * self.off_homography:.0f} % of the "
-            f"matches beyond it (10^{self.off_homography_chance:.0f} by chance), rotation "
-            f"off by {self.rotation_errors:.1f}, translation at {self.translation_ratio:.2g} of its limit"
-        )
 
 
 def classify_configuration(
@@ -225,10 +169,9 @@ def classify_configuration(
     Raises
     ------
     ValueError
-        If F has rank below 2, flags have the wrong shape, or as
-        :func:`~thesisrecon.epipolar.frame.as_matches`.
+        If F has rank below 2, flags have the wrong shape, or matches are not finite (N, 2) arrays.
     StageFailure
-        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+        If there are too few or collinear inliers.
 
     Examples
     --------
@@ -283,36 +226,30 @@ def _scale(f: F64, points: F64) -> float:
 
 
 def _classify(case: _InlierData, scale: float, seed: int) -> ConfigurationReport:
-    sigma = case.sigma
-    errors, off, chance, rotation_errors, angle, camera = np.inf, 1.0, -np.inf, np.inf, np.nan, np.nan
+    sigma, errors, off, chance, angle = case.sigma, np.inf, 1.0, -np.inf, np.nan
+    kind = Configuration.GENERAL
     plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
     if plane is not None:
-        squared = plane.squared * case.sigma**2
+        squared = plane.squared * sigma**2
         noise = _plane_noise(squared[case.agree])
         near, far = squared < NEAR * noise**2, squared > FAR * noise**2
         errors = _excess_errors(case, near, float(squared[near].sum()))
         off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, EPIPOLE)
         # Least squares of all of them, for which the covariance holds.
         refine_plane(plane.h, case.points[near], 1e6 * noise, 4)
-        rotation_errors, angle = _rotation_evidence(
-            plane.h.reshape(3, 3), plane_covariance(plane.h, case.points[near], noise)
-        )
-    ratio = _translation_ratio(case)
-    kind = Configuration.GENERAL
-    if plane is not None and errors < STANDARD_ERRORS and chance > MAX_CHANCE:
-        # F fits the noise of a plane, the homography does not: use the noise of the homography.
-        sigma = noise
-        rotated = rotation_errors < _rotation_limit(int(near.sum())) and np.isfinite(angle)
-        if rotated:
+        H = plane.h.reshape(3, 3)
+        rotation_errors, angle = _rotation_evidence(H, plane_covariance(plane.h, case.points[near], noise))
+        if errors < STANDARD_ERRORS and chance > MAX_CHANCE:
+            # F fits the noise of a plane, the homography does not: use the noise of the homography.
+            sigma, kind = noise, Configuration.PLANE
             xy1, xy2 = case.points[near, :2], case.points[near, 2:]
-            camera = rotation_homography_test(plane.h.reshape(3, 3), xy1, xy2, risk=ROTATION_RISK)
-            rotated = camera <= 1.0
-        kind = Configuration.ROTATION if rotated else Configuration.PLANE
-    elif ratio <= 1.0:
+            # Student's limit, since the noise is estimated.
+            limit = float(scipy.special.stdtrit(int(near.sum()) - 7, 1.0 - ROTATION_RISK))
+            if rotation_errors < limit and np.isfinite(angle) and _rotation_test(H, xy1, xy2) <= 1.0:
+                kind = Configuration.ROTATION
+    if kind is Configuration.GENERAL and _translation_ratio(case) <= 1.0:
         kind = Configuration.TRANSLATION
-    return ConfigurationReport(
-        kind, sigma / scale, errors, off, chance, rotation_errors, camera, angle, ratio
-    )
+    return ConfigurationReport(kind, sigma / scale, errors, off, angle)
 
 
 def _plane_noise(squared: F64) -> float:
@@ -367,11 +304,6 @@ def _rotation_evidence(H: F64, covariance: F64) -> tuple[float, float]:
     return abs(t - t_back) / gap, angle
 
 
-def _rotation_limit(n: int) -> float:
-    """Limit of the rotation errors in standard errors: Student's, since the noise is estimated."""
-    return float(scipy.special.stdtrit(n - 7, 1.0 - ROTATION_RISK))
-
-
 def _translation_ratio(case: _InlierData) -> float:
     """(RSS of [e]x - RSS of F) relative to its limit, an F-test with 5 and n - 7 degrees of freedom."""
     inliers = case.points[case.agree]
@@ -388,11 +320,8 @@ def _translation_ratio(case: _InlierData) -> float:
     _refine_translation(f, near, np.inf)
     rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
     rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
-    limit = (
-        BEYOND_TRANSLATION
-        * float(scipy.special.fdtri(BEYOND_TRANSLATION, degrees, 1.0 - RISK))
-        * max(rss / degrees, 1e-24)
-    )
+    quantile = float(scipy.special.fdtri(BEYOND_TRANSLATION, degrees, 1.0 - RISK))
+    limit = BEYOND_TRANSLATION * quantile * max(rss / degrees, 1e-24)
     strays = case.chance * float(case.weights[~case.agree].sum())
     return (rss_simple - rss) / (limit * (1.0 + ALLOWANCE * min(strays, 1.0)))
 

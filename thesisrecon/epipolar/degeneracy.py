@@ -1,13 +1,8 @@
 """Section 5.5: do the matches determine F, or does another F explain them as well?
 
 If most matches lie on one plane with homography H, every [e]x H explains them, and the epipole depends on the
-few matches off the plane. A wrong F then has as many inliers as the right one. Four indicators are tested:
-matches off the plane agree with F no more often than by chance; another epipole explains about as many; the
-covariance of F is large; or the inliers off the plane lie among matches of the plane where no surface can be,
-as matches between repeated windows of a facade do.
-
-:mod:`thesisrecon.epipolar.configuration` answers a different question: which simpler model (plane, pure
-rotation, pure translation) explains the matches within their noise.
+few matches off the plane. A wrong F then has as many inliers as the right one. Which simpler model explains
+the matches is a different question: :mod:`thesisrecon.epipolar.configuration`.
 """
 
 from __future__ import annotations
@@ -15,21 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numba import njit
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar.frame import PairFrame, check_matches
-from thesisrecon.epipolar.planes import DominantPlane, find_dominant_plane, fundamentals_of_plane
+from thesisrecon.epipolar._chance import chance_of_agreement, log10_false_alarms, multiplicity_weights
+from thesisrecon.epipolar._frame import PairFrame, check_matches
+from thesisrecon.epipolar._planes import DominantPlane, find_dominant_plane, fundamentals_of_plane
+from thesisrecon.epipolar._refinement import SAMPSON, refine
+from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.precision import epipolar_distance_std
-from thesisrecon.epipolar.refinement import SAMPSON, refine
-from thesisrecon.epipolar.sampling import sampson_distances
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
-# Matches within a cell of this size count as one place.
-SAME_PX = 2.0
 NEIGHBOURS = 5
 # Epipoles tried and matches off the plane that each is scored on.
 PAIRS, COMPETING_SUBSET = 300, 400
@@ -121,91 +113,6 @@ def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: f
     return ratios
 
 
-def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
-    """Compute the weight of each match, one over the number of matches at its position.
-
-    At most one of the matches at one position (within 2 px in either image) is right, and all of them agree
-    with every F whose epipole lies there: together they count once.
-
-    Parameters
-    ----------
-    xy1, xy2 : ndarray (N, 2)
-        Matched points, px.
-
-    Returns
-    -------
-    ndarray (N,)
-        Weights in (0, 1].
-    """
-    return 1.0 / np.maximum(_matches_per_cell(xy1), _matches_per_cell(xy2))
-
-
-def _matches_per_cell(xy: F64) -> F64:
-    cell = np.floor(xy / SAME_PX).astype(np.int64)
-    _, place, count = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True, return_counts=True)
-    return np.asarray(count[place], dtype=np.float64)
-
-
-def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: int) -> float:
-    """Compute log10 of the expected number of models with as many inliers among wrong matches.
-
-    A-contrario bound (tried - free) C(tried, free) P(Binomial >= agreeing - free): the model passes through
-    ``free`` matches and each of the rest agrees with probability ``chance``.
-
-    Parameters
-    ----------
-    agreeing : float
-        Weight of the matches that agree with the model.
-    tried : float
-        Weight of all matches.
-    chance : float
-        Probability that a wrong match agrees.
-    free : int
-        Number of matches that define the model.
-
-    Returns
-    -------
-    float
-        0 or more if that many are expected by chance.
-
-    References
-    ----------
-    L. Moisan and B. Stival, "A probabilistic criterion to detect rigid point matches", IJCV 57, 2004.
-    """
-    rest, hits = tried - free, agreeing - free
-    if hits <= 0.0 or rest <= 0.0:
-        return 0.0
-    tail = float(scipy.special.betainc(hits, max(rest - hits, 0.0) + 1.0, min(chance, 1.0)))
-    ways = (
-        scipy.special.gammaln(tried + 1.0)
-        - scipy.special.gammaln(free + 1.0)
-        - scipy.special.gammaln(rest + 1.0)
-        + np.log(max(rest, 1.0))
-    )
-    return float((ways + np.log(max(tail, 1e-300))) / np.log(10.0))
-
-
-def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
-    """Compute the probability that a wrong match lies within a Sampson distance of any F.
-
-    Area of a band of width 2 sqrt(2) band_px across the bounding box of the matches, relative to the box.
-
-    Parameters
-    ----------
-    xy1, xy2 : ndarray (N, 2)
-        Matched points, px.
-    band_px : float
-        Sampson distance.
-
-    Returns
-    -------
-    float
-        Probability in (0, 1].
-    """
-    narrow = min(float(np.ptp(xy)) for xy in (*xy1.T, *xy2.T))
-    return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))
-
-
 @dataclass(frozen=True)
 class _CompetingModel:
     """Another F ``f`` (9,) and how it differs from the estimate.
@@ -226,89 +133,59 @@ class _CompetingModel:
         """Standard errors by which the estimate explains more (McNemar's test)."""
         return (self.lost - self.gained) / float(np.sqrt(max(self.lost + self.gained, 1.0)))
 
+    def differs(self, relevant: float) -> bool:
+        """Whether the estimate is wrong if this model is right.
 
-def _find_competing_models(
+        A model that explains all inliers of the estimate must explain much more, since a wrong match or two
+        that it gains are far from it.
+        """
+        return self.apart > relevant or (self.error > relevant and self.margin < -MIN_MARGIN)
+
+
+def _competing_starts(
     f: F64, points: F64, weights: F64, plane: DominantPlane, *, band: float, rng: Generator
-) -> tuple[list[_CompetingModel], float]:
-    """Competing models of ``f`` and the fraction of matches off the plane that a model explains by chance.
+) -> tuple[F64, float]:
+    """Other F (S, 9) of the plane, and the fraction of matches off it that an F explains by chance.
 
     [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005), right or wrong, is scored
-    on all matches off the plane; the best distinct ones are refined on all ``points`` (N, 4). In half of the
-    pairs one match agrees with ``f`` and the other does not, since a wrong F often shares most of its inliers
-    with the right one. Matches have ``weights`` (N,) and agree within ``band``.
+    on all matches off the plane; the best distinct ones remain. In half of the pairs one match agrees with
+    ``f`` and the other does not, since a wrong F often shares most of its inliers with the right one.
     """
-    distances = np.asarray(sampson_distances(f, points))
-    inside = distances < band
     off = np.flatnonzero(plane.off)
     if len(off) < 3:
-        return [], 0.0
+        return np.empty((0, 9)), 0.0
     off = off[rng.permutation(len(off))[:COMPETING_SUBSET]]
-    w, own = weights[off], inside[off]
-    F, agree, sums = fundamentals_of_plane(
-        plane.h, points[off], np.stack([w, w * ~own]), _pairs(own, rng), WIDE * band
-    )
+    w, own = weights[off], (np.asarray(sampson_distances(f, points)) < band)[off]
+    pairs = rng.integers(0, len(off), (PAIRS, 2))
+    agreeing, others = np.flatnonzero(own), np.flatnonzero(~own)
+    if len(agreeing) and len(others):
+        half = PAIRS // 2
+        pairs[:half, 0] = agreeing[rng.integers(0, len(agreeing), half)]
+        pairs[:half, 1] = others[rng.integers(0, len(others), half)]
+    F, agree, sums = fundamentals_of_plane(plane.h, points[off], np.stack([w, w * ~own]), pairs, WIDE * band)
     # The two matches that define a model always agree with it.
     beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
-    chance = float(np.quantile(beyond, TYPICAL)) / WIDE
     chosen, count = np.empty(2 * COMPETING, dtype=np.int64), 0
     for k, value in enumerate((sums[:, 0], sums[:, 0] + sums[:, 1])):
         order = np.argsort(-value, kind="stable")
         count = _select_distinct(order[:EXAMINED], agree, w, SAME_MODEL, chosen, count, (k + 1) * COMPETING)
-    competing_models = [
-        _competing_model(_refined(F[s], points, band), points, weights, (distances, inside), band)
-        for s in chosen[:count]
-    ]
-    return competing_models, chance
+    return F[chosen[:count]], float(np.quantile(beyond, TYPICAL)) / WIDE
 
 
-def _pairs(inside: B8, rng: Generator) -> NDArray[np.int64]:
-    pairs = rng.integers(0, len(inside), (PAIRS, 2))
-    own, others = np.flatnonzero(inside), np.flatnonzero(~inside)
-    if len(own) and len(others):
-        half = PAIRS // 2
-        pairs[:half, 0] = own[rng.integers(0, len(own), half)]
-        pairs[:half, 1] = others[rng.integers(0, len(others), half)]
-    return pairs
-
-
-def _refined(f: F64, points: F64, band: float) -> F64:
-    f = f.copy()
+def _competing_model(start: F64, f: F64, points: F64, weights: F64, band: float) -> _CompetingModel:
+    """A start (9,) refined on all points and compared with ``f``."""
+    other = start.copy()
     for gate in GATES:
-        refine(f, points, SAMPSON, gate * band, KNEE * gate * band, STEPS)
-    return f
-
-
-def _compare_competing_models(
-    others: list[F64], f: F64, points: F64, weights: F64, *, band: float
-) -> list[_CompetingModel]:
-    """Other matrices (9,) as competing models of ``f``, each refined on all ``points`` (N, 4)."""
-    distances = np.asarray(sampson_distances(f, points))
-    found = (distances, distances < band)
-    return [_competing_model(_refined(other, points, band), points, weights, found, band) for other in others]
-
-
-def _competing_model(
-    f: F64, points: F64, weights: F64, found: tuple[F64, B8], band: float
-) -> _CompetingModel:
-    distances, inside = found
-    own = np.asarray(sampson_distances(f, points))
-    agreeing = own < band
-    lost, gained = weights[inside & ~agreeing].sum(), weights[agreeing & ~inside].sum()
+        refine(other, points, SAMPSON, gate * band, KNEE * gate * band, STEPS)
+    distances, own = np.asarray(sampson_distances(f, points)), np.asarray(sampson_distances(other, points))
+    inside, agreeing = distances < band, own < band
+    lost, gained = float(weights[inside & ~agreeing].sum()), float(weights[agreeing & ~inside].sum())
     if not agreeing.any() or not inside.any():
-        return _CompetingModel(f, float(lost), float(gained), np.inf, np.inf)
+        return _CompetingModel(other, lost, gained, np.inf, np.inf)
     error, back = (
-        np.sqrt(np.mean(np.minimum(d, FAR * band) ** 2)) for d in (distances[agreeing], own[inside])
+        float(np.sqrt(np.mean(np.minimum(d, FAR * band) ** 2))) for d in (distances[agreeing], own[inside])
     )
-    return _CompetingModel(f, float(lost), float(gained), float(error), float(min(error, back)))
-
-
-@dataclass(frozen=True)
-class _OffPlaneWeights:
-    """Weights of matches off the plane: inliers of F, all, and contradicted inliers."""
-
-    agreeing: float
-    tried: float
-    contradicted: float
+    return _CompetingModel(other, lost, gained, error, min(error, back))
 
 
 def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) -> DegeneracyReport:
@@ -316,9 +193,10 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
 
     F is undetermined if the inliers off the dominant plane are no more than expected by chance, if another F
     of that plane or of another search explains about as many matches (McNemar's test) at a relevant distance,
-    if more than a fifth of the inliers off the plane are contradicted by neighbours on it, or if the
-    covariance allows errors of the epipolar lines above a pixel. The F of a pure translation is determined.
-    Wrong matches that are as coherent as a surface (a whole facade shifted by one window) cannot be detected.
+    if more than a fifth of the inliers off the plane are contradicted by neighbours on it (as matches between
+    repeated windows are), or if the covariance allows errors of the epipolar lines above a pixel. The F of a
+    pure translation is determined. Wrong matches as coherent as a surface (a whole facade shifted by one
+    window) cannot be detected.
 
     Parameters
     ----------
@@ -337,9 +215,9 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     Raises
     ------
     ValueError
-        If the inlier flags do not fit the matches, or as :func:`~thesisrecon.epipolar.frame.as_matches`.
+        If the inlier flags do not fit the matches, or these are not finite (N, 2) arrays.
     StageFailure
-        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+        If there are too few or collinear matches.
 
     Examples
     --------
@@ -350,9 +228,6 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     >>> plane = xy1 + [40.0, 10.0] + rng.normal(0, 0.3, (60, 2))
     >>> assess_degeneracy(estimate_fundamental(xy1, plane), xy1, plane, rng=rng).determined
     False
-    >>> relief = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1)) + rng.normal(0, 0.3, (60, 2))
-    >>> assess_degeneracy(estimate_fundamental(xy1, relief), xy1, relief, rng=rng).determined
-    True
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     if fit.inliers.shape != (len(xy1),):
@@ -365,62 +240,60 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     error_px = _expected_error(fit, xy1, xy2)
     if plane is None:
         return DegeneracyReport(False, ("F has too few inliers",), expected_error_px=error_px)
-    weights = multiplicity_weights(xy1, xy2)
-    competing_models, by_model_chance = _find_competing_models(
-        f, points, weights, plane, band=band_px * frame.scale, rng=rng
+    weights, band = multiplicity_weights(xy1, xy2), band_px * frame.scale
+    of_plane, chance_of_model = _competing_starts(f, points, weights, plane, band=band, rng=rng)
+    starts = [*of_plane, *(frame.matrix_in_frame(F) for F in fit.competing_models)]
+    models = [_competing_model(start, f, points, weights, band) for start in starts]
+    on_inliers = fit.inliers & plane.off
+    agreeing, tried = float(weights[on_inliers].sum()), float(weights[plane.off].sum())
+    near = 2.0 * sigma_px * frame.scale
+    part = _contradicted_fraction(
+        points[fit.inliers], weights[fit.inliers], plane.h, on_inliers[fit.inliers], near
     )
-    starts = [frame.matrix_in_frame(F) for F in fit.competing_models]
-    competing_models += _compare_competing_models(starts, f, points, weights, band=band_px * frame.scale)
-    support = _support(points, fit.inliers, weights, plane, 2.0 * sigma_px * frame.scale)
-    by_chance = chance_of_agreement(xy1, xy2, band_px)
-    chance = log10_false_alarms(
-        support.agreeing - support.contradicted,
-        support.tried,
-        chance=max(by_model_chance, by_chance),
-        free=2,
-    )
+    contradicted = agreeing * part
+    chance_of_match = chance_of_agreement(xy1, xy2, band_px)
+    chance = max(chance_of_model, chance_of_match)
+    false_alarms = log10_false_alarms(agreeing - contradicted, tried, chance=chance, free=2)
     relevant_px = max(MAX_ERROR_PX, 2.0 * fit.sigma_px)
-    least = _least_gain(support, by_chance)
-    different = [r for r in competing_models if r.gained >= least and _differs(r, relevant_px * frame.scale)]
-    other = min(different, key=lambda r: r.margin, default=None)
+    # A competing model must gain more than wrong matches agree by chance.
+    expected = 2.0 * chance_of_match * (tried - agreeing)
+    least = max(MIN_GAIN * agreeing, expected + 2.0 * np.sqrt(expected) + 1.0)
+    different = [m for m in models if m.gained >= least and m.differs(relevant_px * frame.scale)]
+    other = min(different, key=lambda m: m.margin, default=None)
+    off = f"{agreeing:.0f} of {tried:.0f} matches off the dominant plane agree with F"
+    reasons = []
+    if false_alarms > MAX_CHANCE:
+        reasons.append(f"{off}, no more than expected by chance")
+    if contradicted > MAX_CONTRADICTED * agreeing:
+        reasons.append(
+            f"{off}, but {contradicted:.0f} of them lie among matches of the plane, as matches "
+            "between repeated structures do"
+        )
+    if other is not None and other.margin < MIN_MARGIN:
+        reasons.append(
+            f"another F explains {other.gained:.0f} matches that this F does not explain, and "
+            f"misses {other.lost:.0f} of its inliers"
+        )
+    if error_px > relevant_px:
+        reasons.append(f"the covariance of F allows epipolar line errors of {error_px:.2g} px")
     return DegeneracyReport(
-        determined=not (reasons := tuple(_reasons(support, chance, other, error_px, relevant_px))),
-        reasons=reasons,
-        off_plane=support.agreeing,
-        contradicted=support.contradicted,
-        log10_false_alarms=chance,
+        determined=not reasons,
+        reasons=tuple(reasons),
+        off_plane=agreeing,
+        contradicted=contradicted,
+        log10_false_alarms=false_alarms,
         competing_margin=other.margin if other is not None else float("inf"),
         competing_model=frame.matrix_in_pixels(other.f) if other is not None else None,
         expected_error_px=error_px,
     )
 
 
-def _least_gain(support: _OffPlaneWeights, chance: float) -> float:
-    """Weight of matches that a competing model must gain: more than wrong matches agree by chance."""
-    expected = 2.0 * chance * (support.tried - support.agreeing)
-    return float(max(MIN_GAIN * support.agreeing, expected + 2.0 * np.sqrt(expected) + 1.0))
-
-
-def _differs(competing_model: _CompetingModel, relevant: float) -> bool:
-    """Return whether F is wrong if the competing model is right.
-
-    A model that explains all inliers of F must explain much more, since a wrong match or two that it gains
-    are far from F.
-    """
-    return competing_model.apart > relevant or (
-        competing_model.error > relevant and competing_model.margin < -MIN_MARGIN
-    )
-
-
-def _support(points: F64, inliers: B8, weights: F64, plane: DominantPlane, near: float) -> _OffPlaneWeights:
-    own = inliers & plane.off
-    chosen = np.flatnonzero(own[inliers])
+def _contradicted_fraction(points: F64, weights: F64, h: F64, off: B8, near: float) -> float:
+    """Fraction of the inliers ``off`` the plane among contradicting matches of the plane, from a sample."""
+    chosen = np.flatnonzero(off)
     chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
-    ratios = _contradicted_ratios(plane.h, points[inliers], ~plane.off[inliers], chosen, near)
-    some = weights[inliers][chosen]
-    agreeing = float(weights[own].sum())
-    part = float(some[ratios > CONTRADICTED].sum() / max(some.sum(), 1e-300))
-    return _OffPlaneWeights(agreeing, float(weights[plane.off].sum()), part * agreeing)
+    ratios, some = _contradicted_ratios(h, points, ~off, chosen, near), weights[chosen]
+    return float(some[ratios > CONTRADICTED].sum() / max(some.sum(), 1e-300))
 
 
 def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
@@ -429,29 +302,3 @@ def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
     some = some[:: max(1, len(some) // SAMPLED)]
     std = epipolar_distance_std(fit.F, fit.covariance, xy1[some], xy2[some])
     return float(np.sqrt(np.mean(std**2))) if len(std) else float("inf")
-
-
-def _reasons(
-    support: _OffPlaneWeights,
-    chance: float,
-    competing_model: _CompetingModel | None,
-    error_px: float,
-    relevant_px: float,
-) -> list[str]:
-    off = f"{support.agreeing:.0f} of {support.tried:.0f} matches off the dominant plane agree with F"
-    reasons = []
-    if chance > MAX_CHANCE:
-        reasons.append(f"{off}, no more than expected by chance")
-    if support.contradicted > MAX_CONTRADICTED * support.agreeing:
-        reasons.append(
-            f"{off}, but {support.contradicted:.0f} of them lie among matches of the plane, as matches "
-            "between repeated structures do"
-        )
-    if competing_model is not None and competing_model.margin < MIN_MARGIN:
-        reasons.append(
-            f"another F explains {competing_model.gained:.0f} matches that this F does not explain, and "
-            f"misses {competing_model.lost:.0f} of its inliers"
-        )
-    if error_px > relevant_px:
-        reasons.append(f"the covariance of F allows epipolar line errors of {error_px:.2g} px")
-    return reasons

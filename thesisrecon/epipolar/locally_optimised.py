@@ -9,11 +9,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
+from thesisrecon.epipolar._frame import PairFrame, check_matches
+from thesisrecon.epipolar._refinement import SAMPSON, refine
+from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
-from thesisrecon.epipolar.frame import PairFrame, check_matches
 from thesisrecon.epipolar.precision import fundamental_covariance
-from thesisrecon.epipolar.refinement import SAMPSON, refine
-from thesisrecon.epipolar.sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.errors import StageFailure
 from thesisrecon.numerics.noise import (
     NoiseMixture,
@@ -56,11 +56,11 @@ FEW_WRONG = 0.2
 
 @dataclass(frozen=True)
 class LocallyOptimisedRansac:
-    """Seven-point RANSAC with a truncated quadratic score and refinement over rank-2 matrices.
+    """Seven-point RANSAC with a truncated quadratic score and refinement over rank-2 matrices [1]_ [2]_.
 
     A search draws samples until one without outliers is likely; its best F is refined by Levenberg-Marquardt
     on the Sampson distances (5.4) with Huber's loss. Searches are repeated until ``starts`` of them end at
-    the best score: they disagree if a plane or a repeated pattern has many inliers, and then more are made.
+    the best score: they disagree if a plane or a repeated pattern has many inliers.
 
     The best F is refined once more with a loss fitted to its residuals: a mixture of noise, its heavier tail
     and wrong matches gives the inlier limit and the best width of Huber's loss. If more matches than expected
@@ -73,10 +73,8 @@ class LocallyOptimisedRansac:
         Sampson distance of an inlier during the search.
     confidence : float
         Probability that one of six searches draws a sample without outliers.
-    starts : int
-        Number of searches that must end at the same score.
-    max_starts : int
-        Maximum number of searches.
+    starts, max_starts : int
+        Number of searches that must end at the same score, and maximum number of searches.
     min_samples : int
         Minimum total of samples over six searches, for any inlier ratio: a wrong F of a dominant plane has
         many inliers.
@@ -91,8 +89,8 @@ class LocallyOptimisedRansac:
 
     References
     ----------
-    P. Torr and A. Zisserman, "MLESAC", CVIU 78, 2000. O. Chum, J. Matas and J. Kittler, "Locally optimized
-    RANSAC", DAGM 2003.
+    .. [1] P. Torr and A. Zisserman, "MLESAC", CVIU 78, 2000.
+    .. [2] O. Chum, J. Matas and J. Kittler, "Locally optimized RANSAC", DAGM 2003.
     """
 
     threshold_px: float = 1.0
@@ -118,38 +116,7 @@ class LocallyOptimisedRansac:
             raise ValueError(f"inlier_sigmas must be positive; got {self.inlier_sigmas}")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
-        """Estimate F of matches with outliers.
-
-        Parameters
-        ----------
-        xy1, xy2 : array_like (N, 2)
-            Matched points, N >= 8, px.
-        rng : numpy.random.Generator
-            Source of the samples.
-
-        Returns
-        -------
-        FundamentalFit
-            F, inliers, noise, covariance and competing models; always finite.
-
-        Raises
-        ------
-        ValueError
-            As :func:`~thesisrecon.epipolar.frame.as_matches`.
-        StageFailure
-            If there are too few or collinear matches, or no F has 8 matches within the threshold.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> rng = np.random.default_rng(0)
-        >>> xy1 = rng.uniform(0, 500, (60, 2))
-        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
-        >>> xy2[:30] = rng.uniform(0, 500, (30, 2))
-        >>> fit = LocallyOptimisedRansac(threshold_px=1.0).estimate(xy1, xy2, rng)
-        >>> bool(fit.inliers[30:].all())
-        True
-        """
+        """See `thesisrecon.config.FundamentalEstimator.estimate`."""
         xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
         frame = PairFrame.of(xy1, xy2)
         points = frame.points(xy1, xy2)
@@ -163,12 +130,12 @@ class LocallyOptimisedRansac:
 
     def _best_of_searches(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         ends, samples = self._repeat_search(points, gate, rng)
-        f, others = _best_and_competing(ends, _score_tolerance(points))
+        f, others = _best_and_competing(ends, SAME_SCORE * len(points) ** 0.5)
         noise, loss = _refine_to_noise(f, points, gate) if f.any() else (None, (0.0, 0.0))
         return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, others)
 
     def _repeat_search(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
-        """Return the score and F (9,) of each search until enough agree, and the number of samples."""
+        """Score and F (9,) of each search until enough agree, and the number of samples."""
         found: list[tuple[float, F64]] = []
         samples = 0
         for _ in range(self.max_starts):
@@ -180,7 +147,7 @@ class LocallyOptimisedRansac:
                 score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
                 found.append((score * len(points), f))
             best = min((score for score, _ in found), default=np.inf)
-            agreeing = sum(score - best < _score_tolerance(points) for score, _ in found)
+            agreeing = sum(score - best < SAME_SCORE * len(points) ** 0.5 for score, _ in found)
             if agreeing >= self.starts + (len(found) - agreeing) // 2 or samples >= self.max_samples:
                 break
         return found, samples
@@ -226,11 +193,9 @@ class LocallyOptimisedRansac:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Result of the searches with one gate.
+    """Result of the searches with one gate: ``f`` (9,), residuals (N,) and their noise (None without F).
 
-    ``f`` (9,), the samples drawn, the residuals (N,) and their noise (None without F). ``loss`` holds the
-    residual limit and the width of Huber's loss of the last refinement, ``competing_models`` the results of
-    other searches.
+    ``loss`` holds the residual limit and the width of Huber's loss of the last refinement.
     """
 
     f: F64
@@ -241,10 +206,10 @@ class _Candidate:
     competing_models: list[F64]
 
     def explains_more_than(self, other: _Candidate) -> bool:
-        """Return whether this result of a wider gate is likelier and leaves few matches unexplained.
+        """Whether this result of a wider gate is likelier and leaves few matches unexplained.
 
-        A wide gate finds wrong matrices that many wrong matches are near. It is accepted only if it explains
-        most of the matches that ``other`` rejects, or nearly all.
+        A wide gate finds wrong matrices that many wrong matches are near. It must explain most of the matches
+        that ``other`` rejects, or nearly all.
         """
         if self.noise is None or other.noise is None:
             return other.noise is None
@@ -255,13 +220,8 @@ class _Candidate:
         return few and self.noise.log_likelihood > other.noise.log_likelihood
 
 
-def _score_tolerance(points: F64) -> float:
-    """Maximum difference between two sums of truncated squares of the same minimum."""
-    return float(SAME_SCORE * len(points) ** 0.5)
-
-
 def _best_and_competing(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:
-    """Return the F with the lowest score (0 without any) and the next ones, each at least ``same`` worse."""
+    """The F with the lowest score (0 without any) and the next ones, each at least ``same`` worse."""
     best, last = np.zeros(9), -np.inf
     competing_models: list[F64] = []
     for score, f in sorted(ends, key=lambda end: end[0]):
@@ -305,7 +265,7 @@ def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | N
 
 
 def _noise_exceeds_gate(r: F64, noise: NoiseMixture, gate: float) -> bool:
-    """Return whether more residuals (N,) lie just beyond the noise than wrong matches explain."""
+    """Whether more residuals (N,) lie just beyond the noise than wrong matches explain."""
     end = COVERED * noise.sigma
     inside = int(np.count_nonzero(r < end))
     beyond = len(r) - inside
@@ -324,9 +284,7 @@ def estimate_fundamental(
     seed: int | Generator = 0,
     check_degeneracy: bool = False,
 ) -> FundamentalFit:
-    """Estimate the fundamental matrix of matches with outliers.
-
-    Uses :class:`LocallyOptimisedRansac`. The same seed gives the same result.
+    """Estimate the fundamental matrix of matches with outliers by :class:`LocallyOptimisedRansac`.
 
     Parameters
     ----------
@@ -335,7 +293,7 @@ def estimate_fundamental(
     threshold_px : float
         Sampson distance of an inlier during the search.
     seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from.
+        Random seed, or the generator to draw from; the same seed gives the same result.
     check_degeneracy : bool
         Also test whether the matches determine F
         (:func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`); many inliers alone do not show it.

@@ -9,8 +9,8 @@ import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar.frame import PairFrame, as_matches, check_matches
-from thesisrecon.epipolar.refinement import (
+from thesisrecon.epipolar._frame import PairFrame, as_matches, check_matches
+from thesisrecon.epipolar._refinement import (
     SAMPSON,
     normal_equations,
     orthonormal_from_fundamental,
@@ -18,7 +18,7 @@ from thesisrecon.epipolar.refinement import (
 )
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras, unit_norm
+from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras
 from thesisrecon.records import FundamentalFit
 
 # Smallest curvature relative to the largest: the F of a plane stays uncertain but finite.
@@ -35,13 +35,13 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
     Parameters
     ----------
     frame : PairFrame
-        Frame of ``f`` and ``points``.
+        Frame of the other arguments.
     f : ndarray (9,)
-        F in the frame.
+        F, row-major.
     points : ndarray (N, 4)
-        Inliers in the frame.
+        Inliers, rows (x1, y1, x2, y2).
     sigma : float
-        Standard deviation of one image coordinate, in frame units.
+        Standard deviation of one image coordinate.
 
     Returns
     -------
@@ -73,18 +73,14 @@ def _degrees_of_freedom(fit: FundamentalFit) -> float:
     return max(float(np.sum(fit.inliers)) - PARAMETERS, 1.0)
 
 
-def _student_95(degrees_of_freedom: float) -> float:
+def _student_95(nu: float) -> float:
     """95 % quantile of the absolute value of a Student variable; 1.96 for infinite degrees of freedom."""
-    if not degrees_of_freedom > 0.0:
-        raise ValueError(f"degrees of freedom must be positive; got {degrees_of_freedom}")
-    return float(scipy.special.stdtrit(min(degrees_of_freedom, 1e9), 0.975))
+    return float(scipy.special.stdtrit(min(nu, 1e9), 0.975))
 
 
-def _ellipse_95(degrees_of_freedom: float) -> float:
+def _ellipse_95(nu: float) -> float:
     """95 % quantile of squared Mahalanobis distances in two dimensions, 2 F(2, nu); 5.99 for infinite nu."""
-    if not degrees_of_freedom > 0.0:
-        raise ValueError(f"degrees of freedom must be positive; got {degrees_of_freedom}")
-    nu = min(degrees_of_freedom, 1e9)
+    nu = min(nu, 1e9)
     return float(nu * np.expm1(-2.0 / nu * np.log(0.05)))
 
 
@@ -108,11 +104,6 @@ def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
     ndarray (N,)
         Standard deviations, px.
 
-    Raises
-    ------
-    ValueError
-        If the shapes are wrong or F has no unit norm.
-
     Examples
     --------
     >>> import numpy as np
@@ -121,7 +112,6 @@ def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
     >>> epipolar_distance_std(F, covariance, np.array([[10.0, 5.0]]), np.array([[20.0, 5.0]])).round(3)
     array([0.283])
     """
-    _check(F, covariance)
     xy1, xy2 = as_matches(xy1, xy2)
     x1, x2 = homogenize(xy1), homogenize(xy2)
     lines = x1 @ F.T
@@ -148,50 +138,26 @@ def epipolar_distance_interval(fit: FundamentalFit, xy1: F64, xy2: F64) -> F64:
     -------
     ndarray (N,)
         Half widths, px.
-
-    Raises
-    ------
-    ValueError
-        As :func:`epipolar_distance_std`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.records import FundamentalFit
-    >>> F = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
-    >>> fit = FundamentalFit(F, np.ones(27, bool), 0.5, np.diag([1e-6, 0, 0, 0, 0, 0, 0, 0, 0]))
-    >>> epipolar_distance_interval(fit, np.array([[10.0, 5.0]]), np.array([[20.0, 5.0]])).round(2)
-    array([0.59])
     """
     return _student_95(_degrees_of_freedom(fit)) * epipolar_distance_std(fit.F, fit.covariance, xy1, xy2)
 
 
 @dataclass(frozen=True)
 class Epipole:
-    """An epipole with its covariance.
-
-    ``xy`` and ``xy_covariance`` are first order: meaningless unless the uncertainty is small compared with
-    the distance of the epipole from the image, and NaN for an epipole at infinity. The region and the
-    intervals are valid for every epipole.
+    """An epipole with its covariance, first order.
 
     Parameters
     ----------
     direction : ndarray (3,)
-        Homogeneous epipole, unit norm.
+        Homogeneous epipole, px, unit norm.
     covariance : ndarray (3, 3)
         Covariance of ``direction``, rank 2.
-    xy : ndarray (2,)
-        Epipole, px.
-    xy_covariance : ndarray (2, 2)
-        Covariance of ``xy``, px^2.
     degrees_of_freedom : float
         Degrees of freedom of the noise estimate.
     """
 
     direction: F64
     covariance: F64
-    xy: F64
-    xy_covariance: F64
     degrees_of_freedom: float = np.inf
 
     def contains(self, direction: F64) -> bool:
@@ -211,18 +177,11 @@ class Epipole:
         z = (direction * np.copysign(1.0, direction @ self.direction) - self.direction) @ vectors[:, 1:]
         return bool(np.sum(z**2 / values[1:]) <= _ellipse_95(self.degrees_of_freedom))
 
-    @property
-    def interval_95(self) -> F64:
-        """Ends (2, 2) of the 95 % intervals of x and y, px: row 0 lower, row 1 upper.
-
-        All x for which e1 - x e3 is within 1.96 (or Student's) standard deviations of 0 (Fieller, J. R. Stat.
-        Soc. B 16, 1954). If e3 may be 0 the epipole may lie at infinity: a lower end above the upper one
-        denotes an interval through infinity, (-inf, inf) that nothing is known.
-        """
-        return np.stack([self._fieller(0), self._fieller(1)], axis=1)
-
     def contains_xy(self, xy: F64) -> NDArray[np.bool_]:
-        """Return whether x and y lie in their 95 % intervals.
+        """Return whether x and y lie in their 95 % intervals (Fieller, J. R. Stat. Soc. B 16, 1954).
+
+        The interval of x holds all x for which e1 - x e3 is within Student's quantile of 0. It may run
+        through infinity.
 
         Parameters
         ----------
@@ -232,41 +191,18 @@ class Epipole:
         Returns
         -------
         ndarray (2,) of bool
-            One flag per coordinate; intervals through infinity are handled.
+            One flag per coordinate.
         """
-        low, high = self.interval_95
-        through = low > high
-        return np.asarray(np.where(through, (xy >= low) | (xy <= high), (xy >= low) & (xy <= high)))
-
-    def _fieller(self, k: int) -> F64:
-        e, C, q2 = self.direction, self.covariance, _student_95(self.degrees_of_freedom) ** 2
-        a, b, c = e[2] ** 2 - q2 * C[2, 2], e[k] * e[2] - q2 * C[k, 2], e[k] ** 2 - q2 * C[k, k]
-        inside = b * b - a * c
-        if a == 0.0 or (a < 0.0 and inside <= 0.0):
-            return np.array([-np.inf, np.inf])
-        # Both roots of a x^2 - 2 b x + c without cancellation; the set lies between them for a > 0.
-        half = b + np.copysign(np.sqrt(max(inside, 0.0)), b)
-        roots = np.sort([half / a, c / half]) if half != 0.0 else np.zeros(2)
-        return np.asarray(roots if a > 0.0 else roots[::-1])
-
-
-def _epipoles_with_covariance(
-    F: F64, covariance: F64, *, degrees_of_freedom: float = np.inf
-) -> tuple[Epipole, Epipole]:
-    """Both epipoles of F with their covariances: F e1 = 0 gives de1 = -F^+ dF e1, and likewise e2 with F'."""
-    _check(F, covariance)
-    e1, e2 = epipoles(F)
-    inverse = np.linalg.pinv(F, rcond=1e-12)
-    D1 = -np.einsum("ia,b->iab", inverse, e1).reshape(3, 9)
-    D2 = -np.einsum("ib,a->iab", inverse.T, e2).reshape(3, 9)
-    return (
-        _epipole(e1, D1 @ covariance @ D1.T, degrees_of_freedom),
-        _epipole(e2, D2 @ covariance @ D2.T, degrees_of_freedom),
-    )
+        e, C = self.direction, self.covariance
+        variance = np.diag(C)[:2] - 2.0 * xy * C[:2, 2] + xy**2 * C[2, 2]
+        off = (e[:2] - xy * e[2]) ** 2
+        return np.asarray(off <= _student_95(self.degrees_of_freedom) ** 2 * variance)
 
 
 def epipoles_of(fit: FundamentalFit) -> tuple[Epipole, Epipole]:
     """Compute both epipoles of a fit with their covariances.
+
+    F e1 = 0 gives de1 = -F^+ dF e1, and likewise e2 with F'.
 
     Parameters
     ----------
@@ -287,14 +223,11 @@ def epipoles_of(fit: FundamentalFit) -> tuple[Epipole, Epipole]:
     >>> np.abs(e1.direction).round(3)
     array([0.894, 0.447, 0.   ])
     """
-    return _epipoles_with_covariance(fit.F, fit.covariance, degrees_of_freedom=_degrees_of_freedom(fit))
-
-
-def _epipole(e: F64, covariance: F64, nu: float) -> Epipole:
-    if not abs(e[2]) > 1e-12:
-        return Epipole(e, covariance, np.full(2, np.nan), np.full((2, 2), np.nan), nu)
-    D = np.hstack([np.eye(2), -e[:2, None] / e[2]]) / e[2]
-    return Epipole(e, covariance, e[:2] / e[2], D @ covariance @ D.T, nu)
+    e1, e2 = epipoles(fit.F)
+    inverse, nu = np.linalg.pinv(fit.F, rcond=1e-12), _degrees_of_freedom(fit)
+    D1 = -np.einsum("ia,b->iab", inverse, e1).reshape(3, 9)
+    D2 = -np.einsum("ib,a->iab", inverse.T, e2).reshape(3, 9)
+    return Epipole(e1, D1 @ fit.covariance @ D1.T, nu), Epipole(e2, D2 @ fit.covariance @ D2.T, nu)
 
 
 @dataclass(frozen=True)
@@ -329,7 +262,7 @@ def fundamental_bound(P1: F64, P2: F64, X: F64, *, sigma_px: float) -> Precision
     X : ndarray (N, 3)
         Space points, N >= 8.
     sigma_px : float
-        Standard deviation of the Gaussian noise of every coordinate.
+        Standard deviation of the Gaussian noise of every coordinate, above 0.
 
     Returns
     -------
@@ -339,14 +272,11 @@ def fundamental_bound(P1: F64, P2: F64, X: F64, *, sigma_px: float) -> Precision
     Raises
     ------
     ValueError
-        If the camera centres coincide or ``sigma_px`` is not positive.
-    StageFailure
-        As :func:`~thesisrecon.epipolar.frame.check_matches`.
+        If the camera centres coincide.
 
     References
     ----------
-    K. Kanatani, Statistical Optimization for Geometric Computation, 1996. N. Chernov and C. Lesort,
-    "Statistical efficiency of curve fitting algorithms", 2004.
+    K. Kanatani, Statistical Optimization for Geometric Computation, 1996.
 
     Examples
     --------
@@ -354,32 +284,16 @@ def fundamental_bound(P1: F64, P2: F64, X: F64, *, sigma_px: float) -> Precision
     >>> X = np.random.default_rng(0).uniform(-1, 1, (40, 3)) + [0, 0, 5]
     >>> P1 = np.diag([800.0, 800.0, 1.0]) @ np.eye(3, 4)
     >>> P2 = P1 + np.array([[0, 0, 0, 400.0], [0, 0, 0, 0], [0, 0, 0, 0]])
-    >>> bound = fundamental_bound(P1, P2, X, sigma_px=0.5)
-    >>> 0.0 < bound.rms_distance_px < 0.5
+    >>> 0.0 < fundamental_bound(P1, P2, X, sigma_px=0.5).rms_distance_px < 0.5
     True
     """
-    if not (np.isfinite(sigma_px) and sigma_px > 0.0):
-        raise ValueError(f"sigma_px must be positive; got {sigma_px}")
     F = fundamental_from_cameras(P1, P2)
     xy1, xy2 = check_matches(project(P1, X), project(P2, X), needed=8)
     frame = PairFrame.of(xy1, xy2)
     covariance = fundamental_covariance(
         frame, frame.matrix_in_frame(F), frame.points(xy1, xy2), sigma_px * frame.scale
     )
+    transposed = np.arange(9).reshape(3, 3).T.ravel()
     forth = epipolar_distance_std(F, covariance, xy1, xy2)
-    back = epipolar_distance_std(F.T, _transposed(covariance), xy2, xy1)
+    back = epipolar_distance_std(F.T, covariance[np.ix_(transposed, transposed)], xy2, xy1)
     return PrecisionBound(F, covariance, float(np.sqrt(0.5 * np.mean(forth**2 + back**2))))
-
-
-def _transposed(covariance: F64) -> F64:
-    order = np.arange(9).reshape(3, 3).T.ravel()
-    return covariance[np.ix_(order, order)]
-
-
-def _check(F: F64, covariance: F64) -> None:
-    if F.shape != (3, 3) or covariance.shape != (9, 9):
-        raise ValueError(
-            f"precision needs F (3, 3) and its covariance (9, 9); got {F.shape}, {covariance.shape}"
-        )
-    if not np.allclose(F, unit_norm(F), atol=1e-9):
-        raise ValueError("precision needs F of unit norm, the norm its covariance refers to")

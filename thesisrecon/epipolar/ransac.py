@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar.frame import PairFrame, as_matches, check_matches
+from thesisrecon.epipolar._frame import PairFrame, as_matches, check_matches
+from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.linear import seven_point
 from thesisrecon.epipolar.precision import fundamental_covariance
-from thesisrecon.epipolar.refinement import refine_epipolar_distance, refine_sampson
-from thesisrecon.epipolar.sampling import sampson_distances
+from thesisrecon.epipolar.refinement import Criterion, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import epipolar_distances, sampson_residuals, symmetric_residuals
 from thesisrecon.numerics.noise import noise_scale
@@ -30,49 +30,41 @@ EXACT_PX = 1e-6
 NEAR_SIGMAS = 2.5
 
 
-@dataclass(frozen=True)
-class InlierTest:
-    """Distance of a match to F and its limit for an inlier.
+class _InlierTest(NamedTuple):
+    """Distances (N,), their ratio to the Sampson distance for images of equal weight, and the squared limit.
 
-    Parameters
-    ----------
-    ratio : float
-        Ratio to the Sampson distance if both images have equal weight.
-    limit : float
-        Maximum squared distance of an inlier, in variances of one coordinate.
-    distances : callable
-        ``distances(F, xy1, xy2)`` returns the distances (N,), px, of either sign.
+    The limit is in variances of one coordinate.
     """
 
+    distances: Callable[[F64, F64, F64], F64]
     ratio: float
     limit: float
-    distances: Callable[[F64, F64, F64], F64]
 
 
 def _larger_epipolar_distance(F: F64, xy1: F64, xy2: F64) -> F64:
     return np.asarray(epipolar_distances(F, xy1, xy2).max(axis=1))
 
 
-# Chi-square with one degree of freedom: 95 % of the right matches pass.
-SAMPSON_TEST = InlierTest(1.0, CHI2_1_95, sampson_residuals)
-# First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines, sigma_d = sqrt(2) sigma.
-# If the images have equal weight the distances are equal and this is the test by the Sampson distance.
-EPIPOLAR_DISTANCE_TEST = InlierTest(1.4142135623730951, 2.0 * CHI2_1_95, _larger_epipolar_distance)
-# Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2. The distances are
-# multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square of one degree of freedom, not the
-# two of the thesis: 92 % of the right matches pass, not 95 %.
-SYMMETRIC_DISTANCE_TEST = InlierTest(2.0, 2.0 * CHI2_2_95, symmetric_residuals)
+InlierTest = Literal["sampson", "epipolar-distance", "symmetric-distance"]
 INLIER_TESTS = {
-    "sampson": SAMPSON_TEST,
-    "epipolar-distance": EPIPOLAR_DISTANCE_TEST,
-    "symmetric-distance": SYMMETRIC_DISTANCE_TEST,
+    # Chi-square with one degree of freedom: 95 % of the right matches pass.
+    "sampson": _InlierTest(sampson_residuals, 1.0, CHI2_1_95),
+    # First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines, sigma_d = sqrt(2)
+    # sigma. If the images have equal weight the distances are equal: the test by the Sampson distance.
+    "epipolar-distance": _InlierTest(_larger_epipolar_distance, 1.4142135623730951, 2.0 * CHI2_1_95),
+    # Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2. Both are
+    # multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square of one degree of freedom, not of
+    # two: 92 % of the right matches pass, not the 95 % of the thesis.
+    "symmetric-distance": _InlierTest(symmetric_residuals, 2.0, 2.0 * CHI2_2_95),
 }
 
 
 def discard_outliers(
-    F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest = SAMPSON_TEST
+    F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest = "sampson"
 ) -> tuple[float, B8]:
     """Estimate the noise from the median distance and test every match against it.
+
+    sigma = 1.4826 (1 + 5 / (n - 7)) median |d|; the thesis divides by Phi(0.75) where Phi^-1(0.75) is meant.
 
     Parameters
     ----------
@@ -83,8 +75,8 @@ def discard_outliers(
     limit_px : float
         The median is taken over matches with a Sampson distance up to this (at least 8). Without it sigma is
         too large if more than half of the matches are wrong.
-    test : InlierTest
-        Distance and limit of an inlier.
+    test : {"sampson", "epipolar-distance", "symmetric-distance"}
+        Distance and limit of an inlier, see :class:`ThesisRansac`.
 
     Returns
     -------
@@ -92,81 +84,35 @@ def discard_outliers(
         Standard deviation of one coordinate.
     inliers : ndarray (N,) of bool
         Matches that pass.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than 8 matches, or as :func:`~thesisrecon.epipolar.frame.as_matches`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> F = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
-    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9], [6, 2]], dtype=float)
-    >>> xy2 = xy1 + [[3.0, 0.1]] * np.array([[1], [-1], [1], [-1], [1], [-1], [1], [-1], [90]])
-    >>> discard_outliers(F, xy1, xy2)[1].tolist()
-    [True, True, True, True, True, True, True, True, False]
     """
     xy1, xy2 = as_matches(xy1, xy2)
-    residuals = np.abs(test.distances(F, xy1, xy2))
+    distances, ratio, most = INLIER_TESTS[test]
+    residuals = np.abs(distances(F, xy1, xy2))
     if len(residuals) < MINIMUM:
         raise ValueError(f"discard_outliers needs at least {MINIMUM} matches; got {len(residuals)}")
-    limit = max(test.ratio * limit_px, float(np.partition(residuals, MINIMUM - 1)[MINIMUM - 1]))
-    sigma = noise_scale(residuals[residuals <= limit]) / test.ratio
-    inliers = residuals**2 <= max(test.limit * sigma**2, EXACT_PX**2)
+    limit = max(ratio * limit_px, float(np.partition(residuals, MINIMUM - 1)[MINIMUM - 1]))
+    sigma = noise_scale(residuals[residuals <= limit]) / ratio
+    inliers = residuals**2 <= max(most * sigma**2, EXACT_PX**2)
     return sigma, inliers if inliers.sum() >= MINIMUM else residuals <= limit
 
 
 @dataclass(frozen=True)
-class SevenPointProblem:
-    """Seven-point sampling of matches for :class:`~thesisrecon.numerics.ransac.SampleConsensus`.
-
-    Parameters
-    ----------
-    points : ndarray (N, 4)
-        Matches as rows (x1, y1, x2, y2) in a common frame.
-    sample_size : int
-        Size of a minimal sample.
-    test : InlierTest
-        Distance of a match to F.
-    """
+class _SevenPointProblem:
+    """Seven-point sampling of matches (N, 4) for :class:`~thesisrecon.numerics.ransac.SampleConsensus`."""
 
     points: F64
     sample_size: int = 7
-    test: InlierTest = SAMPSON_TEST
+    test: InlierTest = "sampson"
 
     def solve(self, sample: I64) -> list[F64]:
-        """Compute the fundamental matrices through seven matches.
-
-        Parameters
-        ----------
-        sample : ndarray (7,)
-            Indices of the matches.
-
-        Returns
-        -------
-        list of ndarray (9,)
-            The solutions, none to three.
-        """
         solutions = np.empty((3, 9))
         return list(solutions[: seven_point(self.points, sample, solutions)])
 
     def residuals(self, model: F64) -> F64:
-        """Compute the distances of all matches to F.
-
-        Parameters
-        ----------
-        model : ndarray (9,)
-            F in the frame.
-
-        Returns
-        -------
-        ndarray (N,)
-            Distances >= 0 in units of the frame.
-        """
-        if self.test is SAMPSON_TEST:
+        if self.test == "sampson":
             return np.asarray(sampson_distances(model, self.points))
-        return self.test.distances(model.reshape(3, 3), self.points[:, :2], self.points[:, 2:])
+        distances = INLIER_TESTS[self.test].distances
+        return distances(model.reshape(3, 3), self.points[:, :2], self.points[:, 2:])
 
 
 @dataclass(frozen=True)
@@ -174,8 +120,7 @@ class ThesisRansac:
     """RANSAC as in section 5.4 of the thesis, with its errors corrected.
 
     Draw samples of seven, keep the F with the most inliers, estimate sigma from the median distance, discard
-    outliers, then refine and discard again ``rounds`` times. sigma = 1.4826 (1 + 5 / (n - 7)) median |d|; the
-    thesis divides by Phi(0.75) where Phi^-1(0.75) is meant.
+    outliers, then refine and discard again ``rounds`` times.
 
     Departures: matches are tested by the Sampson distance unless ``inlier_test`` selects a test of the text;
     the search counts inliers within a fixed threshold, since the fraction within a multiple of the median is
@@ -202,88 +147,34 @@ class ThesisRansac:
     stop_inlier_ratio: float = 0.95
     epipolar_distance: bool = False
     rounds: int = 2
-    inlier_test: Literal["sampson", "epipolar-distance", "symmetric-distance"] = "sampson"
+    inlier_test: InlierTest = "sampson"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
-        if min(self.samples, self.rounds) < 1 or not 0.0 < self.stop_inlier_ratio <= 1.0:
-            raise ValueError("a search needs samples >= 1, rounds >= 1 and 0 < stop_inlier_ratio <= 1")
+        if self.samples < 1 or self.rounds < 0 or not 0.0 < self.stop_inlier_ratio <= 1.0:
+            raise ValueError("a search needs samples >= 1, rounds >= 0 and 0 < stop_inlier_ratio <= 1")
         if self.inlier_test not in INLIER_TESTS:
             raise ValueError(
                 f"inlier_test must be one of {', '.join(INLIER_TESTS)}; got {self.inlier_test!r}"
             )
 
-    @property
-    def test(self) -> InlierTest:
-        """The inlier test."""
-        return INLIER_TESTS[self.inlier_test]
-
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
-        """Estimate F of matches with outliers.
-
-        Parameters
-        ----------
-        xy1, xy2 : array_like (N, 2)
-            Matched points, N >= 8, px.
-        rng : numpy.random.Generator
-            Source of the samples.
-
-        Returns
-        -------
-        FundamentalFit
-            F, inliers, noise and covariance.
-
-        Raises
-        ------
-        ValueError
-            As :func:`~thesisrecon.epipolar.frame.as_matches`.
-        StageFailure
-            If there are too few or collinear matches, or no F has 8 inliers.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> rng = np.random.default_rng(0)
-        >>> xy1 = rng.uniform(0, 500, (60, 2))
-        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1)) + rng.normal(0, 0.3, (60, 2))
-        >>> xy2[:15] = rng.uniform(0, 500, (15, 2))
-        >>> fit = ThesisRansac().estimate(xy1, xy2, rng)
-        >>> bool(fit.inliers[15:].mean() > 0.8)
-        True
-        """
-        xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
-        frame = PairFrame.of(xy1, xy2)
-        points = frame.points(xy1, xy2)
-        test = self.test
-        gate = test.ratio * self.threshold_px * frame.scale
-        loop = SampleConsensus(gate, max_samples=self.samples, stop_inlier_ratio=self.stop_inlier_ratio)
-        found = loop.search(SevenPointProblem(points, test=test), len(points), rng)
-        if found is None or found.inliers.sum() < MINIMUM:
-            raise StageFailure(
-                "no epipolar geometry explains the matches",
-                f"none of {self.samples} samples has {MINIMUM} inliers among {len(xy1)} matches",
-                "check that the images overlap and that the matches are correct",
-            )
-        F, sigma = frame.matrix_in_pixels(found.model), 0.0
-        _, inliers = discard_outliers(F, xy1, xy2, limit_px=self.threshold_px, test=test)
-        refine = refine_epipolar_distance if self.epipolar_distance else refine_sampson
-        for _ in range(self.rounds):
-            F = refine(F, xy1[inliers], xy2[inliers])
-            sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=self.threshold_px, test=test)
-        f = frame.matrix_in_frame(F)
-        covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
-        return FundamentalFit(F, inliers, sigma, covariance, found.samples)
+        """See `thesisrecon.config.FundamentalEstimator.estimate`."""
+        gate_px = INLIER_TESTS[self.inlier_test].ratio * self.threshold_px
+        search = SampleConsensus(gate_px, self.samples, self.stop_inlier_ratio)
+        criterion: Criterion = "epipolar-distance" if self.epipolar_distance else "sampson"
+        limit_px, test = self.threshold_px, self.inlier_test
+        return _search_and_refine(xy1, xy2, rng, search, self.rounds, limit_px, test, criterion)
 
 
 @dataclass(frozen=True)
 class LeastMedianOfSquares:
-    """F with the least median squared Sampson distance among random samples of seven.
+    """F with the least median squared Sampson distance among random samples of seven (Zhang, IJCV 1998).
 
-    Then sigma = 1.4826 (1 + 5 / (n - 7)) sqrt(median), and ``rounds`` times: discard matches beyond the 95 %
-    limit, minimise the Sampson distances (5.4) of the rest, and estimate sigma from the matches nearby. No
-    threshold is needed, but with more than half of the matches wrong the median belongs to wrong matches. 900
-    samples contain one without outliers with 99.9 % probability if half of the matches are wrong.
+    Refined as :class:`ThesisRansac`, sigma from the matches within 2.5 sigma. No threshold is needed, but
+    with more than half of the matches wrong the median belongs to wrong matches. 900 samples contain one
+    without outliers with 99.9 % probability if half of the matches are wrong.
 
     Parameters
     ----------
@@ -291,70 +182,49 @@ class LeastMedianOfSquares:
         Number of samples.
     rounds : int
         Rounds of refinement.
-
-    References
-    ----------
-    P. Rousseeuw, "Least median of squares regression", JASA 79, 1984. Z. Zhang, "Determining the epipolar
-    geometry and its uncertainty", IJCV 27, 1998.
     """
 
     samples: int = 900
     rounds: int = 2
 
     def __post_init__(self) -> None:
-        if min(self.samples, self.rounds) < 1:
-            raise ValueError(f"a search needs samples and rounds of 1; got {self.samples}, {self.rounds}")
+        if self.samples < 1 or self.rounds < 0:
+            raise ValueError(f"a search needs samples >= 1, rounds >= 0; got {self.samples}, {self.rounds}")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
-        """Estimate F of matches with less than half of outliers.
+        """See `thesisrecon.config.FundamentalEstimator.estimate`."""
+        search = SampleConsensus(np.inf, self.samples, least_median=True)
+        return _search_and_refine(xy1, xy2, rng, search, self.rounds)
 
-        Parameters
-        ----------
-        xy1, xy2 : array_like (N, 2)
-            Matched points, N >= 8, px.
-        rng : numpy.random.Generator
-            Source of the samples.
 
-        Returns
-        -------
-        FundamentalFit
-            F, inliers, noise and covariance.
-
-        Raises
-        ------
-        ValueError
-            As :func:`~thesisrecon.epipolar.frame.as_matches`.
-        StageFailure
-            If there are too few or collinear matches, or no sample determines an F.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> rng = np.random.default_rng(0)
-        >>> xy1 = rng.uniform(0, 500, (60, 2))
-        >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
-        >>> xy2[:15] = rng.uniform(0, 500, (15, 2))
-        >>> fit = LeastMedianOfSquares(samples=300).estimate(xy1, xy2, rng)
-        >>> bool(fit.inliers[15:].all())
-        True
-        """
-        xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
-        frame = PairFrame.of(xy1, xy2)
-        points = frame.points(xy1, xy2)
-        loop = SampleConsensus(np.inf, max_samples=self.samples, least_median=True)
-        found = loop.search(SevenPointProblem(points), len(points), rng)
-        if found is None:
-            raise StageFailure(
-                "no epipolar geometry explains the matches",
-                f"none of {self.samples} seven-point samples of {len(xy1)} matches determines one",
-                "check for repeated matches or matches on few points",
-            )
-        F = frame.matrix_in_pixels(found.model)
-        sigma, inliers = discard_outliers(F, xy1, xy2)
-        for _ in range(self.rounds):
-            F = refine_sampson(F, xy1[inliers], xy2[inliers])
-            sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=NEAR_SIGMAS * sigma)
-        covariance = fundamental_covariance(
-            frame, frame.matrix_in_frame(F), points[inliers], sigma * frame.scale
+def _search_and_refine(
+    xy1: F64,
+    xy2: F64,
+    rng: Generator,
+    search: SampleConsensus,
+    rounds: int,
+    limit_px: float | None = None,
+    test: InlierTest = "sampson",
+    criterion: Criterion = "sampson",
+) -> FundamentalFit:
+    """Search with a threshold in pixels, then refine and discard; without a limit sigma sets it."""
+    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+    frame = PairFrame.of(xy1, xy2)
+    points = frame.points(xy1, xy2)
+    search = replace(search, threshold=search.threshold * frame.scale)
+    found = search.search(_SevenPointProblem(points, test=test), len(points), rng)
+    needed = MINIMUM if limit_px else 1
+    if found is None or found.inliers.sum() < needed:
+        raise StageFailure(
+            "no epipolar geometry explains the matches",
+            f"none of {search.max_samples} samples has {needed} inliers among {len(xy1)} matches",
+            "check that the images overlap and that the matches are correct",
         )
-        return FundamentalFit(F, inliers, sigma, covariance, self.samples)
+    F = frame.matrix_in_pixels(found.model)
+    sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or np.inf, test=test)
+    for _ in range(rounds):
+        F = refine_fundamental(F, xy1[inliers], xy2[inliers], criterion)
+        sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or NEAR_SIGMAS * sigma, test=test)
+    f = frame.matrix_in_frame(F)
+    covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
+    return FundamentalFit(F, inliers, sigma, covariance, found.samples)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.features.kernels import (
+from thesisrecon.features._kernels import (
     corner_response,
     enforce_spacing,
     fit_maxima,
@@ -22,8 +22,12 @@ from thesisrecon.records import Features, Image
 
 # det / trace (grey levels squared) below which corners are quantisation and compression noise.
 NOISE_RESPONSE = 0.05
+# Candidates of a selection, as a multiple of the number selected.
+POOL_RATIO = 1.7
 # Maximum fraction of the pool that one part of the image may fill, relative to an even distribution.
 POOL_LIMIT = 1.5
+# Ratio of responses that counts as clearly stronger.
+ROBUSTNESS = 0.9
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,9 @@ class CornerMeasure:
         Gaussian before the derivative; 0 for none.
     derivative_taps : tuple of float
         Derivative kernel along either axis, odd length, sum 0; scaled to slope 1 for a unit ramp.
-    integration_sigma_px : float
-        Gaussian of M. The thesis' experiments use sigma 1 and 9 taps.
-    integration_taps : int
-        Number of taps of this Gaussian, odd; 0 for three sigma to each side.
+    integration_sigma_px, integration_taps : float and int
+        Gaussian of M and its odd number of taps; 0 for three sigma to each side. The thesis has sigma 1 and 9
+        taps.
     colour : bool
         Mean of M over red, green and blue, else M of the grey values.
     subpixel : bool
@@ -96,19 +99,8 @@ class CornerMeasure:
             return image.gray[None]
         return np.ascontiguousarray(np.moveaxis(image.rgb, 2, 0), dtype=np.float32)
 
-    def response(self, channels: F32) -> F32:
-        """Compute the corner response R.
-
-        Parameters
-        ----------
-        channels : ndarray (C, H, W)
-            Channels, float32.
-
-        Returns
-        -------
-        ndarray (H, W)
-            R, zero near the border.
-        """
+    def _response(self, channels: F32) -> F32:
+        """R (H, W), zero near the border."""
         derivative = np.array(self.derivative_taps)
         derivative = (derivative / _slope(derivative)).astype(np.float32)
         if self.derivative_sigma_px > 0.0:
@@ -119,8 +111,7 @@ class CornerMeasure:
         weight = self.harris_k if self.formula == "harris" else 0.0
         return corner_response(channels, derivative, taps, weight)
 
-    @property
-    def noise_response(self) -> float:
+    def _noise_response(self) -> float:
         """R of an isotropic corner whose det / trace is ``NOISE_RESPONSE``."""
         if self.formula == "noble":
             return NOISE_RESPONSE
@@ -134,21 +125,13 @@ class CornerMeasure:
         normalized: F32 = (taps / taps.sum()).astype(np.float32)
         return normalized
 
-    @property
-    def min_side_px(self) -> int:
-        """Smallest image side in which corners are detected: two windows."""
-        return 2 * len(self._integration())
-
 
 def _slope(taps: F64) -> float:
     return float(taps @ (np.arange(len(taps)) - len(taps) // 2))
 
 
 def find_corners(channels: F32, measure: CornerMeasure) -> tuple[F64, F32]:
-    """Detect all corners above the noise, strongest first.
-
-    Maxima of 3 x 3 neighbourhoods of R, refined by a quadratic surface. Equal responses keep the reading
-    order.
+    """Detect all corners above the noise, strongest first; equal responses keep the reading order.
 
     Parameters
     ----------
@@ -169,11 +152,11 @@ def find_corners(channels: F32, measure: CornerMeasure) -> tuple[F64, F32]:
     ValueError
         If a value is not finite.
     """
-    if min(channels.shape[1:]) < measure.min_side_px:
+    if min(channels.shape[1:]) < 2 * len(measure._integration()):
         return np.empty((0, 2)), np.empty(0, np.float32)
     if not np.isfinite(channels).all():
         raise ValueError("corners are found in finite grey values; got NaN or infinity among them")
-    xy, value = fit_maxima(measure.response(channels), measure.noise_response, measure.subpixel)
+    xy, value = fit_maxima(measure._response(channels), measure._noise_response(), measure.subpixel)
     order = np.argsort(-value, kind="stable")
     return xy[order], value[order]
 
@@ -188,21 +171,18 @@ class HarrisCorners:
         Maximum number of corners.
     threshold_rel : float
         Minimum response relative to the largest one; 0 for all above the noise.
-    selection : {"spacing", "spread", "strongest"}
-        Drop corners too near to a stronger one, use :func:`select_spread`, or neither.
+    selection : {"spacing", "spread"}
+        Drop corners too near to a stronger one, or use :func:`select_spread`.
     spacing_rel : float
         Minimum distance of two corners for "spacing", relative to the long side.
-    pool_ratio : float
-        Candidates of "spread", as a multiple of ``max_corners``.
     measure : CornerMeasure
         Response and its parameters.
     """
 
     max_corners: int = 2000
     threshold_rel: float = 0.002
-    selection: Literal["spacing", "spread", "strongest"] = "spacing"
+    selection: Literal["spacing", "spread"] = "spacing"
     spacing_rel: float = 0.004
-    pool_ratio: float = 1.7
     measure: CornerMeasure = field(default_factory=CornerMeasure)
 
     def __post_init__(self) -> None:
@@ -210,54 +190,27 @@ class HarrisCorners:
             raise ValueError(f"max_corners must be at least 1; got {self.max_corners}")
         if not 0.0 <= self.threshold_rel <= 1.0:
             raise ValueError(f"threshold_rel must lie between 0 and 1; got {self.threshold_rel}")
-        if not (self.spacing_rel >= 0.0 and self.pool_ratio >= 1.0):
-            raise ValueError(
-                "spacing_rel must be at least 0 and pool_ratio at least 1; "
-                f"got {self.spacing_rel} and {self.pool_ratio}"
-            )
+        if not self.spacing_rel >= 0.0:
+            raise ValueError(f"spacing_rel must be at least 0; got {self.spacing_rel}")
 
     def detect(self, image: Image) -> Features:
-        """Detect the corners of an image.
-
-        Parameters
-        ----------
-        image : Image
-            The image.
-
-        Returns
-        -------
-        Features
-            Corners at scale 1, strongest first, possibly none.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from thesisrecon.records import Image
-        >>> rgb = np.zeros((40, 40, 3), np.uint8)
-        >>> rgb[10:30, 10:30] = 200
-        >>> HarrisCorners().detect(Image("square", rgb, (40, 40))).xy.round().astype(int).shape
-        (4, 2)
-        """
+        """See `thesisrecon.config.Detector.detect`."""
         xy, response = find_corners(self.measure.channels(image), self.measure)
         if len(xy):
             strong = response >= self.threshold_rel * float(response[0])
             xy, response = xy[strong], response[strong]
-        kept = self._select(xy, response, max(image.size))
+        if self.selection == "spread":
+            kept = select_spread(xy, response, self.max_corners)
+        else:
+            spacing = self.spacing_rel * max(image.size)
+            kept = enforce_spacing(xy, np.arange(len(xy)), spacing)[: self.max_corners]
         return Features(xy=xy[kept], scale=np.ones(len(kept), np.float32), response=response[kept])
 
-    def _select(self, xy: F64, response: F32, long_side: int) -> I64:
-        if self.selection == "spread":
-            return select_spread(xy, response, self.max_corners, pool=int(self.pool_ratio * self.max_corners))
-        kept = np.arange(len(xy), dtype=np.int64)
-        if self.selection == "spacing":
-            kept = enforce_spacing(xy, kept, self.spacing_rel * long_side)
-        return kept[: self.max_corners]
 
+def select_spread(xy: F64, response: F32, count: int) -> I64:
+    """Select corners that cover the image (adaptive non-maximal suppression) [1]_.
 
-def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: float = 0.9) -> I64:
-    """Select corners that cover the image (adaptive non-maximal suppression).
-
-    Among a pool of strong corners those farthest from any that is stronger by 1 / robustness. No sixth of the
+    Among the 1.7 ``count`` strongest those farthest from any that is clearly stronger. No sixth of the
     long side fills the pool beyond ``POOL_LIMIT`` times its part, so that a shaded half still gets corners.
 
     Parameters
@@ -268,10 +221,6 @@ def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: 
         Responses.
     count : int
         Number of corners to select.
-    pool : int
-        Number of candidates.
-    robustness : float
-        Ratio of responses that counts as clearly stronger.
 
     Returns
     -------
@@ -280,13 +229,13 @@ def select_spread(xy: F64, response: F32, count: int, *, pool: int, robustness: 
 
     References
     ----------
-    M. Brown, R. Szeliski and S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005,
-    section 3.
+    .. [1] M. Brown, R. Szeliski and S. Winder, "Multi-image matching using multi-scale oriented patches",
+    CVPR 2005.
     """
-    members = _shared_pool(xy, pool)
+    members = _shared_pool(xy, int(POOL_RATIO * count))
     if len(members) <= count:
         return members
-    radii = squared_suppression_radii(xy[members].astype(np.float32), response[members], robustness)
+    radii = squared_suppression_radii(xy[members].astype(np.float32), response[members], ROBUSTNESS)
     return members[np.sort(np.argsort(-radii, kind="stable")[:count])]
 
 

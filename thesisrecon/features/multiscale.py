@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.features._kernels import sample_patches
 from thesisrecon.features.harris import CornerMeasure, find_corners, select_spread
-from thesisrecon.features.kernels import sample_patches
 from thesisrecon.geometry.raster import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
@@ -34,8 +34,8 @@ class MultiScaleCorners:
     """Harris corners at full and half size, with seed patches at five levels of 1/sqrt(2).
 
     Seeds are the multi-scale oriented patches of Brown, Szeliski and Winder (CVPR 2005), each upright and
-    rotated to its dominant gradient. Small images are doubled first; all coordinates are pixels of the given
-    image.
+    rotated to its dominant gradient. Small images are doubled first: the scales of the corners are 1 and 2,
+    or 0.5 and 1.
 
     Parameters
     ----------
@@ -44,8 +44,6 @@ class MultiScaleCorners:
     spread : bool
         Select corners and seeds that cover the image (:func:`~thesisrecon.features.harris.select_spread`),
         else the strongest.
-    pool_ratio : float
-        Candidates of the selection, as a multiple of the number selected.
     seeds_per_level : int
         Number of seeds at the finest level; each further level has 1/sqrt(2) as many.
     levels : int
@@ -59,7 +57,6 @@ class MultiScaleCorners:
     full_corners: int = 3000
     half_corners: int = 1500
     spread: bool = True
-    pool_ratio: float = 1.7
     seeds_per_level: int = 1400
     levels: int = 5
     upsample_below_px: int = 1000
@@ -73,25 +70,11 @@ class MultiScaleCorners:
                 "full_corners and half_corners must be at least 0, and one of them above; "
                 f"got {self.full_corners} and {self.half_corners}"
             )
-        if not (self.seeds_per_level >= 0 and self.pool_ratio >= 1.0):
-            raise ValueError(
-                "seeds_per_level must be at least 0 and pool_ratio at least 1; "
-                f"got {self.seeds_per_level} and {self.pool_ratio}"
-            )
+        if self.seeds_per_level < 0:
+            raise ValueError(f"seeds_per_level must be at least 0; got {self.seeds_per_level}")
 
     def detect(self, image: Image) -> Features:
-        """Detect the corners and seeds of an image.
-
-        Parameters
-        ----------
-        image : Image
-            The image.
-
-        Returns
-        -------
-        Features
-            Corners, strongest first, at scales 1 and 2 (0.5 and 1 if doubled), and seeds.
-        """
+        """See `thesisrecon.config.Detector.detect`."""
         levels = self._pyramid(image)
         found = [find_corners(level.channels, self.measure) for level in levels]
         parts = []
@@ -108,7 +91,7 @@ class MultiScaleCorners:
 
     def _select(self, xy: F64, response: F32, count: int) -> I64:
         if self.spread:
-            return select_spread(xy, response, count, pool=int(self.pool_ratio * count))
+            return select_spread(xy, response, count)
         return np.arange(min(count, len(xy)), dtype=np.int64)
 
     def _pyramid(self, image: Image) -> list[_PyramidLevel]:

@@ -9,8 +9,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.planes import homography_inlier_ratio
-from thesisrecon.epipolar.verification import PairVerification
+from thesisrecon.epipolar.verification import PairVerification, homography_inlier_ratio
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Tracks, TwoView
 from thesisrecon.runtime.run import stream

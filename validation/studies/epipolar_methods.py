@@ -25,23 +25,14 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.configuration import Configuration
-from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.precision import fundamental_bound
-from thesisrecon.epipolar.ransac import LeastMedianOfSquares, SevenPointProblem, ThesisRansac
-from thesisrecon.epipolar.refinement import (
-    EPIPOLAR_DISTANCE,
-    REPROJECTION,
-    refine_epipolar_distance,
-    refine_reprojection,
-    refine_sampson,
-)
-from thesisrecon.epipolar.row_parameterization import refine_by_rows
+from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
+from thesisrecon.epipolar.refinement import Criterion, refine_by_rows, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import symmetric_residuals
-from thesisrecon.io.files import write_text
-from thesisrecon.numerics.ransac import SampleConsensus
+from thesisrecon.io._files import write_text
 from validation.metrics.epipolar import rms_epipolar_distance
 from validation.metrics.record import Metric
 from validation.references.fundamental import OURS, SOLVERS, opencv_eight_point
@@ -80,8 +71,8 @@ class Method:
         return F if F is not None and F.shape == (3, 3) and np.isfinite(F).all() and F.any() else None
 
 
-def _refined(refine: Callable[[F64, F64, F64], F64]) -> Estimate:
-    return lambda xy1, xy2, _, __: refine(estimate_eight_point(xy1, xy2), xy1, xy2)
+def _refined(refine: Callable[..., F64], criterion: Criterion) -> Estimate:
+    return lambda xy1, xy2, _, __: refine(estimate_eight_point(xy1, xy2), xy1, xy2, criterion)
 
 
 def _linear(*, normalized: bool, rank_two: bool = True) -> Estimate:
@@ -98,20 +89,12 @@ def _thesis(threshold_px: float, **variant: Any) -> ThesisRansac:
     return ThesisRansac(threshold_px=threshold_px, **variant)
 
 
-def _search_alone(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64 | None:
-    frame = PairFrame.of(xy1, xy2)
-    loop = SampleConsensus(threshold_px * frame.scale, stop_inlier_ratio=ThesisRansac().stop_inlier_ratio)
-    problem = SevenPointProblem(frame.points(xy1, xy2))
-    found = loop.search(problem, len(xy1), np.random.default_rng(seed))
-    return None if found is None else frame.matrix_in_pixels(found.model)
-
-
 _default = _robust(lambda t: LocallyOptimisedRansac(threshold_px=t))
 
 
 def _gold_from_default(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> F64 | None:
     F = _default(xy1, xy2, threshold_px, seed)
-    return None if F is None else refine_reprojection(F, xy1, xy2)
+    return None if F is None else refine_fundamental(F, xy1, xy2, "reprojection")
 
 
 def _library(name: str) -> Estimate:
@@ -126,20 +109,17 @@ OWN = (
     Method("eight-point, raw pixels, rank 3", _linear(normalized=False, rank_two=False)),
     Method(RAW, _linear(normalized=False)),
     Method(NORMALISED, _linear(normalized=True)),
-    Method("gradient (5.4), thesis' rows", _refined(refine_by_rows)),
-    Method("gradient (5.4), orthonormal", _refined(refine_sampson)),
-    Method(
-        "epipolar distance (5.6), thesis' rows",
-        _refined(partial(refine_by_rows, criterion=EPIPOLAR_DISTANCE)),
-    ),
-    Method("epipolar distance (5.6), orthonormal", _refined(refine_epipolar_distance)),
-    Method("gold standard, thesis' rows", _refined(partial(refine_by_rows, criterion=REPROJECTION))),
-    Method(GOLD, _refined(refine_reprojection)),
+    Method("gradient (5.4), thesis' rows", _refined(refine_by_rows, "sampson")),
+    Method("gradient (5.4), orthonormal", _refined(refine_fundamental, "sampson")),
+    Method("epipolar distance (5.6), thesis' rows", _refined(refine_by_rows, "epipolar-distance")),
+    Method("epipolar distance (5.6), orthonormal", _refined(refine_fundamental, "epipolar-distance")),
+    Method("gold standard, thesis' rows", _refined(refine_by_rows, "reprojection")),
+    Method(GOLD, _refined(refine_fundamental, "reprojection")),
     Method(GOLD_FROM_DEFAULT, _gold_from_default),
-    Method("Algorithm 2, seven-point search alone", _search_alone, robust=True, thresholded=True),
     *(
         Method(f"Algorithm 2, {label}", _robust(partial(_thesis, **variant)), robust=True, thresholded=True)
         for label, variant in (
+            ("seven-point search alone", {"rounds": 0}),
             ("gradient", {}),
             ("epipolar distance", {"epipolar_distance": True}),
             ("gradient, test of both lines", {"inlier_test": "epipolar-distance"}),

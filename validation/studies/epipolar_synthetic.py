@@ -18,9 +18,9 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar.configuration import Configuration, classify_configuration
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
-from thesisrecon.epipolar.frame import PairFrame
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.precision import (
@@ -29,7 +29,7 @@ from thesisrecon.epipolar.precision import (
     fundamental_bound,
     fundamental_covariance,
 )
-from thesisrecon.epipolar.refinement import refine_reprojection
+from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
@@ -48,7 +48,7 @@ DISTANCES, EPIPOLES, PIXELS = INTERVALS = ("distances", "epipoles", "epipoles in
 
 def gold_standard(xy1: F64, xy2: F64) -> FundamentalFit:
     """Estimate F of least reprojection error with its noise and covariance."""
-    F = refine_reprojection(estimate_eight_point(xy1, xy2), xy1, xy2)
+    F = refine_fundamental(estimate_eight_point(xy1, xy2), xy1, xy2, "reprojection")
     r = sampson_residuals(F, xy1, xy2)
     sigma, frame = float(np.sqrt(r @ r / (len(r) - 7))), PairFrame.of(xy1, xy2)
     covariance = fundamental_covariance(

@@ -1,7 +1,7 @@
-"""Homographies induced by F and a scene plane (HZ 13.6), and the dominant plane of the matches.
+"""Kernels of homographies induced by F and a scene plane (HZ 13.6), and the dominant plane of the matches.
 
-Points are rows (x1, y1, x2, y2); the kernels take F and H as row-major vectors of 9. Distances are Sampson
-distances of H, so that noise has the standard deviation of one coordinate.
+Points are rows (x1, y1, x2, y2); F and H are row-major vectors of 9. Distances are Sampson distances of H, so
+that noise has the standard deviation of one coordinate.
 """
 
 from __future__ import annotations
@@ -13,15 +13,12 @@ from numba import njit
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_residuals, unit_norm
 
 # H is singular at a match if det J J' is below the first times its squared trace; it then has the second
 # squared distance.
 SINGULAR_REL, FARTHEST = 1e-28, 1e280
 # Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
 TRIPLES, SUBSET = 100, 200
-# Planes tried for the inlier ratio: a plane with a quarter of the matches is found with 96 %.
-RATIO_TRIPLES = 200
 # Squared distance in sigma^2 beyond which a match is off the plane; noise exceeds it once in 3000.
 OFF_PLANE = 16.0
 # Gate of the plane in sigma, reweighting steps on the subset and on all matches, maximum number of matches.
@@ -33,10 +30,9 @@ MIN_AREA = 1e-3
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) -> float:
-    """Squared distance of a match to the nearest exact match of x2 ~ H x1, to first order.
+    """Squared distance of a match to the nearest exact match of x2 ~ H x1: c' (J J')^-1 c, to first order.
 
-    c' (J J')^-1 c with the two equations c and their derivatives J by the four coordinates (Chum, Pajdla and
-    Sturm, 2005).
+    c are the two equations and J their derivatives by the four coordinates (Chum, Pajdla and Sturm, 2005).
     """
     w = h[6] * x1 + h[7] * y1 + h[8]
     c0 = h[0] * x1 + h[1] * y1 + h[2] - w * x2
@@ -62,11 +58,10 @@ def _plane_distances(h: F64, points: F64) -> F64:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area: float, h: F64) -> bool:
+def induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area: float, h: F64) -> bool:
     """Homography of the plane of three matches, H = A - e2 v' with A = [e2]x F (HZ, result 13.6).
 
-    Each match gives v . x1 = b with b = (x2 x A x1) . (x2 x e2) / |x2 x e2|^2. False if the points are nearly
-    collinear.
+    Each match gives v . x1 = b with b = (x2 x A x1) . (x2 x e2) / |x2 x e2|^2. False if nearly collinear.
     """
     A = np.empty(9)
     for j in range(3):
@@ -99,7 +94,7 @@ def _induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
-    """Compute ``G`` (9, 9) of the equations of x2 ~ H x1 and return the sum of min(d^2 / gate^2, 1).
+    """Write ``G`` (9, 9) of the equations of x2 ~ H x1; returns the sum of min(d^2 / gate^2, 1).
 
     Each match has the weight (J J')^-1 and, within the gate, (1 - d^2 / gate^2)^2 (Tukey).
     """
@@ -139,24 +134,7 @@ def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
-    """Fit a homography to the points within a gate by reweighted least squares.
-
-    Parameters
-    ----------
-    h : ndarray (9,)
-        Start; overwritten by the result, unit norm.
-    points : ndarray (N, 4)
-        Matches.
-    gate : float
-        Distance beyond which a match has no weight.
-    iterations : int
-        Maximum number of iterations.
-
-    Returns
-    -------
-    ndarray (9, 9)
-        Matrix of the last normal equations.
-    """
+    """Fit ``h`` in place to the points within a gate by reweighted least squares; returns G."""
     G = np.empty((9, 9))
     for _ in range(iterations):
         h /= np.sqrt(np.sum(h * h)) + 1e-300
@@ -173,16 +151,13 @@ def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> float:
-    """Find the plane ``h`` of F with the smallest mean truncated squared distance; return it (1 without any).
-
-    Each triple of ``points`` gives a plane that is scored on all of them.
-    """
+def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> None:
+    """Write the plane ``h`` of triples (S, 3) with the smallest sum of truncated squared distances."""
     best, trial = float(len(points)), np.empty(9)
     h[:] = 0.0
     wide = 1.0 / (gate * gate)
     for t in range(len(triples)):
-        if not _induced_homography(f, e2, points, triples[t], MIN_AREA, trial):
+        if not induced_homography(f, e2, points, triples[t], MIN_AREA, trial):
             continue
         total = 0.0
         for k in range(len(points)):
@@ -195,12 +170,11 @@ def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: flo
         if total < best:
             best = total
             h[:] = trial
-    return best / max(len(points), 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
-    """Count the points (N, 2) that each homography (S, 3, 3) maps to within ``tolerance``."""
+def count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
+    """Number of points (N, 2) that each homography (S, 3, 3) maps to within ``tolerance``."""
     counts = np.zeros(len(H), np.int64)
     for s in range(len(H)):
         h = H[s]
@@ -215,15 +189,7 @@ def _count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
 
 @dataclass(frozen=True)
 class DominantPlane:
-    """The plane that most inliers of an F lie on.
-
-    Parameters
-    ----------
-    h : ndarray (9,)
-        Homography in the frame of the points, unit norm.
-    squared : ndarray (N,)
-        Squared distances of all points, in sigma^2.
-    """
+    """The plane ``h`` (9,) that most inliers of an F lie on, and the squared distances (N,) in sigma^2."""
 
     h: F64
     squared: F64
@@ -237,27 +203,9 @@ class DominantPlane:
 def find_dominant_plane(
     f: F64, points: F64, inliers: B8, *, sigma: float, rng: Generator
 ) -> DominantPlane | None:
-    """Find the plane of F with most of its inliers.
+    """Find the plane of F with most of its inliers; None if there is none.
 
     Least squares over the inliers within 5 sigma of the best of 100 sampled planes.
-
-    Parameters
-    ----------
-    f : ndarray (9,)
-        F in the frame.
-    points : ndarray (N, 4)
-        Matches.
-    inliers : ndarray (N,) of bool
-        Inliers of F.
-    sigma : float
-        Noise of one coordinate in the frame.
-    rng : numpy.random.Generator
-        Source of the samples.
-
-    Returns
-    -------
-    DominantPlane or None
-        None if there is no plane.
     """
     mine = points[inliers]
     if len(mine) < 4:
@@ -278,90 +226,13 @@ def find_dominant_plane(
 
 
 def plane_covariance(h: F64, points: F64, sigma: float) -> F64:
-    """Compute the covariance of a homography fitted to points.
-
-    Parameters
-    ----------
-    h : ndarray (9,)
-        Homography, unit norm.
-    points : ndarray (N, 4)
-        Matches on the plane.
-    sigma : float
-        Noise of one coordinate in the frame.
-
-    Returns
-    -------
-    ndarray (9, 9)
-        Covariance of ``h``.
-    """
+    """Covariance (9, 9) of a homography fitted to points on its plane."""
     G = np.empty((9, 9))
     _plane_normal_equations(h, points, 1e6 * sigma, G)
     values, vectors = np.linalg.eigh(G)
     # The smallest eigenvalue belongs to the scale of H, on which no distance depends.
     half = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-14 * values[-1]))
     return np.asarray(sigma**2 * half @ half.T)
-
-
-def _plane_homographies(F: F64, xy1: F64, xy2: F64, triples: I64) -> F64:
-    """Homographies (S', 3, 3) of the planes through three matches each, without nearly collinear triples."""
-    points, h, found = np.hstack([xy1, xy2]), np.empty(9), []
-    e2, f = epipoles(F)[1].copy(), unit_norm(F).ravel()
-    smallest_area = 1e-4 * float(np.ptp(xy1, axis=0).max()) ** 2
-    for triple in triples:
-        if _induced_homography(f, e2, points, triple, smallest_area, h):
-            found.append(h.copy())
-    return np.array(found).reshape(-1, 3, 3)
-
-
-def homography_inlier_ratio(F: F64, xy1: F64, xy2: F64, *, tolerance_px: float, rng: Generator) -> float:
-    """Compute the largest fraction of matches that one homography explains.
-
-    The best of 200 planes through three matches is fitted again to its inliers until they stay the same. A
-    ratio near 1 indicates a planar scene or a pure rotation.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix, px.
-    xy1, xy2 : ndarray (N, 2)
-        Inliers of F, px.
-    tolerance_px : float
-        Maximum transfer error in image 2.
-    rng : numpy.random.Generator
-        Source of the samples.
-
-    Returns
-    -------
-    float
-        Inlier ratio; 1 for fewer than 5 matches, which always have a homography.
-    """
-    n = len(xy1)
-    if n < 5:
-        return 1.0
-    chosen = rng.permutation(n)[:SUBSET]
-    triples = np.argsort(rng.random((RATIO_TRIPLES, min(len(chosen), 50))), axis=1)[:, :3]
-    offsets = rng.integers(0, len(chosen), (RATIO_TRIPLES, 1))
-    triples = chosen[(triples + offsets) % len(chosen)]
-    planes = _plane_homographies(F, xy1, xy2, triples)
-    if not len(planes):
-        return _refit_inlier_ratio(np.eye(3), xy1, xy2, tolerance_px)
-    counts = _count_transferred(planes, xy1[chosen], xy2[chosen], tolerance_px)
-    best = planes[int(np.argmax(counts))]
-    return _refit_inlier_ratio(best, xy1, xy2, tolerance_px)
-
-
-def _refit_inlier_ratio(H: F64, xy1: F64, xy2: F64, tolerance_px: float) -> float:
-    """Inlier ratio of a homography after refitting it to its inliers while they increase."""
-    inside = homography_residuals(H, xy1, xy2) < tolerance_px
-    for _ in range(5):
-        points1, points2 = xy1[inside], xy2[inside]
-        if len(points1) < 5 or not (np.ptp(points1, axis=0).any() and np.ptp(points2, axis=0).any()):
-            break
-        again = homography_residuals(estimate_homography(points1, points2), xy1, xy2) < tolerance_px
-        if again.sum() <= inside.sum():
-            break
-        inside = again
-    return float(inside.mean())
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -406,27 +277,8 @@ def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
 def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
     """Compute [e2]x H with the epipole of each pair of matches off the plane (plane plus parallax).
 
-    Parameters
-    ----------
-    h : ndarray (9,)
-        Homography of the plane.
-    points : ndarray (N, 4)
-        Matches off the plane.
-    weights : ndarray (M, N)
-        M sets of weights of the matches.
-    pairs : ndarray (S, 2) of int
-        Pairs of matches.
-    gate : float
-        Sampson distance of an inlier.
-
-    Returns
-    -------
-    F : ndarray (S, 9)
-        Fundamental matrices, unit norm.
-    agree : ndarray (S, N)
-        1 for inliers, else 0.
-    sums : ndarray (S, M)
-        Sums of the weights of the inliers.
+    For ``weights`` (M, N) and ``pairs`` (S, 2): F (S, 9), inliers (S, N) as 0 or 1, sums (S, M) of their
+    weights.
     """
     columns = np.ascontiguousarray(points.T)
     lines = _parallax_lines(h, points)

@@ -17,22 +17,9 @@ MAX_PX, MIN_PX = 1e15, 1e-50
 
 
 def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
-    """Return the matches as contiguous float64 arrays.
+    """Matches as contiguous float64 arrays (N, 2).
 
-    Parameters
-    ----------
-    xy1, xy2 : array_like (N, 2)
-        Matched points, px.
-
-    Returns
-    -------
-    tuple of ndarray (N, 2)
-        The two point sets.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ or coordinates are complex, not finite or beyond 1e15 px.
+    A ValueError if the shapes differ or coordinates are complex, not finite or beyond 1e15 px.
     """
     if np.iscomplexobj(xy1) or np.iscomplexobj(xy2):
         raise ValueError("a fundamental matrix needs real pixel coordinates; got complex ones")
@@ -49,26 +36,9 @@ def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
 
 def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
-    """Return the matches as float64 arrays and require that they can determine an F.
+    """As :func:`as_matches`; a StageFailure if the matches cannot determine an F.
 
-    Parameters
-    ----------
-    xy1, xy2 : array_like (N, 2)
-        Matched points, px.
-    needed : int
-        Minimum number of matches.
-
-    Returns
-    -------
-    tuple of ndarray (N, 2)
-        The two point sets.
-
-    Raises
-    ------
-    ValueError
-        As :func:`as_matches`.
-    StageFailure
-        If there are too few matches or the points of an image are equal or collinear.
+    There are fewer than ``needed``, or the points of an image are equal or collinear.
     """
     xy1, xy2 = as_matches(xy1, xy2)
     if len(xy1) < needed:
@@ -92,7 +62,7 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
 
 
 def _clearly_spread(xy: F64) -> bool:
-    """Return whether the points are so far from collinear that rounding of squares cannot hide it."""
+    """Whether the points are so far from collinear that rounding of squares cannot hide it."""
     centred = xy - xy.sum(axis=0) / len(xy)
     (a, b), (_, d) = centred.T @ centred
     size = a + d
@@ -102,17 +72,10 @@ def _clearly_spread(xy: F64) -> bool:
 
 @dataclass(frozen=True)
 class PairFrame:
-    """Coordinates of both images about their centroids with one common scale.
+    """Coordinates of both images about their centroids (2,) with one common scale, units per pixel.
 
     The common factor keeps Sampson distances proportional to pixels; one factor per image would weight the
     images differently.
-
-    Parameters
-    ----------
-    centroid1, centroid2 : ndarray (2,)
-        Centroid of the points of each image, px.
-    scale : float
-        Frame units per pixel.
     """
 
     centroid1: F64
@@ -121,35 +84,13 @@ class PairFrame:
 
     @classmethod
     def of(cls, xy1: F64, xy2: F64) -> PairFrame:
-        """Return the frame in which the mean squared coordinate over both images is 1.
-
-        Parameters
-        ----------
-        xy1, xy2 : ndarray (N, 2)
-            Matched points, px.
-
-        Returns
-        -------
-        PairFrame
-            The frame.
-        """
+        """The frame in which the mean squared coordinate over both images is 1."""
         c1, c2 = xy1.sum(axis=0) / len(xy1), xy2.sum(axis=0) / len(xy2)
         d1, d2 = (xy1 - c1).ravel(), (xy2 - c2).ravel()
         return cls(c1, c2, 1.0 / float(np.sqrt((d1 @ d1 + d2 @ d2) / (4.0 * len(xy1)))))
 
     def points(self, xy1: F64, xy2: F64) -> F64:
-        """Convert matches from pixels to the frame.
-
-        Parameters
-        ----------
-        xy1, xy2 : ndarray (N, 2)
-            Matched points, px.
-
-        Returns
-        -------
-        ndarray (N, 4)
-            Rows (x1, y1, x2, y2).
-        """
+        """Matches in the frame: rows (x1, y1, x2, y2)."""
         points = np.empty((len(xy1), 4))
         points[:, :2] = xy1 - self.centroid1
         points[:, 2:] = xy2 - self.centroid2
@@ -163,34 +104,12 @@ class PairFrame:
         return np.asarray(np.kron(T2.T, T1.T), dtype=np.float64)
 
     def matrix_in_pixels(self, f: F64) -> F64:
-        """Convert F from the frame to pixels.
-
-        Parameters
-        ----------
-        f : ndarray (9,)
-            F in the frame, row-major.
-
-        Returns
-        -------
-        ndarray (3, 3)
-            F in pixels, unit norm.
-        """
+        """F (3, 3) in pixels, unit norm, of F (9,) in the frame."""
         T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
         return unit_norm(T2.T @ f.reshape(3, 3) @ T1)
 
     def matrix_in_frame(self, F: F64) -> F64:
-        """Convert F from pixels to the frame.
-
-        Parameters
-        ----------
-        F : ndarray (3, 3)
-            F in pixels.
-
-        Returns
-        -------
-        ndarray (9,)
-            F in the frame, row-major, unit norm.
-        """
+        """F (9,) in the frame, unit norm, of F (3, 3) in pixels."""
         T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
         return np.ascontiguousarray(unit_norm(np.linalg.inv(T2).T @ F @ np.linalg.inv(T1)).ravel())
 
@@ -201,25 +120,7 @@ class PairFrame:
 
 
 def check_start(F: F64, frame: PairFrame) -> F64:
-    """Convert the start of a refinement to the frame and check it.
-
-    Parameters
-    ----------
-    F : array_like (3, 3)
-        F in pixels.
-    frame : PairFrame
-        Frame of the matches.
-
-    Returns
-    -------
-    ndarray (9,)
-        F in the frame, row-major, unit norm.
-
-    Raises
-    ------
-    ValueError
-        If F is not a finite (3, 3) matrix of rank 2 or 3.
-    """
+    """The start of a refinement in the frame (9,); a ValueError unless it has rank 2 or 3."""
     F = np.asarray(F, dtype=np.float64)
     if F.shape != (3, 3) or not np.isfinite(F).all():
         raise ValueError(f"the refinement starts from a finite (3, 3) matrix of rank 2 or 3; got {F.shape}")

@@ -13,27 +13,12 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: float) -> F32:
-    """Compute the corner response R of section 4.2.1.
+    """Compute the corner response R (H, W) of section 4.2.1, zero where windows leave the image.
 
-    M holds the products of the gradients, summed over the channels and smoothed by ``taps``; the gradient at
-    x is sum_k derivative[k] I(x + k), k from the middle. One sweep down the image keeps only the last 2 r + 1
+    M holds the products of the gradients of ``channels`` (C, H, W), summed over them and smoothed by
+    ``taps``; the gradient at x is sum_k derivative[k] I(x + k), k from the middle. ``trace_weight`` is 0 for
+    det M / trace M, else k of det M - k (trace M)^2. One sweep down the image keeps only the last 2 r + 1
     rows of products, which stay in the cache.
-
-    Parameters
-    ----------
-    channels : ndarray (C, H, W)
-        Channels, float32.
-    derivative : ndarray (k,)
-        Derivative kernel, odd length.
-    taps : ndarray (m,)
-        Smoothing kernel, odd length.
-    trace_weight : float
-        0 for det M / trace M, else det M - trace_weight (trace M)^2.
-
-    Returns
-    -------
-    ndarray (H, W)
-        R, zero where windows leave the image.
     """
     count, height, width = channels.shape
     reach, size = derivative.size // 2, taps.size
@@ -112,24 +97,7 @@ def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
 
 @njit(cache=True, nogil=True)
 def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[F64, F32]:
-    """Find the local maxima of R and refine them by least-squares quadratic surfaces.
-
-    Parameters
-    ----------
-    response : ndarray (H, W)
-        R.
-    threshold : float
-        Minimum response.
-    subpixel : bool
-        Refine, else keep the pixels; a fit without a maximum within one pixel keeps its pixel.
-
-    Returns
-    -------
-    xy : ndarray (N, 2)
-        Positions, px.
-    value : ndarray (N,)
-        Responses at the pixels.
-    """
+    """Local maxima of R: positions (N, 2) refined by least-squares quadratic surfaces, and responses (N,)."""
     height, width = response.shape
     # Maxima do not touch: at most one in four pixels.
     most = (height // 2 + 1) * (width // 2 + 1)
@@ -190,22 +158,7 @@ def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
-    """Compute the squared distance of each corner to the nearest clearly stronger one.
-
-    Parameters
-    ----------
-    xy : ndarray (N, 2)
-        Corners, strongest first, px.
-    response : ndarray (N,)
-        Responses.
-    robustness : float
-        A corner is clearly stronger if robustness times its response is larger.
-
-    Returns
-    -------
-    ndarray (N,)
-        Squared distances, inf without a stronger corner.
-    """
+    """Squared distances (N,) to the nearest corner whose response times robustness is larger."""
     n = len(xy)
     x, y = xy[:, 0].copy(), xy[:, 1].copy()
     out = np.full(n, np.inf, np.float32)
@@ -224,26 +177,7 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
-    """Sample rotated square patches bilinearly.
-
-    Parameters
-    ----------
-    image : ndarray (H, W)
-        Image, float32.
-    xy : ndarray (N, 2)
-        Centres, px; samples outside the image are clamped.
-    angle : ndarray (N,)
-        Rotation, rad.
-    side : int
-        Samples per side.
-    spacing : float
-        Distance of samples, px.
-
-    Returns
-    -------
-    ndarray (N, side^2)
-        The patches.
-    """
+    """Square patches (N, side^2) of an image, clamped, rotated by ``angle`` (N,) rad, sampled bilinearly."""
     height, width = image.shape
     out = np.empty((len(xy), side * side), np.float32)
     centre = 0.5 * (side - 1)
@@ -264,22 +198,7 @@ def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -
 
 @njit(cache=True, nogil=True)
 def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
-    """Select corners at least a given distance from every corner selected before.
-
-    Parameters
-    ----------
-    xy : ndarray (N, 2)
-        Corners, px.
-    order : ndarray (M,) of int
-        Indices in order of preference.
-    distance : float
-        Minimum distance, px.
-
-    Returns
-    -------
-    ndarray (K,) of int
-        Selected indices.
-    """
+    """Of the indices ``order`` those at least ``distance`` from every corner selected before."""
     kept = np.empty(len(order), np.int64)
     n = 0
     for i in order:
