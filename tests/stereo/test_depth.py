@@ -72,9 +72,8 @@ def test_the_same_bytes_with_any_number_of_threads(walled):
 def test_the_surroundings_of_a_view_are_enough_for_its_map(linker):
     """What is sent to a worker elsewhere: a part of the scene, and the same bytes come back."""
     walled = make_walled(on_arc(tuple(np.linspace(-15.0, 15.0, 5))))
-    selection = replace(STEREO.selection, max_neighbours=1)
     stereo = replace(
-        STEREO, linker=linker, selection=selection, min_comparison_views=2, max_side=80, match_side=64
+        STEREO, linker=linker, max_neighbours=1, min_comparison_views=2, max_side=80, match_side=64
     )
     scene = stereo.prepare(walled.images, walled.reconstruction)
     raw = {i: stereo.depth_map(scene, i) for i in scene.views}

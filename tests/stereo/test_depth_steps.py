@@ -12,14 +12,9 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import DepthMap, DisparityMap
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
-from thesisrecon.stereo.depth import DepthCompletion, GeometricConsistency, _region_sizes, _transfer
+from thesisrecon.stereo.depth import _region_sizes, _transfer, complete_depths, confirm_depths
 from thesisrecon.stereo.depth_fusion import _concatenated, _inverse_depth_of
-from thesisrecon.stereo.neighbours import (
-    NeighbourSelection,
-    pinhole_view,
-    shared_projections,
-    sparse_points,
-)
+from thesisrecon.stereo.neighbours import pinhole_view, select_neighbours, shared_projections, sparse_points
 from thesisrecon.stereo.planar import common_orientation
 from thesisrecon.stereo.plane_refinement import PlaneRefinement
 from thesisrecon.stereo.polar import polar
@@ -67,12 +62,11 @@ def test_views_are_refused_with_a_sentence(walled):
 
 def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
     views, points = views_of(walled), sparse_points(walled.reconstruction)
-    selection = NeighbourSelection(max_neighbours=2)
-    assert set(selection.select(points, views, 1)) == {0, 2}
-    assert set(selection.select(points, views, 2)) == {1, 3}
+    assert set(select_neighbours(points, views, 1, 2)) == {0, 2}
+    assert set(select_neighbours(points, views, 2, 2)) == {1, 3}
     S = np.diag([1e3, 1e3, 1e3, 1.0])
     larger = {i: replace(view, P=1e3 * view.P @ np.linalg.inv(S)) for i, view in views.items()}
-    assert selection.select(replace(points, X=1e3 * points.X), larger, 1) == selection.select(
+    assert select_neighbours(replace(points, X=1e3 * points.X), larger, 1) == select_neighbours(
         points, views, 1
     )
 
@@ -80,11 +74,9 @@ def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
 def test_a_view_without_baseline_or_points_is_not_a_neighbour(walled):
     views, points = views_of(walled), sparse_points(walled.reconstruction)
     same = {0: views[0], 1: replace(views[1], P=views[0].P)}
-    assert NeighbourSelection().select(points, same, 0) == []
+    assert select_neighbours(points, same, 0) == []
     few = replace(points, seen=points.seen & (np.arange(points.seen.shape[1]) < 5))
-    assert NeighbourSelection().select(few, views, 0) == []
-    assert NeighbourSelection(min_angle_deg=8.0).select(points, views, 0) != []
-    assert NeighbourSelection(min_angle_deg=40.0).select(points, views, 0) == []
+    assert select_neighbours(few, views, 0) == []
 
 
 @dataclass(frozen=True)
@@ -131,10 +123,10 @@ def test_exact_disparities_give_exact_depth(method):
 
 def test_working_pixels_map_back_to_pixels_of_the_file():
     walled = make_walled(on_arc((-6.0, 6.0)))
-    true = TrueDisparity(walled, (0, 1), "metric")
+    true = TrueDisparity(walled, (0, 1), common_orientation)
     larger = (2 * SIZE[0], 2 * SIZE[1])
     own = PairMatching()._back(true.frame(), true.found(), (SIZE[::-1],) * 2, (SIZE[::-1],) * 2)
-    reported = PairMatching()._back(true.frame(), true.found(), (SIZE, SIZE), (larger, larger))
+    reported = PairMatching()._back(true.frame(), true.found(), (SIZE[::-1],) * 2, (larger[::-1],) * 2)
     assert reported.sigma.shape == (2 * SIZE[1], 2 * SIZE[0])
     # The middle of four pixels is the pixel of the smaller photograph.
     four = np.mean([reported.xy[a::2, b::2] for a in (0, 1) for b in (0, 1)], axis=0)
@@ -200,7 +192,7 @@ def test_holes_are_filled_from_views_that_agree():
     # The other view is wrong there: what the photographs say counts, with the planes around the gap.
     other[120:] *= 0.8
     own, offering = replace(maps[0], depth=depth), replace(maps[1], depth=other)
-    found = DepthCompletion().complete(own, [offering], views, refinement=PlaneRefinement())
+    found = complete_depths(own, [offering], views, PlaneRefinement())
     kept = np.isfinite(depth)
     assert (found.depth[kept] == depth[kept]).all()
     error = np.abs(found.depth[lacks] / maps[0].depth[lacks] - 1.0)
@@ -213,7 +205,7 @@ def test_holes_are_filled_from_views_that_agree():
     assert np.isfinite(found.std[np.isfinite(found.depth)]).all()
     assert (found.views[lacks][np.isfinite(found.depth[lacks])] == 1).all()
     nothing = replace(offering, depth=np.full_like(other, np.nan))
-    assert DepthCompletion().complete(own, [nothing], views, refinement=PlaneRefinement()) is own
+    assert complete_depths(own, [nothing], views, PlaneRefinement()) is own
 
 
 def test_seen_through_and_small_pieces_are_removed():
@@ -223,11 +215,11 @@ def test_seen_through_and_small_pieces_are_removed():
     depth[80:100, 20:40] *= 0.6
     depth[100, 200:203] = np.nan
     depth[101, 199:203] = np.nan
-    found = GeometricConsistency().confirm(replace(maps[0], depth=depth), [maps[1]])
+    found = confirm_depths(replace(maps[0], depth=depth), [maps[1]])
     assert np.isnan(found.depth[80:100, 20:40]).all()
     assert np.isfinite(found.depth).mean() > 0.7
     assert (found.views == np.isfinite(found.depth)).all()
-    alone = GeometricConsistency().confirm(maps[0], [])
+    alone = confirm_depths(maps[0], [])
     assert np.isnan(alone.depth).all()
     lonely = np.full((50, 60), np.nan, dtype=np.float32)
     lonely[:20], lonely[30:32, 5:8] = 2.0, 3.0
@@ -244,12 +236,12 @@ def test_unconfirmed_depths_stay_if_they_continue_confirmed_ones():
     other[20:26, 60:200] = np.nan
     depth = maps[0].depth.copy()
     depth[22:25, 100:103] *= 0.98
-    found = GeometricConsistency().confirm(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
+    found = confirm_depths(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
     assert np.isnan(found.depth[22:25, 100:103]).all()
     strip = np.isfinite(found.depth[20:26, 110:180])
     assert strip.mean() > 0.95
     other[20:60, 60:200] = np.nan
-    found = GeometricConsistency().confirm(maps[0], [replace(maps[1], depth=other)])
+    found = confirm_depths(maps[0], [replace(maps[1], depth=other)])
     assert np.isnan(found.depth[35:45, 110:180]).all()
 
 

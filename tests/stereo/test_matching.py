@@ -11,13 +11,7 @@ from thesisrecon.stereo._cost import estimate_noise, prepare_stereo_images, row_
 from thesisrecon.stereo.correspondence import PairMatching
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import (
-    PUBLISHED,
-    CensusAndColour,
-    DisparityPostprocessing,
-    PathPenalties,
-    SemiGlobalMatching,
-)
+from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 
 VARIANTS = [SemiGlobalMatching(), PUBLISHED, MaximumLikelihoodScanline()]
 HEIGHT, WIDTH = 120, 180
@@ -189,12 +183,8 @@ def test_rectified_images_are_matched_by_the_matcher_of_the_stage():
 @pytest.mark.parametrize(
     ("make", "rule"),
     [
-        (lambda: CensusAndColour(census_share=1.2), "census_share"),
-        (lambda: CensusAndColour(truncation=0.0), "truncation"),
-        (lambda: PathPenalties(P1=2.0), "penalties must obey"),
-        (lambda: PathPenalties(edge=0.0), "edge"),
-        (lambda: DisparityPostprocessing(radius=-1), "must not be negative"),
-        (lambda: DisparityPostprocessing(min_confidence=1.0), "min_confidence"),
+        (lambda: SemiGlobalMatching(paths=6), "paths"),
+        (lambda: SemiGlobalMatching(census_share=1.2), "census_share"),
         (lambda: MaximumLikelihoodScanline(detection=1.0), "detection"),
         (lambda: MaximumLikelihoodScanline(radius=9), "radius"),
         (lambda: MaximumLikelihoodScanline(cohesion="both"), "cohesion"),

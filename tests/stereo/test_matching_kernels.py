@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from tests.stereo import twins
-from thesisrecon.stereo._cost import (
-    _count_ones,
-    census,
-    cost_volume,
-    split_bytes,
-    split_channels,
-    support_masks,
-)
+from thesisrecon.stereo._cost import _count_ones, census, cost_volume, split_channels, support_masks
 from thesisrecon.stereo._path_kernels import (
     _transpose_back,
     _transpose_rows,
@@ -50,20 +43,6 @@ def test_channels_are_quarter_levels_and_invalid_pixels_are_rejected():
     assert channels[0].tolist() == [[0, 40], [1020, 0]]
     assert channels[1].tolist() == [[1020, 0], [0, 4]]
     assert (grey == channels.sum(axis=0)).all()
-
-
-def test_bytes_are_split_as_numbers_are():
-    image = np.random.default_rng(9).integers(0, 256, (7, 9, 3)).astype(np.uint8)
-    found = []
-    for values in (image, image.astype(np.float32)):
-        channels, grey = np.empty((3, 7, 9), np.int16), np.empty((7, 9), np.int16)
-        if values.dtype == np.uint8:
-            split_bytes(values, channels, grey)
-        else:
-            split_channels(values, channels, grey, np.empty((7, 9), np.uint8))
-        found.append((channels, grey))
-    assert (found[0][0] == found[1][0]).all()
-    assert (found[0][1] == found[1][1]).all()
 
 
 def test_ones_are_counted():

@@ -100,12 +100,9 @@ def _side(image: NDArray[np.generic]) -> StereoImage:
         raise ValueError(f"an image must be (H, W) or (H, W, K) with K <= 4; got {image.shape}")
     height, width, n = (*image.shape, 1)[:3]
     channels, grey = np.empty((n, height, width), np.int16), np.empty((height, width), np.int16)
-    valid = np.full((height, width), 255, np.uint8)
-    if image.dtype == np.uint8:
-        split_bytes(np.ascontiguousarray(image.reshape(height, width, n), dtype=np.uint8), channels, grey)
-    else:
-        levels = np.ascontiguousarray(image.reshape(height, width, n), dtype=np.float32)
-        split_channels(levels, channels, grey, valid)
+    valid = np.empty((height, width), np.uint8)
+    levels = np.ascontiguousarray(image.reshape(height, width, n), dtype=np.float32)
+    split_channels(levels, channels, grey, valid)
     return StereoImage(channels, grey, valid)
 
 
@@ -167,21 +164,6 @@ def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
 
 
 @njit(cache=True, nogil=True)
-def split_bytes(image: U8, channels: I16, grey: I16) -> None:
-    """Convert an 8-bit image (H, W, K) to integer channels (K, H, W) and their sum (H, W)."""
-    height, width, n = image.shape
-    for y in range(height):
-        total = grey[y]
-        total[:] = 0
-        for k in range(n):
-            channel = channels[k, y]
-            for x in range(width):
-                whole = np.int16(np.int16(image[y, x, k]) * np.int16(LEVELS))
-                channel[x] = whole
-                total[x] = np.int16(total[x] + whole)
-
-
-@njit(cache=True, nogil=True)
 def _compare(centre: I16, other: I16, bits: I32) -> None:
     for x in range(len(centre)):
         bits[x] = np.int32(bits[x] << 1) | np.int32(other[x] < centre[x])
@@ -240,13 +222,7 @@ def _both(a: U8, b: U8, out: U8) -> None:
 
 @njit(cache=True, nogil=True)
 def _row_costs(
-    y: int,
-    left: CostFeatures,
-    right: CostFeatures,
-    first: int,
-    weights: I16,
-    outside: np.uint8,
-    out: U8,
+    y: int, left: CostFeatures, right: CostFeatures, first: int, weights: I16, outside: np.uint8, out: U8
 ) -> None:
     """Costs (D, W) of row y of the left image at the disparities first, first + 1, ...
 

@@ -123,13 +123,7 @@ def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_agreement(
-    own: DepthStd,
-    to: F64,
-    other: DepthStd,
-    back: F64,
-    limits: F64,
-    agree: U8,
-    contradict: U8,
+    own: DepthStd, to: F64, other: DepthStd, back: F64, limits: F64, agree: U8, contradict: U8
 ) -> None:
     """Count pixels that another depth map confirms or contradicts.
 

@@ -52,15 +52,7 @@ def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.flo
 
 
 @njit(cache=True, nogil=True)
-def _extend(
-    cost: U8,
-    before: tuple[U8, U8, U8],
-    base: U8,
-    p2: U8,
-    P1: np.uint8,
-    path: U8,
-    least: U8,
-) -> None:
+def _extend(cost: U8, before: tuple[U8, U8, U8], base: U8, p2: U8, P1: np.uint8, path: U8, least: U8) -> None:
     """Path costs of one disparity: L = C + min(L'(d), L'(d +- 1) + P1, min L' + P2) - min L'.
 
     ``before`` are the rows L'(d - 1), L'(d), L'(d + 1) of the previous pixels, ``base`` their minimum over d;
@@ -99,13 +91,7 @@ def _extend_row(
             below = before[q - 1, c:d] if q > 0 else unreachable[c:d]
             above = before[q + 1, c:d] if q < n - 1 else unreachable[c:d]
             _extend(
-                cost[q, a:b],
-                (below, before[q, c:d], above),
-                base[c:d],
-                p2[c:d],
-                P1,
-                path[q, a:b],
-                least[a:b],
+                cost[q, a:b], (below, before[q, c:d], above), base[c:d], p2[c:d], P1, path[q, a:b], least[a:b]
             )
         for x in range(a):
             path[q, x] = cost[q, x]

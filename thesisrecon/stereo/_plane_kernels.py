@@ -244,13 +244,7 @@ def _view_cost(
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always", forceinline=True)
 def _plane_cost(
-    views: PatchViews,
-    at: tuple[int, int],
-    plane: F64,
-    offsets: F32,
-    samples: F32,
-    variance: float,
-    warp: F64,
+    views: PatchViews, at: tuple[int, int], plane: F64, offsets: F32, samples: F32, variance: float, warp: F64
 ) -> float:
     """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first.
 
@@ -365,13 +359,7 @@ def sweep_planes(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=SUMS)
 def rate_planes(
-    views: PatchViews,
-    window: PatchWindow,
-    planes: F32,
-    max_cost: float,
-    least: F32,
-    support: U8,
-    slope: F32,
+    views: PatchViews, window: PatchWindow, planes: F32, max_cost: float, least: F32, support: U8, slope: F32
 ) -> None:
     """Compute the smallest cost of planes (H, W, 3), their support and slope (H, W).
 

@@ -264,11 +264,7 @@ def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32
                 lo, hi = min(max(-dx, 0), width), max(min(width, width - dx), 0)
                 if hi > lo:
                     _gather_similar(
-                        disparity[y, lo:hi],
-                        disparity[b, lo + dx : hi + dx],
-                        step,
-                        total[lo:hi],
-                        count[lo:hi],
+                        disparity[y, lo:hi], disparity[b, lo + dx : hi + dx], step, total[lo:hi], count[lo:hi]
                     )
         for x in range(width):
             out[y, x] = total[x] / count[x] if count[x] > 0 else np.float32(np.nan)

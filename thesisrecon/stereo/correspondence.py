@@ -71,13 +71,7 @@ class PairMatching:
     min_confidence: float = 0.0
 
     def correspond(
-        self,
-        reference: PinholeView,
-        other: PinholeView,
-        xy1: F64,
-        xy2: F64,
-        *,
-        shapes: tuple[Shape, Shape],
+        self, reference: PinholeView, other: PinholeView, xy1: F64, xy2: F64, *, shapes: tuple[Shape, Shape]
     ) -> Correspondence:
         """Compute the positions of the pixels of ``reference`` in ``other``.
 

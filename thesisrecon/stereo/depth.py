@@ -14,17 +14,12 @@ from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._depth_kernels import DepthStd, count_agreement, splat_depths, surface_continuation
-from thesisrecon.stereo.correspondence import (
-    Correspondence,
-    PairMatching,
-    RectifiedPair,
-    match_two_views,
-)
+from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair, match_two_views
 from thesisrecon.stereo.depth_fusion import InverseDepth, RobustFusion, SequenceLinking, pixel_transfer
 from thesisrecon.stereo.neighbours import (
-    NeighbourSelection,
     SparsePoints,
     pinhole_view,
+    select_neighbours,
     shared_projections,
     sparse_points,
 )
@@ -34,89 +29,58 @@ SURE = 3.0
 """Standard deviations by which an inverse depth must exceed 0, that of infinity."""
 
 
-@dataclass(frozen=True)
-class GeometricConsistency:
-    """Confirmation of depths by the depth maps of other views.
+REPROJECTION_PX, MAX_RELATIVE, MAX_SIGMAS = 1.5, 0.01, 2.0
+"""Limits of the reprojection error, and of the depth difference: a share plus standard deviations."""
+MIN_VIEWS = 1
+"""Views that must confirm a pixel."""
+MIN_REGION_RATIO, STEP = 1e-4, 0.02
+"""Connected regions below this share of the pixels are removed; relative depth step in a region."""
+RADIUS, GATE = 5, 2.0
+"""Window of the surface continuation, and distance from its plane in standard deviations."""
+MAX_SOURCES = 4
+"""Largest number of views from which a depth map is completed."""
+GAP_PX, SWEEPS = 1, 2
+"""Completion also searches gaps of this size between projected pixels, in so many passes."""
+
+
+def confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
+    """Keep the depths that the depth maps of other views confirm.
 
     A pixel is projected into another view, and the depth there is projected back (Merrell et al., ICCV 2007;
     fusion in COLMAP). It is confirmed if both agree and contradicted if the other view sees through it. It is
-    kept if at least ``min_views`` views and more than contradict it confirm it, or if none contradicts it and
+    kept if at least ``MIN_VIEWS`` views and more than contradict it confirm it, or if none contradicts it and
     it continues the surface of confirmed pixels.
 
     Parameters
     ----------
-    reprojection_px : float
-        Largest reprojection error.
-    max_relative : float
-        Largest relative depth difference.
-    max_sigmas : float
-        Standard deviations added to that limit.
-    min_views : int
-        Views that must confirm a pixel.
-    min_region_ratio : float
-        Connected regions below this share of the pixels are removed.
-    step : float
-        Largest relative depth step between connected pixels.
-    radius : int
-        Radius of the window of the surface continuation.
-    gate : float
-        Distance from the plane of that window in standard deviations.
+    depth_map : DepthMap
+        Depths of a view.
+    others : sequence of DepthMap
+        Depths of other views.
+
+    Returns
+    -------
+    DepthMap
+        Confirmed depths; ``views`` is the number of confirming views.
     """
+    agree, contradict, joins = np.zeros((3, *depth_map.depth.shape), dtype=np.uint8)
+    limits = np.array([REPROJECTION_PX, MAX_RELATIVE, MAX_SIGMAS])
+    own = DepthStd(depth_map.depth, depth_map.std)
+    for other in others:
+        to, back = _transfer(depth_map.P, other.P), _transfer(other.P, depth_map.P)
+        count_agreement(own, to, DepthStd(other.depth, other.std), back, limits, agree, contradict)
+    keep = (agree >= MIN_VIEWS) & (agree > contradict)
+    with np.errstate(divide="ignore"):
+        rho = (1.0 / depth_map.depth).astype(np.float32)
+    std = depth_map.std * rho * rho
+    surface_continuation(rho, std, keep.astype(np.uint8), RADIUS, ALIKE, GATE, joins)
+    keep |= (contradict == 0) & (joins > 0)
+    return _without_small_regions(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
 
-    reprojection_px: float = 1.5
-    max_relative: float = 0.01
-    max_sigmas: float = 2.0
-    min_views: int = 1
-    min_region_ratio: float = 1e-4
-    step: float = 0.02
-    radius: int = 5
-    gate: float = 2.0
 
-    def confirm(self, depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
-        """Keep the depths that other depth maps confirm.
-
-        Parameters
-        ----------
-        depth_map : DepthMap
-            Depths of a view.
-        others : sequence of DepthMap
-            Depths of other views.
-
-        Returns
-        -------
-        DepthMap
-            Confirmed depths; ``views`` is the number of confirming views.
-        """
-        agree = np.zeros(depth_map.depth.shape, dtype=np.uint8)
-        contradict = np.zeros_like(agree)
-        limits = np.array([self.reprojection_px, self.max_relative, self.max_sigmas])
-        for other in others:
-            count_agreement(
-                DepthStd(depth_map.depth, depth_map.std),
-                _transfer(depth_map.P, other.P),
-                DepthStd(other.depth, other.std),
-                _transfer(other.P, depth_map.P),
-                limits,
-                agree,
-                contradict,
-            )
-        keep = (agree >= self.min_views) & (agree > contradict)
-        keep |= (contradict == 0) & self._continues_surface(depth_map, keep)
-        return self._remove_small_regions(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
-
-    def _continues_surface(self, depth_map: DepthMap, sure: B8) -> B8:
-        """(H, W) pixels that continue the surface of those that are ``sure``."""
-        with np.errstate(divide="ignore"):
-            rho = (1.0 / depth_map.depth).astype(np.float32)
-        joins = np.zeros(sure.shape, dtype=np.uint8)
-        std = depth_map.std * rho * rho
-        surface_continuation(rho, std, sure.astype(np.uint8), self.radius, ALIKE, self.gate, joins)
-        return joins > 0
-
-    def _remove_small_regions(self, depth_map: DepthMap) -> DepthMap:
-        """Remove small connected regions."""
-        least = self.min_region_ratio * depth_map.depth.size
-        return _kept(depth_map, _region_sizes(depth_map.depth, self.step) >= least)
+def _without_small_regions(depth_map: DepthMap) -> DepthMap:
+    least = MIN_REGION_RATIO * depth_map.depth.size
+    return _kept(depth_map, _region_sizes(depth_map.depth, STEP) >= least)
 
 
 def _transfer(P: F64, P_other: F64) -> F64:
@@ -154,82 +118,57 @@ def _kept(depth_map: DepthMap, keep: B8) -> DepthMap:
     )
 
 
-@dataclass(frozen=True)
-class DepthCompletion:
-    """Completion of a depth map with surfaces that only the depth maps of other views contain.
+def complete_depths(
+    own: DepthMap, others: Sequence[DepthMap], views: Mapping[int, PinholeView], refinement: PlaneRefinement
+) -> DepthMap:
+    """Complete a depth map with surfaces that only the depth maps of other views contain.
 
     The depths of other views are projected into the view. Where it has none, the nearest of these initialise
-    the plane search against the ``max_sources`` images that contribute most pixels. Accepted planes (by the
+    the plane search against the ``MAX_SOURCES`` images that contribute most pixels. Accepted planes (by the
     rule of :class:`PlaneRefinement`) are measured depths: nothing is interpolated.
 
     Parameters
     ----------
-    max_sources : int
-        Largest number of contributing views.
-    gap_px : int
-        Gaps of this size between projected pixels are searched too.
-    sweeps : int
-        Passes of the plane search.
+    own : DepthMap
+        Depths of a view.
+    others : sequence of DepthMap
+        Depths of other views.
+    views : mapping of int to PinholeView
+        Images of all views.
+    refinement : PlaneRefinement
+        Plane search.
+
+    Returns
+    -------
+    DepthMap
+        The depth map with additional depths.
     """
-
-    max_sources: int = 4
-    gap_px: int = 1
-    sweeps: int = 2
-
-    def complete(
-        self,
-        own: DepthMap,
-        others: Sequence[DepthMap],
-        views: Mapping[int, PinholeView],
-        *,
-        refinement: PlaneRefinement,
-    ) -> DepthMap:
-        """Complete a depth map from the depth maps of other views.
-
-        Parameters
-        ----------
-        own : DepthMap
-            Depths of a view.
-        others : sequence of DepthMap
-            Depths of other views.
-        views : mapping of int to PinholeView
-            Images of all views.
-        refinement : PlaneRefinement
-            Plane search.
-
-        Returns
-        -------
-        DepthMap
-            The depth map with additional depths.
-        """
-        unknown = np.isnan(own.depth) & views[own.view].seen
-        offers = []
-        for other in others:
-            offer = np.full_like(own.depth, np.nan)
-            splat_depths(other.depth, _transfer(other.P, own.P), offer)
-            offers.append(np.where(unknown, offer, np.float32(np.nan)))
-        worth = [int(np.isfinite(offer).sum()) for offer in offers]
-        order = sorted(range(len(offers)), key=lambda k: (-worth[k], k))
-        best = [k for k in order if worth[k]][: self.max_sources]
-        if not best:
-            return own
-        nearest = np.fmin.reduce([offers[k] for k in best])
-        wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), self.gap_px)
-        rho = (np.float32(1.0) / np.where(unknown, nearest, own.depth)).astype(np.float32)
-        images = [views[others[k].view] for k in best]
-        found, std, support = refinement.search(
-            views[own.view], images, rho, wanted=wanted, sweeps=self.sweeps
-        )
-        new = np.isfinite(found)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.float32(1.0) / found
-            std = std * depth * depth
-        return replace(
-            own,
-            depth=np.where(new, depth, own.depth),
-            std=np.where(new, std, own.std),
-            views=np.where(new, support, own.views).astype(np.uint8),
-        )
+    unknown = np.isnan(own.depth) & views[own.view].seen
+    offers = []
+    for other in others:
+        offer = np.full_like(own.depth, np.nan)
+        splat_depths(other.depth, _transfer(other.P, own.P), offer)
+        offers.append(np.where(unknown, offer, np.float32(np.nan)))
+    worth = [int(np.isfinite(offer).sum()) for offer in offers]
+    order = sorted(range(len(offers)), key=lambda k: (-worth[k], k))
+    best = [k for k in order if worth[k]][:MAX_SOURCES]
+    if not best:
+        return own
+    nearest = np.fmin.reduce([offers[k] for k in best])
+    wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), GAP_PX)
+    rho = (np.float32(1.0) / np.where(unknown, nearest, own.depth)).astype(np.float32)
+    images = [views[others[k].view] for k in best]
+    found, std, support = refinement.search(views[own.view], images, rho, wanted=wanted, sweeps=SWEEPS)
+    new = np.isfinite(found)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.float32(1.0) / found
+        std = std * depth * depth
+    return replace(
+        own,
+        depth=np.where(new, depth, own.depth),
+        std=np.where(new, std, own.std),
+        views=np.where(new, support, own.views).astype(np.uint8),
+    )
 
 
 @dataclass(frozen=True)
@@ -285,16 +224,14 @@ class MultiViewStereo:
     ----------
     pairs : PairMatching
         Dense correspondence of two views.
-    selection : NeighbourSelection
-        Selection of neighbouring views.
+    max_neighbours : int
+        Largest number of neighbouring views, chosen by :func:`select_neighbours`.
     linker : RobustFusion or SequenceLinking
         Fusion of correspondences to one inverse depth.
     refinement : PlaneRefinement or None
         Refinement with slanted windows.
-    consistency : GeometricConsistency
-        Confirmation by the depth maps of other views.
-    completion : DepthCompletion or None
-        Completion from the depth maps of other views.
+    completion : bool
+        Complete depth maps from those of other views, which needs the refinement.
     min_comparison_views : int
         Number of depth maps to compare with, if there are as many.
     max_side : int
@@ -304,11 +241,10 @@ class MultiViewStereo:
     """
 
     pairs: PairMatching = field(default_factory=PairMatching)
-    selection: NeighbourSelection = field(default_factory=NeighbourSelection)
+    max_neighbours: int = 4
     linker: RobustFusion | SequenceLinking = field(default_factory=RobustFusion)
     refinement: PlaneRefinement | None = field(default_factory=PlaneRefinement)
-    consistency: GeometricConsistency = field(default_factory=GeometricConsistency)
-    completion: DepthCompletion | None = field(default_factory=DepthCompletion)
+    completion: bool = True
     min_comparison_views: int = 12
     max_side: int = 1024
     match_side: int = 640
@@ -338,7 +274,9 @@ class MultiViewStereo:
             }
             for side in (self.max_side, min(self.match_side, self.max_side))
         )
-        chosen = {i: tuple(self.selection.select(points, views, i)) for i in views}
+        chosen = {
+            i: tuple(select_neighbours(points, views, i, max_neighbours=self.max_neighbours)) for i in views
+        }
         return MultiViewScene(views, points, chosen, matched)
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
@@ -362,15 +300,15 @@ class MultiViewStereo:
         else:
             others = [scene.views[j] for j in scene.neighbours[view]]
             found = self.refinement.refine(scene.views[view], others, found)
-        return self.consistency._remove_small_regions(_depth_map(scene.views[view], found, keep))
+        return _without_small_regions(_depth_map(scene.views[view], found, keep))
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
         """See `thesisrecon.config.DepthEstimator.confirm`."""
         others = [depth_maps[j] for j in self._comparison_views(scene, view) if j in depth_maps]
         own = depth_maps[view]
-        if self.completion is not None and self.refinement is not None:
-            own = self.completion.complete(own, others, scene.views, refinement=self.refinement)
-        return self.consistency.confirm(own, others)
+        if self.completion and self.refinement is not None:
+            own = complete_depths(own, others, scene.views, self.refinement)
+        return confirm_depths(own, others)
 
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
         """See `thesisrecon.config.DepthEstimator.required_views`."""

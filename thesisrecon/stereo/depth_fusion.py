@@ -17,6 +17,9 @@ from thesisrecon.stereo.correspondence import Correspondence
 Correspond = Callable[[int, int], Correspondence | None]
 """Returns the correspondence of view i in view j, None if the pair fails."""
 
+GATE = 3.0
+"""Standard deviations within which estimates agree; limit of the innovation of the filter."""
+
 
 @dataclass(frozen=True)
 class InverseDepth:
@@ -42,21 +45,10 @@ class RobustFusion:
 
     The largest group of estimates that agree is averaged, the more certain one among equals. A measurement
     with a single neighbour is kept; the depth map of another view must confirm it.
-
-    Parameters
-    ----------
-    gate : float
-        Standard deviations within which estimates agree.
     """
 
-    gate: float = 3.0
-
     def link(
-        self,
-        view: int,
-        views: Mapping[int, PinholeView],
-        neighbours: Sequence[int],
-        correspond: Correspond,
+        self, view: int, views: Mapping[int, PinholeView], neighbours: Sequence[int], correspond: Correspond
     ) -> InverseDepth:
         """Compute the inverse depths of the pixels of a view from its neighbours.
 
@@ -85,7 +77,7 @@ class RobustFusion:
         result = _nothing(shape)
         if found:
             rho, std = (np.stack([one[k] for one in found]) for k in (0, 1))
-            fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.conflicts)
+            fuse_inverse_depths(rho, std, GATE, result.value, result.std, result.views, result.conflicts)
         return result
 
 
@@ -103,12 +95,9 @@ class SequenceLinking:
     ----------
     length : int
         Maximal number of links in each direction.
-    gate : float
-        Limit of the innovation in standard deviations.
     """
 
     length: int = 4
-    gate: float = 3.0
 
     def link(
         self,
@@ -143,7 +132,7 @@ class SequenceLinking:
         if not ends:
             return result
         rho, std = (np.stack(part) for part in ([e.value for e in ends], [e.std for e in ends]))
-        fuse_inverse_depths(rho, std, self.gate, result.value, result.std, result.views, result.conflicts)
+        fuse_inverse_depths(rho, std, GATE, result.value, result.std, result.views, result.conflicts)
         result.views[:] = np.where(np.isfinite(result.value), np.maximum.reduce([e.views for e in ends]), 0)
         return result
 
@@ -160,7 +149,7 @@ class SequenceLinking:
                 break
             linked = step if linked is None else _concatenated(linked, step)
             new = _inverse_depth_of(reference.P, views[following].P, linked)
-            update_kalman(state.value, state.std, *new, self.gate, alive, state.views)
+            update_kalman(state.value, state.std, *new, GATE, alive, state.views)
         return state
 
 

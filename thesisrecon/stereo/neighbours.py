@@ -13,6 +13,11 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Image, PinholeView, Reconstruction
 from thesisrecon.stereo.resampling import warp_image
 
+BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
+"""Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones."""
+MIN_ANGLE_DEG, MIN_POINTS = 1.0, 12
+"""A neighbour has at least so many common points of at least this angle."""
+
 
 @dataclass(frozen=True)
 class SparsePoints:
@@ -84,9 +89,10 @@ def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> 
     return places[0][keep], places[1][keep]
 
 
-@dataclass(frozen=True)
-class NeighbourSelection:
-    """Greedy selection of neighbouring views.
+def select_neighbours(
+    points: SparsePoints, views: dict[int, PinholeView], view: int, max_neighbours: int = 4
+) -> list[int]:
+    """Select the neighbours of a view greedily.
 
     The weight of a common point is a Gaussian of its triangulation angle. Points that earlier neighbours
     observe count less, and so does a view whose baseline has the direction of an earlier one, because views
@@ -94,79 +100,60 @@ class NeighbourSelection:
 
     Parameters
     ----------
+    points : SparsePoints
+        Points of the scene.
+    views : dict of int to PinholeView
+        All views.
+    view : int
+        Number of the view.
     max_neighbours : int
         Largest number of neighbours.
-    best_deg : float
-        Triangulation angle of the greatest weight.
-    sigma_below_deg, sigma_above_deg : float
-        Decay of the weight for smaller and larger angles.
-    min_angle_deg, min_points : float, int
-        A neighbour has at least ``min_points`` common points of at least ``min_angle_deg``.
+
+    Returns
+    -------
+    list of int
+        Numbers of the neighbours, the most useful first.
     """
+    centre = _centre(views[view].P)
+    worth: dict[int, F64] = {}
+    direction: dict[int, F64] = {}
+    for other in sorted(views):
+        weight = _weights(points, centre, views, view, other)
+        if weight is not None:
+            worth[other] = weight
+            baseline = _centre(views[other].P) - centre
+            direction[other] = baseline / np.linalg.norm(baseline)
+    served = np.zeros(len(points.X))
+    chosen: list[int] = []
+    while worth and len(chosen) < max_neighbours:
+        gains = {
+            j: float(np.sum(np.sqrt(served + w) - np.sqrt(served)))
+            * 0.7 ** sum(direction[j] @ direction[c] > 0.5 for c in chosen)
+            for j, w in worth.items()
+        }
+        best_neighbour = max(gains, key=lambda j: (gains[j], -j))
+        served += worth.pop(best_neighbour)
+        chosen.append(best_neighbour)
+    return chosen
 
-    max_neighbours: int = 4
-    best_deg: float = 10.0
-    sigma_below_deg: float = 3.0
-    sigma_above_deg: float = 10.0
-    min_angle_deg: float = 1.0
-    min_points: int = 12
 
-    def select(self, points: SparsePoints, views: dict[int, PinholeView], view: int) -> list[int]:
-        """Select the neighbours of a view.
-
-        Parameters
-        ----------
-        points : SparsePoints
-            Points of the scene.
-        views : dict of int to PinholeView
-            All views.
-        view : int
-            Number of the view.
-
-        Returns
-        -------
-        list of int
-            Numbers of the neighbours, the most useful first.
-        """
-        centre = _centre(views[view].P)
-        worth: dict[int, F64] = {}
-        direction: dict[int, F64] = {}
-        for other in sorted(views):
-            weight = self._weights(points, centre, views, view, other)
-            if weight is not None:
-                worth[other] = weight
-                baseline = _centre(views[other].P) - centre
-                direction[other] = baseline / np.linalg.norm(baseline)
-        served = np.zeros(len(points.X))
-        chosen: list[int] = []
-        while worth and len(chosen) < self.max_neighbours:
-            gains = {
-                j: float(np.sum(np.sqrt(served + w) - np.sqrt(served)))
-                * 0.7 ** sum(direction[j] @ direction[c] > 0.5 for c in chosen)
-                for j, w in worth.items()
-            }
-            best_neighbour = max(gains, key=lambda j: (gains[j], -j))
-            served += worth.pop(best_neighbour)
-            chosen.append(best_neighbour)
-        return chosen
-
-    def _weights(
-        self, points: SparsePoints, centre: F64, views: dict[int, PinholeView], view: int, other: int
-    ) -> F64 | None:
-        """Weights (N,) of the points seen with ``other``, None if it cannot be a neighbour."""
-        common = points.seen[view] & points.seen[other]
-        if other == view or int(common.sum()) < self.min_points:
-            return None
-        a, b = points.X[common] - centre, points.X[common] - _centre(views[other].P)
-        sine = np.linalg.norm(np.cross(a, b), axis=1)
-        angle = np.degrees(np.arctan2(sine, np.sum(a * b, axis=1)))
-        if int(np.sum(angle >= self.min_angle_deg)) < self.min_points:
-            return None
-        off = angle - self.best_deg
-        width = np.where(off < 0.0, self.sigma_below_deg, self.sigma_above_deg)
-        weights = np.zeros(len(points.X))
-        weights[common] = np.where(angle >= self.min_angle_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
-        return weights
+def _weights(
+    points: SparsePoints, centre: F64, views: dict[int, PinholeView], view: int, other: int
+) -> F64 | None:
+    """Weights (N,) of the points seen with ``other``, None if it cannot be a neighbour."""
+    common = points.seen[view] & points.seen[other]
+    if other == view or int(common.sum()) < MIN_POINTS:
+        return None
+    a, b = points.X[common] - centre, points.X[common] - _centre(views[other].P)
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    angle = np.degrees(np.arctan2(sine, np.sum(a * b, axis=1)))
+    if int(np.sum(angle >= MIN_ANGLE_DEG)) < MIN_POINTS:
+        return None
+    off = angle - BEST_DEG
+    width = np.where(off < 0.0, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG)
+    weights = np.zeros(len(points.X))
+    weights[common] = np.where(angle >= MIN_ANGLE_DEG, np.exp(-0.5 * (off / width) ** 2), 0.0)
+    return weights
 
 
 def _centre(P: F64) -> F64:

@@ -24,6 +24,22 @@ from thesisrecon.stereo.depth_fusion import InverseDepth, pixel_transfer
 
 ALIKE = 0.03
 """Largest relative difference of inverse depths on one surface."""
+SWEEPS = 4
+"""Passes over the image, alternating in direction."""
+FIRST_STEP_PX = 0.5
+"""Perturbation of the first pass; it is halved in every pass."""
+RADIUS, SPACING = 4, 2
+"""Radius of the window, and distance of its samples, in pixels."""
+INTENSITY_SCALE = 15.0
+"""Grey level difference to the centre at which the weight of a sample is 1/e."""
+MAX_COST, MAX_CONTINUATION_COST = 0.4, 0.6
+"""Largest accepted cost, and that of pixels that are accepted if they continue a surface."""
+CONVERGED_COST = 0.1
+"""Planes up to this cost are not changed."""
+GATE = 3.0
+"""Standard deviations within which plane and fused correspondences agree."""
+SIGMA_PX = 0.4
+"""Standard deviation of a position in the neighbours."""
 
 
 @dataclass(frozen=True)
@@ -36,43 +52,9 @@ class PlaneRefinement:
     (Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV 2016). The search is
     deterministic: it starts from the fused correspondences. The cost is 1 - correlation.
 
-    A pixel is kept if two neighbours have at most ``max_cost``, one has at most half of it, or two of the
+    A pixel is kept if two neighbours have at most ``MAX_COST``, one has at most half of it, or two of the
     fused correspondences agree.
-
-    Parameters
-    ----------
-    sweeps : int
-        Passes over the image, alternating in direction.
-    first_step_px : float
-        Perturbation of the first pass; it is halved in every pass.
-    radius : int
-        Radius of the window in pixels.
-    spacing : int
-        Distance of the samples in the window.
-    intensity_scale : float
-        Grey level difference to the centre at which the weight of a sample is 1/e.
-    max_cost : float
-        Largest accepted cost.
-    max_continuation_cost : float
-        Largest cost of pixels that are accepted if they continue a surface.
-    converged_cost : float
-        Planes up to this cost are not changed.
-    gate : float
-        Standard deviations within which plane and fused correspondences agree.
-    sigma_px : float
-        Standard deviation of a position in the neighbours.
     """
-
-    sweeps: int = 4
-    first_step_px: float = 0.5
-    radius: int = 4
-    spacing: int = 2
-    intensity_scale: float = 15.0
-    max_cost: float = 0.4
-    max_continuation_cost: float = 0.6
-    converged_cost: float = 0.1
-    gate: float = 3.0
-    sigma_px: float = 0.4
 
     def refine(
         self, reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth
@@ -95,10 +77,10 @@ class PlaneRefinement:
         """
         if not others or not np.isfinite(found.value).any():
             return found
-        setting = _Setting.of(reference, others, self._offsets(), self.intensity_scale)
+        setting = _Setting.of(reference, others, self._offsets(), INTENSITY_SCALE)
         planes = self._planes(found.value)
         cost = setting.begin(planes)
-        self._sweep(setting, planes, cost, self.sweeps)
+        self._sweep(setting, planes, cost, SWEEPS)
         return self._kept(found, setting, planes)
 
     def search(
@@ -125,43 +107,43 @@ class PlaneRefinement:
             Inverse depth, its standard deviation, and number of supporting views; NaN where no plane is
             accepted.
         """
-        setting = _Setting.of(reference, others, self._offsets(), self.intensity_scale)
+        setting = _Setting.of(reference, others, self._offsets(), INTENSITY_SCALE)
         planes = self._planes(rho)
         begun = np.where(wanted[..., None], planes, np.float32(np.nan))
         # Cost 0 excludes the other pixels from the search.
         cost = np.where(wanted, setting.begin(begun), np.float32(0.0))
         self._sweep(setting, planes, cost, sweeps)
         planes[~wanted] = np.nan
-        least, support, slope = setting.rate(planes, self.max_cost)
+        least, support, slope = setting.rate(planes, MAX_COST)
         seen = self._is_supported(least, support)
         with np.errstate(divide="ignore"):
-            std = (self.sigma_px / slope).astype(np.float32)
+            std = (SIGMA_PX / slope).astype(np.float32)
         unknown = np.float32(np.nan)
         return np.where(seen, planes[..., 0], unknown), np.where(seen, std, unknown), support * seen
 
     def _planes(self, rho: F32) -> F32:
         """(H, W, 3) inverse depths and their gradients."""
         gradients = np.empty((2, *rho.shape), dtype=np.float32)
-        fit_planes(rho, self.radius, ALIKE, gradients[0], gradients[1])
+        fit_planes(rho, RADIUS, ALIKE, gradients[0], gradients[1])
         return np.stack([rho, gradients[0], gradients[1]], axis=-1)
 
     def _sweep(self, setting: _Setting, planes: F32, cost: F32, sweeps: int) -> None:
         for k in range(sweeps):
-            step = self.first_step_px * 0.5**k
-            sweep_planes(setting.views, setting.window, step, self.converged_cost, k % 2 == 1, planes, cost)
+            step = FIRST_STEP_PX * 0.5**k
+            sweep_planes(setting.views, setting.window, step, CONVERGED_COST, k % 2 == 1, planes, cost)
 
     def _is_supported(self, least: F32, support: U8) -> B8:
         """(H, W) planes that two neighbours support, or one clearly."""
-        return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * self.max_cost)))
+        return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * MAX_COST)))
 
     def _kept(self, found: InverseDepth, setting: _Setting, planes: F32) -> InverseDepth:
         rho = planes[..., 0]
-        least, support, slope = setting.rate(planes, self.max_cost)
+        least, support, slope = setting.rate(planes, MAX_COST)
         seen = self._is_supported(least, support)
         joining, std = self._continuing_surfaces(setting, planes, seen, least)
         with np.errstate(divide="ignore", invalid="ignore"):
-            std = np.where(joining, std, self.sigma_px / slope).astype(np.float32)
-            near = np.abs(rho - found.value) <= self.gate * np.hypot(found.std, std)
+            std = np.where(joining, std, SIGMA_PX / slope).astype(np.float32)
+            near = np.abs(rho - found.value) <= GATE * np.hypot(found.std, std)
         seen |= joining
         matched = ~seen & (found.views >= 2)
         # Without texture the fused correspondences are kept.
@@ -177,20 +159,20 @@ class PlaneRefinement:
 
     def _continuing_surfaces(self, setting: _Setting, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
         """(H, W) doubtful planes that continue the surface of accepted ones; standard deviations."""
-        doubtful = ~seen & (least <= self.max_continuation_cost)
+        doubtful = ~seen & (least <= MAX_CONTINUATION_COST)
         slope = setting.rate(
-            np.where(doubtful[..., None], planes, np.float32(np.nan)), self.max_continuation_cost
+            np.where(doubtful[..., None], planes, np.float32(np.nan)), MAX_CONTINUATION_COST
         )[2]
         with np.errstate(divide="ignore"):
-            std = (self.sigma_px / slope).astype(np.float32)
+            std = (SIGMA_PX / slope).astype(np.float32)
         joins = np.zeros(seen.shape, dtype=np.uint8)
         rho = np.where(seen | doubtful, planes[..., 0], np.float32(np.nan))
-        surface_continuation(rho, std, seen.astype(np.uint8), self.radius + 1, ALIKE, self.gate, joins)
+        surface_continuation(rho, std, seen.astype(np.uint8), RADIUS + 1, ALIKE, GATE, joins)
         return joins > 0, std
 
     def _offsets(self) -> F32:
         """(2, S) offsets of the window samples."""
-        one = self.spacing * np.arange(-(self.radius // self.spacing), self.radius // self.spacing + 1)
+        one = SPACING * np.arange(-(RADIUS // SPACING), RADIUS // SPACING + 1)
         return np.stack(np.meshgrid(one, one)).reshape(2, -1).astype(np.float32)
 
 

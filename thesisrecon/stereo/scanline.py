@@ -42,6 +42,8 @@ ROWS, WARM_UP = 96, 8
 """Rows of a strip, and rows above it that are solved first to provide a previous row."""
 MATCH_NATS = 0.5
 """Expected cost of a match per component: (z - z')^2 / (2 s^2) is chi-square distributed."""
+STEPS_PER_NAT = 16.0
+"""Resolution of equal likelihoods: costs are integers; the grey levels and s^2 = 4 of the paper give 16."""
 SIGNIFICANT = 30.0
 """Nats above the minimum from which the probability is taken as 0."""
 
@@ -294,8 +296,6 @@ class MaximumLikelihoodScanline:
     cohesion : {"none", "along", "along and across"}
         Minimise the discontinuities among solutions of equal likelihood along the row (MLMH), or along the
         row and against the previous row (MLMH+V).
-    steps_per_nat : float
-        Resolution of equal likelihoods: costs are integers; the grey levels and s^2 = 4 of the paper give 16.
     out_of_view : bool
         Pixels outside the other camera's view cost as much as an expected match, which does not bias the
         disparities; the paper charges them as occluded, which pulls both row ends to disparity 0.
@@ -306,15 +306,14 @@ class MaximumLikelihoodScanline:
     min_variance: float = 4.0
     radius: int = 1
     cohesion: Cohesion = "along and across"
-    steps_per_nat: float = 16.0
     out_of_view: bool = True
     threads: int = 1
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.detection < 1.0:
             raise ValueError(f"detection must be in [0.5, 1); got {self.detection}")
-        if not (self.min_variance > 0.0 and self.steps_per_nat > 0.0 and 0 <= self.radius <= 4):
-            raise ValueError("min_variance and steps_per_nat must be above 0, radius in 0 .. 4")
+        if not (self.min_variance > 0.0 and 0 <= self.radius <= 4):
+            raise ValueError("min_variance must be above 0, radius in 0 .. 4")
         if self.cohesion not in ("none", "along", "along and across"):
             raise ValueError(f"cohesion must be none, along, or along and across; got {self.cohesion}")
 
@@ -345,13 +344,13 @@ class MaximumLikelihoodScanline:
         occluded = self._occlusion_cost(components, variance)
         model = (
             self.radius,
-            self.steps_per_nat / (4.0 * variance * LEVELS**2),
-            round(self.steps_per_nat * occluded),
-            round(self.steps_per_nat * (MATCH_NATS * components if self.out_of_view else occluded)),
+            STEPS_PER_NAT / (4.0 * variance * LEVELS**2),
+            round(STEPS_PER_NAT * occluded),
+            round(STEPS_PER_NAT * (MATCH_NATS * components if self.out_of_view else occluded)),
             int(self.cohesion != "none"),
             int(self.cohesion == "along and across"),
         )
-        likelihood = np.exp(-np.arange(int(SIGNIFICANT * self.steps_per_nat) + 2) / self.steps_per_nat)
+        likelihood = np.exp(-np.arange(int(SIGNIFICANT * STEPS_PER_NAT) + 2) / STEPS_PER_NAT)
         likelihood[-1] = 0.0
         height, width = sides[0].valid.shape
         disparity, confidence = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
