@@ -3,8 +3,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
@@ -87,7 +85,6 @@ def test_pycolmap_projects_as_we_do(tmp_path, k1, aspect, kind, binary, scale):
     theirs = pycolmap.Reconstruction(tmp_path)
 
     assert theirs.num_reg_images() == 4
-    assert ours.K is not None
     compared = 0
     for i in np.flatnonzero(ours.registered):
         image = theirs.images[int(i) + 1]
@@ -119,15 +116,6 @@ def test_round_trip_keeps_every_byte(tmp_path, binary):
     second = {path.name: path.read_bytes() for path in (tmp_path / "second").iterdir()}
     assert first == second
     assert len(first) == 5
-
-
-def test_binary_and_text_hold_the_same_model(tmp_path):
-    model = _plain_names(_export(_scene(k1=0.05)))
-    write_colmap_model(tmp_path / "text", model, binary=False)
-    write_colmap_model(tmp_path / "direct", model)
-    write_colmap_model(tmp_path / "by_text", read_colmap_model(tmp_path / "text"))
-    for path in (tmp_path / "direct").iterdir():
-        assert path.read_bytes() == (tmp_path / "by_text" / path.name).read_bytes()
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -186,10 +174,7 @@ def test_import_restores_the_export(tmp_path):
     back = reconstruction_from_colmap(read_colmap_model(tmp_path), names=NAMES)
     np.testing.assert_array_equal(back.registered, ours.registered)
     np.testing.assert_allclose(back.P, ours.P, atol=1e-9)
-    assert ours.K is not None
-    assert back.K is not None
     np.testing.assert_allclose(back.K, ours.K, atol=1e-10)
-    assert back.distortion is not None
     np.testing.assert_array_equal(back.distortion[:, 0], np.where(ours.registered, -0.08, 0.0))
     assert not back.distortion[:, 1:].any()
     assert back.reasons[3] == "not in the COLMAP model"
@@ -205,7 +190,6 @@ def test_import_restores_the_export(tmp_path):
 def test_views_of_a_group_share_a_camera_only_where_their_intrinsics_agree():
     ours = _scene()
     assert len(_export(ours).cameras) == 1
-    assert ours.K is not None
     K = ours.K.copy()
     K[1, 0, 0] = K[1, 1, 1] = 650.0
     P = ours.P.copy()
@@ -250,7 +234,6 @@ def test_a_point_seen_twice_in_an_image_keeps_its_first_observation():
 
 def test_export_rejects_values_that_colmap_cannot_store():
     ours = _scene()
-    assert ours.K is not None
     K = ours.K.copy()
     K[:, 0, 1] = 2.0
     with pytest.raises(ValueError, match="skew"):
@@ -279,7 +262,6 @@ def test_import_refuses_distortion_it_has_no_camera_for():
         reconstruction_from_colmap(replace(model, cameras=(tangential,)))
     harmless = replace(model.cameras[0], model="RADIAL", params=(500.0, 250.0, 200.0, 0.1, 0.0))
     back = reconstruction_from_colmap(replace(model, cameras=(harmless,)))
-    assert back.distortion is not None
     np.testing.assert_array_equal(back.distortion[0], [0.1, 0.0, 0.0])
     with pytest.raises(ValueError, match="names must hold"):
         reconstruction_from_colmap(model, names=["other.jpg"])
@@ -292,8 +274,6 @@ def test_a_lens_of_three_coefficients_goes_out_and_comes_back(tmp_path):
     assert {camera.model for camera in model.cameras} == {"FULL_OPENCV"}
     write_colmap_model(tmp_path, model)
     theirs = pycolmap.Reconstruction(tmp_path)
-    assert ours.K is not None
-    assert ours.distortion is not None
     for i in np.flatnonzero(ours.registered):
         pose = np.linalg.solve(ours.K[i], ours.P[i])
         X = ours.X[ours.valid, :3]
@@ -301,7 +281,6 @@ def test_a_lens_of_three_coefficients_goes_out_and_comes_back(tmp_path):
         projected = [theirs.images[int(i) + 1].project_point(x) for x in X]
         np.testing.assert_allclose(projected, xy + 0.5, atol=1e-6, rtol=0)
     back = reconstruction_from_colmap(model)
-    assert back.distortion is not None
     np.testing.assert_allclose(back.distortion[0], ours.distortion[0])
 
 
@@ -371,55 +350,23 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path):
     read_colmap_model(tmp_path)
 
 
-@settings(max_examples=150, deadline=None)
-@given(name=st.sampled_from(["cameras", "images", "points3D"]), seed=st.integers(0, 2**32 - 1))
-def test_damaged_bytes_never_end_in_a_trace(tmp_path_factory, name, seed):
-    rng = np.random.default_rng(seed)
-    folder = tmp_path_factory.mktemp("damaged")
-    write_colmap_model(folder, _SMALL)
-    path = folder / f"{name}.bin"
-    data = bytearray(path.read_bytes())
-    for _ in range(int(rng.integers(1, 9))):
-        data[int(rng.integers(0, min(len(data), 400)))] = int(rng.integers(0, 256))
-    path.write_bytes(bytes(data))
-    try:
-        model = read_colmap_model(folder)
-        read = reconstruction_from_colmap(model)
-    except StageFailure:
-        return
-    # Damage that leaves a consistent model is read as one.
-    views, points = len(model.images), len(model.points.ids)
-    assert (read.P.shape, read.X.shape) == ((views, 3, 4), (points, 4))
-    assert read.K is not None
-    assert all(np.isfinite(values).all() for values in (read.P, read.K, read.X, read.tracks.xy))
-
-
-def test_a_folder_without_a_model_names_the_missing_file(tmp_path):
+@pytest.mark.parametrize("binary", [True, False])
+def test_an_image_without_points_and_an_empty_model_survive_both_forms(tmp_path, binary):
     with pytest.raises(StageFailure, match="holds no COLMAP model"):
         read_colmap_model(tmp_path)
-
-
-def test_an_image_without_points_survives_both_forms(tmp_path):
-    model = _plain_names(_export(_scene()))
-    lonely = replace(
-        model.images[0], image_id=99, name="z.jpg", xy=np.zeros((0, 2)), point_ids=np.zeros(0, np.int64)
-    )
+    model, none = _plain_names(_export(_scene())), np.zeros(0, np.int64)
+    lonely = replace(model.images[0], image_id=99, name="z.jpg", xy=np.zeros((0, 2)), point_ids=none)
     model = replace(model, images=(lonely, *model.images))
-    for binary in (True, False):
-        write_colmap_model(tmp_path / str(binary), model, binary=binary)
-        back = read_colmap_model(tmp_path / str(binary))
-        assert [len(image.xy) for image in back.images] == [len(image.xy) for image in model.images]
-        assert back.images[0].name == "z.jpg"
-
-
-def test_an_empty_model_survives_both_forms(tmp_path):
-    none = np.zeros(0, dtype=np.int64)
+    write_colmap_model(tmp_path / "lonely", model, binary=binary)
+    back = read_colmap_model(tmp_path / "lonely")
+    assert [len(image.xy) for image in back.images] == [len(image.xy) for image in model.images]
+    assert back.images[0].name == "z.jpg"
+    no_xyz = np.zeros((0, 3))
     points = ColmapPoints(
-        none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(1, np.int64), none, none
+        none, no_xyz, no_xyz.astype(np.uint8), np.zeros(0), np.zeros(1, np.int64), none, none
     )
-    for binary in (True, False):
-        write_colmap_model(tmp_path / str(binary), ColmapModel((), (), points), binary=binary)
-        assert read_colmap_model(tmp_path / str(binary)).images == ()
+    write_colmap_model(tmp_path / "empty", ColmapModel((), (), points), binary=binary)
+    assert read_colmap_model(tmp_path / "empty").images == ()
 
 
 _SMALL = _export(_scene())

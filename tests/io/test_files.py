@@ -157,12 +157,11 @@ def test_json_has_no_nan(tmp_path):
     )
     assert read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, 2], "c": [None, 1.0]}
     assert read_json(tmp_path / "b.json") is None
-
-
-def test_names_of_partial_files_after_a_kill():
-    assert is_partial(".points.ply.partial")
-    assert not is_partial("points.ply.partial")
-    assert not is_partial(".lock")
+    assert [is_partial(name) for name in (".points.ply.partial", "points.ply.partial", ".lock")] == [
+        True,
+        False,
+        False,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -183,16 +182,13 @@ def test_names_are_shown_in_one_line_and_in_their_order(name, shown):
     shown.encode("utf-8")
 
 
-def test_long_text_is_begun():
-    assert shortened("x" * 60) == "x" * 60
-    assert shortened("x" * 61) == "x" * 57 + "..."
-
-
 def test_a_long_sentence_keeps_its_beginning_and_its_end():
     said = f"'--seed': '{'9' * 50}' is no integer"
     assert shorten_middle(said, len(said)) == said
     assert shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
     assert len(shorten_middle(said, 60)) == 60
+    assert shortened("x" * 60) == "x" * 60
+    assert shortened("x" * 61) == "x" * 57 + "..."
 
 
 def test_only_regular_files_of_a_size_are_read(tmp_path):
@@ -205,6 +201,9 @@ def test_only_regular_files_of_a_size_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UsageError, match="pipe cannot be read: it is a pipe, a device or a socket"):
         read_text(tmp_path / "pipe")
+    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UsageError, match="not a UTF-8 text"):
+        read_pairs(tmp_path / "binary")
     with pytest.raises(UsageError, match="cannot be read: No such file"):
         read_text(tmp_path / "nowhere")
     # Files of the system say that they are empty.
@@ -214,22 +213,12 @@ def test_only_regular_files_of_a_size_are_read(tmp_path):
 
 def test_names_with_and_without_blanks(tmp_path):
     path = tmp_path / "pairs.txt"
-    path.write_text(
-        '# a list\n\na.jpg b.jpg\n"my a.jpg"  "my b.jpg"\nc d.jpg\te.jpg\n"f.jpg"\t"g.jpg"\n',
-        encoding="utf-8",
+    # The byte order mark and the line ends of other systems belong to no name.
+    path.write_bytes(
+        b'\xef\xbb\xbf# a list\n\na.jpg b.jpg\r\n"my a.jpg"  "my b.jpg"\nc d.jpg\te.jpg\r\n"f.jpg"\t"g.jpg"\n'
     )
-    assert read_pairs(path) == [
-        ("a.jpg", "b.jpg"),
-        ("my a.jpg", "my b.jpg"),
-        ("c d.jpg", "e.jpg"),
-        ("f.jpg", "g.jpg"),
-    ]
-
-
-def test_the_mark_and_the_line_ends_of_other_systems_belong_to_no_name(tmp_path):
-    path = tmp_path / "pairs.txt"
-    path.write_bytes(b"\xef\xbb\xbfa.jpg b.jpg\r\nc.jpg\td.jpg\r\n")
-    assert read_pairs(path) == [("a.jpg", "b.jpg"), ("c.jpg", "d.jpg")]
+    pairs = [("a.jpg", "b.jpg"), ("my a.jpg", "my b.jpg"), ("c d.jpg", "e.jpg"), ("f.jpg", "g.jpg")]
+    assert read_pairs(path) == pairs
 
 
 @pytest.mark.parametrize("line", ["a.jpg", "a.jpg b.jpg c.jpg", 'a.jpg "b.jpg', "a\tb\tc"])
@@ -237,13 +226,6 @@ def test_a_line_that_is_not_a_pair_is_named(tmp_path, line):
     path = tmp_path / "pairs.txt"
     path.write_text(f"a.jpg b.jpg\n{line}\n", encoding="utf-8")
     with pytest.raises(UsageError, match=r"line 2 of .* must hold two file names"):
-        read_pairs(path)
-
-
-def test_a_binary_file_is_rejected_as_text(tmp_path):
-    path = tmp_path / "pairs.txt"
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match="not a UTF-8 text"):
         read_pairs(path)
 
 

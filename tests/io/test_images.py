@@ -75,12 +75,6 @@ def test_deep_grey_keeps_its_contrast(tmp_path, bits):
     assert np.abs(image.rgb[..., 0] - expected).max() <= 1
 
 
-def test_real_numbers_are_stretched_over_their_range(tmp_path):
-    image = read_one(save(tmp_path / "a.tif", picture()[..., 0].astype(np.float32) / 1000 + 5))
-    assert image.rgb.min() == 0
-    assert image.rgb.max() == 255
-
-
 def test_transparent_pixels_become_grey(tmp_path):
     rgba = np.dstack([picture(), np.full((80, 96), 255, np.uint8)])
     rgba[:40, :, 3] = 0
@@ -281,13 +275,9 @@ def test_threads_take_no_more_room_together_than_there_is():
         assert not thread.is_alive()
     assert held == [0]
     assert 60 <= most[0] <= 100
-
-
-def test_an_error_gives_the_room_back():
-    room = MemoryBudget(10)
-    with pytest.raises(KeyError), room.reserve(10):
+    with pytest.raises(KeyError), room.reserve(100):
         raise KeyError
-    with room.reserve(10):
+    with room.reserve(100):
         pass
 
 
@@ -303,6 +293,8 @@ def test_memory_for_decoding_depends_on_the_format():
     assert decoding_bytes(opened("JPEG", image)) == 4 * 8100
     assert decoding_bytes(opened("JPEG", image, progressive=True)) == 10 * 8100
     assert decoding_bytes(opened("WEBP", image)) == 16 * 8100
+    # The largest sensors are read in every kind of JPEG.
+    assert MAX_DECODED_BYTES > 10 * 14204 * 10652
 
 
 def test_an_image_whose_decoder_needs_too_much_memory_is_rejected_first(tmp_path, monkeypatch):
@@ -315,10 +307,6 @@ def test_an_image_whose_decoder_needs_too_much_memory_is_rejected_first(tmp_path
     assert "decoding a WEBP of this size takes" in read.refused["a.webp"]
     assert "decoding a progressive JPEG of this size takes" in read.refused["c.jpg"]
     assert "save it as PNG or TIFF" in read.refused["a.webp"]
-
-
-def test_the_largest_sensors_are_read_in_every_kind_of_jpeg():
-    assert MAX_DECODED_BYTES > 10 * 14204 * 10652
 
 
 def solid(k):
@@ -356,12 +344,7 @@ def test_an_animation_plays_all_frames_for_ever(suffix, apart, tmp_path):
     again = write_animation(tmp_path / f"again{suffix}", frames(tmp_path, 4), milliseconds=50)
     assert again.read_bytes() == path.read_bytes()
     assert animation_suffix() in (".webp", ".png")
-
-
-@pytest.mark.parametrize("suffix", [".webp", ".png"])
-def test_one_frame_is_an_animation_too(suffix, tmp_path):
-    path = write_animation(tmp_path / f"one{suffix}", frames(tmp_path, 1))
-    with PIL.Image.open(path) as image:
+    with PIL.Image.open(write_animation(tmp_path / f"one{suffix}", frames(tmp_path, 1))) as image:
         assert image.size == (64, 48)
 
 

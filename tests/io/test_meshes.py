@@ -69,11 +69,8 @@ def test_a_bare_mesh_is_written_and_the_bytes_are_the_same_again(tmp_path):
             write_mesh(tmp_path / f"{name}.{kind}", mesh)
         assert (tmp_path / f"one.{kind}").read_bytes() == (tmp_path / f"two.{kind}").read_bytes()
         assert len(trimesh.load(tmp_path / f"one.{kind}", process=False, force="mesh").faces) == 2
-
-
-def test_other_formats_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"\.glb, \.obj or \.ply"):
-        write_mesh(tmp_path / "model.stl", roof())
+        write_mesh(tmp_path / "model.stl", mesh)
 
 
 def test_a_textured_glb_is_read_as_it_was_written(tmp_path):
@@ -82,11 +79,7 @@ def test_a_textured_glb_is_read_as_it_was_written(tmp_path):
     read = read_mesh(tmp_path / "model.glb")
     np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-7)
     np.testing.assert_array_equal(read.faces, mesh.faces)
-    assert read.uv is not None
-    assert mesh.uv is not None
     np.testing.assert_allclose(read.uv, mesh.uv, atol=1e-4)
-    assert read.texture is not None
-    assert mesh.texture is not None
     assert np.abs(read.texture.astype(int) - mesh.texture).max() <= 70  # JPEG, at the edge of the colours
     assert np.abs(read.texture.astype(int) - mesh.texture).mean() <= 8
     write_mesh(tmp_path / "again.glb", read)
@@ -105,7 +98,6 @@ def test_a_large_glb_keeps_its_surface_and_its_order(tmp_path):
     read = read_mesh(tmp_path / "model.glb")
     np.testing.assert_array_equal(read.vertices, vertices.astype(np.float32))
     np.testing.assert_array_equal(read.faces, faces)
-    assert read.uv is not None
     np.testing.assert_allclose(read.uv, uv, atol=1e-4)
 
 
@@ -141,14 +133,8 @@ def test_another_reader_finds_points_and_colours(tmp_path):
     cloud = trimesh.load(tmp_path / "deep" / "points.ply")
     np.testing.assert_allclose(cloud.vertices, xyz, atol=1e-6)
     np.testing.assert_array_equal(cloud.colors[:, :3], rgb)
-
-
-def test_no_points_are_a_file_too(tmp_path):
-    write_point_cloud(tmp_path / "points.ply", np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert b"element vertex 0\n" in (tmp_path / "points.ply").read_bytes()
-
-
-def test_infinite_points_are_refused(tmp_path):
+    write_point_cloud(tmp_path / "none.ply", np.zeros((0, 3)), rgb[:0])
+    assert b"element vertex 0\n" in (tmp_path / "none.ply").read_bytes()
     with pytest.raises(ValueError, match="finite"):
-        write_point_cloud(tmp_path / "points.ply", np.full((2, 3), np.nan), np.zeros((2, 3), np.uint8))
-    assert not list(tmp_path.iterdir())
+        write_point_cloud(tmp_path / "nan.ply", np.full((2, 3), np.nan), rgb[:2])
+    assert not (tmp_path / "nan.ply").exists()

@@ -22,30 +22,11 @@ def panorama():
     pairs = []
     for i in range(4):
         for j in range(i + 1, 4):
-            m = matcher.match(
-                prepared[i],
-                prepared[j],
-                pair=(i, j),
-                estimate_fundamental=sideways_fundamental,
-                rng=np.random.default_rng(0),
-            )
-            fit = sideways_fundamental(m.xy1, m.xy2, np.random.default_rng(0))
-            pairs.append(
-                TwoView(
-                    i,
-                    j,
-                    fit.F,
-                    0.1,
-                    m.index1,
-                    m.index2,
-                    m.xy1,
-                    m.xy2,
-                    m.affine,
-                    len(m.xy1),
-                    0.0,
-                    accepted=True,
-                )
-            )
+            estimate = {"estimate_fundamental": sideways_fundamental, "rng": np.random.default_rng(0)}
+            m = matcher.match(prepared[i], prepared[j], pair=(i, j), **estimate)
+            F = sideways_fundamental(m.xy1, m.xy2, np.random.default_rng(0)).F
+            found = (m.index1, m.index2, m.xy1, m.xy2, m.affine, len(m.xy1))
+            pairs.append(TwoView(i, j, F, 0.1, *found, 0.0, accepted=True))
     return prepared, pairs
 
 
@@ -92,21 +73,9 @@ def test_no_accepted_pair_gives_no_tracks(scene, variant):
 def test_a_false_link_does_not_join_two_corners_of_one_view(scene):
     prepared, pairs = scene
     good = pairs[0]
-    crossed = np.roll(good.index2, 1)
-    wrong = TwoView(
-        0,
-        1,
-        good.F,
-        9.0,
-        good.index1[:50],
-        crossed[:50],
-        good.xy1[:50],
-        good.xy2[:50],
-        good.affine[:50],
-        50,
-        0.0,
-        True,
-    )
+    moved = (good.index1, np.roll(good.index2, 1), good.xy1, good.xy2, good.affine)
+    rows = [values[:50] for values in moved]
+    wrong = TwoView(0, 1, good.F, 9.0, *rows, 50, 0.0, True)
     with_it = PlainTracks().build(prepared, [*pairs, wrong], np.random.default_rng(0))
     without = PlainTracks().build(prepared, pairs, np.random.default_rng(0))
     assert np.array_equal(np.unique(with_it.point_index, return_counts=True)[1].max(), 4)
