@@ -10,10 +10,11 @@ from scipy.sparse.csgraph import connected_components
 
 from tests.surface.sphere import ring_of
 from thesisrecon.records import TexturedMesh
-from thesisrecon.surface.bspline import _energies, basis
-from thesisrecon.surface.bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
+from thesisrecon.surface._bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
+from thesisrecon.surface._mesh import face_areas
+from thesisrecon.surface.bspline import _basis, _energies
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.mesh import face_areas, simplify_mesh
+from thesisrecon.surface.simplification import simplify_mesh
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +139,7 @@ def domain():
     covered = rng.random((21, 26)) < 0.85
     right = (rng.random((21, 25)) < 0.7) & covered[:, :-1] & covered[:, 1:]
     down = (rng.random((20, 26)) < 0.7) & covered[:-1] & covered[1:]
-    return Domain(covered, covered, right, down)
+    return Domain(covered, covered, (down, right))
 
 
 @pytest.fixture
@@ -148,8 +149,8 @@ def pieces(domain):
 
 def edges(domain):
     number = np.arange(domain.covered.size).reshape(domain.covered.shape)
-    start = np.concatenate([number[:, :-1][domain.right], number[:-1][domain.down]])
-    stop = np.concatenate([number[:, 1:][domain.right], number[1:][domain.down]])
+    start = np.concatenate([number[:, :-1][domain.joined[1]], number[:-1][domain.joined[0]]])
+    stop = np.concatenate([number[:, 1:][domain.joined[1]], number[1:][domain.joined[0]]])
     return start, stop
 
 
@@ -190,7 +191,7 @@ def test_coefficients_are_shared_within_connected_parts(domain, pieces):
 def rows_of(pieces):
     """(pixels, coefficients) weights of the coefficients in each pixel of a piece."""
     y, x = np.nonzero(pieces.piece >= 0)
-    tensor = basis((y % CELL + 0.5) / CELL)[:, :, None] * basis((x % CELL + 0.5) / CELL)[:, None, :]
+    tensor = _basis((y % CELL + 0.5) / CELL)[:, :, None] * _basis((x % CELL + 0.5) / CELL)[:, None, :]
     rows = np.zeros((len(y), pieces.count))
     np.add.at(
         rows, (np.arange(len(y))[:, None], pieces.coefficient[pieces.piece[y, x]]), tensor.reshape(-1, 16)
@@ -203,7 +204,7 @@ def test_values_and_sums_are_those_of_the_rows(pieces):
     rows, covered = rows_of(pieces), pieces.piece >= 0
     c, target = rng.normal(size=pieces.count), rng.normal(size=covered.shape)
     weight = rng.random(covered.shape) * (rng.random(covered.shape) < 0.9)
-    along = basis((np.arange(CELL) + 0.5) / CELL)
+    along = _basis((np.arange(CELL) + 0.5) / CELL)
     value = np.empty(covered.shape)
     evaluate_pixels(pieces.piece, pieces.coefficient, c, along, CELL, value)
     np.testing.assert_allclose(value[covered], rows @ c, atol=1e-12)
@@ -227,14 +228,14 @@ def test_the_basis_is_that_of_cubic_splines():
         for k in range(4):
             spline = BSpline.basis_element(np.arange(-3.0, 2.0) + k, extrapolate=False)
             expected = (spline.derivative(derivative) if derivative else spline)(u)
-            np.testing.assert_allclose(basis(u, derivative)[:, k], np.nan_to_num(expected), atol=1e-12)
+            np.testing.assert_allclose(_basis(u, derivative)[:, k], np.nan_to_num(expected), atol=1e-12)
 
 
 def test_energies_are_integrals():
     rng = np.random.default_rng(2)
     c = rng.normal(size=16)
     u = (np.arange(200) + 0.5) / 200
-    f = {(i, j): basis(u, i) @ c.reshape(4, 4) @ basis(u, j).T for i in range(3) for j in range(3)}
+    f = {(i, j): _basis(u, i) @ c.reshape(4, 4) @ _basis(u, j).T for i in range(3) for j in range(3)}
     bending, gradient = _energies()
     assert c @ bending @ c == pytest.approx(np.mean(f[2, 0] ** 2 + 2 * f[1, 1] ** 2 + f[0, 2] ** 2), rel=1e-4)
     assert c @ gradient @ c == pytest.approx(np.mean(f[1, 0] ** 2 + f[0, 1] ** 2), rel=1e-4)

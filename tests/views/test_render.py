@@ -13,7 +13,6 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import RenderedView, TexturedMesh
 from thesisrecon.surface.linear import surface_from_depth
 from thesisrecon.surface.texture_atlas import TextureAtlas
-from thesisrecon.surface.texture_views import color_vertices
 from thesisrecon.views.image_similarity import GREY, covered_pixels, match_exposure, psnr_db, ssim, ssim_map
 from thesisrecon.views.render import Light, Shading, render
 
@@ -142,12 +141,10 @@ def test_averaged_pixels_are_those_of_the_photograph_but_for_its_finest_detail()
     assert np.mean(apart) < 1.0
 
 
-@pytest.mark.parametrize("kind", ["texture", "vertex colours"])
-def test_from_between_two_photographs_the_model_has_the_colours_of_the_scene(kind):
+def test_from_between_two_photographs_the_model_has_the_colours_of_the_scene():
     maps = [sphere_map(k, looking_at_origin(a, -1.0, 3.5)) for k, a in enumerate((-0.2, 0.2))]
     views = [photograph(m) for m in maps]
-    mesh = surface_from_depth(maps[0])
-    mesh = TextureAtlas().texture(mesh, views) if kind == "texture" else color_vertices(mesh, views)
+    mesh = TextureAtlas().texture(surface_from_depth(maps[0]), views)
     between = sphere_map(2, looking_at_origin(0.0, -0.9, 3.5))
     seen = render(mesh, Camera.from_matrix(between.P, SPHERE_SIZE))
     inside = seen.valid & np.isfinite(between.depth)

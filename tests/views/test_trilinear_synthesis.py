@@ -208,8 +208,7 @@ def test_the_kernel_is_its_plain_twin():
     own = rng.choice([0.1, 0.2, 0.4, np.nan], (11, 14)).astype(np.float32)
     other = rng.choice([0.15, 0.3, np.nan], (12, 13)).astype(np.float32)
     P2 = np.column_stack([np.eye(3) + 0.01 * rng.normal(size=(3, 3)), [-20.0, 3.0, 0.1]])
-    distance = np.empty((len(DIRECTIONS), *own.shape), dtype=np.int16)
-    distances_to_known(own, DIRECTIONS, distance)
+    distance = distances_to_known(own)
     found = np.empty_like(own)
     _extrapolate_inverse_depth((own, other), P2, DIRECTIONS, distance, 0.05, found)
     for y, x in np.ndindex(own.shape):

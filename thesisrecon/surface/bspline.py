@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import B8, F64, I32
 from thesisrecon.numerics.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
-from thesisrecon.surface.bspline_pieces import (
+from thesisrecon.surface._bspline_pieces import (
     SplinePieces,
     domain_of,
     evaluate_pixels,
     pieces_of,
     sum_squares,
 )
-from thesisrecon.surface.linear import SurfaceSample
 
 _POLYNOMIALS = (
     np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]])
@@ -29,8 +27,10 @@ GRADIENT_WEIGHT = 1e-7
 """Weight of the gradient energy relative to the bending energy; it determines undetermined slopes."""
 HUBER, TUKEY = 1.345, 4.685
 """Thresholds of the weights in standard deviations; both have 95 % efficiency (Huber 1981)."""
-HUBER_ROUNDS, INITIAL_ROUNDS = 2, 5
-"""Rounds with convex weights, and rounds with the softest spline, which detect outliers."""
+ROUNDS, HUBER_ROUNDS, INITIAL_ROUNDS = 13, 2, 5
+"""Rounds of reweighting; those with convex weights, and with the softest spline, which detect outliers."""
+WINDOW = 5
+"""Cells of the window of the discrepancy principle along each side."""
 MIN_ROOT_WEIGHT = 1e-3
 """Root of the least weight, which keeps pieces of outliers determined."""
 MIN_STIFFNESS = 1e-3
@@ -39,21 +39,8 @@ FIRST_STEP, STEP_DECAY = 1e3, 0.65
 """First factor of a change of stiffness, and the exponent from one factor to the next."""
 
 
-def basis(u: F64, derivative: int = 0) -> F64:
-    """Evaluate the four uniform cubic B-splines that are non-zero between two knots.
-
-    Parameters
-    ----------
-    u : ndarray (N,)
-        Positions in [0, 1] between the knots.
-    derivative : int
-        Order of the derivative.
-
-    Returns
-    -------
-    ndarray (N, 4)
-        Values.
-    """
+def _basis(u: F64, derivative: int = 0) -> F64:
+    """The four uniform cubic B-splines (N, 4) that are non-zero between two knots, at u (N,) in [0, 1]."""
     row = _POLYNOMIALS
     for _ in range(derivative):
         row = row[:, 1:] * np.arange(1.0, row.shape[1])
@@ -67,7 +54,7 @@ def _energies() -> tuple[F64, F64]:
     index 4 i + j.
     """
     nodes, weights = np.polynomial.legendre.leggauss(4)
-    values = [basis(0.5 * (nodes + 1.0), d) for d in (0, 1, 2)]
+    values = [_basis(0.5 * (nodes + 1.0), d) for d in (0, 1, 2)]
     M0, M1, M2 = (np.einsum("n,ni,nj->ij", 0.5 * weights, v, v) for v in values)
     bending = np.kron(M2, M0) + 2.0 * np.kron(M1, M1) + np.kron(M0, M2)
     return bending, np.kron(M1, M0) + np.kron(M0, M1)
@@ -77,17 +64,16 @@ def _energies() -> tuple[F64, F64]:
 class _NormalEquations:
     """Normal equations of a spline in ``pieces`` with ``cell`` px between knots.
 
-    ``rows``, ``starts`` is the pattern of the sparse matrix, ``place`` (N, 256) the index of each piece's
-    entries.
+    ``rows``, ``starts``: pattern of the sparse matrix; ``place`` (N, 256): index of each piece's entries.
     """
 
     pieces: SplinePieces
     cell: int
     pixel_basis: F64
     energy: F64
-    rows: NDArray[np.int32]
-    starts: NDArray[np.int32]
-    place: NDArray[np.int32]
+    rows: I32
+    starts: I32
+    place: I32
 
     @classmethod
     def of(cls, pieces: SplinePieces, cell: int) -> _NormalEquations:
@@ -97,17 +83,9 @@ class _NormalEquations:
         places, place = np.unique(code, return_inverse=True)
         starts = np.searchsorted(places, np.arange(count + 1) * count).astype(np.int32)
         bending, gradient = _energies()
-        along = basis((np.arange(cell) + 0.5) / cell)
-        rows = (places % count).astype(np.int32)
-        return cls(
-            pieces,
-            cell,
-            along,
-            bending + GRADIENT_WEIGHT * gradient,
-            rows,
-            starts,
-            place.astype(np.int32).reshape(-1, 256),
-        )
+        along = _basis((np.arange(cell) + 0.5) / cell)
+        rows, place = (places % count).astype(np.int32), place.astype(np.int32).reshape(-1, 256)
+        return cls(pieces, cell, along, bending + GRADIENT_WEIGHT * gradient, rows, starts, place)
 
     def sums(self, value: F64, weight: F64) -> tuple[F64, F64]:
         """Contributions of the depths (H, W) and weights to each piece: (N, 16, 16) and (N, 16)."""
@@ -144,7 +122,7 @@ class BSplineSurface:
     Minimises sum w(r) r^2 + sum s_k E_k with the residuals r in standard deviations, Tukey's weights w in
     iteratively reweighted least squares, and the bending energy E_k of cell k. The stiffness s_k is chosen by
     the discrepancy principle (Morozov 1966) for each cell: as large as possible while the residuals of the
-    ``window`` x ``window`` cells around it do not exceed the noise level, which the softest spline provides
+    5 x 5 cells around it do not exceed the noise level, which the softest spline provides
     (the errors of adjacent depths are correlated). At surface breaks both sides have separate coefficients;
     pixels without depth stay empty.
 
@@ -153,27 +131,28 @@ class BSplineSurface:
     knot_px : int
         Distance of the knots. Connected regions smaller than a cell are outliers: within ``knot_px`` of a
         surface they take its depth, elsewhere they become empty.
-    rounds : int
-        Rounds of reweighting.
-    window : int
-        Cells of the window of the discrepancy principle.
-    grazing_deg : float
-        Surfaces break where they are seen at a smaller angle.
     """
 
     knot_px: int = 4
-    rounds: int = 13
-    window: int = 5
-    grazing_deg: float = 10.0
 
     def __post_init__(self) -> None:
-        if self.knot_px < 2 or self.rounds < 1 or self.window < 1:
-            raise ValueError(
-                f"knot_px must be >= 2, rounds >= 1 and window >= 1; got {self.knot_px}, {self.rounds} "
-                f"and {self.window}"
-            )
-        if not 0.0 < self.grazing_deg < 90.0:
-            raise ValueError(f"grazing_deg must be in (0, 90); got {self.grazing_deg}")
+        if self.knot_px < 2:
+            raise ValueError(f"knot_px must be >= 2; got {self.knot_px}")
+
+    def smooth(self, depth_map: DepthMap) -> DepthMap:
+        """Return the depths of the fitted surface.
+
+        Parameters
+        ----------
+        depth_map : DepthMap
+            Depths of one view.
+
+        Returns
+        -------
+        DepthMap
+            The same view, see :meth:`BSplineFit.sample`.
+        """
+        return self.fit(depth_map).sample()
 
     def fit(self, depth_map: DepthMap) -> BSplineFit:
         """Fit the surface to a depth map.
@@ -181,6 +160,7 @@ class BSplineSurface:
         Parameters
         ----------
         depth_map : DepthMap
+            Depths of one view.
 
         Returns
         -------
@@ -188,7 +168,7 @@ class BSplineSurface:
             The surface, defined at the pixels of the map.
         """
         cell = self.knot_px
-        domain = domain_of(depth_map, grazing_deg=self.grazing_deg, least=cell * cell, reach=float(cell))
+        domain = domain_of(depth_map, least=cell * cell, reach=float(cell))
         pieces = pieces_of(domain, cell)
         if not pieces.count:
             return BSplineFit(depth_map, pieces, cell, np.zeros(0))
@@ -202,7 +182,7 @@ class BSplineSurface:
         cells = equations.pieces.cell
         weight, stiffness = np.where(reliable, 1.0, 0.0), np.full(len(cells), MIN_STIFFNESS)
         noise = np.zeros(0)
-        for k in range(self.rounds):
+        for k in range(ROUNDS):
             c = equations.solve(*equations.sums(value, weight / std**2), stiffness)
             residual = np.where(reliable, equations.values(c) - value, 0.0) / std
             weight = np.where(reliable, _weights(residual, reliable, redescending=k >= HUBER_ROUNDS), 0.0)
@@ -220,7 +200,7 @@ class BSplineSurface:
         The n residuals of a window have n - p degrees of freedom with standard deviation sqrt(2 p) of the
         fitted part.
         """
-        n, p = (self.knot_px * self.window) ** 2, self.window**2
+        n, p = (self.knot_px * WINDOW) ** 2, WINDOW**2
         return float(n / (n - p) * (1.0 + np.sqrt(2.0 * p) / n))
 
     def _mean_square(self, cells: tuple[int, int], residual: F64, weight: F64) -> F64:
@@ -230,7 +210,7 @@ class BSplineSurface:
         sums = [
             scipy.ndimage.uniform_filter(
                 np.bincount(number, part.ravel(), cells[0] * cells[1]).reshape(cells),
-                self.window,
+                WINDOW,
                 mode="constant",
             )
             for part in (weight * residual**2, weight)
@@ -258,16 +238,14 @@ def _inverse(depth_map: DepthMap, reliable: B8) -> tuple[F64, F64]:
 class BSplineFit:
     """B-spline surface of a depth map.
 
-    Attributes
+    Parameters
     ----------
     depth_map : DepthMap
         The map it was fitted to.
-    pieces : SplinePieces
-        Pieces and their coefficients.
+    pieces, coefficients : SplinePieces, ndarray (C,)
+        Pieces and the values of their coefficients.
     cell : int
         Pixels between knots.
-    coefficients : ndarray (C,)
-        Spline coefficients.
     """
 
     depth_map: DepthMap
@@ -275,22 +253,18 @@ class BSplineFit:
     cell: int
     coefficients: F64
 
-    @property
-    def interpolates(self) -> bool:
-        """False: the surface approximates the depths."""
-        return False
-
-    def evaluate(self, xy: F64) -> SurfaceSample:
+    def evaluate(self, xy: F64) -> tuple[F64, F64]:
         """Evaluate the spline piece of the nearest pixel.
 
         Parameters
         ----------
         xy : ndarray (N, 2)
+            Pixels.
 
         Returns
         -------
-        SurfaceSample
-            Inverse depth and gradient, NaN where there is no surface.
+        inverse_depth, gradient : ndarray (N,), (N, 2)
+            NaN where there is no surface.
         """
         height, width = self.depth_map.depth.shape
         pixel = np.rint(xy)
@@ -301,10 +275,47 @@ class BSplineFit:
         value, gradient = np.full(len(xy), np.nan), np.full((len(xy), 2), np.nan)
         c = self.coefficients[self.pieces.coefficient[piece[there]]].reshape(-1, 4, 4)
         u, v = ((xy[there] + 0.5) / self.cell - pixel[there] // self.cell).T
-        value[there] = _tensor(c, basis(v), basis(u))
-        gradient[there, 0] = _tensor(c, basis(v), basis(u, 1)) / self.cell
-        gradient[there, 1] = _tensor(c, basis(v, 1), basis(u)) / self.cell
-        return SurfaceSample(value, gradient)
+        value[there] = _tensor(c, _basis(v), _basis(u))
+        gradient[there, 0] = _tensor(c, _basis(v), _basis(u, 1)) / self.cell
+        gradient[there, 1] = _tensor(c, _basis(v, 1), _basis(u)) / self.cell
+        return value, gradient
+
+    def sample(self, scale: float = 1.0) -> DepthMap:
+        """Sample the surface as a depth map.
+
+        Parameters
+        ----------
+        scale : float
+            Size relative to the original depth map.
+
+        Returns
+        -------
+        DepthMap
+            Depths of the surface; standard deviations and view counts are those of the nearest original
+            pixel, because a fit cannot reveal errors that neighbours share.
+        """
+        depth_map = self.depth_map
+        shape = tuple(max(round(n * scale), 1) for n in depth_map.depth.shape)
+        places = [(np.arange(n) + 0.5) / scale - 0.5 for n in shape]
+        xy = np.stack(np.meshgrid(places[1], places[0]), axis=-1).reshape(-1, 2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rho = self.evaluate(xy)[0].reshape(shape)
+            depth = np.where(rho > 0.0, 1.0 / rho, np.nan).astype(np.float32)
+        nearest = np.ix_(
+            *(
+                np.clip(np.rint(at), 0, n - 1).astype(np.int64)
+                for at, n in zip(places, depth_map.depth.shape, strict=True)
+            )
+        )
+        known = np.isfinite(depth)
+        zoom = np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
+        return replace(
+            depth_map,
+            P=zoom @ depth_map.P,
+            depth=depth,
+            std=np.where(known, depth_map.std[nearest], np.float32(np.nan)),
+            views=np.where(known, depth_map.views[nearest], np.uint8(0)),
+        )
 
 
 def _tensor(c: F64, along_y: F64, along_x: F64) -> F64:

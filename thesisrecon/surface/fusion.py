@@ -18,31 +18,35 @@ from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import decompose_camera, project
 from thesisrecon.records import DepthMap, TexturedMesh
-from thesisrecon.surface.fusion_kernels import (
+from thesisrecon.surface._depth_grid import GRAZING_DEG, max_depth_slope, triangulate_grid
+from thesisrecon.surface._fusion_kernels import (
     SIDE,
     MapSamples,
-    SignedDistances,
     integrate_view,
     join_vertices,
     place_vertices,
     touched_blocks,
 )
-from thesisrecon.surface.linear import max_depth_slope, surface_from_depth, triangulate_grid
-from thesisrecon.surface.mesh import remove_small_parts, remove_unused_vertices, select_faces
+from thesisrecon.surface._mesh import remove_small_parts, remove_unused_vertices, select_faces
+from thesisrecon.surface.linear import surface_from_depth
 
 MIN_COSINE = 0.1
 """Lower limit of the incidence cosine."""
-
+TRUNCATION_VOXELS = 3.0
+"""Truncation of the signed distances; less certain depths are ignored."""
+FUSED_GRAZING_DEG = 5.0
+"""Surfaces break where they are seen at a smaller angle."""
+MAX_RELATIVE = 0.02
+"""Relative depth difference, or three standard deviations, up to which a sheet already shows a point."""
 VOXEL_GROWTH = 1.15
 """Factor by which voxels are enlarged until the blocks fit into memory."""
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """Sparse voxel grid.
+    """Sparse voxel grid: ``origin`` (3,) of the first voxel centre and ``voxel`` size.
 
-    ``origin`` (3,) of the first voxel centre, ``voxel`` size, ``blocks`` (B, 3) grid positions, ``place``
-    (X, Y, Z) block number at each position or -1.
+    ``blocks`` (B, 3): grid positions; ``place`` (X, Y, Z): block number at each position or -1.
     """
 
     origin: F64
@@ -59,34 +63,19 @@ class VolumetricFusion:
     ----------
     voxel_px : float
         Voxel size in pixels of the depth maps at their median depth.
-    truncation_voxels : float
-        Truncation of the distances in voxels; less certain depths are ignored.
     max_blocks : int
         Largest number of blocks of 8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
-    grazing_deg : float
-        Surfaces break where they are seen at a smaller angle.
-    min_part_share : float
-        Connected parts below this share of the area are removed.
     """
 
     voxel_px: float = 1.5
-    truncation_voxels: float = 3.0
     max_blocks: int = 250_000
-    grazing_deg: float = 5.0
-    min_part_share: float = 0.0005
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.voxel_px < np.inf and 0.0 < self.truncation_voxels < np.inf):
+        # A single depth may need eight blocks, however large the voxels are.
+        if not 0.0 < self.voxel_px < np.inf or self.max_blocks < 8:
             raise ValueError(
-                "voxel_px and truncation_voxels must be positive; got "
-                f"{self.voxel_px} and {self.truncation_voxels}"
+                f"voxel_px must be positive and max_blocks >= 8; got {self.voxel_px} and {self.max_blocks}"
             )
-        # A single depth may need so many blocks, however large the voxels are.
-        least = int(np.ceil(2.0 * self.truncation_voxels / SIDE) + 1) ** 3
-        if self.max_blocks < least:
-            raise ValueError(f"max_blocks must be >= {least}; got {self.max_blocks}")
-        if not 0.0 < self.grazing_deg < 90.0:
-            raise ValueError(f"grazing_deg must be in (0, 90); got {self.grazing_deg}")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
         """Fuse depth maps to one surface.
@@ -94,6 +83,7 @@ class VolumetricFusion:
         Parameters
         ----------
         depth_maps : sequence of DepthMap
+            Depths of the views.
         threads : int
             Number of threads; the result does not depend on it.
 
@@ -108,7 +98,7 @@ class VolumetricFusion:
             If the maps contain no depths.
         """
         with ThreadPoolExecutor(max(threads, 1)) as pool:
-            measured = list(pool.map(lambda m: _measured(m, self.grazing_deg), depth_maps))
+            measured = list(pool.map(_measured, depth_maps))
             grid, truncation, measured = self._lay_out(measured)
             value = np.zeros((len(grid.blocks), SIDE, SIDE, SIDE), dtype=np.float32)
             weight = np.zeros_like(value)
@@ -124,7 +114,7 @@ class VolumetricFusion:
         mesh = _extract_surface(grid, value, weight)
         if not len(mesh.faces):
             raise _nothing_to_fuse()
-        return remove_small_parts(mesh, self.min_part_share)
+        return remove_small_parts(mesh)
 
     def _lay_out(self, measured: list[_FusionMap]) -> tuple[_Grid, float, list[_FusionMap]]:
         """Voxel grid, truncation distance, and the depths that are certain enough for it."""
@@ -133,7 +123,7 @@ class VolumetricFusion:
             raise _nothing_to_fuse()
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
-            truncation = self.truncation_voxels * voxel
+            truncation = TRUNCATION_VOXELS * voxel
             without_uncertain_depths = [m.without_uncertain_depths(truncation) for m in measured]
             grid = _grid(without_uncertain_depths, voxel, truncation)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
@@ -163,21 +153,18 @@ class _FusionMap:
         return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
 
 
-def _measured(depth_map: DepthMap, grazing_deg: float) -> _FusionMap:
+def _measured(depth_map: DepthMap) -> _FusionMap:
     K = decompose_camera(depth_map.P)[0]
-    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
-    slope = max_depth_slope(depth_map.P, grazing_deg)
-    facing = _remove_grazing(depth_map, slope)
-    return _FusionMap(
-        facing.P, focal, MapSamples(facing.depth, facing.std, incidence_cosines(facing.depth, K), slope)
-    )
+    slope = max_depth_slope(depth_map.P, FUSED_GRAZING_DEG)
+    depth = _without_grazing(depth_map, slope)
+    samples = MapSamples(depth, depth_map.std, _incidence_cosines(depth, K), slope)
+    return _FusionMap(depth_map.P, float(np.sqrt(K[0, 0] * K[1, 1])), samples)
 
 
 def _integrate(grid: _Grid, truncation: float, one: _FusionMap, some: slice, value: F32, weight: F32) -> None:
     K, R, t = decompose_camera(one.P)
     P = K @ np.column_stack([R, t + R @ grid.origin])
-    sums = SignedDistances(value[some], weight[some])
-    integrate_view(grid.blocks[some], grid.voxel, P, one.samples, truncation, sums)
+    integrate_view(grid.blocks[some], grid.voxel, P, one.samples, truncation, value[some], weight[some])
 
 
 def _nothing_to_fuse() -> StageFailure:
@@ -189,23 +176,12 @@ def _nothing_to_fuse() -> StageFailure:
     )
 
 
-def incidence_cosines(depth: F32, K: F64) -> F32:
-    """Compute n . r for the unit surface normal n and the ray r with unit depth.
+def _incidence_cosines(depth: F32, K: F64) -> F32:
+    """n . r (H, W) for the unit surface normal n and the ray r with unit depth, at least ``MIN_COSINE``.
 
     It is the distance across the surface per unit of depth: 1 for frontal surfaces, towards 0 at grazing
     incidence. The inverse depth of a plane is linear in the pixel, and its gradient determines the normal.
     The smaller of the differences to both neighbours is averaged over 3 x 3 pixels.
-
-    Parameters
-    ----------
-    depth : ndarray (H, W) float32
-    K : ndarray (3, 3)
-        Camera matrix.
-
-    Returns
-    -------
-    ndarray (H, W) float32
-        Cosines, at least ``MIN_COSINE``.
     """
     with np.errstate(divide="ignore"):
         inverse = np.float32(1.0) / depth
@@ -224,7 +200,7 @@ def incidence_cosines(depth: F32, K: F64) -> F32:
 
 
 def _smaller_difference(values: F32, axis: int) -> F32:
-    """(H, W) the smaller of the differences to the previous and the next neighbour, NaN without either."""
+    """The smaller of the differences to the previous and the next neighbour, NaN without either."""
     step = np.diff(values, axis=axis)
     before = np.insert(step, 0, np.nan, axis=axis)
     after = np.insert(step, step.shape[axis], np.nan, axis=axis)
@@ -232,8 +208,8 @@ def _smaller_difference(values: F32, axis: int) -> F32:
         return np.where((np.abs(after) < np.abs(before)) | np.isnan(before), after, before)
 
 
-def _remove_grazing(depth_map: DepthMap, slope: float) -> DepthMap:
-    """Remove pixels at grazing incidence, whose depths blend into the background.
+def _without_grazing(depth_map: DepthMap, slope: float) -> F32:
+    """Depths without pixels at grazing incidence, which blend into the background.
 
     The smaller of the differences to both neighbours counts, which preserves occluding borders.
     """
@@ -243,7 +219,7 @@ def _remove_grazing(depth_map: DepthMap, slope: float) -> DepthMap:
         steepest = np.hypot(steepest, np.nan_to_num(_smaller_difference(depth, axis)))
     with np.errstate(invalid="ignore"):
         flat = steepest > np.maximum(slope * depth, 3.0 * depth_map.std)
-    return replace(depth_map, depth=np.where(flat, np.float32(np.nan), depth))
+    return np.where(flat, np.float32(np.nan), depth)
 
 
 def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid | None:
@@ -298,25 +274,13 @@ class DepthSheets:
     ----------
     step : int
         Row and column step of the triangulation.
-    max_relative : float
-        Relative depth difference, or three standard deviations, up to which a point is already shown.
-    grazing_deg : float
-        Surfaces break where they are seen at a smaller angle.
-    min_part_share : float
-        Connected parts of a map below this share of its area are removed.
     """
 
     step: int = 2
-    max_relative: float = 0.02
-    grazing_deg: float = 10.0
-    min_part_share: float = 0.0005
 
     def __post_init__(self) -> None:
-        if self.step < 1 or not self.max_relative >= 0.0 or not 0.0 < self.grazing_deg < 90.0:
-            raise ValueError(
-                "step must be >= 1, max_relative >= 0 and grazing_deg in (0, 90); got "
-                f"{self.step}, {self.max_relative} and {self.grazing_deg}"
-            )
+        if self.step < 1:
+            raise ValueError(f"step must be >= 1; got {self.step}")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:  # noqa: ARG002
         """Combine the depth maps to one mesh.
@@ -324,6 +288,7 @@ class DepthSheets:
         Parameters
         ----------
         depth_maps : sequence of DepthMap
+            Depths of the views.
         threads : int
             Ignored.
 
@@ -341,10 +306,7 @@ class DepthSheets:
         sheets: list[TexturedMesh] = []
         shows: list[Callable[[F64], B8]] = []
         for depth_map in order:
-            sheet = remove_small_parts(
-                surface_from_depth(depth_map, step=self.step, grazing_deg=self.grazing_deg),
-                self.min_part_share,
-            )
+            sheet = remove_small_parts(surface_from_depth(depth_map, step=self.step))
             shown = np.zeros(len(sheet.vertices), dtype=bool)
             for earlier in shows:
                 shown |= earlier(sheet.vertices)
@@ -361,7 +323,7 @@ class DepthSheets:
         """Function that tests whether points (N, 3) lie on the sheet of a map."""
         depth = depth_map.depth[:: self.step, :: self.step].astype(np.float64)
         std = depth_map.std[:: self.step, :: self.step].astype(np.float64)
-        slope = self.step * max_depth_slope(depth_map.P, self.grazing_deg)
+        slope = self.step * max_depth_slope(depth_map.P, GRAZING_DEG)
         whole: B8 = np.asarray(triangulate_grid(depth, std, slope).whole.all(axis=-1))
 
         def shown(X: F64) -> B8:
@@ -376,7 +338,7 @@ class DepthSheets:
             (x, y), (u, v) = np.stack([x, y])[:, n], place[n].T % 1.0
             a, b, c, d = (1.0 / depth[y + k, x + m] for k in (0, 1) for m in (0, 1))
             there = 1.0 / ((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
-            inside[n] = np.abs(there - z[n]) <= np.maximum(self.max_relative * z[n], 3.0 * std[y, x])
+            inside[n] = np.abs(there - z[n]) <= np.maximum(MAX_RELATIVE * z[n], 3.0 * std[y, x])
             return np.asarray(inside)
 
         return shown

@@ -1,48 +1,36 @@
 """Texture atlas of a mesh: charts in the geometry of an image, packed into one texture.
 
 A chart consists of connected faces that are assigned to one image and has the outline and resolution of that
-image. Its colours are blended from all images (:class:`BlendedTexture`) or taken from that image alone
-(:class:`SeamLeveledTexture`).
+image. Its colours are blended from all images (:func:`paint_texture`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.raster import resample, smooth
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface.mesh import face_neighbours
-from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture
-from thesisrecon.surface.texture_views import (
-    Charts,
+from thesisrecon.surface._mesh import face_neighbours
+from thesisrecon.surface._texture_views import (
     choose_views,
     face_quality,
     label_charts,
     project_to_view,
     view_camera,
 )
+from thesisrecon.surface.texture_blending import paint_texture
 
 CHART_MARGIN = 2
 """Pixels around each chart, so that reduced textures do not mix charts."""
-
 SWATCH = 3
 """Texels per side of the patch of an unseen face."""
 MIN_SCALE = 0.05
 """Smallest reduction of the images."""
-
-
-@dataclass(frozen=True)
-class _AtlasFaces:
-    """Faces before packing: ``xy`` (M, 3, 2) image corners, ``label`` (M,) view or -1, ``chart`` (M,)."""
-
-    xy: F64
-    label: I64
-    chart: I64
 
 
 @dataclass(frozen=True)
@@ -53,16 +41,9 @@ class TextureAtlas:
     ----------
     max_texels : int
         Limit of the texture size; images are reduced to fit.
-    smooth_rounds, min_chart_faces : int
-        Parameters of :func:`choose_views`.
-    painter : BlendedTexture or SeamLeveledTexture
-        Method that computes the colours.
     """
 
     max_texels: int = 4096 * 4096
-    smooth_rounds: int = 40
-    min_chart_faces: int = 30
-    painter: BlendedTexture | SeamLeveledTexture = field(default_factory=BlendedTexture)
 
     def __post_init__(self) -> None:
         if self.max_texels < 1:
@@ -74,15 +55,16 @@ class TextureAtlas:
         Parameters
         ----------
         mesh : TexturedMesh
+            The surface.
         views : sequence of PinholeView
             Undistorted images with their cameras.
         threads : int
+            Number of threads; the result does not depend on it.
 
         Returns
         -------
         TexturedMesh
-            The mesh with ``uv``, ``texture`` and ``untextured``; unseen faces get the colour of their
-            surroundings.
+            The mesh with a texture; unseen faces get the colour of their surroundings.
 
         Raises
         ------
@@ -91,17 +73,15 @@ class TextureAtlas:
         """
         neighbours = face_neighbours(mesh.faces)
         quality = face_quality(mesh, views, threads=threads)
-        label = choose_views(
-            quality, neighbours, rounds=self.smooth_rounds, min_chart_faces=self.min_chart_faces
-        )
+        label = choose_views(quality, neighbours)
         if not (label >= 0).any():
             raise StageFailure("the surface has no texture", "no image shows any part of it")
         chart = label_charts(label, neighbours)
         scale = 1.0
         while True:
             smaller = [_reduced(view, scale) for view in views]
-            faces = _AtlasFaces(_corners(mesh, smaller, label), label, chart)
-            rectangles = _rectangles(faces, smaller)
+            xy = _corners(mesh, smaller, label)
+            rectangles = _rectangles(xy, label, chart, smaller)
             offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
             if size[0] * size[1] <= self.max_texels:
                 break
@@ -110,12 +90,13 @@ class TextureAtlas:
                 raise StageFailure(
                     "the texture is too large",
                     f"{len(rectangles)} charts need {texels} texels, the limit is {self.max_texels}",
-                    "increase max_texels or min_chart_faces",
+                    "increase max_texels",
                 )
             scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), MIN_SCALE)
-        uv = faces.xy + (offsets - rectangles[:, :2])[chart][:, None, :]
-        cut_out = _fill(smaller, faces, rectangles, offsets, size)
-        texture = self.painter.paint(mesh, smaller, Charts(label, chart, uv, cut_out), threads=threads)
+        uv = xy + (offsets - rectangles[:, :2])[chart][:, None, :]
+        cut_out = _fill(smaller, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
+        seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
+        texture = paint_texture(mesh, smaller, seen_uv, cut_out, threads=threads)
         uv, texture = _swatches(mesh, label, uv, texture)
         return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 
@@ -143,16 +124,16 @@ def _corners(mesh: TexturedMesh, views: Sequence[PinholeView], label: I64) -> F6
     return xy
 
 
-def _rectangles(faces: _AtlasFaces, views: Sequence[PinholeView]) -> I64:
+def _rectangles(xy: F64, label: I64, chart: I64, views: Sequence[PinholeView]) -> I64:
     """(C, 4) left, top, right, bottom of each chart in its image, the last two exclusive."""
-    charts = int(faces.chart.max()) + 1
+    charts = int(chart.max()) + 1
     low = np.full((charts, 2), np.iinfo(np.int64).max)
     high = np.full((charts, 2), -1)
     view = np.zeros(charts, dtype=np.int64)
-    seen = faces.label >= 0
-    view[faces.chart[seen]] = faces.label[seen]
-    np.minimum.at(low, faces.chart[seen], np.floor(faces.xy[seen].min(axis=1)).astype(np.int64))
-    np.maximum.at(high, faces.chart[seen], np.ceil(faces.xy[seen].max(axis=1)).astype(np.int64) + 1)
+    seen = label >= 0
+    view[chart[seen]] = label[seen]
+    np.minimum.at(low, chart[seen], np.floor(xy[seen].min(axis=1)).astype(np.int64))
+    np.maximum.at(high, chart[seen], np.ceil(xy[seen].max(axis=1)).astype(np.int64) + 1)
     sizes = np.array([[v.rgb.shape[1], v.rgb.shape[0]] for v in views])[view]
     low = np.where(high < 0, 0, np.maximum(low - CHART_MARGIN, 0))
     high = np.where(high < 0, 0, np.minimum(high + CHART_MARGIN, sizes))
@@ -179,20 +160,17 @@ def _pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
 
 
 def _fill(
-    views: Sequence[PinholeView], faces: _AtlasFaces, rectangles: I64, offsets: I64, size: tuple[int, int]
-) -> np.ndarray:
-    """(H, W, 3) uint8 texture with the image rectangle of every chart at its position."""
+    views: Sequence[PinholeView], label: I64, rectangles: I64, offsets: I64, size: tuple[int, int]
+) -> U8:
+    """Texture (H, W, 3) with the image rectangle of every chart of view ``label`` at its position."""
     texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
-    first = np.unique(faces.chart, return_index=True)[1]
-    for c, v in enumerate(faces.label[first]):
+    for v, (left, top, right, bottom), (x, y) in zip(label, rectangles, offsets, strict=True):
         if v >= 0:
-            left, top, right, bottom = rectangles[c]
-            x, y = offsets[c]
             texture[y : y + bottom - top, x : x + right - left] = views[v].rgb[top:bottom, left:right]
     return texture
 
 
-def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> tuple[F64, np.ndarray]:
+def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
     """Append a patch of one colour for each unseen face: that of the nearest seen faces along the surface."""
     unseen = np.flatnonzero(label < 0)
     if not len(unseen):
@@ -211,7 +189,7 @@ def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> t
     return uv, np.concatenate([texture, strip])
 
 
-def _surroundings(mesh: TexturedMesh, label: I64, uv: F64, texture: np.ndarray) -> np.ndarray:
+def _surroundings(mesh: TexturedMesh, label: I64, uv: F64, texture: U8) -> U8:
     """(M, 3) uint8 colours of seen faces, propagated from face to face to unseen ones."""
     neighbours = face_neighbours(mesh.faces)
     x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T

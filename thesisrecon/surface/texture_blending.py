@@ -1,4 +1,4 @@
-"""Colours of a texture: blended from all images, or from one image per chart with levelled seams."""
+"""Colours of a texture, blended from all images."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import scipy
 from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.geometry.zbuffer import rasterize, rasterize_corners
 from thesisrecon.records import PinholeView, TexturedMesh
+from thesisrecon.surface._mesh import vertex_normals
 from thesisrecon.surface._texture_kernels import (
     ViewSurface,
     combine_colors,
@@ -21,39 +22,42 @@ from thesisrecon.surface._texture_kernels import (
     observe_points,
 )
 from thesisrecon.surface._texture_views import DEPTH_TOLERANCE_PX, view_camera
-from thesisrecon.surface.mesh import vertex_normals
 
 POINTS_PER_CHUNK = 1 << 17
 """Points processed at a time, which bounds the memory."""
-
 STRIP_ROWS = 64
 """Rows of the texture processed at a time."""
-
 RIM_TEXELS = 1
 """Texels by which a chart is extrapolated for bilinear sampling."""
-
 BEYOND_FACE = 4.0
 """Limit of that extrapolation in sides of a face."""
-
 GROWN_TEXELS = 3
 """Further texels that take the colours of the rim, for reduced textures."""
-
 OUTLINE_PX = 10.0
 """Depth step in pixel sizes that marks the outline of a foreground object."""
-
 MIN_TRUST = 1e-3
 """Weight of pixels at outlines and image borders, which count where no other image shows the point."""
-
 GAIN_POINTS = 50_000
 """Points at which image gains are estimated."""
-
 DARK, BRIGHT = 16.0, 240.0
 """Colours outside this range are clipped or noisy and not used for gains."""
+POWER = 2.0
+"""Exponent of the pixels per area: 0 weighs all images equally, large values select the best one."""
+SCATTER = 20.0
+"""Distance from the median colour in grey levels at which the weight is a quarter."""
+FEATHER_PX = 8.0
+"""Width of the border in which the weight decreases."""
 
 
-@dataclass(frozen=True)
-class BlendedTexture:
-    """Robust blend of all images that show a point.
+def paint_texture(
+    mesh: TexturedMesh,
+    views: Sequence[PinholeView],
+    uv: F64,
+    cut_out: U8,
+    *,
+    threads: int = 1,
+) -> U8:
+    """Compute the colours of a texture as a robust blend of all images that show a point.
 
     The weight of an image is its number of pixels per area, reduced towards image borders and outlines of
     foreground objects and where its colour contradicts the others (thin objects missing from the surface,
@@ -61,98 +65,68 @@ class BlendedTexture:
 
     Parameters
     ----------
-    power : float
-        Exponent of the pixels per area: 0 weighs all images equally, large values select the best one.
-    scatter : float
-        Distance from the median colour in grey levels at which the weight is a quarter.
-    feather_px : float
-        Width of the border in which the weight decreases.
+    mesh : TexturedMesh
+        The surface.
+    views : sequence of PinholeView
+        Undistorted images with their cameras.
+    uv : ndarray (M, 3, 2)
+        Corners of the faces in texels, NaN for faces that no view shows.
+    cut_out : ndarray (H, W, 3) uint8
+        Texture with the image rectangle of each chart.
+    threads : int
+        Number of threads; the result does not depend on it.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8
+        The texture; texels that no image shows well keep the colours of ``cut_out``.
     """
+    prepared = prepare_views(mesh, views, threads=threads)
+    normals = vertex_normals(mesh)
+    texture = cut_out.copy()
+    drawn = np.zeros(texture.shape[:2], dtype=bool)
 
-    power: float = 2.0
-    scatter: float = 20.0
-    feather_px: float = 8.0
+    def work(first: int) -> None:
+        rows = slice(first, min(first + STRIP_ROWS, len(texture)))
+        at, points, towards = _points_of_rows(mesh, normals, uv, rows, texture.shape[1])
+        color, shown = prepared.colors(points, towards)
+        at = at[shown]
+        texture[at[:, 0], at[:, 1]] = np.clip(np.rint(color[shown]), 0, 255)
+        drawn[at[:, 0], at[:, 1]] = True
 
-    def __post_init__(self) -> None:
-        if not (self.power >= 0.0 and self.scatter > 0.0 and self.feather_px > 0.0):
-            raise ValueError(
-                "power must be >= 0, scatter and feather_px positive; got "
-                f"{self.power}, {self.scatter} and {self.feather_px}"
-            )
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        list(pool.map(work, range(0, len(texture), STRIP_ROWS)))
+    for _ in range(GROWN_TEXELS):
+        grow_colors(texture, drawn)
+    return texture
 
-    def paint(
-        self,
-        mesh: TexturedMesh,
-        views: Sequence[PinholeView],
-        uv: F64,
-        cut_out: U8,
-        *,
-        threads: int = 1,
-    ) -> U8:
-        """Compute the colours of a texture.
 
-        Parameters
-        ----------
-        mesh : TexturedMesh
-        views : sequence of PinholeView
-            Undistorted images with their cameras.
-        charts : Charts
-            Layout of the texture.
-        threads : int
-            Number of threads; the result does not depend on it.
+def prepare_views(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> ViewBlender:
+    """Prepare the views for colour queries.
 
-        Returns
-        -------
-        ndarray (H, W, 3) uint8
-            The texture; texels that no image shows well keep the colours of ``charts``.
-        """
-        prepared = self.prepare(mesh, views, threads=threads)
-        normals = vertex_normals(mesh)
-        texture = cut_out.copy()
-        drawn = np.zeros(texture.shape[:2], dtype=bool)
+    Parameters
+    ----------
+    mesh, views, threads
+        As in :func:`paint_texture`.
 
-        def work(first: int) -> None:
-            rows = slice(first, min(first + STRIP_ROWS, len(texture)))
-            at, points, towards = _points_of_rows(mesh, normals, uv, rows, texture.shape[1])
-            color, shown = prepared.colors(points, towards)
-            at = at[shown]
-            texture[at[:, 0], at[:, 1]] = np.clip(np.rint(color[shown]), 0, 255)
-            drawn[at[:, 0], at[:, 1]] = True
-
-        with ThreadPoolExecutor(max(threads, 1)) as pool:
-            list(pool.map(work, range(0, len(texture), STRIP_ROWS)))
-        for _ in range(GROWN_TEXELS):
-            grow_colors(texture, drawn)
-        return texture
-
-    def prepare(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> ViewBlender:
-        """Prepare the views for colour queries.
-
-        Parameters
-        ----------
-        mesh : TexturedMesh
-        views : sequence of PinholeView
-            Undistorted images with their cameras.
-        threads : int
-
-        Returns
-        -------
-        ViewBlender
-            The prepared views with their gains.
-        """
-        with ThreadPoolExecutor(max(threads, 1)) as pool:
-            prepared = list(pool.map(lambda view: _prepared(mesh, view, self.feather_px), views))
-        blending = ViewBlender(self, tuple(prepared), np.ones((len(views), 3), dtype=np.float32))
-        stride = max(1, len(mesh.vertices) // GAIN_POINTS)
-        normals = vertex_normals(mesh)
-        weight, color = blending.observe(mesh.vertices[::stride], normals[::stride])
-        return ViewBlender(self, tuple(prepared), _equalizing_gains(weight, color))
+    Returns
+    -------
+    ViewBlender
+        The prepared views with their gains.
+    """
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        prepared = list(pool.map(lambda view: _prepared(mesh, view), views))
+    blending = ViewBlender(tuple(prepared), np.ones((len(views), 3), dtype=np.float32))
+    stride = max(1, len(mesh.vertices) // GAIN_POINTS)
+    normals = vertex_normals(mesh)
+    weight, color = blending._observe(mesh.vertices[::stride], normals[::stride])
+    return ViewBlender(tuple(prepared), _equalizing_gains(weight, color))
 
 
 def _points_of_rows(
     mesh: TexturedMesh, normals: F64, uv: F64, rows: slice, width: int
 ) -> tuple[I64, F64, F64]:
-    """Texels (N, 2) as row and column, points (N, 3) and normals (N, 3) of some rows of the texture."""
+    """Texels (N, 2) as row and column, points and normals (N, 3) of some rows of the texture."""
     top, bottom = uv[..., 1].min(axis=1), uv[..., 1].max(axis=1)
     # Comparisons with NaN are false: such faces are not seen.
     some = np.flatnonzero((bottom >= rows.start - RIM_TEXELS) & (top <= rows.stop + RIM_TEXELS))
@@ -176,33 +150,22 @@ def _points_of_rows(
 class ViewBlender:
     """Views of one surface with brightness gains.
 
-    Attributes
+    Parameters
     ----------
-    blending : BlendedTexture
-        Parameters.
     views : tuple of ViewSurface
         Prepared views.
     gains : ndarray (V, 3) float32
         Gains that equalise the brightness.
+    scatter : float
+        Distance from the median colour in grey levels at which the weight is a quarter.
     """
 
-    blending: BlendedTexture
     views: tuple[ViewSurface, ...]
     gains: F32
+    scatter: float = SCATTER
 
-    def observe(self, points: F64, normals: F64) -> tuple[F32, F32]:
-        """Observe points in all views.
-
-        Parameters
-        ----------
-        points, normals : ndarray (N, 3)
-            Points and outward normals.
-
-        Returns
-        -------
-        tuple of ndarray (V, N), (V, N, 3)
-            Weights, 0 where a view does not show a point, and colours.
-        """
+    def _observe(self, points: F64, normals: F64) -> tuple[F32, F32]:
+        """Weights (V, N) of points in all views, 0 where one does not show them, and colours (V, N, 3)."""
         weight = np.zeros((len(self.views), len(points)), dtype=np.float32)
         color = np.zeros((len(self.views), len(points), 3), dtype=np.float32)
         for v, one in enumerate(self.views):
@@ -219,20 +182,20 @@ class ViewBlender:
 
         Returns
         -------
-        tuple of ndarray (N, 3), (N,)
+        color, shown : ndarray (N, 3), (N,)
             Colours, and whether any view shows the point.
         """
         out = np.zeros((len(points), 3), dtype=np.float32)
         shown = np.zeros(len(points), dtype=bool)
         for first in range(0, len(points), POINTS_PER_CHUNK):
             some = slice(first, first + POINTS_PER_CHUNK)
-            weight, color = self.observe(points[some], normals[some])
-            combine_colors(weight, color, self.blending.power, self.blending.scatter, out[some])
+            weight, color = self._observe(points[some], normals[some])
+            combine_colors(weight, color, POWER, self.scatter, out[some])
             shown[some] = weight.max(axis=0, initial=0.0) > 0.0
         return out, shown
 
 
-def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> ViewSurface:
+def _prepared(mesh: TexturedMesh, view: PinholeView) -> ViewSurface:
     camera = view_camera(view)
     depth = rasterize(mesh.vertices, mesh.faces, camera).depth
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
@@ -243,7 +206,7 @@ def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> ViewS
         outline = far - near > OUTLINE_PX / focal * near
     inside = np.pad(np.ones_like(view.seen[1:-1, 1:-1]), 1)
     distance = scipy.ndimage.distance_transform_edt(inside & view.seen & ~outline)
-    trust = np.clip(distance / feather_px, MIN_TRUST, 1.0)
+    trust = np.clip(distance / FEATHER_PX, MIN_TRUST, 1.0)
     # Bilinear interpolation must not use missing pixels.
     trust[scipy.ndimage.minimum_filter(view.seen, 3) == 0] = 0.0
     tolerance = DEPTH_TOLERANCE_PX / focal
@@ -253,8 +216,7 @@ def _prepared(mesh: TexturedMesh, view: PinholeView, feather_px: float) -> ViewS
 def _equalizing_gains(weight: F32, color: F32) -> F32:
     """Gains (V, 3) that equalise the brightness of the views, with geometric mean 1.
 
-    Least squares over the median log ratios of all pairs of views; ``weight`` (V, N) is 0 where a view does
-    not show a point, ``color`` (V, N, 3).
+    Least squares over the median log ratios of all pairs of views at points that both show.
     """
     views = len(weight)
     usable = (weight[..., None] > 0.0) & (color > DARK) & (color < BRIGHT)

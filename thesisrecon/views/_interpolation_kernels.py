@@ -5,55 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from thesisrecon.arrays import B8, F32, F64
+from thesisrecon.arrays import F32, F64
 from thesisrecon.geometry.raster import weighted_median
 
 ONE_SURFACE_PX = 1.0
 """Neighbouring disparities that differ by more belong to different surfaces."""
-
-
 REACH, SPARSE = 12, 3
 """Radius and step of the search for the disparity of a guessed pixel."""
 WINDOW = 2 * REACH // SPARSE + 1
 NEAR = 2
 """Radius of the median over guessed pixels."""
-
-
-@njit(cache=True, nogil=True)
-def mark_crossings(disparity: F32, slack: float, crossing: B8) -> None:
-    """Mark pixels whose correspondence x - d crosses that of another pixel of their row by ``slack`` px."""
-    height, width = disparity.shape
-    least = np.empty(width + 1)
-    for y in range(height):
-        least[width] = np.inf
-        for x in range(width - 1, -1, -1):
-            d = disparity[y, x]
-            least[x] = least[x + 1] if np.isnan(d) else min(least[x + 1], x - d)
-        most = -np.inf
-        for x in range(width):
-            d = disparity[y, x]
-            crossing[y, x] = not np.isnan(d) and (most > x - d + slack or least[x + 1] < x - d - slack)
-            if not np.isnan(d):
-                most = max(most, x - d)
-
-
-@njit(cache=True, nogil=True)
-def fill_empty_rows(disparity: F32) -> None:
-    """Copy the nearest other row (first the upper one) into rows that are NaN throughout, in place."""
-    height = disparity.shape[0]
-    known = np.empty(height, np.bool_)
-    for y in range(height):
-        known[y] = not np.isnan(disparity[y]).all()
-    for y in range(height):
-        if known[y]:
-            continue
-        for k in range(1, height):
-            if y - k >= 0 and known[y - k]:
-                disparity[y] = disparity[y - k]
-                break
-            if y + k < height and known[y + k]:
-                disparity[y] = disparity[y + k]
-                break
 
 
 @njit(cache=True, nogil=True)
@@ -215,26 +176,3 @@ def blend(
                 else:
                     rgb[y, x, c] = (1.0 - t) * colors[0][y, x, c] + t * colors[1][y, x, c]
             near[y, x] = n0 if w0 >= w1 else n1
-
-
-@njit(cache=True, nogil=True)
-def blending_weights(disparity: F32, sure: F32, floors: tuple[float, float, float], out: F32) -> None:
-    """Compute the blending weight of each pixel from its confidence.
-
-    ``floors``: weight of guesses, minimum weight of other pixels, factor beside a depth discontinuity (mixed
-    pixels).
-    """
-    height, width = disparity.shape
-    for y in range(height):
-        for x in range(width):
-            if sure[y, x] <= 0.0:
-                out[y, x] = floors[0]
-                continue
-            weight = max(float(sure[y, x]), floors[1])
-            d = disparity[y, x]
-            for k in range(4):
-                v, u = y + (k == 0) - (k == 1), x + (k == 2) - (k == 3)
-                if 0 <= v < height and 0 <= u < width and abs(disparity[v, u] - d) > ONE_SURFACE_PX:
-                    weight *= floors[2]
-                    break
-            out[y, x] = weight

@@ -14,13 +14,10 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.views._interpolation_kernels import (
     ONE_SURFACE_PX,
     blend,
-    blending_weights,
     disparity_from_rectified,
-    fill_empty_rows,
     filter_extrapolated_by_colour,
     filter_extrapolated_by_median,
     intermediate_positions,
-    mark_crossings,
 )
 from thesisrecon.views.warping import fill_holes, forward_map, sample
 
@@ -146,9 +143,11 @@ def detect_monotonicity_violations(disparity: F32) -> B8:
     ndarray (H, W) of bool
         Pixels whose order relative to another pixel of their row differs between the images.
     """
-    violated = np.zeros(disparity.shape, dtype=np.bool_)
-    mark_crossings(np.ascontiguousarray(disparity, dtype=np.float32), SLACK_PX, violated)
-    return violated
+    at = np.arange(disparity.shape[1]) - disparity.astype(np.float64)
+    padded = np.pad(at, ((0, 0), (1, 1)), constant_values=((0, 0), (-np.inf, np.inf)))
+    rightmost = np.fmax.accumulate(padded[:, :-2], axis=1)
+    leftmost = np.fmin.accumulate(padded[:, :1:-1], axis=1)[:, ::-1]
+    return np.asarray((rightmost > at + SLACK_PX) | (leftmost < at - SLACK_PX))
 
 
 @dataclass(frozen=True)
@@ -178,11 +177,6 @@ class InterpolatedPair:
         Homographies to the rectified frame, third coordinate positive for visible pixels.
     left, right : DisparityMap
         Disparities of both images in the rectified frame (x_right = x_left - d in both).
-
-    Raises
-    ------
-    ValueError
-        If the sizes of the images or the shapes of the maps differ.
     """
 
     images: tuple[U8, U8]
@@ -315,13 +309,11 @@ class InterpolatedPair:
 
 
 def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
-    whole = np.ascontiguousarray(found.filled())
-    fill_empty_rows(whole)
     # Without any known disparity the views are cross-dissolved.
-    maps = np.nan_to_num(whole), np.ascontiguousarray(found.confidence)
+    maps = np.nan_to_num(_with_all_rows(found.filled())), np.ascontiguousarray(found.confidence)
     shape = image.shape[:2]
     places = np.empty((*shape, 2))
-    disparity, sure, weight = (np.empty(shape, dtype=np.float32) for _ in range(3))
+    disparity, sure = (np.empty(shape, dtype=np.float32) for _ in range(2))
     disparity_from_rectified(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
     levels, filtered = image.astype(np.float32), np.empty_like(disparity)
     limits = (COLOUR, GUESS_WEIGHT)
@@ -333,8 +325,25 @@ def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
     run_in_strips(
         lambda rows: filter_extrapolated_by_median(filtered, sure, rows, disparity), shape[0], PREPARING
     )
-    blending_weights(disparity, sure, (UNKNOWN_WEIGHT, MIN_KNOWN_WEIGHT, EDGE_FACTOR), weight)
-    return _Side(levels, places, disparity, weight)
+    return _Side(levels, places, disparity, _blending_weights(disparity, sure))
+
+
+def _with_all_rows(disparity: F32) -> F32:
+    """Disparities (H, W); rows without any are copies of the nearest other row, first the upper one."""
+    known = np.flatnonzero(np.isfinite(disparity).any(axis=1))
+    if not len(known):
+        return disparity
+    nearest = np.abs(np.arange(len(disparity))[:, None] - known).argmin(axis=1)
+    return np.ascontiguousarray(disparity[known[nearest]])
+
+
+def _blending_weights(disparity: F32, sure: F32) -> F32:
+    """Weights (h, w): the confidence, less beside a depth discontinuity, where pixels are mixed."""
+    padded = np.pad(disparity, 1, constant_values=np.nan)
+    around = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
+    edge = np.any([np.abs(other - disparity) > ONE_SURFACE_PX for other in around], axis=0)
+    known = np.maximum(sure.astype(np.float64), MIN_KNOWN_WEIGHT) * np.where(edge, EDGE_FACTOR, 1.0)
+    return np.where(sure > 0.0, known, UNKNOWN_WEIGHT).astype(np.float32)
 
 
 def disparity_of_right(left: DisparityMap) -> DisparityMap:

@@ -13,32 +13,23 @@ from thesisrecon.records import TexturedMesh
 
 ROUND_GAP = np.radians(120.0)
 """Cameras without a wider gap in azimuth surround the scene; the orbit is then a full circle."""
-
 MIN_ARC = np.radians(30.0)
 """Minimum arc of an orbit that is not a full circle."""
-
 TILT_WEIGHT = 0.02
 """Squared ratio of typical roll to typical tilt of hand-held cameras (about 3 and 20 degrees)."""
-
 MIN_HORIZONTAL_DISTANCE = 0.1
 """Minimum horizontal distance of an orbit relative to its distance: near the vertical axis "up" is
 undefined."""
-
 GROWTH = 1.1 ** np.arange(13)
 """Radius factors, tried in this order until the orbit keeps clear of the model and shows it."""
-
 CLEARANCE = 0.5
 """Minimum distance to the model, in units of the median distance of the cameras."""
-
 SHOWN = 0.9
 """Minimum visible share of the model, in units of the median over the cameras."""
-
 TURNING = 3.0
 """If rotation per path length exceeds the mean of the path by this factor, rotation determines the time."""
-
 STEPS = 64
 """Samples per spline segment for measuring its length."""
-
 SAMPLE = 5000
 """Model points that are used to choose an orbit."""
 
@@ -77,11 +68,6 @@ def orbit(
     -------
     list of Camera
         The path.
-
-    Raises
-    ------
-    ValueError
-        Without a camera, a frame or a finite point, or if all points and cameras coincide.
     """
     _check(cameras, frames)
     X = _sample(X)
@@ -125,11 +111,6 @@ def interpolate_cameras(
     -------
     list of Camera
         The path.
-
-    Raises
-    ------
-    ValueError
-        Without a camera or a frame.
     """
     _check(cameras, frames)
     shown = [_fit_to_size(camera, size or cameras[0].size) for camera in cameras]

@@ -93,11 +93,6 @@ class Light:
         Position of a point light. Exactly one of direction and position is given.
     color : tuple of float
         Strength in red, green and blue; 1 leaves the texture as it is.
-
-    Raises
-    ------
-    ValueError
-        If both or neither of direction and position are given, or the direction is zero.
     """
 
     direction: tuple[float, float, float] | None = None
@@ -188,11 +183,6 @@ def render(
     -------
     RenderedView
         Colour, depth and validity of each pixel.
-
-    Raises
-    ------
-    ValueError
-        If ``samples`` is below 1 or the mesh arrays are inconsistent.
 
     Examples
     --------

@@ -69,11 +69,6 @@ class CalibratedPair:
         Intrinsics.
     R, t : ndarray (3, 3), (3,)
         Rotation and translation from the first to the second camera frame.
-
-    Raises
-    ------
-    ValueError
-        If the arguments are no intrinsics, rotation or non-zero translation.
     """
 
     K1: F64
@@ -272,11 +267,6 @@ class VirtualCamera:
         Intrinsics.
     size : tuple of int
         Width and height in pixels.
-
-    Raises
-    ------
-    ValueError
-        If the arguments are no rotation, translation or intrinsics, or the size is below 1 px.
     """
 
     rotation: F64
@@ -377,11 +367,6 @@ class VirtualTensor:
         -------
         VirtualTensor
             The tensor; in pixels the motion is K R K_3^-1 and K t.
-
-        Raises
-        ------
-        ValueError
-            If the arguments are no rotation, translation or intrinsics.
         """
         _require_motion(rotation, translation)
         K = self.K if K is None else K
@@ -492,11 +477,6 @@ def seed_of_three(
     -------
     CalibratedPair, VirtualTensor
         The first two cameras, and the tensor in their frame.
-
-    Raises
-    ------
-    ValueError, StageFailure
-        As :func:`pair_from_fundamental`.
     """
     require_finite("seed_of_three", T)
     _require_intrinsics(K[2])

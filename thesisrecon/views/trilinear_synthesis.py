@@ -169,8 +169,7 @@ def _agreeing(places: F32, others: F32, agree_px: float) -> B8:
 def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32], step: float) -> F32:
     """``places`` (H, W, 2) with guesses for NaN, from the inverse depth of both images."""
     own = inverse_depth[0]
-    distance = np.empty((len(DIRECTIONS), *own.shape), dtype=np.int16)
-    distances_to_known(own, DIRECTIONS, distance)
+    distance = distances_to_known(own)
     guessed = np.empty_like(own)
     _extrapolate_inverse_depth(
         inverse_depth, np.ascontiguousarray(pair.P2), DIRECTIONS, distance, step, guessed

@@ -16,11 +16,9 @@ from thesisrecon.geometry.zbuffer import run_in_strips
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
-
 BACKGROUND_FRACTION = 0.4
 """Pixels in this farther part of the range of inverse depth count as background; a single far pixel
 may be an outlier."""
-
 MIN_AREA = 1e-9
 """Twice the area (px^2) of the smallest triangle that is drawn."""
 STRETCH = 3.0
@@ -237,7 +235,7 @@ def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.floa
 
 
 @njit(cache=True, nogil=True)
-def distances_to_known(inverse_depth: F32, steps: I32, distance: I16) -> None:
+def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
     """Count the ``steps`` (K, 2) (down, right) from each pixel to the next known one, ``distance`` (K, H, W).
 
     0 at known pixels, -1 if there is none.
@@ -295,6 +293,24 @@ DIRECTIONS = np.array(
     [(a, b) for a in range(-2, 3) for b in range(-2, 3) if np.gcd(a, b) == 1], dtype=np.int32
 )
 """Sixteen directions (down, right) in which known pixels around a hole are searched."""
+
+
+def distances_to_known(inverse_depth: F32) -> I16:
+    """Count the steps from each pixel to the next known one in each of the sixteen directions.
+
+    Parameters
+    ----------
+    inverse_depth : ndarray (H, W) of float32
+        NaN if unknown.
+
+    Returns
+    -------
+    ndarray (16, H, W)
+        0 at known pixels, -1 if there is none.
+    """
+    distance = np.empty((len(DIRECTIONS), *inverse_depth.shape), dtype=np.int16)
+    _count_steps(inverse_depth, DIRECTIONS, distance)
+    return distance
 
 
 def forward_map(
@@ -379,8 +395,7 @@ def fill_holes(rgb: F32, inverse_depth: F32, *, step: float) -> F32:
     ndarray (H, W, C) of float32
         The image; NaN where no direction leads to a known pixel.
     """
-    distance = np.empty((len(DIRECTIONS), *inverse_depth.shape), dtype=np.int16)
-    distances_to_known(inverse_depth, DIRECTIONS, distance)
     filled = rgb.copy()
+    distance = distances_to_known(inverse_depth)
     _fill_from_behind(rgb, inverse_depth, DIRECTIONS, distance, step, filled)
     return filled

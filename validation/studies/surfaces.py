@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,18 +19,62 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera
 from thesisrecon.records import DepthMap
-from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.linear import DepthSurface, LinearSurface, resample_surface, surface_normals
+from thesisrecon.surface._depth_grid import GRAZING_DEG, max_depth_slope, triangulate_grid
+from thesisrecon.surface.bspline import BSplineFit, BSplineSurface
+from thesisrecon.surface.linear import LinearSurface
 from validation.metrics.depth import SAME, true_depth, true_from_maps
 from validation.metrics.record import Metric
 from validation.scenes.real import Scene, load_fixture_scene
 from validation.studies.runner import Part
 
-SURFACES: Mapping[str, DepthSurface] = {"linear": LinearSurface(), "b-spline": BSplineSurface()}
+SURFACES: Mapping[str, LinearSurface | BSplineSurface] = {
+    "linear": LinearSurface(),
+    "b-spline": BSplineSurface(),
+}
 SMOOTH_DEG = 3.0
 """A pixel whose two one-sided normals differ by more lies on an edge and has no true normal."""
 NOISE = 5e-4
 """Standard deviation of the inverse depths, which are about 0.2."""
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """Piecewise linear surface of a depth map, as ``surface_from_depth`` triangulates it."""
+
+    depth_map: DepthMap
+
+    def evaluate(self, xy: F64) -> tuple[F64, F64]:
+        """Inverse depth (N,) and gradient (N, 2) at pixels (N, 2), which are linear within a triangle."""
+        # Padding gives every pixel its own square.
+        depth, std = (
+            np.pad(part.astype(np.float64), ((0, 1), (0, 1)), constant_values=np.nan)
+            for part in (self.depth_map.depth, self.depth_map.std)
+        )
+        triangles = triangulate_grid(depth, std, max_depth_slope(self.depth_map.P, GRAZING_DEG))
+        height, width = self.depth_map.depth.shape
+        inside = np.all((xy >= -1e-9) & (xy <= np.array([width, height]) - 1.0 + 1e-9), axis=1)
+        at = np.where(inside[:, None], xy, 0.0)
+        x, y = np.floor(at + 1e-9).astype(np.int64).T
+        u, v = (at - np.stack([x, y], axis=1)).T
+        a, b, c, d = (1.0 / depth[y + j, x + i] for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)))
+        rising = triangles.rising[y, x]
+        second = np.where(rising, u + v > 1.0, u > v)
+        along_x, along_y = np.where(rising == second, d - c, b - a), np.where(second, d - b, c - a)
+        value = np.where(
+            rising & second, d - (1.0 - u) * along_x - (1.0 - v) * along_y, a + u * along_x + v * along_y
+        )
+        whole = inside & triangles.whole[y, x, second.astype(np.int64)]
+        pixel = inside & (np.maximum(np.abs(u), np.abs(v)) < 1e-6)
+        value = np.where(whole, value, np.where(pixel, a, np.nan))
+        return value, np.where(whole[:, None], np.stack([along_x, along_y], axis=1), np.nan)
+
+
+def camera_normals(fit: LinearFit | BSplineFit, xy: F64) -> F64:
+    """Unit normals (N, 3) in the camera frame: a . (x, y, 1) = 1 / z near a pixel, the normal is -K' a."""
+    inverse_depth, gradient = fit.evaluate(xy)
+    offset = inverse_depth - np.sum(gradient * xy, axis=1)
+    normal = -np.column_stack([gradient, offset]) @ decompose_camera(fit.depth_map.P)[0]
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 def known_surfaces() -> dict[str, F64]:
@@ -63,8 +107,7 @@ def check_known(name: str, rho: F64, wrong: float) -> Metric:
     views = np.ones(rho.shape, dtype=np.uint8)
     given = DepthMap(0, P, (1.0 / noisy).astype(np.float32), std.astype(np.float32), views)
     off = {
-        word: 1.0 / resample_surface(surface.fit(given)).depth.astype(np.float64) - rho
-        for word, surface in SURFACES.items()
+        word: 1.0 / surface.smooth(given).depth.astype(np.float64) - rho for word, surface in SURFACES.items()
     }
     rms = {word: float(np.sqrt(np.nanmean(e**2))) / NOISE for word, e in off.items()}
     label = f"RMS error, {wrong:.0%} wrong" if wrong else "RMS error"
@@ -97,15 +140,14 @@ def check_map(found: DepthMap, scene: Scene, scale: float) -> dict[str, dict[str
     shrink = found.depth.shape[1] / (stride * depth.shape[1])
     y, x = (np.indices(depth.shape) * stride + 0.5) * shrink - 0.5
     xy = np.stack([x, y], axis=-1).reshape(-1, 2)
-    R = decompose_camera(found.P)[1]
     measured = {}
-    for word, surface in SURFACES.items():
+    for word in SURFACES:
         start = time.process_time()
-        fit = surface.fit(found)
+        fit = LinearFit(found) if word == "linear" else BSplineSurface().fit(found)
         seconds = time.process_time() - start
         with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.abs(scale / fit.evaluate(xy).inverse_depth.reshape(depth.shape) / depth - 1.0)
-            cosine = np.sum((surface_normals(fit, xy) @ R.T).reshape(true.shape) * true, axis=-1)
+            error = np.abs(scale / fit.evaluate(xy)[0].reshape(depth.shape) / depth - 1.0)
+            cosine = np.sum(camera_normals(fit, xy).reshape(true.shape) * true, axis=-1)
         known = seen & np.isfinite(error)
         angle = np.degrees(np.arccos(np.clip(cosine[seen & np.isfinite(cosine)], -1.0, 1.0)))
         measured[word] = {

@@ -13,8 +13,7 @@ from thesisrecon.arrays import B8, U8
 from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.surface.texture_atlas import TextureAtlas
-from thesisrecon.surface.texture_blending import BlendedTexture, SeamLeveledTexture
+from thesisrecon.surface.texture_blending import prepare_views
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Task
@@ -25,7 +24,6 @@ from validation.metrics.record import Metric
 from validation.references.open3d_meshes import render_open3d
 from validation.references.open3d_surfaces import OpenTsdf
 
-SINGLE = "ours (one image each)"
 TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF, 1 px, levelled"
 OWN_PICTURE = "Open3D TSDF, 1 px, its own image"
 VOXELS_PX = {TSDF: 1.5, FINE: 1.0, LEVELLED: 1.0}
@@ -68,10 +66,10 @@ class ViewsStage:
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
         sternest = (OURS, FINE, LEVELLED)
-        return sternest if options.quick or options.gates_only else (OURS, SINGLE, TSDF, FINE, LEVELLED)
+        return sternest if options.quick or options.gates_only else (OURS, TSDF, FINE, LEVELLED)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        return (("depth", OURS), *(((self.name, OURS),) if method in (SINGLE, LEVELLED) else ()))
+        return (("depth", OURS), *(((self.name, OURS),) if method == LEVELLED else ()))
 
     def run(self, task: Task, options: ReportOptions) -> None:
         photographs = load_photographs(task.scene, options)
@@ -132,8 +130,6 @@ def _model(
         surface_model = SurfaceModel().surface_of(maps)
         np.savez(surface, vertices=surface_model.vertices, faces=surface_model.faces)
         return SurfaceModel().color(surface_model, views)
-    if method == SINGLE:
-        return TextureAtlas(painter=SeamLeveledTexture()).texture(_read_surface(surface), views)
     if method == LEVELLED:
         views = _equally_bright(_read_surface(surface), views)
     return OpenTsdf(voxel_px=VOXELS_PX[method]).fuse(maps, views)
@@ -146,7 +142,7 @@ def _read_surface(path: Path) -> TexturedMesh:
 
 def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list[PinholeView]:
     """Return the images with equalised exposures, by our texture gains."""
-    gains = BlendedTexture().prepare(surface, views).gains
+    gains = prepare_views(surface, views).gains
     return [
         replace(view, rgb=np.clip(np.rint(view.rgb * gain), 0, 255).astype(np.uint8))
         for view, gain in zip(views, gains, strict=True)

@@ -11,22 +11,15 @@ from thesisrecon.arrays import F32, F64, I64, U8
 
 SIDE = 8
 """Voxels per side of a block."""
-
 WEIGHT_BEYOND = 0.1
 """Weight of a depth extrapolated by half a pixel or more."""
 
 
 class MapSamples(NamedTuple):
-    """A depth map prepared for fusion.
+    """A depth map prepared for fusion: depth, std and ``cosine`` (H, W) float32, NaN = unknown.
 
-    Attributes
-    ----------
-    depth, std : ndarray (H, W) float32
-        Depth and its standard deviation, NaN = unknown.
-    cosine : ndarray (H, W) float32
-        Distance across the surface per unit of depth.
-    slope : float
-        Largest relative depth step between neighbours on one surface.
+    ``cosine``: distance across the surface per unit of depth; ``slope``: largest relative depth step between
+    neighbours on one surface.
     """
 
     depth: F32
@@ -35,38 +28,14 @@ class MapSamples(NamedTuple):
     slope: float
 
 
-class SignedDistances(NamedTuple):
-    """Truncated signed distances of blocks.
-
-    Attributes
-    ----------
-    value, weight : ndarray (B, 8, 8, 8) float32
-        Weighted mean distance and total weight.
-    """
-
-    value: F32
-    weight: F32
-
-
 @njit(cache=True, nogil=True)
 def touched_blocks(
     samples: MapSamples, rays: F64, centre: F64, reach: float, edge: float, marked: U8
 ) -> None:
-    """Mark the blocks that the surface may pass.
+    """Mark the blocks (X, Y, Z) of size ``edge`` that lie within ``reach`` of the surface.
 
-    Parameters
-    ----------
-    samples : MapSamples
-    rays : ndarray (3, 3)
-        From (x, y, 1) to the point at depth 1 relative to the centre.
-    centre : ndarray (3,)
-        Camera centre relative to the grid origin.
-    reach : float
-        Distance from the surface within which blocks are needed.
-    edge : float
-        Block size.
-    marked : ndarray (X, Y, Z) uint8
-        Receives 1; points outside are ignored.
+    ``rays`` (3, 3): from (x, y, 1) to the point at depth 1 relative to the centre; ``centre`` (3,): of the
+    camera, relative to the grid origin.
     """
     depth, cosine = samples.depth, samples.cosine
     for y in range(depth.shape[0]):
@@ -90,30 +59,16 @@ def touched_blocks(
 
 @njit(cache=True, nogil=True)
 def integrate_view(
-    blocks: I64, voxel: float, P: F64, surface: MapSamples, truncation: float, sums: SignedDistances
+    blocks: I64, voxel: float, P: F64, surface: MapSamples, truncation: float, value: F32, weight: F32
 ) -> None:
     """Add one depth map to the signed distances of blocks (Curless and Levoy 1996).
 
-    Distances are in units of the truncation and limited to 1; voxels farther behind the surface are not
-    visible. The weight is cos^4 / (s^2 + (truncation / 8)^2) with the standard deviation s across the
-    surface: the surface is assumed to be plane near the ray, with an error that grows with 1 / cos^2.
-
-    Parameters
-    ----------
-    blocks : ndarray (B, 3)
-        Grid positions.
-    voxel : float
-        Voxel size.
-    P : ndarray (3, 4)
-        Camera K [R t] with the centre of the first voxel as origin.
-    surface : MapSamples
-    truncation : float
-        Truncation distance.
-    sums : SignedDistances
-        Distances and weights, updated.
+    ``P``: camera K [R t] with the centre of the first voxel as origin. Distances are in units of the
+    truncation and limited to 1; voxels farther behind the surface are not visible. The weight is cos^4 / (s^2
+    + (truncation / 8)^2) with the standard deviation s across the surface: the surface is assumed to be plane
+    near the ray, with an error that grows with 1 / cos^2.
     """
     depth, std, cosine, slope = surface
-    value, weight = sums
     height, width = depth.shape
     base = (truncation / 8.0) ** 2
     for b in range(blocks.shape[0]):
@@ -194,23 +149,9 @@ def _find(place: I64, i: int, j: int, k: int) -> int:
 def place_vertices(blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64) -> int:
     """Place one vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
 
-    Parameters
-    ----------
-    blocks : ndarray (B, 3)
-        Grid positions.
-    place : ndarray (X, Y, Z)
-        Block numbers or -1.
-    value, weight : ndarray (B, 8, 8, 8) float32
-        Signed distances.
-    vertex : ndarray (B, 8, 8, 8)
-        Receives the vertex number of each cell or -1.
-    points : ndarray (N, 3)
-        Receives the first N vertices in voxels, each the mean of the zero crossings of the cell edges.
-
-    Returns
-    -------
-    int
-        Number of vertices.
+    ``place`` (X, Y, Z): block numbers or -1; ``vertex`` (B, 8, 8, 8) receives the vertex number of each cell
+    or -1; ``points`` (N, 3) receives the first N vertices in voxels, each the mean of the zero crossings of
+    the cell edges. Returns the number of vertices.
     """
     count = 0
     corner = np.empty(8)
@@ -267,25 +208,7 @@ def join_vertices(
 ) -> int:
     """Create two triangles across each voxel edge that the surface crosses, anticlockwise from outside.
 
-    Parameters
-    ----------
-    blocks : ndarray (B, 3)
-        Grid positions.
-    place : ndarray (X, Y, Z)
-        Block numbers or -1.
-    value, weight : ndarray (B, 8, 8, 8) float32
-        Signed distances.
-    vertex : ndarray (B, 8, 8, 8)
-        Vertex numbers of :func:`place_vertices`.
-    points : ndarray (N, 3)
-        Vertices.
-    faces : ndarray (M, 3)
-        Receives the first M faces; the shorter diagonal is used.
-
-    Returns
-    -------
-    int
-        Number of faces.
+    ``faces`` (M, 3) receives the first M faces; the shorter diagonal is used. Returns the number of faces.
     """
     count = 0
     step = np.zeros(3, np.int64)

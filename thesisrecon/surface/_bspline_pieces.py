@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -17,7 +17,8 @@ from numba import njit
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.numerics.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
-from thesisrecon.surface.linear import max_depth_slope, same_surface
+from thesisrecon.surface._depth_grid import GRAZING_DEG, max_depth_slope, same_surface
+from thesisrecon.surface._mesh import components
 
 STEP = 5.0
 """Standard deviations of a significant depth step."""
@@ -93,23 +94,7 @@ def _within(first: I64, columns: int, k: int, p0: int, p1: int, q0: int, q1: int
 def sum_squares(
     piece: I64, value: F64, weight: F64, basis: F64, cell: int, matrix: F64, right_side: F64
 ) -> None:
-    """Accumulate the normal equations of all pixels.
-
-    Parameters
-    ----------
-    piece : ndarray (H, W)
-        Piece of each pixel, -1 for none.
-    value, weight : ndarray (H, W)
-        Observations and their weights.
-    basis : ndarray (cell, 4)
-        B-splines at the pixels of a cell.
-    cell : int
-        Pixels between knots.
-    matrix : ndarray (N, 16, 16)
-        Receives the upper triangles.
-    right_side : ndarray (N, 16)
-        Receives the right-hand sides.
-    """
+    """Accumulate the upper triangles (N, 16, 16) and right sides (N, 16) of the normal equations."""
     height, width = piece.shape
     b = np.empty(16)
     for y in range(height):
@@ -130,23 +115,7 @@ def sum_squares(
 
 @njit(cache=True, nogil=True)
 def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int, value: F64) -> None:
-    """Evaluate the spline at all pixels.
-
-    Parameters
-    ----------
-    piece : ndarray (H, W)
-        Piece of each pixel, -1 for none.
-    coefficient : ndarray (N, 16)
-        Coefficients of each piece.
-    c : ndarray (C,)
-        Values of the coefficients.
-    basis : ndarray (cell, 4)
-        B-splines at the pixels of a cell.
-    cell : int
-        Pixels between knots.
-    value : ndarray (H, W)
-        Receives the values, NaN for pixels without a piece.
-    """
+    """Evaluate the spline at all pixels, NaN for pixels without a piece."""
     height, width = piece.shape
     for y in range(height):
         for x in range(width):
@@ -160,42 +129,22 @@ def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int,
             value[y, x] = total
 
 
-@dataclass(frozen=True)
-class Domain:
-    """Support of a surface in a depth map.
+class Domain(NamedTuple):
+    """Pixels with a surface and with depths that are used.
 
-    Attributes
-    ----------
-    covered : ndarray (H, W) bool
-        Pixels with a surface.
-    reliable : ndarray (H, W) bool
-        Pixels whose depths are used.
-    right, down : ndarray (H, W - 1), (H - 1, W) bool
-        Whether neighbours belong to one surface.
+    ``joined``: whether neighbours below (H - 1, W) and to the right (H, W - 1) belong to one surface.
     """
 
     covered: B8
     reliable: B8
-    right: B8
-    down: B8
+    joined: tuple[B8, B8]
 
 
 @dataclass(frozen=True)
 class SplinePieces:
-    """Pieces of a depth map and their spline coefficients.
+    """Piece (H, W) of each pixel, -1 for none; ``coefficient`` (N, 16) and ``cell`` (N,) of each piece.
 
-    Attributes
-    ----------
-    piece : ndarray (H, W)
-        Piece of each pixel, -1 for none.
-    coefficient : ndarray (N, 16)
-        Coefficients of each piece.
-    cell : ndarray (N,)
-        Cell of each piece.
-    shape : tuple of int
-        Rows and columns of cells.
-    count : int
-        Number of coefficients.
+    ``shape``: rows and columns of cells; ``count``: number of coefficients.
     """
 
     piece: I64
@@ -205,26 +154,14 @@ class SplinePieces:
     count: int
 
 
-def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: float) -> Domain:
+def domain_of(depth_map: DepthMap, *, least: int, reach: float) -> Domain:
     """Connect the depths of a map to surfaces.
 
-    Parameters
-    ----------
-    depth_map : DepthMap
-    grazing_deg : float
-        Surfaces break where they are seen at a smaller angle.
-    least : int
-        Connected regions of fewer pixels are unreliable.
-    reach : float
-        Distance in pixels within which unreliable pixels are covered by the nearest surface.
-
-    Returns
-    -------
-    Domain
-        Pixels with a surface and their connections.
+    Connected regions of fewer than ``least`` pixels are unreliable; within ``reach`` px of the nearest
+    surface they are covered by it.
     """
     depth, std = depth_map.depth.astype(np.float64), depth_map.std.astype(np.float64)
-    slope = max_depth_slope(depth_map.P, grazing_deg)
+    slope = max_depth_slope(depth_map.P, GRAZING_DEG)
     known = np.isfinite(depth) & (depth > 0.0) & (std > 0.0) & np.isfinite(std)
     depth = np.where(known, depth, np.nan)
     joined = [
@@ -233,7 +170,7 @@ def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: flo
     ]
     reliable = known & (_sizes(joined, known) >= least)
     if not reliable.any():
-        return Domain(reliable, reliable, joined[1], joined[0])
+        return Domain(reliable, reliable, (joined[0], joined[1]))
     away, (y, x) = scipy.ndimage.distance_transform_edt(~reliable, return_indices=True)
     covered = known & (away <= reach)
     for axis in (0, 1):
@@ -242,8 +179,7 @@ def domain_of(depth_map: DepthMap, *, grazing_deg: float, least: int, reach: flo
         joined[axis] = np.where(_both(reliable, axis), joined[axis], extended) & _both(covered, axis)
     # They must be connected to reliable pixels.
     covered &= _sizes(joined, reliable) >= least
-    joined = [one & _both(covered, axis) for axis, one in enumerate(joined)]
-    return Domain(covered, reliable & covered, joined[1], joined[0])
+    return Domain(covered, reliable & covered, (joined[0] & _both(covered, 0), joined[1] & _both(covered, 1)))
 
 
 def _pairs(values: Any, axis: int) -> tuple[Any, Any]:
@@ -291,18 +227,6 @@ def pieces_of(domain: Domain, cell: int) -> SplinePieces:
 
     A node has one coefficient for every connected part of the surface within its sixteen cells, so that both
     sides of a cut are separate and the surface is smooth around the end of a cut.
-
-    Parameters
-    ----------
-    domain : Domain
-        Pixels with a surface and their connections.
-    cell : int
-        Pixels between knots.
-
-    Returns
-    -------
-    SplinePieces
-        Pieces and coefficients.
     """
     height, width = domain.covered.shape
     shape = (-(-height // cell), -(-width // cell))
@@ -324,7 +248,7 @@ def _label_pieces(domain: Domain, cell: int, columns: int) -> tuple[I64, I64]:
     number.ravel()[pixels] = np.arange(len(pixels))
     inside = [
         joined & (np.diff(place, axis=axis) == 0) & _both(domain.covered, axis)
-        for axis, joined in enumerate((domain.down, domain.right))
+        for axis, joined in enumerate(domain.joined)
     ]
     label = _components(number, inside, len(pixels))
     piece = number.copy()
@@ -337,17 +261,14 @@ def _components(number: I64, joined: Sequence[B8], count: int) -> I64:
     start, stop = (
         np.concatenate([_pairs(number, axis)[end][joined[axis]] for axis in (0, 1)]) for end in (0, 1)
     )
-    graph = scipy.sparse.coo_array((np.ones(len(start), dtype=np.int8), (start, stop)), shape=(count, count))
-    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
+    return components(start, stop, count)
 
 
 def _links(piece: I64, domain: Domain, count: int) -> tuple[I64, I64]:
     """Connections of pieces: starts (count + 1,) and numbers."""
-    pairs = [
-        np.stack([piece[:, :-1][domain.right], piece[:, 1:][domain.right]]),
-        np.stack([piece[:-1][domain.down], piece[1:][domain.down]]),
-    ]
-    pair = np.concatenate(pairs, axis=1)
+    pair = np.concatenate(
+        [[part[joined] for part in _pairs(piece, axis)] for axis, joined in enumerate(domain.joined)], axis=1
+    )
     pair = np.concatenate([pair, pair[::-1]], axis=1)
     code = np.unique(pair[0] * count + pair[1])
     start = np.searchsorted(code, np.arange(count + 1) * count)

@@ -14,20 +14,9 @@ from thesisrecon.geometry.raster import weighted_median
 class ViewSurface(NamedTuple):
     """A surface seen by one view.
 
-    Attributes
-    ----------
-    P : ndarray (3, 4)
-        Camera K [R t].
-    depth : ndarray (H, W) float32
-        Nearest depth, inf without a surface.
-    trust : ndarray (H, W) float32
-        Weight of each pixel in 0 .. 1.
-    tolerance : float
-        Relative depth by which visible points may lie behind ``depth``.
-    rgb : ndarray (H, W, 3) uint8
-        Image.
-    gain : ndarray (3,) float32
-        Brightness gain.
+    ``depth`` (H, W): nearest depth, inf without a surface; ``trust`` (H, W): weight of each pixel in 0 .. 1;
+    ``tolerance``: relative depth by which visible points may lie behind ``depth``; ``gain`` (3,): of the
+    brightness.
     """
 
     P: F64
@@ -40,20 +29,9 @@ class ViewSurface(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> None:
-    """Diffuse shares over neighbouring faces by one step.
+    """Diffuse ``spread`` (M, V) over neighbouring faces by one step, among the views with a ``share``.
 
-    Parameters
-    ----------
-    share : ndarray (M, V) float32
-        Initial share of each view, 0 where it does not see the face.
-    neighbours : ndarray (M, 3)
-        Adjacent faces, -1 for none.
-    keep : float
-        Weight of the initial share against the mean of the neighbours.
-    spread : ndarray (M, V) float32
-        Shares before the step.
-    out : ndarray (M, V) float32
-        Receives the shares after the step.
+    ``keep``: weight of the initial share against the mean of the neighbours.
     """
     for m in range(share.shape[0]):
         count = 0
@@ -72,20 +50,10 @@ def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> 
 
 @njit(cache=True, nogil=True)
 def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, color: F32) -> None:
-    """Observe points in one view.
+    """Observe points in one view: weights (pixels per area times trust) and colours times the gain.
 
     A point is visible if it is at most ``view.tolerance`` of its depth behind the farthest of the four pixels
     around.
-
-    Parameters
-    ----------
-    points, normals : ndarray (N, 3)
-        Points and outward normals.
-    view : ViewSurface
-    weight : ndarray (N,) float32
-        Receives pixels per area times trust, 0 if not visible.
-    color : ndarray (N, 3) float32
-        Receives the bilinear colour times the gain.
     """
     P, depth, trust, tolerance, rgb, gain = view
     height, width = depth.shape
@@ -142,21 +110,10 @@ def _sort_weighted(values: F32, weights: F64, order: I64) -> tuple[int, float]:
 
 @njit(cache=True, nogil=True)
 def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
-    """Blend the colours of points.
+    """Blend the colours (V, N, 3) of points; those without positive ``weight`` (V, N) stay in ``out``.
 
     Relative weights are raised to ``power`` and multiplied by 1 / (1 + (d / scatter)^2)^2 with the RMS
     distance d from the weighted median colour.
-
-    Parameters
-    ----------
-    weight : ndarray (V, N) float32
-        Weights, 0 where a view does not show a point.
-    color : ndarray (V, N, 3) float32
-        Colours.
-    power, scatter : float
-        See :class:`~thesisrecon.surface.texture_blending.BlendedTexture`.
-    out : ndarray (N, 3) float32
-        Receives the colours; points that no view shows are unchanged.
     """
     views = weight.shape[0]
     relative = np.empty(views)
@@ -192,15 +149,7 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
 
 @njit(cache=True, nogil=True)
 def grow_colors(texture: U8, drawn: B8) -> None:
-    """Extend the drawn texels by the mean of their neighbours.
-
-    Parameters
-    ----------
-    texture : ndarray (H, W, 3) uint8
-        Texture, updated.
-    drawn : ndarray (H, W) bool
-        Drawn texels, updated.
-    """
+    """Extend the drawn texels by the mean of their neighbours."""
     height, width = drawn.shape
     before = drawn.copy()
     total = np.zeros(3)
@@ -224,18 +173,10 @@ def grow_colors(texture: U8, drawn: B8) -> None:
 
 @njit(cache=True, nogil=True)
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
-    """Extrapolate faces to adjacent empty texels.
+    """Extrapolate faces to adjacent empty texels, as far as their barycentric coordinates allow.
 
-    Parameters
-    ----------
-    corners : ndarray (M, 3, 3)
-        Corners in homogeneous texels.
-    farthest : float
-        Limit of the barycentric coordinates.
-    face : ndarray (H, W)
-        Face of each texel, -1 for none; updated from the left, right, upper or lower neighbour.
-    weights : ndarray (H, W, 2) float32
-        Barycentric coordinates of corners 1 and 2, updated.
+    ``corners`` (M, 3, 3): in homogeneous texels; ``face`` (H, W), -1 for none, and ``weights`` (H, W, 2) of
+    corners 1 and 2 are updated from the left, right, upper or lower neighbour.
     """
     height, width = face.shape
     before = face.copy()
