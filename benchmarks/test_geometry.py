@@ -63,7 +63,7 @@ def test_bundle_adjustment(bench: Bench, method: str, views: int) -> None:
     rng = np.random.default_rng(3)
     walk = make_walk(views, "street", rng)
     cameras, X = walk.start(rng)
-    options = BundleOptions(loss="soft_l1", loss_px=1.0, max_iterations=100, threads=1)
+    options = BundleOptions(loss="soft_l1", loss_px=1.0, max_iterations=100)
 
     def ours() -> object:
         return refine_metric_bundle(cameras, X, walk.seen, free=FOCAL_K1, options=options)

@@ -20,7 +20,6 @@ from thesisrecon.numerics._projective_kernels import (
 )
 from thesisrecon.numerics._reduced_solvers import (
     BandedCholesky,
-    ConjugateGradients,
     DenseCholesky,
     ReducedSystem,
     add_diagonal,
@@ -164,7 +163,7 @@ def _full_jacobian(J, layout):
     return full
 
 
-@pytest.mark.parametrize("solver", ["chosen", "banded", "conjugate"])
+@pytest.mark.parametrize("solver", ["chosen", "banded"])
 @pytest.mark.parametrize("twice", [False, True])
 def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     block = make_block(views=6, points=30, groups=2)
@@ -183,8 +182,6 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     assert isinstance(layout.solver, DenseCholesky)
     if solver == "banded":
         layout = replace(layout, solver=BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
-    if solver == "conjugate":
-        layout = replace(layout, solver=ConjugateGradients(1e-13))
     J = layout.jacobians()
     model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     cost = linearize_metric(model, o.seen, Weighting(1.0, 0, 1.0), own, common, J)
@@ -208,30 +205,13 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     assert gain == pytest.approx(-g @ expected - 0.5 * expected @ H @ expected, rel=1e-5)
 
 
-def test_chunks_and_threads_do_not_change_a_byte(monkeypatch):
+def test_chunks_give_the_sums_of_the_whole(monkeypatch):
     block = make_block(views=6, points=200, groups=1)
-    monkeypatch.setattr(_schur, "CHUNK", 100)
     cameras, X = perturbed(block)
-    fits = [
-        refine_metric_bundle(
-            cameras,
-            X,
-            Observations(block.view, block.point, block.xy),
-            free=np.array([True, False, False, True, True, False]),
-            options=BundleOptions(threads=threads),
-        )
-        for threads in (1, 3)
-    ]
-    assert fits[0].X.tobytes() == fits[1].X.tobytes()
-    assert fits[0].cameras.R.tobytes() == fits[1].cameras.R.tobytes()
-    monkeypatch.setattr(_schur, "CHUNK", 10**6)
-    whole = refine_metric_bundle(
-        cameras,
-        X,
-        Observations(block.view, block.point, block.xy),
-        free=np.array([True, False, False, True, True, False]),
-    )
-    np.testing.assert_allclose(whole.X, fits[0].X, atol=1e-6)
+    seen, free = Observations(block.view, block.point, block.xy), ~np.isin(np.arange(6), [1, 2, 5])
+    whole = refine_metric_bundle(cameras, X, seen, free=free)
+    monkeypatch.setattr(_schur, "CHUNK", 100)
+    np.testing.assert_allclose(refine_metric_bundle(cameras, X, seen, free=free).X, whole.X, atol=1e-6)
 
 
 def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
@@ -253,8 +233,6 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
     add_diagonal(blocks, pair, corner, more)
     full += np.diag(more)
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
-    x = rng.normal(size=11)
-    np.testing.assert_allclose(system.multiply(x), full @ x, rtol=1e-12)
     place = np.array([1, 3, 0, 2])
     band = np.zeros((8, 6))
     fill_band(blocks, row, column, place, band)
@@ -265,9 +243,7 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
             assert band[i, j - i] == moved[j, i]
 
 
-@pytest.mark.parametrize(
-    "solver", [DenseCholesky(), BandedCholesky(np.arange(3), 2), ConjugateGradients()], ids=lambda s: type(s)
-)
+@pytest.mark.parametrize("solver", [DenseCholesky(), BandedCholesky(np.arange(3), 2)], ids=lambda s: type(s))
 @pytest.mark.parametrize("spoiled", ["views", "corner", "rhs"])
 @pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
 def test_every_solver_detects_an_indefinite_system(solver, spoiled, value):
@@ -276,7 +252,8 @@ def test_every_solver_detects_an_indefinite_system(solver, spoiled, value):
     blocks[row == column] = np.eye(2)
     sums = ReducedSums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
     system = ReducedSystem(row, column, sums)
-    np.testing.assert_allclose(system.multiply(solver.solve(system)), 1.0, atol=1e-2)
+    full = np.triu(system.dense()) + np.triu(system.dense(), 1).T
+    np.testing.assert_allclose(full @ solver.solve(system), 1.0)
     what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
     what *= value
     if spoiled != "rhs" or np.isnan(value):
@@ -295,7 +272,7 @@ def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
     every = {(i, j) for i in range(150) for j in range(i, 150)}
     assert chosen(400, near).reach == 7
     assert isinstance(chosen(400, ring), BandedCholesky)
-    assert isinstance(chosen(2000, wild), ConjugateGradients)
+    assert isinstance(chosen(2000, wild), DenseCholesky)
     assert isinstance(chosen(150, every), DenseCholesky)
 
 

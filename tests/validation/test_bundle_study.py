@@ -77,7 +77,7 @@ def test_a_model_is_perturbed_and_taken_several_times():
 @pytest.mark.parametrize("shared", [True, False])
 def test_one_problem_is_reported_with_cost_time_and_steps(shared):
     block = make_block(k1=0.02, points=150)
-    rows = check_same_problem(_model(block, 0.3), Case(1, "squared", True, 1, shared), repeats=2)
+    rows = check_same_problem(_model(block, 0.3), Case(1, "squared", True, shared), repeats=2)
     named = {row.name: row for row in rows}
     assert named["cost over Ceres' - 1"].verdict == "reached"
     assert named["final cost"].values["Ceres"] == pytest.approx(named["final cost"].values["ours"], rel=1e-4)

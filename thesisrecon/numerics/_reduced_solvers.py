@@ -1,13 +1,11 @@
 """Solvers of the reduced camera system, and the choice between them by size and sparsity.
 
-Dense Cholesky serves up to some hundred views. Beyond, a banded Cholesky factor is linear in the views if an
-order keeps neighbours together (corridors, loops, streets); otherwise conjugate gradients are used.
+A banded Cholesky factor is linear in the views if an order keeps neighbours together (corridors, streets).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 import scipy
@@ -17,9 +15,8 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics._elimination import ReducedSums
 from thesisrecon.numerics.levenberg_marquardt import solve_positive
 
-# Cost of an operation relative to dense Cholesky: narrow bands compute slower, products read from memory.
-BAND_COST, PRODUCT_COST = 2.0, 8.0
-TYPICAL_PRODUCTS = 150
+# Cost of an operation relative to dense Cholesky: narrow bands compute slower.
+BAND_COST = 2.0
 SMALL = 600
 
 
@@ -58,25 +55,6 @@ def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None
 
 
 @njit(cache=True, nogil=True)
-def _multiply_blocks(blocks: F64, row: I64, column: I64, x: F64, y: F64) -> None:
-    """Fill y (b, C) = S x for the symmetric S with upper triangle ``blocks``; x (b, C)."""
-    C = blocks.shape[1]
-    y[:] = 0.0
-    for i in range(len(blocks)):
-        r, c, S = row[i], column[i], blocks[i]
-        for a in range(C):
-            total = 0.0
-            for b in range(C):
-                total += S[a, b] * x[c, b]
-            y[r, a] += total
-        if r != c:
-            for a in range(C):
-                left = x[r, a]
-                for b in range(C):
-                    y[c, b] += S[a, b] * left
-
-
-@njit(cache=True, nogil=True)
 def invert_band(L: F64, Z: F64) -> None:
     """Fill the entries inside the band of (L L')^-1 by the recursion of Takahashi (1973); L[j, i - j]."""
     D, width = L.shape
@@ -112,15 +90,6 @@ class ReducedSystem:
         S[:edge, edge:] = self.sums.border.reshape(edge, D - edge)
         S[edge:, edge:] = self.sums.corner
         return S
-
-    def multiply(self, x: F64) -> F64:
-        """Return S x for x (D,)."""
-        s, (b, C, e) = self.sums, self.sums.border.shape
-        border, y = s.border.reshape(b * C, e), np.empty((b, C))
-        _multiply_blocks(s.blocks, self.row, self.column, x[: b * C].reshape(b, C), y)
-        return np.concatenate(
-            [y.ravel() + border @ x[b * C :], border.T @ x[: b * C] + s.corner @ x[b * C :]]
-        )
 
 
 @dataclass(frozen=True)
@@ -212,67 +181,16 @@ class BandedCholesky:
         return _BandedFactor(self.place, factor, s.border, moved, s.corner - flat.T @ moved)
 
 
-@dataclass(frozen=True)
-class ConjugateGradients:
-    """Conjugate gradients with a block Jacobi preconditioner (views' blocks and the corner), from zero.
-
-    Ends after ``max_products`` or a decrease of the residual in the preconditioner's norm by ``tolerance``.
-    """
-
-    tolerance: float = 1e-3
-    max_products: int = 1000
-
-    def solve(self, system: ReducedSystem) -> F64 | None:
-        """Return x (D,), or None if the system is not positive."""
-        s, (b, C, _) = system.sums, system.sums.border.shape
-        own = s.blocks[system.row == system.column]
-        try:
-            # Cholesky rejects blocks that are not positive, whose inverses give no descent.
-            np.linalg.cholesky(own), np.linalg.cholesky(s.corner)
-            inverse, corner = np.linalg.inv(own), np.linalg.inv(s.corner)
-        except np.linalg.LinAlgError:
-            return None
-
-        def precondition(r: F64) -> F64:
-            views = np.einsum("bij,bj->bi", inverse, r[: b * C].reshape(b, C))
-            return np.concatenate([views.ravel(), corner @ r[b * C :]])
-
-        x, r = np.zeros_like(s.rhs), s.rhs.copy()
-        z = precondition(r)
-        p, energy = z, float(r @ z)
-        if not energy >= 0.0:
-            return None
-        enough = self.tolerance**2 * energy
-        for _ in range(self.max_products):
-            if not energy > enough:
-                break
-            product = system.multiply(p)
-            curvature = float(p @ product)
-            if not curvature > 0.0:
-                return None
-            x, r = x + energy / curvature * p, r - energy / curvature * product
-            z = precondition(r)
-            before, energy = energy, float(r @ z)
-            p = z + energy / before * p
-        return x if np.isfinite(x).all() else None
-
-
-ReducedSolver: TypeAlias = DenseCholesky | BandedCholesky | ConjugateGradients
-
-
-def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) -> ReducedSolver:
-    """Choose the solver with the least work for blocks of ``width`` and a border; dense for small systems."""
+def choose_solver(
+    row: I64, column: I64, n_views: int, width: int, border: int
+) -> DenseCholesky | BandedCholesky:
+    """Choose the solver with less work for blocks of ``width`` and a border; dense for small systems."""
     D = float(n_views * width + border)
     if D <= SMALL:
         return DenseCholesky()
     banded = order_views(row, column, n_views)
-    band, products = float((banded.reach + 1) * width), 4.0 * (len(row) * width**2 + D * border)
-    work: list[tuple[float, ReducedSolver]] = [
-        (D**3 / 3.0, DenseCholesky()),
-        (BAND_COST * D * band * (band + 4.0 * (border + 1)), banded),
-        (PRODUCT_COST * TYPICAL_PRODUCTS * products, ConjugateGradients()),
-    ]
-    return min(work, key=lambda choice: choice[0])[1]
+    band = float((banded.reach + 1) * width)
+    return banded if BAND_COST * D * band * (band + 4.0 * (border + 1)) < D**3 / 3.0 else DenseCholesky()
 
 
 def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:

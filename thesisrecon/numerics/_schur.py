@@ -2,17 +2,14 @@
 
 [[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then b = -V^-1 (h
 + W' a). The reduced matrix has a block for every pair of views that observe a common point, and a border for
-common unknowns. Points are eliminated in chunks whose number depends on the problem alone, summed in order:
-the same bytes for any number of threads.
+common unknowns. Points are eliminated in chunks: the sum of their sums loses fewer digits than one long sum.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -23,15 +20,18 @@ from thesisrecon.numerics._elimination import (
     ReducedSums,
     eliminate_points,
     mark_pairs,
-    revert_crossing_points,
     substitute_points,
 )
 from thesisrecon.numerics._observations import Jacobians, SortedObservations
-from thesisrecon.numerics._reduced_solvers import ReducedSolver, ReducedSystem, add_diagonal, choose_solver
+from thesisrecon.numerics._reduced_solvers import (
+    BandedCholesky,
+    DenseCholesky,
+    ReducedSystem,
+    add_diagonal,
+    choose_solver,
+)
 from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
 from thesisrecon.numerics.observations import Observations
-
-Result = TypeVar("Result")
 
 CHUNK = 16384
 # Every chunk has its own sums: few chunks if these are large.
@@ -53,44 +53,21 @@ class BundleLayout:
     row: I64
     column: I64
     chunks: tuple[tuple[int, int], ...]
-    solver: ReducedSolver
-    threads: int
+    solver: DenseCholesky | BandedCholesky
 
     @property
     def size(self) -> int:
         """Number of camera unknowns D."""
         return len(self.index.pair) * self.width + self.border
 
-    def over_chunks(self, work: Callable[[int, int], Result]) -> list[Result]:
-        """Return the results of work(first, last + 1) for every range of points, in order."""
-        if self.threads == 1 or len(self.chunks) == 1:
-            return [work(*chunk) for chunk in self.chunks]
-        with ThreadPoolExecutor(self.threads) as pool:
-            return list(pool.map(lambda chunk: work(*chunk), self.chunks))
-
     def sum_over_observations(self, work: Callable[[slice, Observations], float]) -> float:
         """Return the sum of work(rows, observations) over the observations of every range of points."""
-        start, seen = self.observations.start, self.observations.seen
-
-        def run(first: int, last: int) -> float:
+        start, seen, total = self.observations.start, self.observations.seen, 0.0
+        for first, last in self.chunks:
             rows = slice(start[first], start[last])
             part = Observations(seen.view_index[rows], seen.point_index[rows], seen.xy[rows])
-            return float(work(rows, part))
-
-        return sum(self.over_chunks(run))
-
-    def revert_cheirality_violations(self, before: F64, after: F64, X_before: F64, X_after: F64) -> None:
-        """Undo the steps of points that cross the focal plane of a view that observes them, in place.
-
-        ``before`` and ``after`` are the third rows (V, 4) of the cameras; points are (N, 3) or (N, 4).
-        """
-        start, view = self.observations.start, self.observations.seen.view_index
-
-        def work(first: int, last: int) -> None:
-            rows = start[first : last + 1]
-            revert_crossing_points(rows, view, before, after, X_before[first:last], X_after[first:last])
-
-        self.over_chunks(work)
+            total += float(work(rows, part))
+        return total
 
     def jacobians(self) -> Jacobians:
         """Allocate the buffers of one linearisation."""
@@ -104,7 +81,7 @@ class BundleLayout:
 
 
 def build_layout(
-    observations: SortedObservations, block: I64, *, width: int, common: I64, border: int, threads: int = 1
+    observations: SortedObservations, block: I64, *, width: int, common: I64, border: int
 ) -> BundleLayout:
     """Find the pairs of views with common points, divide the points into chunks and choose a solver.
 
@@ -123,7 +100,7 @@ def build_layout(
     chunks = tuple(itertools.pairwise([0, *bounds.tolist(), len(start) - 1]))
     index = BlockIndex(start, seen.view_index, block, pair, np.ascontiguousarray(common))
     solver = choose_solver(row, column, n, width, border)
-    return BundleLayout(observations, index, width, border, row, column, chunks, solver, threads)
+    return BundleLayout(observations, index, width, border, row, column, chunks, solver)
 
 
 @dataclass(frozen=True)
@@ -160,14 +137,12 @@ class BundleSystem:
         """Eliminate the points; return the damped system, sums of the points, and the damping terms (D,)."""
         N, layout = len(self.layout.observations.start) - 1, self.layout
         points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
-
-        def eliminate(first: int, last: int) -> ReducedSums:
-            sums = layout.sums()
-            eliminate_points(first, last, damping, self.jacobians, layout.index, sums, points)
-            return sums
-
-        total, *rest = layout.over_chunks(eliminate)
-        for part in rest:
+        parts = []
+        for first, last in layout.chunks:
+            parts.append(layout.sums())
+            eliminate_points(first, last, damping, self.jacobians, layout.index, parts[-1], points)
+        total = parts[0]
+        for part in parts[1:]:
             for into, values in zip(total, part, strict=True):
                 into += values
         pair = layout.index.pair
@@ -185,11 +160,7 @@ class BundleSystem:
         if cameras is None:
             return None
         moves = np.zeros_like(points.gradient)
-
-        def substitute(first: int, last: int) -> None:
-            substitute_points(first, last, cameras, self.jacobians, self.layout.index, points, moves)
-
-        self.layout.over_chunks(substitute)
+        substitute_points(0, len(moves), cameras, self.jacobians, self.layout.index, points, moves)
         if not np.isfinite(moves).all():
             return None
         stiff = float(damped @ cameras**2) + damping * float(np.vdot(points.diagonal, moves**2))

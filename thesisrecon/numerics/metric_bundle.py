@@ -15,7 +15,7 @@ from thesisrecon.numerics._covariance import (
     bundle_covariances,
     robust_sigma,
 )
-from thesisrecon.numerics._elimination import sum_leverages
+from thesisrecon.numerics._elimination import revert_crossing_points, sum_leverages
 from thesisrecon.numerics._intrinsic_unknowns import (
     IntrinsicColumns,
     IntrinsicUnknowns,
@@ -59,8 +59,6 @@ class BundleOptions:
         Poses that must not move.
     covariance, noise_floor_px : bool, float
         Whether to compute covariances (one more linear system), and the least noise assumed for them.
-    threads : int
-        Worker threads; the result does not depend on them.
     """
 
     sigma_px: float = 1.0
@@ -70,16 +68,11 @@ class BundleOptions:
     fixed_views: B8 | None = field(default=None, compare=False)
     covariance: bool = False
     noise_floor_px: float = 0.0
-    threads: int = 1
 
     def __post_init__(self) -> None:
         loss_code(self.loss, self.loss_px)
         if not self.sigma_px > 0.0:
             raise ValueError(f"sigma_px must be positive; got {self.sigma_px}")
-        if self.threads < 1 or self.max_iterations < 0:
-            raise ValueError(
-                f"a bundle needs a thread and iterations >= 0; got {self.threads}, {self.max_iterations}"
-            )
 
 
 @dataclass(frozen=True)
@@ -173,7 +166,8 @@ class _MetricProblem:
         values = self.values.step(state.values, step.cameras[self.columns.place])
         X = m.X + step.points
         before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
-        layout.revert_cheirality_violations(before, after, m.X, X)
+        o = layout.observations
+        revert_crossing_points(o.start, o.seen.view_index, before, after, m.X, X)
         return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
 
     def cost(self, state: _State) -> float:
@@ -313,9 +307,8 @@ def _metric_problem(
     free_views = observed & ~fixed.astype(bool)
     columns = assign_columns(values, group, np.flatnonzero(free), observed, free_views)
     layout = build_layout(
-        o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border,
-        threads=options.threads,
-    )  # fmt: skip
+        o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border
+    )
     code, delta = loss_code(options.loss, options.loss_px), options.loss_px / options.sigma_px
     weighting = Weighting(options.sigma_px, code, delta)
     return _MetricProblem(layout, columns, free_views, values, weighting, layout.jacobians()), start, table

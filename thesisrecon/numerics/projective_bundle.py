@@ -11,6 +11,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import pixel_conditioning, require_shapes, whitening_transform
+from thesisrecon.numerics._elimination import revert_crossing_points
 from thesisrecon.numerics._observations import Jacobians, SortedObservations, Weighting, sort_observations
 from thesisrecon.numerics._projective_kernels import (
     UnitState,
@@ -69,7 +70,8 @@ class _ProjectiveProblem:
         P, X = np.empty_like(state.P), np.empty_like(state.X)
         tangent_step(state.P, state.vP, state.bP, views, P)
         tangent_step(state.X, state.vX, state.bX, step.points, X)
-        self.layout.revert_cheirality_violations(state.P[:, 8:], P[:, 8:], state.X, X)
+        o = self.layout.observations
+        revert_crossing_points(o.start, o.seen.view_index, state.P[:, 8:], P[:, 8:], state.X, X)
         return UnitState.at(P, X)
 
     def cost(self, state: UnitState) -> float:

@@ -51,22 +51,19 @@ class Case:
     """One problem.
 
     ``copies``: how often each point is repeated; ``loss``: name of the loss; ``centre``: whether the
-    principal point is free; ``threads``: number of threads; ``shared``: one camera for all images, or one
-    for each.
+    principal point is free; ``shared``: one camera for all images, or one for each.
     """
 
     copies: int
     loss: LossName
     centre: bool
-    threads: int
     shared: bool
 
     def title(self, observations: int) -> str:
         """Describe the problem."""
         point = f"principal point {'free' if self.centre else 'fixed'}"
         cameras = "one camera" if self.shared else "a camera each"
-        threads = f"{self.threads} thread{'s' * (self.threads > 1)}"
-        return f"{2 * observations} residuals, {self.loss}, {cameras}, {point}, {threads}"
+        return f"{2 * observations} residuals, {self.loss}, {cameras}, {point}"
 
 
 def model_as_bundle(model: Reconstruction) -> tuple[MetricCameras, F64, Observations]:
@@ -121,16 +118,10 @@ def timed_often(work: Callable[[], tuple[Any, float, float]]) -> tuple[Any, floa
 
 
 def ours(
-    cameras: MetricCameras,
-    X: F64,
-    seen: Observations,
-    free: B8,
-    *,
-    loss: LossName = "squared",
-    threads: int = 1,
+    cameras: MetricCameras, X: F64, seen: Observations, free: B8, *, loss: LossName = "squared"
 ) -> MetricBundleResult:
     """Run our bundle adjustment to convergence."""
-    options = BundleOptions(loss=loss, loss_px=LOSS_PX, max_iterations=200, threads=threads)
+    options = BundleOptions(loss=loss, loss_px=LOSS_PX, max_iterations=200)
     return refine_metric_bundle(cameras, X, seen, free=free, options=options)
 
 
@@ -139,12 +130,12 @@ def check_same_problem(model: Reconstruction, case: Case, *, repeats: int) -> li
     rng = np.random.default_rng(0)
     cameras, X, seen = perturbed_model(model, rng, copies=case.copies, shared=case.shared)
     size = (int(model.sizes[0][0]), int(model.sizes[0][1]))
-    options = CeresOptions(case.loss, LOSS_PX, case.centre, case.threads)
+    options = CeresOptions(case.loss, LOSS_PX, case.centre)
     times: dict[str, list[tuple[float, float]]] = {OURS: [], CERES: []}
 
     def once() -> MetricBundleResult:
         free = WITH_CENTRE if case.centre else FOCAL_K1
-        return ours(cameras, X, seen, free, loss=case.loss, threads=case.threads)
+        return ours(cameras, X, seen, free, loss=case.loss)
 
     once()
     for _ in range(repeats):
@@ -306,7 +297,6 @@ def bundle_study(
     model: Path | None = None,
     repeats: int = 5,
     trials: int = 200,
-    threads: Sequence[int] = (1, 2),
     losses: Sequence[LossName] = tuple(LOSSES),
     cameras: Sequence[Literal["shared", "per-image"]] = ("shared", "per-image"),
     copies: Sequence[int] = (1, 2),
@@ -330,8 +320,8 @@ def bundle_study(
     if "same" in parts:
         final = final_model(model, out)
         shared = [kind == "shared" for kind in cameras]
-        for many, n, one, centre, loss in itertools.product(copies, threads, shared, (False, True), losses):
-            yield check_same_problem(final, Case(many, loss, centre, n, one), repeats=repeats)
+        for many, one, centre, loss in itertools.product(copies, shared, (False, True), losses):
+            yield check_same_problem(final, Case(many, loss, centre, one), repeats=repeats)
     if "covariance" in parts:
         yield check_covariance(trials)
     if "growth" in parts:

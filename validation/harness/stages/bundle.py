@@ -137,7 +137,7 @@ def _adjust(
     if method == CERES:
         result = refine_with_ceres(cameras, X, seen, size, CeresOptions("soft_l1", LOSS_PX))
         return result.cameras, result.X, result.cpu_s
-    options = BundleOptions(loss="soft_l1", loss_px=LOSS_PX, max_iterations=200, threads=1)
+    options = BundleOptions(loss="soft_l1", loss_px=LOSS_PX, max_iterations=200)
     for _ in range(2):
         start = time.process_time()
         fit = refine_metric_bundle(cameras, X, seen, free=FOCAL_K1, options=options)
