@@ -18,7 +18,7 @@ from thesisrecon.numerics.noise import MAD_FACTOR, noise_from_distances
 from thesisrecon.numerics.partial_bundle import refine_pose
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 
-OWN = np.array([True, True, False, False, False, False])
+OWN = 2
 """Intrinsics that each view estimates from its own points: focal and aspect."""
 MAX_OBSERVATIONS = 1500
 MIN_OBSERVATIONS = 30
@@ -158,8 +158,7 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
     seen, _ = reproject_observations(cameras, model.X, t.view_index[index], t.point_index[index])
     noise = max(noise_from_distances(np.linalg.norm(seen - xy, axis=1)), 1e-3)
     intrinsics = cameras.intrinsics[cameras.group[view]]
-    free = np.zeros(len(intrinsics), dtype=bool)
-    free[: len(OWN)] = OWN
+    free = np.arange(len(intrinsics)) < OWN
     try:
         fit = refine_pose(
             cameras.R[view], cameras.t[view], intrinsics, X, xy, free=free, loss_px=2.0 * noise, iterations=10
@@ -213,22 +212,18 @@ def _whole(
     near = triangulable_observations(model)
     before = calibration.K[views, 0, 0]
     both = before > 0
+    focal_std = [intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views]
+    agree, noise = inlier_mask(model, sigmas=sigmas), residual_norms(model)
+    shift = np.linalg.norm(rows[:, 3:5] - (model.sizes[views] - 1) / 2, axis=1) / longest
+    change = np.abs(np.log(rows[both, 0] / before[both]))
     return {
         "focal_min_long_sides": float((rows[:, 0] / longest).min()),
         "focal_max_long_sides": float((rows[:, 0] / longest).max()),
-        "focal_std_rel_max": max(
-            intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views
-        ),
-        "explained_share": float(inlier_mask(model, sigmas=sigmas)[near].mean()) if near.any() else 0.0,
-        "sigma_rel": float(noise_from_distances(residual_norms(model)) / np.median(longest))
-        if model.inlier.any()
-        else np.inf,
-        "principal_shift_max_long_sides": float(
-            (np.linalg.norm(rows[:, 3:5] - (model.sizes[views] - 1) / 2, axis=1) / longest).max()
-        ),
-        "focal_change_since_calibration": float(np.abs(np.log(rows[both, 0] / before[both])).max())
-        if both.any()
-        else 0.0,
+        "focal_std_rel_max": max(focal_std),
+        "explained_share": float(agree[near].mean()) if near.any() else 0.0,
+        "sigma_rel": float(noise_from_distances(noise) / np.median(longest)) if len(noise) else np.inf,
+        "principal_shift_max_long_sides": float(shift.max()),
+        "focal_change_since_calibration": float(change.max()) if both.any() else 0.0,
     }
 
 

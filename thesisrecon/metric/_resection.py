@@ -61,57 +61,6 @@ def _squared(R: F64, t: F64, X: F64, xy: F64) -> F64:
     return np.where((Y[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
 
 
-def _register_missing_cameras(
-    model: MetricEstimate, *, sigmas: float, min_points: int, rng: np.random.Generator, allowed: B8
-) -> tuple[MetricEstimate, dict[int, str]]:
-    """Register every view that sees enough of the model by calibrated resection."""
-    t = model.tracks
-    counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
-    rejected: dict[int, str] = {}
-    for view in np.argsort(-counts, kind="stable"):
-        if model.registered[view] or not allowed[view]:
-            continue
-        if counts[view] < min_points:
-            rejected[int(view)] = (
-                f"sees only {counted(counts[view], 'point')} of the model (at least {min_points} needed): "
-                "too little overlap"
-            )
-            continue
-        added = _register(model, int(view), sigmas, rng, min_points)
-        if isinstance(added, str):
-            rejected[int(view)] = added
-        else:
-            model = added
-    return model, rejected
-
-
-def _register(
-    model: MetricEstimate, view: int, sigmas: float, rng: np.random.Generator, min_points: int
-) -> MetricEstimate | str:
-    t, cameras = model.tracks, model.cameras
-    k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
-    row = int(cameras.group[view])
-    assert cameras.shared is not None
-    focals = cameras.shared[:, 0]
-    alone = not model.registered[focals[cameras.group] == focals[row]].any()
-    zooms = ZOOMS if alone else (1.0,)
-    found = _pose_and_focal(model, k, row, 2.0 * sigmas * model.gate_px, zooms, rng)
-    support = 0 if found is None else int(found[3].sum())
-    if found is None or support < min_points or support < 0.3 * len(k):
-        return f"only {support} of its {counted(len(k), 'point')} are inliers of one camera"
-    R, translation, start, inlier = found
-    pose = refine_pose(
-        R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
-        free=(np.arange(len(start)) == 0) & alone, loss_px=2.0 * model.sigma_px, iterations=20,
-    )  # fmt: skip
-    Rs, ts, intrinsics = cameras.R.copy(), cameras.t.copy(), cameras.intrinsics.copy()
-    Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
-    registered = model.registered.copy()
-    registered[view] = True
-    cameras = replace(cameras, R=Rs, t=ts, intrinsics=intrinsics)
-    return replace(model, cameras=cameras, registered=registered)
-
-
 def _pose_and_focal(
     model: MetricEstimate,
     k: I64,
@@ -171,9 +120,7 @@ class MissingCameraRegistration:
         share = 0.0
         for n in range(MAX_ROUNDS):
             before = int(model.registered.sum())
-            model, rejected = _register_missing_cameras(
-                model, sigmas=early, min_points=self.min_points, rng=rng, allowed=allowed
-            )
+            model, rejected = self._register_missing(model, rng, allowed)
             joined = int(model.registered.sum()) > before
             if joined:
                 model = retriangulate_tracks(model, sigmas=early, min_angle=self.min_angle)
@@ -186,16 +133,61 @@ class MissingCameraRegistration:
             share = now
         return model, rejected
 
+    def _register_missing(
+        self, model: MetricEstimate, rng: np.random.Generator, allowed: B8
+    ) -> tuple[MetricEstimate, dict[int, str]]:
+        """Register every ``allowed`` view that sees enough of the model by calibrated resection."""
+        t = model.tracks
+        counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
+        rejected: dict[int, str] = {}
+        for view in np.argsort(-counts, kind="stable").tolist():
+            if model.registered[view] or not allowed[view]:
+                continue
+            if counts[view] < self.min_points:
+                rejected[view] = (
+                    f"sees only {counted(counts[view], 'point')} of the model (at least {self.min_points} "
+                    "needed): too little overlap"
+                )
+                continue
+            added = self._register(model, view, rng)
+            if isinstance(added, str):
+                rejected[view] = added
+            else:
+                model = added
+        return model, rejected
+
+    def _register(self, model: MetricEstimate, view: int, rng: np.random.Generator) -> MetricEstimate | str:
+        """Add a camera to the model; otherwise the reason against it."""
+        t, cameras = model.tracks, model.cameras
+        k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
+        row = int(cameras.group[view])
+        assert cameras.shared is not None
+        focals = cameras.shared[:, 0]
+        alone = not model.registered[focals[cameras.group] == focals[row]].any()
+        zooms = ZOOMS if alone else (1.0,)
+        found = _pose_and_focal(model, k, row, 2.0 * self.gates[0] * model.gate_px, zooms, rng)
+        support = 0 if found is None else int(found[3].sum())
+        if found is None or support < self.min_points or support < 0.3 * len(k):
+            return f"only {support} of its {counted(len(k), 'point')} are inliers of one camera"
+        R, translation, start, inlier = found
+        pose = refine_pose(
+            R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
+            free=(np.arange(len(start)) == 0) & alone, loss_px=2.0 * model.sigma_px, iterations=20,
+        )  # fmt: skip
+        Rs, ts, intrinsics = cameras.R.copy(), cameras.t.copy(), cameras.intrinsics.copy()
+        Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
+        registered = model.registered | (np.arange(len(Rs)) == view)
+        return replace(
+            model, cameras=replace(cameras, R=Rs, t=ts, intrinsics=intrinsics), registered=registered
+        )
+
     def _register_again(
         self, model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, suspects: B8
     ) -> tuple[MetricEstimate, dict[int, str]]:
         """Remove suspects, adjust the rest without them, then register them again if they fit."""
         none = np.zeros(len(suspects), dtype=bool)
-        model = replace(
-            model,
-            registered=model.registered & ~suspects,
-            inlier=model.inlier & ~suspects[model.tracks.view_index],
-        )
+        inlier = model.inlier & ~suspects[model.tracks.view_index]
+        model = replace(model, registered=model.registered & ~suspects, inlier=inlier)
         model, _ = self._grow(model, adjustment, rng, none)
         model, rejected = self._grow(model, adjustment, rng, ~none)
         share = inlier_ratios(model)

@@ -144,9 +144,8 @@ def estimate_spread(value: F64, std: F64, total: F64) -> float:
     """
     if len(value) < 2:
         return np.inf
-    taus = np.concatenate(
-        [[0.0], np.geomspace(1e-2 * float(total.min()), 10.0 * float(np.ptp(value)) + 1e-9, 200)]
-    )
+    low, high = 1e-2 * float(total.min()), 10.0 * float(np.ptp(value)) + 1e-9
+    taus = np.concatenate([[0.0], np.geomspace(low, high, 200)])
     variance = taus[:, None] ** 2 + total**2
     weight = 1.0 / variance
     mean = (weight @ value) / weight.sum(axis=1)
@@ -187,13 +186,14 @@ class FocalShrinkage:
 
     def warnings(self, registered: Sequence[int], least: float) -> tuple[str, ...]:
         """A sentence for each view whose matches determine its focal worse than ``least`` (relative)."""
+        others = np.where(
+            self.weight < 0.5,
+            "; the stated value rests on the other cameras",
+            ", and no other camera of its kind constrains it",
+        )
         return tuple(
             f"Image #{view}: its own matches determine the focal length only to {self.own_std[view]:.0%} "
-            + (
-                "(1 sigma); the stated value rests on the other cameras"
-                if self.weight[view] < 0.5
-                else "(1 sigma), and no other camera of its kind constrains it"
-            )
+            f"(1 sigma){others[view]}"
             for view in registered
             if self.own_std[view] > least
         )
@@ -275,8 +275,7 @@ def widen_unverified_focals(
     for own, rel in zip(intervals, focal_std, strict=True):
         focal = own.get("focal_px")
         if focal is not None and np.isfinite(rel) and rel * focal.value > focal.std:
-            wide = IntrinsicInterval(focal.value, rel * focal.value, UNVERIFIED_SHARING)
-            own = {**own, "focal_px": wide}
+            own = {**own, "focal_px": IntrinsicInterval(focal.value, rel * focal.value, UNVERIFIED_SHARING)}
         answer.append(own)
     return tuple(answer)
 
