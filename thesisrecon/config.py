@@ -657,8 +657,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
             # This matcher also assigns disparities to textureless regions, with low confidence.
             pairs=PairMatching(matcher=MaximumLikelihoodScanline(), min_confidence=0.25),
             linker=SequenceLinking(),
-            refinement=None,
-            completion=False,
+            refinement=False,
         ),
         # "By fitting parametric surfaces through the points ... sampled in a fine scale triangular pattern".
         model=SurfaceModel(surface=BSplineSurface(), fusion=DepthSheets()),
@@ -679,12 +678,6 @@ def preset(name: Any) -> PipelineConfig:
     Returns
     -------
     PipelineConfig
-
-    Examples
-    --------
-    >>> from thesisrecon.config import preset
-    >>> type(preset("thesis").features).__name__
-    'HarrisCorners'
     """
     if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(unknown_word("preset", name, PRESETS))

@@ -99,11 +99,6 @@ def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
     Returns
     -------
     str
-
-    Examples
-    --------
-    >>> unknown_word("preset", "tesis", ["default", "thesis"])
-    "unknown preset 'tesis'; did you mean thesis?"
     """
     known = list(known)
     near = difflib.get_close_matches(word, known, n=3, cutoff=0.6) if isinstance(word, str) else []

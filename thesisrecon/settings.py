@@ -56,12 +56,6 @@ def config_from_toml(
     ------
     UsageError
         For invalid TOML, unknown stages, kinds or settings, and values of the wrong type.
-
-    Examples
-    --------
-    >>> from thesisrecon.settings import config_from_toml
-    >>> config_from_toml("[images]\\nmax_size_px = 800").images.max_size_px
-    800
     """
     try:
         tables = tomllib.loads(text)
@@ -160,12 +154,6 @@ def tables_from_settings(settings: Sequence[str]) -> Table:
     ------
     UsageError
         If a text has another form.
-
-    Examples
-    --------
-    >>> from thesisrecon.settings import tables_from_settings
-    >>> tables_from_settings(["features.kind=harris-corners", "images.max_size_px=800"])
-    {'features': {'kind': 'harris-corners'}, 'images': {'max_size_px': 800}}
     """
     tables: Table = {}
     for setting in settings:
@@ -194,11 +182,6 @@ def parse_word(text: str) -> Any:
     Returns
     -------
     bool, int, float, list or str
-
-    Examples
-    --------
-    >>> parse_word("[1, 2.5, none]"), parse_word("true")
-    ([1, 2.5, 'none'], True)
     """
     text = text.strip()
     if text.startswith("[") and text.endswith("]"):

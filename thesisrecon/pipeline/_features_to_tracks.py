@@ -11,7 +11,7 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, cache_friendly_order
+from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs
 from thesisrecon.pipeline.image_pair import detect_features, match_views
 from thesisrecon.records import Features, Image, PairChoice, TwoView
 from thesisrecon.runtime._run_state import Batch
@@ -26,24 +26,17 @@ def find_features(state: PipelineState) -> None:
     """Detect the features of all images (4.2.1); sets ``result.features``."""
     run, images = state.run, state.result.images
     variant = run.variant_key("features")
-    keys = {
-        f"{i:05d}": run.key("features", variant, image.digest) for i, image in enumerate(state.inputs.decoded)
-    }
+    digests = enumerate(image.digest for image in state.inputs.decoded)
+    keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
     features = run.map_cached(
         "features", keys, _detect_all, lambda missing: (([i], (state.config, [images[i]])) for i in missing)
     )
     state.result = replace(state.result, features=tuple(features))
-    counts = [len(f.xy) for f in features]
-    poor = [
-        f"{image.name} has only {counted(n, 'corner')}"
-        for image, n in zip(images, counts, strict=True)
-        if n < MIN_CORNERS
-    ]
-    run.finish(
-        "features",
-        counts={"images": len(images), "corners": sum(counts), "fewest_in_one_image": min(counts)},
-        warnings=poor,
-    )
+    found = [len(f.xy) for f in features]
+    few = [(image, n) for image, n in zip(images, found, strict=True) if n < MIN_CORNERS]
+    poor = [f"{image.name} has only {counted(n, 'corner')}" for image, n in few]
+    counts = {"images": len(images), "corners": sum(found), "fewest_in_one_image": min(found)}
+    run.finish("features", counts=counts, warnings=poor)
 
 
 def _detect_all(config: PipelineConfig, images: Sequence[Image]) -> list[Features]:
@@ -59,13 +52,9 @@ def select_pairs(state: PipelineState) -> None:
     names = [image.name for image in images]
     key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
     run.progress("pairs", 0, 1)
+    select, map_all, rng = state.config.pairs.select, run.workers.map_all, stream(run.seed, "pairs")
     choice: PairChoice = run.cached(
-        "pairs",
-        "choice",
-        key,
-        lambda: state.config.pairs.select(
-            names, features, map_all=run.workers.map_all, rng=stream(run.seed, "pairs")
-        ),
+        "pairs", "choice", key, lambda: select(names, features, map_all=map_all, rng=rng)
     )
     state.result = replace(state.result, pair_choice=choice)
     possible = len(images) * (len(images) - 1) // 2
@@ -81,23 +70,14 @@ def match_pairs(state: PipelineState) -> None:
     pairs = [(int(i), int(j)) for i, j in result.pair_choice.pairs]
     variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
     features = list(run.logs["features"].keys.values())
-    keys = {
-        f"{i:05d}-{j:05d}": run.key("matches", variants, features[i], features[j], run.seed, i, j)
-        for i, j in pairs
-    }
+    inputs = {(i, j): (features[i], features[j], run.seed, i, j) for i, j in pairs}
+    keys = {f"{i:05d}-{j:05d}": run.key("matches", variants, *inputs[i, j]) for i, j in pairs}
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
-        views = _prepared(state)
-        if run.workers.in_process:
-            groups = [[n] for n in cache_friendly_order(pairs, missing)]
-        else:
-            groups = batch_pairs(pairs, missing, run.workers.parallel())
-        for numbers in groups:
+        views, shared = _prepared(state), run.workers.in_process
+        for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel()):
             some = [pairs[n] for n in numbers]
-            if run.workers.in_process:
-                given = views
-            else:
-                given = views.subset({view for pair in some for view in pair})
+            given = views if shared else views.subset({view for pair in some for view in pair})
             yield numbers, (state.config, given, some, run.seed)
 
     two_views: list[TwoView] = run.map_cached("matches", keys, _match_all, batches)
@@ -116,10 +96,8 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
         return []
     kinds = Counter(pair.configuration for pair in undetermined)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
-    return [
-        f"The epipolar geometry of {len(undetermined)} of {len(accepted)} accepted pairs is degenerate "
-        f"({listed})"
-    ]
+    of_all = f"{len(undetermined)} of {len(accepted)} accepted pairs"
+    return [f"The epipolar geometry of {of_all} is degenerate ({listed})"]
 
 
 def _prepared(state: PipelineState) -> PreparedViews:
@@ -142,12 +120,10 @@ def build_tracks(state: PipelineState) -> None:
     accepted = [pair for pair in result.pairs if pair.accepted]
     if not accepted:
         best = max(result.pairs, key=lambda pair: pair.inliers)
-        raise StageFailure(
-            "no two images could be matched",
-            f"the best of {counted(len(result.pairs), 'pair')} has "
-            f"{counted(best.inliers, 'verified match')}: {best.reason}",
-            "add images with more overlap, all of one textured scene",
-        )
+        tried, verified = counted(len(result.pairs), "pair"), counted(best.inliers, "verified match")
+        evidence = f"the best of {tried} has {verified}: {best.reason}"
+        advice = "add images with more overlap, all of one textured scene"
+        raise StageFailure("no two images could be matched", evidence, advice)
     key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
     tracks = run.cached(
         "tracks",

@@ -35,26 +35,21 @@ DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 150_000, 2048 * 2048
 SUMMARY, PAGE = "summary.json", "report.html"
 COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
-MODEL_FILES = (
-    *COLMAP_FILES,
-    *("points.ply", "affine.ply", "cameras.json", "model.glb"),
-)
+MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", "model.glb")
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 MAX_AFFINE = 1e3
 """Largest affine coordinate written to affine.ply, in standard deviations of the points."""
 
 
-def _affine_stratum(result: RunResult) -> Reconstruction | None:
+def _affine_stratum(result: RunResult) -> Reconstruction:
     """The projective reconstruction upgraded by the plane at infinity of self-calibration."""
-    if result.projective is None or result.calibration is None:
-        return None
+    assert result.projective is not None
+    assert result.calibration is not None
     return upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
 
 
-def write_affine(path: Path, affine: Reconstruction | None, colors: U8) -> None:
+def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
     """Write the affine points within ``MAX_AFFINE`` and the camera centres (red) as a PLY file."""
-    if affine is None:
-        return
     X = affine.X[:, :3]
     near = affine.valid & (np.abs(X) < MAX_AFFINE).all(axis=1)
     centres = affine_camera_centres(affine)
@@ -119,12 +114,13 @@ def _described(run: Run, result: RunResult, until: str, failure: StageFailure | 
 
 
 def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
-    out, colors = run.directory.path, None
+    out, colors, affine = run.directory.path, None, None
     with run.clock("outputs"):
         if result.metric is not None:
             colors = point_colors(result.metric.reconstruction, result.images)
             run.warnings.extend(_write_model(run.directory, result, result.metric.reconstruction, colors))
-            write_affine(out / "affine.ply", _affine_stratum(result), colors)
+            affine = _affine_stratum(result)
+            write_affine(out / "affine.ply", affine, colors)
             if result.mesh is not None:
                 write_mesh(out / "model.glb", result.mesh)
             else:
@@ -132,13 +128,32 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         else:
             run.directory.remove(MODEL_FILES)
         result = _described(run, result, until, failure)
-        write_text(out / "config.toml", toml_from_config(run.config))
-        page = _report_data(run, result, colors, failure)
-        write_text(out / PAGE, render_report(replace(page, until=None if until == "model" else until)))
+        config = toml_from_config(run.config)
+        write_text(out / "config.toml", config)
+        page = ReportData(
+            title=run.title,
+            images=result.images,
+            reports=result.reports,
+            config_text=config,
+            summary=result.summary,
+            version=__version__,
+            unread=result.unread,
+            pairs=result.pairs,
+            pair_choice=result.pair_choice,
+            reconstruction=result.projective,
+            metric=result.metric,
+            colors=colors,
+            affine=affine,
+            model=_model_for_page(run, result),
+            held_out=result.held_out,
+            depth_maps={m.view: _thinned(m.depth) for m in result.depth_maps},
+            until=None if until == "model" else until,
+            failure=failure,
+        )
+        write_text(out / PAGE, render_report(page))
     run.finish("outputs", counts={})
-    result = replace(
-        result, reports=tuple(run.reports.values()), summary={**result.summary, **_run_facts(run, until)}
-    )
+    summary = {**result.summary, **_run_facts(run, until)}
+    result = replace(result, reports=tuple(run.reports.values()), summary=summary)
     write_json(out / SUMMARY, result.summary)
     return result
 
@@ -171,14 +186,11 @@ def _write_model(
             f"{counted(int(reconstruction.registered.sum()), 'camera')} have skew; see cameras.json"
         )
     else:
-        model = colmap_from_reconstruction(
-            reconstruction,
-            [image.name for image in result.images],
-            colors=colors,
-            groups=result.groups,
-            scales=np.array([1 / image.scale for image in result.images]),
-            original_sizes=np.array([image.original_size for image in result.images]),
+        names, scales, sizes = zip(
+            *((i.name, 1 / i.scale, i.original_size) for i in result.images), strict=True
         )
+        frame = {"groups": result.groups, "scales": np.array(scales), "original_sizes": np.array(sizes)}
+        model = colmap_from_reconstruction(reconstruction, names, colors=colors, **frame)
         write_colmap_model(directory.path / "sparse" / "0", model)
     X = reconstruction.X[reconstruction.valid]
     write_point_cloud(directory.path / "points.ply", X[:, :3] / X[:, 3:], colors[reconstruction.valid])
@@ -189,6 +201,7 @@ def _write_model(
 def _run_facts(run: Run, until: str) -> dict[str, Any]:
     """Summary entries about the run itself."""
     seconds = {stage: round(report.seconds, 3) for stage, report in run.reports.items()}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "version": __version__,
         "seed": run.seed,
@@ -198,35 +211,8 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
         "elapsed_seconds": round(run.elapsed_s, 3),
         "resumed": list(run.resumed),
-        "peak_memory_mb": round(_peak_memory_mb(), 1),
+        "peak_memory_mb": round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1),
     }
-
-
-def _peak_memory_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
-
-
-def _report_data(run: Run, result: RunResult, colors: U8 | None, failure: StageFailure | None) -> ReportData:
-    return ReportData(
-        title=run.title,
-        images=result.images,
-        reports=result.reports,
-        config_text=toml_from_config(run.config),
-        summary=result.summary,
-        version=__version__,
-        unread=result.unread,
-        pairs=result.pairs,
-        pair_choice=result.pair_choice,
-        reconstruction=result.projective,
-        metric=result.metric,
-        colors=colors,
-        affine=_affine_stratum(result) if result.metric is not None else None,
-        failure=failure,
-        model=_model_for_page(run, result),
-        held_out=result.held_out,
-        depth_maps={m.view: _thinned(m.depth) for m in result.depth_maps},
-    )
 
 
 def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -33,32 +33,16 @@ class PreparedViews(Sequence[Any]):
 
     def __init__(self, matching: Matcher, given: Mapping[int, tuple[Image, Features]]) -> None:
         self._matching, self._given = matching, dict(given)
-        self._forget()
-
-    def _forget(self) -> None:
         self._kept: OrderedDict[int, tuple[Any, int]] = OrderedDict()
         self._lock, self._bytes = threading.Lock(), 0
 
-    def __getstate__(self) -> tuple[Matcher, dict[int, tuple[Image, Features]]]:
-        return self._matching, self._given
-
-    def __setstate__(self, state: tuple[Matcher, dict[int, tuple[Image, Features]]]) -> None:
-        self._matching, self._given = state
-        self._forget()
+    def __reduce__(self) -> tuple[type[PreparedViews], tuple[Matcher, dict[int, tuple[Image, Features]]]]:
+        return PreparedViews, (self._matching, self._given)
 
     def __len__(self) -> int:
         return len(self._given)
 
-    def __iter__(self) -> Iterator[Any]:
-        return (self[view] for view in sorted(self._given))
-
-    @overload
-    def __getitem__(self, view: int) -> Any: ...
-    @overload
-    def __getitem__(self, view: slice) -> Sequence[Any]: ...
-    def __getitem__(self, view: int | slice) -> Any:
-        if isinstance(view, slice):
-            return [self[v] for v in sorted(self._given)[view]]
+    def __getitem__(self, view: int) -> Any:  # type: ignore[override]
         if view not in self._given:
             raise IndexError(f"view {view} is not among those given")
         with self._lock:
@@ -89,16 +73,18 @@ def _size_of(value: Any) -> int:
     return 0
 
 
-def cache_friendly_order(pairs: Sequence[tuple[int, int]], numbers: Sequence[int]) -> list[int]:
-    """Sort the numbers of pairs so that consecutive pairs share views (Morton order)."""
+def batch_pairs(
+    pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None
+) -> list[list[int]]:
+    """Divide the numbers of pairs into batches, so that consecutive pairs share views (Morton order).
+
+    Several batches per worker; ``workers`` None: one pair each.
+    """
+    size = 1
+    if workers is not None:
+        size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
-    return [numbers[k] for k in morton_pair_order(first, second)]
-
-
-def batch_pairs(pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int) -> list[list[int]]:
-    """Divide the numbers of pairs into batches that share views, several per worker."""
-    size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
-    ordered = cache_friendly_order(pairs, numbers)
+    ordered = [numbers[k] for k in morton_pair_order(first, second)]
     return [ordered[k : k + size] for k in range(0, len(ordered), size)]
 
 
@@ -133,14 +119,12 @@ class PipelineState:
         """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""
         found, needed = len(self.result.images), 1 if self.until == "features" else 2
         if found < needed:
-            refused = [f"{name} {reason}" for name, reason in self.result.unread.items()]
-            why = "; ".join([*refused[:3], f"and {len(refused) - 3} more"] if len(refused) > 3 else refused)
+            unread = [f"{name} {reason}" for name, reason in self.result.unread.items()]
+            why = "; ".join([*unread[:3], f"and {len(unread) - 3} more"] if len(unread) > 3 else unread)
             wanted = "two different ones are" if needed == 2 else "one is"
-            raise StageFailure(
-                counted(found, "usable image") if found else "no usable images",
-                f"at least {wanted} needed{'; ' + why if why else ''}",
-                "add images of the scene from other places",
-            )
+            reason = counted(found, "usable image") if found else "no usable images"
+            evidence = f"at least {wanted} needed{'; ' + why if why else ''}"
+            raise StageFailure(reason, evidence, "add images of the scene from other places")
 
 
 def name_images(text: str, names: Sequence[str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,22 +32,17 @@ def _middle_view(views: Sequence[PinholeView]) -> PinholeView:
     return views[int(np.argmin(apart))]
 
 
-def _compare_held_out(
-    mesh: TexturedMesh,
-    views: Sequence[PinholeView],
-    color: Callable[[int], TexturedMesh],
-    *,
-    threads: int = 1,
-) -> HeldOut | None:
-    """Compare the middle view with the model that ``color(view)`` textures without it.
+def _compare_held_out(state: PipelineState, mesh: TexturedMesh) -> HeldOut | None:
+    """Compare the middle view with the model textured without it; None if they cannot be compared.
 
-    The rendering is exposure-matched, one factor per channel. None with too few views or no common pixels.
+    The rendering is exposure-matched, one factor per channel.
     """
+    views, threads = state.result.views, state.run.workers.threads
     if len(views) < MIN_VIEWS or not len(mesh.faces):
         return None
     view = _middle_view(views)
     try:
-        painted = color(view.view)
+        painted = state.config.model.color(mesh, views, without=view.view, threads=threads)
     except StageFailure:
         return None
     height, width = view.rgb.shape[:2]
@@ -56,14 +51,8 @@ def _compare_held_out(
     if not compared.any():
         return None
     matched = match_exposure(view.rgb, rendered.color, compared)
-    return HeldOut(
-        view.view,
-        view.rgb,
-        matched,
-        compared,
-        psnr_db(view.rgb, matched, compared),
-        ssim(view.rgb, matched, compared),
-    )
+    similarity = (psnr_db(view.rgb, matched, compared), ssim(view.rgb, matched, compared))
+    return HeldOut(view.view, view.rgb, matched, compared, *similarity)
 
 
 def _depths(config: PipelineConfig, scene: MultiViewScene, view: int) -> list[DepthMap]:
@@ -111,19 +100,15 @@ def estimate_depth_maps(state: PipelineState) -> None:
     state.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))
     known = [float(np.isfinite(m.depth).mean()) for m in final]
     counts = {"views": len(order), "depths": int(sum(np.isfinite(m.depth).sum() for m in final))}
-    empty = [i for i, share in zip(order, known, strict=True) if not share]
+    empty = [result.images[i].name for i, share in zip(order, known, strict=True) if not share]
+    warnings = [f"Image {name} has no depth values" for name in empty]
     run.finish(
-        "dense",
-        counts=counts,
-        metrics={"median_share_known": float(np.median(known))},
-        warnings=[f"Image {result.images[i].name} has no depth values" for i in empty],
+        "dense", counts=counts, metrics={"median_share_known": float(np.median(known))}, warnings=warnings
     )
     if not counts["depths"]:
-        raise StageFailure(
-            "no depth was found",
-            f"none of {len(order)} views agrees with another on any surface",
-            "add images with more overlap of a textured scene",
-        )
+        evidence = f"none of {len(order)} views agrees with another on any surface"
+        advice = "add images with more overlap of a textured scene"
+        raise StageFailure("no depth was found", evidence, advice)
 
 
 def _depth_inputs(reconstruction: Reconstruction, images: tuple[Image, ...]) -> list[object]:
@@ -137,23 +122,12 @@ def build_model(state: PipelineState) -> None:
     run, result = state.run, state.result
     key = run.key("model", run.variant_key("model"), list(run.logs["dense"].keys.values()))
     run.progress("model", 0, 1)
-    mesh = run.cached(
-        "model",
-        "model",
-        key,
-        lambda: state.config.model.build(result.depth_maps, result.views, threads=run.workers.threads),
+    build, threads = state.config.model.build, run.workers.threads
+    mesh: TexturedMesh = run.cached(
+        "model", "model", key, lambda: build(result.depth_maps, result.views, threads=threads)
     )
-    model, threads = state.config.model, run.workers.threads
-
-    def without(view: int) -> TexturedMesh:
-        return model.color(mesh, result.views, without=view, threads=threads)
-
-    held_out = run.cached(
-        "model",
-        "held-out",
-        run.key("model", key, "held-out", code_key(RENDERER)),
-        lambda: _compare_held_out(mesh, result.views, without, threads=threads),
-    )
+    held_out_key = run.key("model", key, "held-out", code_key(RENDERER))
+    held_out = run.cached("model", "held-out", held_out_key, lambda: _compare_held_out(state, mesh))
     state.result = replace(state.result, mesh=mesh, held_out=held_out)
     without_texture = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
     counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}

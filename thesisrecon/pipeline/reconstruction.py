@@ -100,8 +100,8 @@ def reconstruct(
         try:
             state.require_images()
             _run_steps(state, surface_required=options.get("until") is not None)
-        except StageFailure as failure:
-            parts = (failure.reason, failure.evidence, failure.advice)
+        except StageFailure as error:
+            parts = (error.reason, error.evidence, error.advice)
             failure = StageFailure(*(name_images(part, state.names) for part in parts))
             write_outputs(run, state.result, until=until, failure=failure)
             raise failure from None
@@ -127,10 +127,11 @@ def _read_inputs(run: Run, images: ImageSource) -> ImageSet:
     found, refused = len(inputs.decoded), len(inputs.refused)
     if found + refused == 0:
         raise UsageError("no images")
-    check_sizes(run.config.intrinsics, [image.original_size for image in inputs.images])
-    notes = [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
-    refusals = [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
-    warnings = [*notes, *refusals, *prior_warnings(run.config.intrinsics, inputs.exif_focal_px)]
+    intrinsics = run.config.intrinsics
+    check_sizes(intrinsics, [image.original_size for image in inputs.images])
+    warnings = [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
+    warnings += [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
+    warnings += prior_warnings(intrinsics, inputs.exif_focal_px)
     run.finish("images", counts={"read": found, "refused": refused}, warnings=warnings)
     return inputs
 
@@ -150,12 +151,5 @@ def _identity(run: Run, inputs: ImageSet) -> dict[str, Any]:
 def _empty_result(run: Run, inputs: ImageSet) -> RunResult:
     sizes = [image.original_size for image in inputs.images]
     groups = camera_numbers(sizes, run.config.intrinsics, inputs.exif_focal_px)
-    return RunResult(
-        out=run.directory.path,
-        images=inputs.images,
-        unread=inputs.refused,
-        features=(),
-        pairs=(),
-        groups=groups,
-        settings=tables_from_config(run.config),
-    )
+    settings = tables_from_config(run.config)
+    return RunResult(run.directory.path, inputs.images, inputs.refused, (), (), groups, settings)

@@ -48,15 +48,11 @@ def assess(data: ReportData) -> Assessment:
     """Assess a run: trusted, not trusted, stopped early or failed."""
     total = len(data.images)
     if data.failure is not None:
-        last = (
-            f"the last stage that finished was {data.reports[-1].stage}"
-            if data.reports
-            else "no stage finished"
-        )
-        evidence = tuple(_sentence(text) for text in (data.failure.evidence, last) if text)
-        return Assessment(
-            "bad", "Failed", _sentence(data.failure.reason), evidence, _sentence(data.failure.advice)
-        )
+        failure, done = data.failure, "no stage finished"
+        if data.reports:
+            done = f"the last stage that finished was {data.reports[-1].stage}"
+        evidence = tuple(_sentence(text) for text in (failure.evidence, done) if text)
+        return Assessment("bad", "Failed", _sentence(failure.reason), evidence, _sentence(failure.advice))
     if data.metric is None:
         done = _STAGE_RESULTS.get(data.until or "", "the stages below were run")
         return Assessment("open", "Stopped early", f"The run ended as requested: {done}.")
@@ -64,15 +60,8 @@ def assess(data: ReportData) -> Assessment:
     have = "has a metric camera" if registered == 1 else "have a metric camera"
     found = f"{registered} of {count_of(total, 'image')} {have}."
     if not data.metric.trusted:
-        failed_checks = tuple(_sentence(check) for check in data.metric.failed_checks) or (
-            "The self-check failed.",
-        )
-        return Assessment(
-            "doubt",
-            "Not trusted",
-            f"{found} Inspect the result before you use it.",
-            failed_checks,
-        )
+        reasons = tuple(_sentence(check) for check in data.metric.failed_checks or ("the self-check failed",))
+        return Assessment("doubt", "Not trusted", f"{found} Inspect the result before you use it.", reasons)
     if registered < total:
         return Assessment("good", "Trusted, but incomplete", f"{found} They passed the self-check.")
     return Assessment("good", "Trusted", f"{found} The result passed the self-check.")
@@ -93,18 +82,15 @@ def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
         facts.append(Fact("Reprojection residual", f"{overall.median_px:.2f} px median", note))
     best = data.best_reconstruction
     if best is not None:
-        facts.append(_point_fact(int(best.valid.sum()), overall))
+        points = int(best.valid.sum())
+        seen = f"{overall.count / points:.1f} observations per point" if overall and points else ""
+        facts.append(Fact("Points", grouped(points), seen))
     seconds = sum(report.seconds for report in data.reports)
     if data.reports:
         slowest = max(data.reports, key=lambda report: report.seconds)
         share = round(100 * slowest.seconds / seconds) if seconds > 0 else 0
-        facts.append(
-            Fact(
-                "Computing time",
-                duration(seconds),
-                f"longest stage: {slowest.stage}, {share} %",
-            )
-        )
+        note = f"longest stage: {slowest.stage}, {share} %"
+        facts.append(Fact("Computing time", duration(seconds), note))
     return facts
 
 
@@ -151,40 +137,26 @@ def model_text(mesh: TexturedMesh) -> str:
     return words
 
 
-def _point_fact(points: int, overall: ResidualSummary | None) -> Fact:
-    seen = f"{overall.count / points:.1f} observations per point" if overall and points else ""
-    return Fact("Points", grouped(points), seen)
-
-
 def _intrinsic_facts(data: ReportData) -> list[Fact]:
     known = [(view, photo) for view, photo in zip(data.original_intrinsics, data.images, strict=True) if view]
-    focal = [view["focal_px"] for view, _ in known if "focal_px" in view]
-    facts = []
-    if focal:
-        widths = np.array(
-            [photo.original_size[0] for view, photo in known if "focal_px" in view], dtype=float
-        )
-        angle = np.degrees(2 * np.arctan(widths / (2 * np.array([f.value for f in focal]))))
-        sizes = {photo.original_size for _, photo in known}
-        where = (
-            f"images of {'×'.join(map(str, sizes.pop()))} px"
-            if len(sizes) == 1
-            else "images of several sizes"
-        )
-        note = f"horizontal field of view {np.median(angle):.1f}°; {where}. {_source_of(focal)}"
-        facts.append(Fact("Focal length", _interval_text(focal, "px"), note))
-    centre_x = [view["principal_x_px"] for view, _ in known if "principal_x_px" in view]
-    centre_y = [view["principal_y_px"] for view, _ in known if "principal_y_px" in view]
-    if centre_x and centre_y:
-        middles = (
-            np.array([photo.original_size for view, photo in known if "principal_x_px" in view]) - 1.0
-        ) / 2
-        offset = np.stack([[p.value for p in centre_x], [p.value for p in centre_y]], axis=1) - middles
-        away = float(np.median(np.linalg.norm(offset, axis=1)))
-        note = f"x, y; {away:.1f} px from the image centre. {_source_of([*centre_x, *centre_y])}"
-        value = f"{_interval_text(centre_x, '')}, {_interval_text(centre_y, 'px')}"
-        facts.append(Fact("Principal point", value, note))
-    return facts
+    if not known:
+        return []
+    focal, x, y = (
+        [view[f"{name}_px"] for view, _ in known] for name in ("focal", "principal_x", "principal_y")
+    )
+    sizes = np.array([photo.original_size for _, photo in known], dtype=float)
+    angle = np.degrees(2 * np.arctan(sizes[:, 0] / (2 * np.array([f.value for f in focal]))))
+    distinct = {photo.original_size for _, photo in known}
+    width, height = known[0][1].original_size
+    where = f"images of {width}×{height} px" if len(distinct) == 1 else "images of several sizes"
+    field = f"horizontal field of view {np.median(angle):.1f}°; {where}. {_source_of(focal)}"
+    offset = np.array([[p.value for p in x], [p.value for p in y]]).T - (sizes - 1.0) / 2
+    away = float(np.median(np.linalg.norm(offset, axis=1)))
+    centre = f"x, y; {away:.1f} px from the image centre. {_source_of([*x, *y])}"
+    return [
+        Fact("Focal length", _interval_text(focal, "px"), field),
+        Fact("Principal point", f"{_interval_text(x, '')}, {_interval_text(y, 'px')}", centre),
+    ]
 
 
 def _interval_text(intervals: Sequence[IntrinsicInterval], unit: str) -> str:

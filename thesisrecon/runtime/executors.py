@@ -95,8 +95,9 @@ class Workers:
         if self.threads < 1:
             raise UsageError(f"threads must be at least 1; got {self.threads}")
         if not isinstance(self.executor, str | futures.Executor):
+            names = ", ".join(NAMES)
             raise UsageError(
-                f"executor must be {', '.join(NAMES)} or a concurrent.futures.Executor; got {self.executor!r}"
+                f"executor must be {names} or a concurrent.futures.Executor; got {self.executor!r}"
             )
         if is_dask_address(self.executor):
             tcp_address(str(self.executor))
@@ -154,9 +155,6 @@ class Workers:
         if self.executor == "local" and self.threads == 1:
             for n, given in enumerate(tasks):
                 finished(n, function(*given))
-        elif self.executor == "local":
-            with futures.ThreadPoolExecutor(self.threads) as pool:
-                _run_all(_Remote(pool, lambda: self.threads), (function, False), tasks, finished)
         elif self._open_stack is None:
             with self:
                 self.run(function, tasks, finished)
@@ -185,6 +183,9 @@ class Workers:
     def _opened(self) -> Iterator[_Remote]:
         if isinstance(self.executor, futures.Executor):
             yield _Remote(self.executor, lambda: self.threads)
+        elif self.executor == "local":
+            with futures.ThreadPoolExecutor(self.threads) as threads:
+                yield _Remote(threads, lambda: self.threads)
         elif is_dask_address(self.executor):
             with connect_dask(self.executor) as cluster:
                 yield _Remote(cluster.executor, cluster.parallel, cluster)

@@ -70,12 +70,6 @@ def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
     Returns
     -------
     numpy.random.Generator
-
-    Examples
-    --------
-    >>> from thesisrecon.runtime.run import stream
-    >>> stream(0, "matches", 1, 2).integers(100) == stream(0, "matches", 1, 2).integers(100)
-    np.True_
     """
     entropy = [checked_seed(seed), zlib.crc32(stage.encode()), *ids]
     return np.random.default_rng(np.random.SeedSequence(entropy))
