@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.stereo.correspondence import PairMatching, match_two_views
+from thesisrecon.records import Image
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.depth_fusion import SequenceLinking
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
@@ -177,12 +177,16 @@ def courtyard():
     return images, P, correspondences
 
 
+def photographs(images):
+    return [Image(f"{k}.png", rgb, SIZE) for k, rgb in enumerate(images)]
+
+
 def test_both_photographs_know_where_their_pixels_are_in_the_other(courtyard):
     images, P, truth = courtyard
     F = fundamental_from_cameras(P[0], P[1])
     here, there = (part[::12, ::12].reshape(-1, 2) for part in truth[0])
     seen = np.all((there > 0) & (there < np.array(SIZE)), axis=1)
-    pair = match_two_views(images[0], images[1], F, here[seen], there[seen], pairs=PairMatching())
+    pair = STEREO.match_two_views(*photographs(images), F, here[seen], there[seen])
     for side in (0, 1):
         found = pair.correspondences(side, SIZE)
         assert found.shape == (384, 512, 2)
@@ -201,7 +205,7 @@ def test_there_and_back_is_where_one_was(courtyard):
     here, there = (part[::12, ::12].reshape(-1, 2) for part in truth[0])
     seen = np.all((there > 0) & (there < np.array(SIZE)), axis=1)
     darker = (images[1] * 0.8).astype(np.uint8)
-    pair = match_two_views(images[0], darker, F, here[seen], there[seen], pairs=PairMatching())
+    pair = STEREO.match_two_views(*photographs((images[0], darker)), F, here[seen], there[seen])
     np.testing.assert_allclose(pair.gain, 1.25 * np.ones(3), rtol=0.2)
     forth, back = pair.correspondences(0, SIZE), pair.correspondences(1, SIZE)
     at = np.rint(forth)

@@ -4,7 +4,6 @@ import numpy as np
 
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.stereo._depth_kernels import (
-    DepthStd,
     count_agreement,
     fuse_inverse_depths,
     inverse_depths,
@@ -106,7 +105,7 @@ def test_agreement_counts_consistent_and_contradicted_depths():
     std = np.full(SHAPE, 1e-3, np.float32)
     agree, contradict = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, np.uint8)
     limits = np.array([1.0, 0.01, 2.0])
-    count_agreement(DepthStd(depth, std), to, DepthStd(other, std), back, limits, agree, contradict)
+    count_agreement((depth, std), to, (other, std), back, limits, agree, contradict)
     v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
     x, y = u + 3.0 / depth, v + 1.0 / depth
     inside = (x > -0.5) & (x < SHAPE[1] - 0.5) & (y > -0.5) & (y < SHAPE[0] - 0.5)

@@ -16,7 +16,6 @@ from thesisrecon.stereo.depth import _region_sizes, _transfer, complete_depths, 
 from thesisrecon.stereo.depth_fusion import _concatenated, _inverse_depth_of
 from thesisrecon.stereo.neighbours import pinhole_view, select_neighbours, shared_projections, sparse_points
 from thesisrecon.stereo.planar import common_orientation
-from thesisrecon.stereo.plane_refinement import PlaneRefinement
 from thesisrecon.stereo.polar import polar
 
 
@@ -192,7 +191,7 @@ def test_holes_are_filled_from_views_that_agree():
     # The other view is wrong there: what the photographs say counts, with the planes around the gap.
     other[120:] *= 0.8
     own, offering = replace(maps[0], depth=depth), replace(maps[1], depth=other)
-    found = complete_depths(own, [offering], views, PlaneRefinement())
+    found = complete_depths(own, [offering], views)
     kept = np.isfinite(depth)
     assert (found.depth[kept] == depth[kept]).all()
     error = np.abs(found.depth[lacks] / maps[0].depth[lacks] - 1.0)
@@ -205,7 +204,7 @@ def test_holes_are_filled_from_views_that_agree():
     assert np.isfinite(found.std[np.isfinite(found.depth)]).all()
     assert (found.views[lacks][np.isfinite(found.depth[lacks])] == 1).all()
     nothing = replace(offering, depth=np.full_like(other, np.nan))
-    assert complete_depths(own, [nothing], views, PlaneRefinement()) is own
+    assert complete_depths(own, [nothing], views) is own
 
 
 def test_seen_through_and_small_pieces_are_removed():

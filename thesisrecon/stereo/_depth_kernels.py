@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
 from thesisrecon.arrays import F32, F64, U8
-
-
-class DepthStd(NamedTuple):
-    """Depth and its standard deviation, (H, W) each, NaN = unknown."""
-
-    depth: F32
-    std: F32
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -123,10 +114,11 @@ def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_agreement(
-    own: DepthStd, to: F64, other: DepthStd, back: F64, limits: F64, agree: U8, contradict: U8
+    own: tuple[F32, F32], to: F64, other: tuple[F32, F32], back: F64, limits: F64, agree: U8, contradict: U8
 ) -> None:
     """Count pixels that another depth map confirms or contradicts.
 
+    ``own`` and ``other`` are depths and standard deviations (H, W), NaN = unknown.
     A pixel is confirmed if the reprojection of the other map's depth returns within ``limits[0]`` pixels and
     the depths differ by less than ``limits[1]`` of the depth plus ``limits[2]`` standard deviations; it is
     contradicted if the other view sees through it. ``to`` (3, 4) transforms z (x, y, 1), 1 to z' (x', y', 1)

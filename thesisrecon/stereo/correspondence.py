@@ -1,8 +1,4 @@
-"""Dense correspondence of two views: rectify, match, and map the disparities back to the original pixels.
-
-:class:`PairMatching` serves multi-view stereo; :func:`match_two_views` rectifies two images by their
-fundamental matrix and matches both directions (thesis, section 2.5).
-"""
+"""Dense correspondence of two views: rectify, match, and map the disparities back to the original pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.errors import StageFailure
-from thesisrecon.records import DisparityMap, PinholeView
+from thesisrecon.records import DisparityMap, Image, PinholeView
 from thesisrecon.stereo._cost import MAX_DISPARITIES
 from thesisrecon.stereo.rectification import METHODS, PLANAR, disparity_range, rectify_cameras, rectify_pair
 from thesisrecon.stereo.resampling import Rectification
@@ -103,6 +99,19 @@ class PairMatching:
         found = self.matcher.match(left, right, disparity_range=wanted)
         return self._back(frame, found, own, shapes)
 
+    def match_two_views(
+        self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
+    ) -> RectifiedPair:
+        """See `thesisrecon.config.DepthEstimator.match_two_views`."""
+        methods = PLANAR if planar else METHODS
+        frame = rectify_pair(F, xy1, xy2, image1.rgb.shape[1::-1], image2.rgb.shape[1::-1], methods=methods)
+        wanted = _searched_range(frame, disparity_range(frame, xy1, xy2, margin=self.range_margin))
+        gain = _brightness_gain(image1.rgb, image2.rgb, xy1, xy2)
+        left = frame.warp(image1.rgb.astype(np.float32), 0)
+        right = frame.warp(image2.rgb.astype(np.float32) * gain, 1)
+        match = partial(self.matcher.match, disparity_range=wanted)
+        return RectifiedPair(frame, (left, right), gain, *match_both_sides(match, left, right))
+
     def _back(
         self, frame: Rectification, found: DisparityMap, own: tuple[Shape, Shape], wanted: tuple[Shape, Shape]
     ) -> Correspondence:
@@ -114,7 +123,7 @@ class PairMatching:
         sigma_px = found.sigma_px if np.isfinite(found.sigma_px) else 0.0
         deviation = max(sigma_px, self.min_sigma_px)
         for first in range(0, shape[0], STRIP_ROWS):
-            rows = slice(first, min(first + STRIP_ROWS, shape[0]))
+            rows = range(first, min(first + STRIP_ROWS, shape[0]))
             pixels = _resized(_pixels(shape[1], rows), wanted[0], own[0])
             places = frame.rectified_from_original(0, pixels)
             d, sure = _sample_disparity(found, places)
@@ -210,8 +219,8 @@ def _levels(view: PinholeView) -> F32:
     return levels
 
 
-def _pixels(width: int, rows: slice) -> F64:
-    x, y = np.meshgrid(np.arange(float(width)), np.arange(float(rows.start), float(rows.stop)))
+def _pixels(width: int, rows: range) -> F64:
+    y, x = np.meshgrid(np.array(rows, dtype=np.float64), np.arange(float(width)), indexing="ij")
     return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
@@ -257,51 +266,12 @@ class RectifiedPair:
         complete = replace(found, disparity=found.filled())
         places = np.full((size[1], size[0], 2), np.nan, dtype=np.float32)
         for first in range(0, size[1], STRIP_ROWS):
-            rows = places[first : first + STRIP_ROWS]
-            y, x = np.indices(rows.shape[:2], dtype=np.float64)
-            here = self.frame.rectified_from_original(side, np.stack([x, y + first], axis=-1).reshape(-1, 2))
+            rows = range(first, min(first + STRIP_ROWS, size[1]))
+            here = self.frame.rectified_from_original(side, _pixels(size[0], rows))
             d = _sample_disparity(complete, here)[0]
             inside: B8 = np.isfinite(d)
             here = here[inside]
             here[:, 0] += d[inside] if side else -d[inside]
             there = self.frame.original_from_rectified(1 - side, here, within=False)
-            rows.reshape(-1, 2)[inside] = there
+            places[first : rows.stop].reshape(-1, 2)[inside] = there
         return places
-
-
-def match_two_views(
-    rgb1: U8, rgb2: U8, F: F64, xy1: F64, xy2: F64, *, pairs: PairMatching, planar: bool = False
-) -> RectifiedPair:
-    """Compute dense correspondence of two images with known fundamental matrix.
-
-    Parameters
-    ----------
-    rgb1, rgb2 : ndarray (H, W, 3) uint8
-        The images.
-    F : ndarray (3, 3)
-        Fundamental matrix, x2' F x1 = 0.
-    xy1, xy2 : ndarray (N >= 8, 2)
-        Inlier matches in pixels.
-    pairs : PairMatching
-        Matcher and disparity range.
-    planar : bool
-        Rectify by homographies only, which requires the epipoles to lie outside the images.
-
-    Returns
-    -------
-    RectifiedPair
-        Rectified images and disparities of both.
-
-    Raises
-    ------
-    StageFailure
-        If the pair cannot be rectified or the disparity range is too large.
-    """
-    sizes = rgb1.shape[1::-1], rgb2.shape[1::-1]
-    frame = rectify_pair(F, xy1, xy2, sizes[0], sizes[1], methods=PLANAR if planar else METHODS)
-    wanted = _searched_range(frame, disparity_range(frame, xy1, xy2, margin=pairs.range_margin))
-    gain = _brightness_gain(rgb1, rgb2, xy1, xy2)
-    left = frame.warp(rgb1.astype(np.float32), 0)
-    right = frame.warp(rgb2.astype(np.float32) * gain, 1)
-    match = partial(pairs.matcher.match, disparity_range=wanted)
-    return RectifiedPair(frame, (left, right), gain, *match_both_sides(match, left, right))

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
-from thesisrecon.stereo._depth_kernels import DepthStd, count_agreement, splat_depths, surface_continuation
-from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair, match_two_views
+from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
+from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 from thesisrecon.stereo.depth_fusion import InverseDepth, RobustFusion, SequenceLinking, pixel_transfer
 from thesisrecon.stereo.neighbours import (
     SparsePoints,
@@ -23,7 +23,7 @@ from thesisrecon.stereo.neighbours import (
     shared_projections,
     sparse_points,
 )
-from thesisrecon.stereo.plane_refinement import ALIKE, PlaneRefinement
+from thesisrecon.stereo.plane_refinement import ALIKE, refine_depths, search_planes
 
 SURE = 3.0
 """Standard deviations by which an inverse depth must exceed 0, that of infinity."""
@@ -65,10 +65,10 @@ def confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
     """
     agree, contradict, joins = np.zeros((3, *depth_map.depth.shape), dtype=np.uint8)
     limits = np.array([REPROJECTION_PX, MAX_RELATIVE, MAX_SIGMAS])
-    own = DepthStd(depth_map.depth, depth_map.std)
+    own = depth_map.depth, depth_map.std
     for other in others:
         to, back = _transfer(depth_map.P, other.P), _transfer(other.P, depth_map.P)
-        count_agreement(own, to, DepthStd(other.depth, other.std), back, limits, agree, contradict)
+        count_agreement(own, to, (other.depth, other.std), back, limits, agree, contradict)
     keep = (agree >= MIN_VIEWS) & (agree > contradict)
     with np.errstate(divide="ignore"):
         rho = (1.0 / depth_map.depth).astype(np.float32)
@@ -118,14 +118,12 @@ def _kept(depth_map: DepthMap, keep: B8) -> DepthMap:
     )
 
 
-def complete_depths(
-    own: DepthMap, others: Sequence[DepthMap], views: Mapping[int, PinholeView], refinement: PlaneRefinement
-) -> DepthMap:
+def complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[int, PinholeView]) -> DepthMap:
     """Complete a depth map with surfaces that only the depth maps of other views contain.
 
     The depths of other views are projected into the view. Where it has none, the nearest of these initialise
     the plane search against the ``MAX_SOURCES`` images that contribute most pixels. Accepted planes (by the
-    rule of :class:`PlaneRefinement`) are measured depths: nothing is interpolated.
+    rule of :func:`refine_depths`) are measured depths: nothing is interpolated.
 
     Parameters
     ----------
@@ -135,8 +133,6 @@ def complete_depths(
         Depths of other views.
     views : mapping of int to PinholeView
         Images of all views.
-    refinement : PlaneRefinement
-        Plane search.
 
     Returns
     -------
@@ -158,7 +154,7 @@ def complete_depths(
     wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), GAP_PX)
     rho = (np.float32(1.0) / np.where(unknown, nearest, own.depth)).astype(np.float32)
     images = [views[others[k].view] for k in best]
-    found, std, support = refinement.search(views[own.view], images, rho, wanted=wanted, sweeps=SWEEPS)
+    found, std, support = search_planes(views[own.view], images, rho, wanted=wanted, sweeps=SWEEPS)
     new = np.isfinite(found)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.float32(1.0) / found
@@ -228,10 +224,8 @@ class MultiViewStereo:
         Largest number of neighbouring views, chosen by :func:`select_neighbours`.
     linker : RobustFusion or SequenceLinking
         Fusion of correspondences to one inverse depth.
-    refinement : PlaneRefinement or None
-        Refinement with slanted windows.
-    completion : bool
-        Complete depth maps from those of other views, which needs the refinement.
+    refinement : bool
+        Refine depth maps with slanted windows, and complete them from those of other views.
     min_comparison_views : int
         Number of depth maps to compare with, if there are as many.
     max_side : int
@@ -243,8 +237,7 @@ class MultiViewStereo:
     pairs: PairMatching = field(default_factory=PairMatching)
     max_neighbours: int = 4
     linker: RobustFusion | SequenceLinking = field(default_factory=RobustFusion)
-    refinement: PlaneRefinement | None = field(default_factory=PlaneRefinement)
-    completion: bool = True
+    refinement: bool = True
     min_comparison_views: int = 12
     max_side: int = 1024
     match_side: int = 640
@@ -259,7 +252,7 @@ class MultiViewStereo:
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
     ) -> RectifiedPair:
         """See `thesisrecon.config.DepthEstimator.match_two_views`."""
-        return match_two_views(image1.rgb, image2.rgb, F, xy1, xy2, pairs=self.pairs, planar=planar)
+        return self.pairs.match_two_views(image1, image2, F, xy1, xy2, planar=planar)
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
         """See `thesisrecon.config.DepthEstimator.prepare`."""
@@ -294,20 +287,19 @@ class MultiViewStereo:
 
         found = self.linker.link(view, scene.views, scene.neighbours[view], correspond)
         keep = scene.views[view].seen
-        if self.refinement is None:
-            # Several contradictory measurements.
-            keep = keep & ~((found.views < 2) & (found.conflicts > 0))
+        if self.refinement:
+            found = refine_depths(scene.views[view], [scene.views[j] for j in scene.neighbours[view]], found)
         else:
-            others = [scene.views[j] for j in scene.neighbours[view]]
-            found = self.refinement.refine(scene.views[view], others, found)
+            # Several contradictory measurements are not kept.
+            keep = keep & ~((found.views < 2) & (found.conflicts > 0))
         return _without_small_regions(_depth_map(scene.views[view], found, keep))
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
         """See `thesisrecon.config.DepthEstimator.confirm`."""
         others = [depth_maps[j] for j in self._comparison_views(scene, view) if j in depth_maps]
         own = depth_maps[view]
-        if self.completion and self.refinement is not None:
-            own = complete_depths(own, others, scene.views, self.refinement)
+        if self.refinement:
+            own = complete_depths(own, others, scene.views)
         return confirm_depths(own, others)
 
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
