@@ -99,19 +99,17 @@ def _list(header: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _require_tree(nodes: list[dict[str, Any]]) -> None:
-    """Require at most one parent per node and no cycles."""
-    children = [node.get("children", []) for node in nodes]
-    held = [child for own in children if isinstance(own, list) for child in own]
-    if not all(isinstance(own, list) for own in children) or not all(isinstance(c, int) for c in held):
+    """Require at most one parent per node, before its children."""
+    held: list[int] = []
+    for number, node in enumerate(nodes):
+        children = node.get("children", [])
+        if not isinstance(children, list) or not all(isinstance(c, int) and c < len(nodes) for c in children):
+            raise ValueError("its nodes are not a tree")
+        if any(child <= number for child in children):
+            raise ValueError("its nodes are cyclic or out of order")
+        held += children
+    if len(set(held)) < len(held):
         raise ValueError("its nodes are not a tree")
-    if len(set(held)) < len(held) or not all(0 <= child < len(children) for child in held):
-        raise ValueError("its nodes are not a tree")
-    waiting, reached = sorted(set(range(len(children))) - set(held)), 0
-    while waiting:
-        waiting += children[waiting.pop()]
-        reached += 1
-    if reached < len(children):
-        raise ValueError("its nodes are cyclic")
 
 
 def write_mesh(path: Path, mesh: TexturedMesh) -> None:
