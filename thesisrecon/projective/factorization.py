@@ -46,23 +46,6 @@ _PLANE_SIGMAS = 3.0
 Edge = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class Factors:
-    """Result of a factorization.
-
-    Parameters
-    ----------
-    P, X : ndarray (V, 3, 4), (N, 4)
-        Cameras for pixels and points of unit norm.
-    residual_px : ndarray (V, N)
-        Reprojection distances.
-    """
-
-    P: F64
-    X: F64
-    residual_px: F64
-
-
 def depths_from_fundamentals(
     xy: F64, F: Mapping[tuple[int, int], F64], tree: Sequence[tuple[int, int]]
 ) -> F64:
@@ -119,24 +102,23 @@ def _balance_depths(depths: F64, sizes: F64) -> F64:
     return np.asarray(depths * a[:, None] * b)
 
 
-def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Factors:
+def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> tuple[F64, F64, F64]:
     """Factorize matches seen in every view into cameras and points (rank 4).
 
     Parameters
     ----------
-    xy : ndarray (V, N, 2)
-        Matches in pixels; the points of a view must not coincide.
-    depths : ndarray (V, N), optional
-        Initial depths (:func:`depths_from_fundamentals`); equal by default, an affine camera, which needs
-        ``iterations``.
+    xy, depths : ndarray (V, N, 2), (V, N)
+        Matches in pixels and initial depths; equal by default, an affine camera, which needs ``iterations``.
     iterations : int
         Maximum number of depth updates; 0 is the published algorithm. Stops when the rank-4 residual of the
         balanced matrix, which approximates the reprojection error, no longer falls.
 
     Returns
     -------
-    Factors
-        Cameras, points and residuals.
+    P, X : ndarray (V, 3, 4), (N, 4)
+        Cameras for pixels and points of unit norm.
+    residual_px : ndarray (V, N)
+        Reprojection distances.
 
     Raises
     ------
@@ -170,7 +152,7 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> Fac
     xh = np.einsum("vab,nb->vna", P, X)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.linalg.norm(xh[..., :2] / xh[..., 2:] - xy, axis=2)
-    return Factors(P, X, np.nan_to_num(distance, nan=np.inf))
+    return P, X, np.nan_to_num(distance, nan=np.inf)
 
 
 def _measurements(wx: F64) -> F64:
@@ -256,13 +238,13 @@ class Factorization:
             )
         depths = depths_from_fundamentals(table, {e: F[v] for e, v in zip(edges, tree, strict=True)}, edges)
         growth, early, views = self.growth, self.growth.outlier_sigmas[0], _tree_views(tree)
-        factors, _ = _factorize_robustly(table, depths, growth.outlier_sigmas[1], self.iterations)
+        P, X, residual_px = _factorize_robustly(table, depths, growth.outlier_sigmas[1], self.iterations)
         model = ProjectiveModel.empty(tracks, sizes, sigma_px=sigma_px, noise_floor_px=growth.noise_floor_px)
         # Before bundle adjustment the residuals are those of the factors.
-        model.sigma_px = max(model.sigma_px, noise_from_distances(factors.residual_px.ravel()))
-        every = np.indices(factors.residual_px.shape).reshape(2, -1)
-        signs, _, _ = orient_signs(factors.P, factors.X, every[0], every[1])
-        model.P[views] = factors.P * signs[:, None, None]
+        model.sigma_px = max(model.sigma_px, noise_from_distances(residual_px.ravel()))
+        every = np.indices(residual_px.shape).reshape(2, -1)
+        signs, _, _ = orient_signs(P, X, every[0], every[1])
+        model.P[views] = P * signs[:, None, None]
         model.registered[views] = True
         for _ in range(2):
             retriangulate_points(model, early)
@@ -325,17 +307,13 @@ def _is_planar(xy: F64, edges: Sequence[Edge], threshold_px: float) -> bool:
     return bool(min(shares) >= NO_PARALLAX)
 
 
-def _factorize_robustly(xy: F64, depths: F64, sigmas: float, iterations: int) -> tuple[Factors, B8]:
-    """Return factors without inconsistent points, and the kept points (N,).
-
-    Points with a residual beyond ``sigmas`` times the noise are removed and the rest is factorized again.
-    """
+def _factorize_robustly(xy: F64, depths: F64, sigmas: float, iterations: int) -> tuple[F64, F64, F64]:
+    """Factorize, remove points with residuals beyond ``sigmas`` times the noise, factorize the rest again."""
     kept = np.ones(xy.shape[1], dtype=bool)
     for _ in range(_MAX_ROUNDS):
-        factors = factorize(xy[:, kept], depths[:, kept], iterations=iterations)
-        worst = factors.residual_px.max(axis=0)
-        within = worst <= sigmas * noise_from_distances(factors.residual_px.ravel())
+        P, X, residual_px = factorize(xy[:, kept], depths[:, kept], iterations=iterations)
+        within = residual_px.max(axis=0) <= sigmas * noise_from_distances(residual_px.ravel())
         if within.all() or within.sum() < _MIN_POINTS:
             break
         kept[np.flatnonzero(kept)[~within]] = False
-    return factors, kept
+    return P, X, residual_px

@@ -123,11 +123,15 @@ class IncrementalProjective:
         Another pair is tried only if it may add a view that was not merely deferred; once half of the views
         are registered, no other part is larger.
         """
+
+        def rank(model: ProjectiveModel) -> tuple[int, int]:
+            return int(model.registered.sum()), int(model.used.sum())
+
         best, left, half = None, list(starts), len(sizes) // 2 + 1
         for tried in range(self.max_initial_pairs):
             found = self.begin(tracks, left.pop(0), sizes)
             self.complete(found, pairs, rng)
-            if best is None or _rank(found) > _rank(best):
+            if best is None or rank(found) > rank(best):
                 best = found
             out = [v for v in np.flatnonzero(~best.registered) if not best.deferred[v]]
             left = [pair for pair in left if pair.i in out or pair.j in out]
@@ -281,7 +285,3 @@ class IncrementalProjective:
         model.reasons[view] = reason
         retriangulate_points(model, self.outlier_sigmas[0])
         return True
-
-
-def _rank(model: ProjectiveModel) -> tuple[int, int]:
-    return int(model.registered.sum()), int(model.used.sum())

@@ -72,10 +72,7 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
 
 def require_pair_with_parallax(pairs: Sequence[TwoView]) -> None:
-    """Raise an error if no accepted pair shows parallax.
-
-    Without parallax (rotation about the camera centre, a static camera, a planar scene) no F is determined,
-    and a reconstruction would be arbitrary even with small residuals.
+    """Raise an error if no accepted pair shows parallax: no F is determined, a reconstruction is arbitrary.
 
     Parameters
     ----------
@@ -113,10 +110,8 @@ def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
 
     Parameters
     ----------
-    pair : TwoView
-        Verified pair.
-    sizes : ndarray (2, 2) of int
-        Width and height of both images.
+    pair, sizes : TwoView, ndarray (2, 2) of int
+        Verified pair, and width and height of its images.
 
     Returns
     -------

@@ -92,7 +92,7 @@ def starts(tracks: Tracks, xy: F64, sizes: NDArray[np.int64], seed: int) -> dict
         ITERATED: factorize(xy, depths, iterations=50),
         AFFINE: factorize(xy, iterations=200),
     }
-    found = {name: Start(factors.P, factors.X) for name, factors in tables.items()}
+    found = {name: Start(P, X) for name, (P, X, _) in tables.items()}
     return found | {GROWN: grown(tracks, pairs, sizes, seed)}
 
 
