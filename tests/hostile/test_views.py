@@ -128,7 +128,7 @@ BETWEEN = [
     ("linked", ["linked.png", "a.png"], 2, "is given twice"),
     ("bomb", ["bomb.png", "a.png"], 3, "claims more than 178 megapixels"),
     ("too long", [files.TOO_LONG, "a.png"], 2, "File name too long"),
-    ("frames", ["a.png", "b.png", "--frames", "1000000000"], 2, "--frames takes at most 9999"),
+    ("frames", ["a.png", "b.png", "--frames", "1000000000"], 2, "'--frames'"),
     ("background", ["a.png", "--background", "#" * 9000], 2, "--background"),
 ]
 

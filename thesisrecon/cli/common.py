@@ -56,6 +56,7 @@ MaxSize = Annotated[
     int | None,
     typer.Option("--max-size", help="Long side (px) to which larger images are reduced (default: 1600)."),
 ]
+Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
 OutputFolder = Annotated[
     Path, typer.Option("-o", "--out", parser=parse_folder, metavar="FOLDER", help="Output folder.")
 ]
@@ -133,7 +134,8 @@ def exit_code_of(command: Callable[[], object]) -> int:
     except Exception as error:
         # The parser's error classes differ between its versions; all have this method.
         if hasattr(error, "format_message"):
-            return _report(f"{shorten_middle(error.format_message())} (see thesisrecon --help)", USAGE)
+            message = shorten_middle(error.format_message().replace("Value error, ", ""))
+            return _report(f"{message} (see thesisrecon --help)", USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
         if "no locator available" in str(error):

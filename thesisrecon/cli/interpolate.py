@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from thesisrecon.cli.common import (
+    Frames,
     MaxSize,
     Seed,
     Threads,
@@ -30,7 +31,7 @@ def interpolate(
         Literal["interpolation", "tensor"],
         typer.Option("--method", help="Image interpolation (section 1.2) or trilinear tensor (1.3)."),
     ] = "interpolation",
-    frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 21,
+    frames: Frames = 21,
     seed: Seed = 0,
     max_size: MaxSize = None,
     folder: Annotated[

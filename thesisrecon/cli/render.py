@@ -8,9 +8,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from thesisrecon.cli.common import Threads, cap_threads, interruptible, parse_folder, progress_bars
+from thesisrecon.cli.common import Frames, Threads, cap_threads, interruptible, parse_folder, progress_bars
 from thesisrecon.errors import UsageError
 from thesisrecon.runtime.executors import available_threads
+
+_MAX_SIDE_PX = 8192
 
 
 def render(
@@ -19,7 +21,7 @@ def render(
         Literal["orbit", "interpolate"],
         typer.Option("--path", help="Camera path: orbit the model, or interpolate between the cameras."),
     ] = "orbit",
-    frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 90,
+    frames: Frames = 90,
     size: Annotated[
         str | None,
         typer.Option(
@@ -60,7 +62,10 @@ def _size(text: str) -> tuple[int, int]:
     found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
     if found is None:
         raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
-    return int(found[1]), int(found[2])
+    width, height = int(found[1]), int(found[2])
+    if not (1 <= width <= _MAX_SIDE_PX and 1 <= height <= _MAX_SIDE_PX):
+        raise UsageError(f"--size takes sides of 1 to {_MAX_SIDE_PX} pixels; got {width}x{height}")
+    return width, height
 
 
 def _color(text: str) -> tuple[int, int, int]:

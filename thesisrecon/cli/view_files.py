@@ -12,7 +12,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.cli._view_sequences import interpolated_sequence, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import OutputError, UsageError, counted, in_words
+from thesisrecon.errors import OutputError, UsageError, counted
 from thesisrecon.io._exports import animation_suffix, frame_name, read_cameras, write_animation, write_frame
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io.images import read_image
@@ -29,21 +29,11 @@ METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
 """Method -> function that returns its :class:`ViewSequence`."""
 _FRAME_MS = 100
 """Time per frame of an animation of ``interpolate``."""
-_MAX_SIDE_PX = 8192
-_MAX_FRAMES = 9999
-"""File names have four digits."""
 _DEFAULT_SIDE_PX = 1000
 _NO_MODEL = "No surface model was built"
 """Beginning of the warning of a run whose surface stage failed."""
 
 Progress = Callable[[str, int, int], None]
-
-
-def _check_frames(frames: int) -> None:
-    if frames < 1:
-        raise UsageError(f"--frames takes a whole number of at least 1; got {frames}")
-    if frames > _MAX_FRAMES:
-        raise UsageError(f"--frames takes at most {_MAX_FRAMES}; got {in_words(frames)}")
 
 
 @dataclass(frozen=True)
@@ -55,12 +45,6 @@ class RenderOptions:
     size: tuple[int, int] | None = None
     light: str = "none"
     background: tuple[int, int, int] = (0, 0, 0)
-
-    def __post_init__(self) -> None:
-        _check_frames(self.frames)
-        if self.size is not None and not all(1 <= side <= _MAX_SIDE_PX for side in self.size):
-            width, height = self.size
-            raise UsageError(f"--size takes sides of 1 to {_MAX_SIDE_PX} pixels; got {width}x{height}")
 
 
 @dataclass(frozen=True)
@@ -74,7 +58,6 @@ class InterpolateOptions:
     max_size_px: int | None = None
 
     def __post_init__(self) -> None:
-        _check_frames(self.frames)
         if len(self.images) not in (2, 3):
             raise UsageError(f"interpolate takes 2 or 3 images; got {len(self.images)}")
         for path in self.images:
@@ -160,9 +143,8 @@ def interpolate_images(
         frames.append((sequence.captions[k], rgb))
         report("views", k + 1, count + 2)
     files = [folder / frame_name(k + 1) for k in range(count)]
-    animation = write_animation(
-        folder / f"{options.method}{animation_suffix()}", files, milliseconds=_FRAME_MS
-    )
+    target = folder / f"{options.method}{animation_suffix()}"
+    animation = write_animation(target, files, milliseconds=_FRAME_MS)
     report("views", count + 1, count + 2)
     title = "Between " + " and ".join(image.name for image in images)
     write_text(folder / STRIP, strip_page(title, frames, notes=sequence.notes))
@@ -187,10 +169,8 @@ def _missing_model(out: Path) -> str:
     reason = next((str(w) for w in warnings if str(w).startswith(_NO_MODEL)), None)
     if reason is not None:
         return f"the run in {out} has cameras but no model: {reason}"
-    return (
-        f"the run in {out} has no model yet ({MODEL}); continue it with thesisrecon reconstruct IMAGES "
-        f"-o {out}, without --until"
-    )
+    command = f"thesisrecon reconstruct IMAGES -o {out}, without --until"
+    return f"the run in {out} has no model yet ({MODEL}); continue it with {command}"
 
 
 def _claim(folder: Path) -> None:
@@ -203,10 +183,8 @@ def _claim(folder: Path) -> None:
         raise UsageError(f"the folder {folder} cannot be used: {error.strerror}") from None
     foreign = sorted(name for name in names if not is_partial(name))
     if foreign:
-        raise UsageError(
-            f"the folder {folder} contains {foreign[0]!r}, which this command did not create; choose an "
-            "empty or a new folder"
-        )
+        strange = f"contains {foreign[0]!r}, which this command did not create"
+        raise UsageError(f"the folder {folder} {strange}; choose an empty or a new folder")
 
 
 def _remove_old(folder: Path, frames: int) -> None:
@@ -222,10 +200,8 @@ def _remove_old(folder: Path, frames: int) -> None:
 
 
 def _camera_path(mesh: TexturedMesh, cameras: list[Camera], options: RenderOptions) -> list[Camera]:
-    size = options.size
-    if size is None:
-        width, height = cameras[0].scaled(min(1.0, _DEFAULT_SIDE_PX / max(cameras[0].size))).size
-        size = width, height
+    first = cameras[0]
+    size = options.size or first.scaled(min(1.0, _DEFAULT_SIDE_PX / max(first.size))).size
     if options.path == "interpolate":
         return interpolate_cameras(cameras, options.frames, size=size)
     points = sample_surface(mesh)
