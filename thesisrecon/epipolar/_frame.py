@@ -48,8 +48,6 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
             "use images with more overlap",
         )
     for name, xy in (("first", xy1), ("second", xy2)):
-        if _clearly_spread(xy):
-            continue
         spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
         length = max(float(spread[0]), 1e-3 * float(np.abs(xy).max()))
         if not spread[1] > max(COLLINEAR * length, MIN_PX):
@@ -59,15 +57,6 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
                 "collinear points do not determine the epipolar geometry; use matches from the whole image",
             )
     return xy1, xy2
-
-
-def _clearly_spread(xy: F64) -> bool:
-    """Whether the points are so far from collinear that rounding of squares cannot hide it."""
-    centred = xy - xy.sum(axis=0) / len(xy)
-    (a, b), (_, d) = centred.T @ centred
-    size = a + d
-    large = size > max(1e-6 * len(xy) * float(xy[0] @ xy[0]), MIN_PX**2)
-    return bool(large and a * d - b * b > 1e-6 * size**2)
 
 
 @dataclass(frozen=True)

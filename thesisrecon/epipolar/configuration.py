@@ -141,9 +141,7 @@ class ConfigurationReport:
     rotation_deg: float
 
 
-def classify_configuration(
-    F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None, seed: int = 0
-) -> ConfigurationReport:
+def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None) -> ConfigurationReport:
     """Determine which model explains the inliers of F.
 
     The matches with their outliers show how many agree by chance. Both images are assumed to share their
@@ -158,8 +156,6 @@ def classify_configuration(
         Matched points, px.
     inliers : ndarray (N,) of bool, optional
         At least 12 inliers of F; all matches by default.
-    seed : int
-        Seed of the sampled planes.
 
     Returns
     -------
@@ -198,7 +194,7 @@ def classify_configuration(
     agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
     chance = chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
     case = _InlierData(f, points, agree, multiplicity_weights(xy1, xy2), sigma, chance)
-    return _classify(case, frame.scale, seed)
+    return _classify(case, frame.scale)
 
 
 @dataclass(frozen=True)
@@ -225,10 +221,10 @@ def _scale(f: F64, points: F64) -> float:
     return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
 
 
-def _classify(case: _InlierData, scale: float, seed: int) -> ConfigurationReport:
+def _classify(case: _InlierData, scale: float) -> ConfigurationReport:
     sigma, errors, off, chance, angle = case.sigma, np.inf, 1.0, -np.inf, np.nan
     kind = Configuration.GENERAL
-    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(seed))
+    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(0))
     if plane is not None:
         squared = plane.squared * sigma**2
         noise = _plane_noise(squared[case.agree])

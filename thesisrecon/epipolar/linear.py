@@ -39,9 +39,9 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
     Raises
     ------
     ValueError
-        If there are fewer than 8 matches or they are not finite (N, 2) arrays.
+        If the matches are not finite (N, 2) arrays.
     StageFailure
-        If the matches do not determine F (all collinear, or coplanar without noise).
+        If the matches do not determine F (fewer than 8, all collinear, or coplanar without noise).
 
     References
     ----------
@@ -56,9 +56,6 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
     >>> float(np.round(np.abs(F[0, 2] / F[1, 2]), 6))
     0.5
     """
-    xy1, xy2 = as_matches(xy1, xy2)
-    if len(xy1) < 8:
-        raise ValueError(f"the eight-point algorithm needs at least 8 matches; got {len(xy1)}")
     xy1, xy2 = check_matches(xy1, xy2, needed=8)
     T1 = normalizing_transform(xy1) if normalized else np.eye(3)
     T2 = normalizing_transform(xy2) if normalized else np.eye(3)

@@ -15,18 +15,15 @@ from thesisrecon.records import Features, Image, Seeds
 
 @dataclass(frozen=True)
 class _PyramidLevel:
-    """One image size: ``channels`` (C, h, w), ``gray`` (h, w) and image pixels per level pixel."""
+    """One image size: ``channels`` (C, h, w), ``gray`` (h, w) and image pixels per pixel in x and y (2,)."""
 
     channels: F32
     gray: F32
-    scale_x: float
-    scale_y: float
+    scale: F64
 
     def to_image(self, xy: F64) -> F64:
         """Convert pixels of this level to pixels of the image."""
-        scale = np.array([self.scale_x, self.scale_y])
-        inside: F64 = (xy + 0.5) * scale - 0.5
-        return inside
+        return (xy + 0.5) * self.scale - 0.5
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class MultiScaleCorners:
             if index < len(levels):
                 xy, response = found[index]
                 kept = self._select(xy, response, count)
-                nominal = np.float32(round(2.0 * levels[index].scale_x) / 2.0)
+                nominal = np.float32(round(2.0 * levels[index].scale[0]) / 2.0)
                 parts.append((levels[index].to_image(xy[kept]), np.full(len(kept), nominal), response[kept]))
         xy, scale, response = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.argsort(-response, kind="stable")
@@ -96,19 +93,13 @@ class MultiScaleCorners:
 
     def _pyramid(self, image: Image) -> list[_PyramidLevel]:
         doubled = max(image.size) < self.upsample_below_px
-        grays = _image_pyramid(image.gray, self.levels, doubled=doubled)
-        channels = [gray[None] for gray in grays]
+        grays, scales = _image_pyramid(image.gray, self.levels, doubled=doubled)
+        colours = [grays]
         if self.measure.colour:
-            sizes = zip(
-                *(_image_pyramid(c, self.levels, doubled=doubled) for c in self.measure.channels(image)),
-                strict=True,
-            )
-            channels = [np.stack(size) for size in sizes]
-        width, height = image.size
-        return [
-            _PyramidLevel(c, gray, *scale)
-            for c, gray, scale in zip(channels, grays, _scales(grays, width, height), strict=True)
-        ]
+            planes = self.measure.channels(image)
+            colours = [_image_pyramid(plane, self.levels, doubled=doubled)[0] for plane in planes]
+        channels = [np.stack(size) for size in zip(*colours, strict=True)]
+        return [_PyramidLevel(*level) for level in zip(channels, grays, scales, strict=True)]
 
     def _seeds(self, levels: list[_PyramidLevel], found: list[tuple[F64, F32]]) -> Seeds:
         xy, scale, angle, upright, turned = [], [], [], [], []
@@ -118,7 +109,7 @@ class MultiScaleCorners:
             blurred = smooth(level.gray, 2.0)
             direction = _dominant_direction(blurred, corners[kept])
             xy.append(level.to_image(corners[kept]))
-            scale.append(np.full(len(kept), np.sqrt(level.scale_x * level.scale_y), np.float32))
+            scale.append(np.full(len(kept), np.sqrt(np.prod(level.scale)), np.float32))
             angle.append(direction)
             upright.append(sample_patches(blurred, corners[kept], np.zeros_like(direction), 8, 4.0))
             turned.append(sample_patches(blurred, corners[kept], direction, 8, 4.0))
@@ -132,10 +123,14 @@ class MultiScaleCorners:
         )
 
 
-def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> list[F32]:
-    """An image (H, W), doubled on request, and smaller sizes by 1/sqrt(2) each; no side below 16."""
+def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> tuple[list[F32], list[F64]]:
+    """Sizes of an image (H, W), smaller by 1/sqrt(2) each, and their image pixels per pixel in x and y.
+
+    No side is below 16. Halving drops an odd row, so its scale is 2.
+    """
     height, width = plane.shape
     sizes = [resample(plane, 2 * width, 2 * height) if doubled else plane]
+    scales = [np.array([width / sizes[0].shape[1], height / sizes[0].shape[0]])]
     for index in range(1, levels):
         finer = sizes[max(index - 2, 0)]
         if min(finer.shape) < 32:
@@ -144,22 +139,11 @@ def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> list[F32]:
             # A step of sqrt(2) needs a weaker low-pass than halving: sigma 0.6 avoids aliasing.
             h, w = finer.shape
             sizes.append(resample(smooth(finer, 0.6), round(w / np.sqrt(2.0)), round(h / np.sqrt(2.0))))
+            scales.append(scales[0] * (w, h) / sizes[1].shape[::-1])
         else:
             sizes.append(halve(finer))
-    return sizes
-
-
-def _scales(grays: list[F32], width: int, height: int) -> list[tuple[float, float]]:
-    """Image pixels per pixel of each size along x and y; halving drops an odd row, so its scale is 2."""
-    first = (width / grays[0].shape[1], height / grays[0].shape[0])
-    scales = [first]
-    for index, gray in enumerate(grays[1:], 1):
-        if index == 1:
-            h, w = grays[0].shape
-            scales.append((first[0] * w / gray.shape[1], first[1] * h / gray.shape[0]))
-        else:
-            scales.append((2.0 * scales[index - 2][0], 2.0 * scales[index - 2][1]))
-    return scales
+            scales.append(2.0 * scales[index - 2])
+    return sizes, scales
 
 
 def _dominant_direction(blurred: F32, xy: F64) -> F32:
