@@ -83,9 +83,8 @@ def test_images_stay_what_they_are_and_depths_are_positive():
 def test_a_located_plane_is_not_needed_where_one_is_given():
     given = projective_reconstruction(make_scene(seed=3), seed=3)
     plane = np.array([0.1, 0.0, -0.1, 1.0])
-    np.testing.assert_array_equal(
-        thesisrecon.upgrade_affine(given, plane).X, upgrade_to_affine(given, plane).X
-    )
+    upgraded = upgrade_to_affine(given, plane)
+    np.testing.assert_array_equal(thesisrecon.upgrade_affine(given, plane).X, upgraded.X)
 
 
 def test_wrong_calls_and_hopeless_data_are_refused():
@@ -114,8 +113,5 @@ def test_points_and_camera_centres_are_written(tmp_path):
     assert (vertices["rgb"][-8:] == [255, 0, 0]).all()
     assert (vertices["rgb"][:-8] == 77).all()
     np.testing.assert_allclose(vertices["xyz"][:-8], affine.X[near, :3], rtol=1e-5)
-
-
-def test_nothing_is_written_of_nothing(tmp_path):
-    write_affine(tmp_path / "affine.ply", None, np.zeros((0, 3), dtype=np.uint8))
-    assert not (tmp_path / "affine.ply").exists()
+    write_affine(tmp_path / "none.ply", None, colours)
+    assert not (tmp_path / "none.ply").exists()

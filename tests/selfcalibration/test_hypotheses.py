@@ -73,37 +73,16 @@ def test_each_closed_form_contains_the_truth():
     assert criterion.cost(frame, both_signs, np.repeat(log_f, 2, axis=0)).min() < 1e-12
 
 
-def test_two_cameras_are_refused():
-    scene = make_scene()
-    reconstruction = projective_reconstruction(scene)
-    registered = np.zeros(8, dtype=bool)
-    registered[:2] = True
-    with pytest.raises(StageFailure, match="at least 3"):
-        HypothesesAndRefinement().calibrate(
-            replace(reconstruction, registered=registered),
-            prior=prior_for(reconstruction),
-            rng=np.random.default_rng(0),
-        )
-
-
-def test_pure_translation_is_called_unidentifiable():
+def test_pure_translation_is_unidentifiable_and_a_prior_pulls_its_focal():
     scene = make_scene(seed=7)
     still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     answer = calibrate(HypothesesAndRefinement(), still)
     assert not answer.identifiable
     assert any("translation" in reason for reason in answer.reasons)
-
-
-def test_a_prior_pulls_an_undetermined_focal():
-    scene = make_scene(seed=7)
-    still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
     reconstruction = projective_reconstruction(still)
-    answer = HypothesesAndRefinement().calibrate(
-        reconstruction,
-        prior=prior_for(reconstruction, IntrinsicsOptions(focal_px=1500.0, focal_std_rel=0.01)),
-        rng=np.random.default_rng(0),
-    )
-    np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=0.1)
+    prior = prior_for(reconstruction, IntrinsicsOptions(focal_px=1500.0, focal_std_rel=0.01))
+    pulled = HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(pulled.K[:, 0, 0], 1500.0, rtol=0.1)
 
 
 def test_the_same_seed_gives_the_same_bytes():

@@ -9,9 +9,10 @@ from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CO
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.selfcalibration._cheirality import CheiralityRegion
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
-from thesisrecon.selfcalibration.cheirality import CheiralityRegion, CheiralitySearch, _local_minima
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch, _local_minima
 from thesisrecon.selfcalibration.modulus import (
     ModulusConstraint,
     _pairs_of_constant_cameras,
@@ -62,11 +63,8 @@ def test_the_cheirality_bounds_hold_the_true_plane(seed):
         found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
     )
     assert region.wrong_side_ratio(plane[None])[0] == 0.0
-    inside = [
-        part.contains((np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0))[None, :3]
-                      / (np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0))[3])[0]
-        for part in region.polytopes
-    ]  # fmt: skip
+    planes = [np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0) for part in region.polytopes]
+    inside = [part.contains(v[None, :3] / v[3])[0] for part, v in zip(region.polytopes, planes, strict=True)]
     assert sum(inside) == 1
 
 

@@ -11,10 +11,9 @@ from tests.selfcalibration.test_direct_methods import adjusted, at_distance, pri
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.selfcalibration._candidates import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
-from thesisrecon.selfcalibration._refinement import RotationCriterion, refine_hypotheses
+from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals, refine_hypotheses
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import _plane_for_focals
-from thesisrecon.selfcalibration.quadric import dual_image_residuals
 
 FREE = RotationCriterion(focal_weight=0.0)
 

@@ -50,10 +50,6 @@ class Candidate:
     method: str
     K_std: F64 | None = None
 
-    def log_focals(self, frame: ReferenceFrame) -> F64:
-        """Return the median log focal length (G,) of each camera group."""
-        return group_log_focals(frame, self.K)
-
 
 def as_stage_failure(calibrate: Callable[P, SelfCalibration]) -> Callable[P, SelfCalibration]:
     """Wrap a ``calibrate`` method so that a failed decomposition raises ``StageFailure``.
@@ -109,6 +105,11 @@ def candidates_from_parameters(frame: ReferenceFrame, theta: F64, cost: F64, met
     return [Candidate(t[:3], k, float(c), method) for t, k, c in zip(theta, K, cost, strict=True)]
 
 
+def _same_focals(frame: ReferenceFrame, one: Candidate, other: Candidate) -> bool:
+    difference = group_log_focals(frame, one.K) - group_log_focals(frame, other.K)
+    return bool(np.abs(difference).max() < _SAME_LOG_FOCAL)
+
+
 def distinct_candidates(
     frame: ReferenceFrame, candidates: Sequence[Candidate], max_candidates: int
 ) -> list[Candidate]:
@@ -116,7 +117,7 @@ def distinct_candidates(
 
     def same(one: Candidate, other: Candidate) -> bool:
         apart = np.linalg.norm(one.plane - other.plane) > _SAME_LOG_FOCAL * np.linalg.norm(one.plane)
-        return not apart and np.abs(one.log_focals(frame) - other.log_focals(frame)).max() < _SAME_LOG_FOCAL
+        return not apart and _same_focals(frame, one, other)
 
     chosen: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda a: a.cost):
@@ -144,7 +145,7 @@ def select_candidate(
     if not chosen:
         raise _no_candidate_failure(frame, reconstruction, len(candidates))
     candidate, best = chosen[0]
-    theta = np.concatenate([candidate.plane, candidate.log_focals(frame)])
+    theta = np.concatenate([candidate.plane, group_log_focals(frame, candidate.K)])
     std_log_f = focal_std(criterion, frame, theta)
     report = check_identifiability(reconstruction, best, frame.prior)
     K_std = _calibration_std(frame, best.K, candidate, np.minimum(std_log_f[frame.group], _MAX_LOG_STD))
@@ -212,8 +213,7 @@ def _distinct_upgrades(
     for candidate in sorted(candidates, key=lambda a: a.cost):
         if len(chosen) == max_candidates or not np.isfinite(candidate.cost):
             break
-        log_f = candidate.log_focals(frame)
-        if any(np.abs(log_f - other.log_focals(frame)).max() < _SAME_LOG_FOCAL for other, _ in chosen):
+        if any(_same_focals(frame, candidate, other) for other, _ in chosen):
             continue
         upgrade = _upgrade_of_candidate(frame, reconstruction, candidate, min_in_front_ratio)
         if upgrade is not None:

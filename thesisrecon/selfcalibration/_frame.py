@@ -5,10 +5,10 @@ With H = [[K_r, 0], [-p' K_r, 1]], P H is metric if the plane at infinity p and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
@@ -158,9 +158,7 @@ def example_frame(n: int = 6, f: float = 1.2) -> tuple[ReferenceFrame, F64]:
     """Return ``n`` exact cameras of focal length ``f`` and the plane at infinity p (3,), for the examples."""
     rng = np.random.default_rng(0)
     K, p = np.diag([f, f, 1.0]), np.array([0.1, -0.2, 0.3])
-    R = scipy.spatial.transform.Rotation.from_rotvec(
-        0.4 * rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]
-    ).as_matrix()
+    R = Rotation.from_rotvec(0.4 * rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]).as_matrix()
     a = rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]
     A = K @ R @ np.linalg.inv(K) + a[:, :, None] * p
     unit, group = np.tile(np.eye(3), (n, 1, 1)), np.zeros(n, dtype=np.int64)
@@ -297,12 +295,25 @@ def square_pixel_constraints(frame: ReferenceFrame) -> ConicConstraints:
 
 @dataclass(frozen=True)
 class ProjectiveScene:
-    """Input of the stratified methods: a projective reconstruction in a frame, with its prior knowledge."""
+    """Input of the stratified methods: a projective reconstruction in a frame, with its prior knowledge.
+
+    ``orthogonal`` (M, 2, 3) are pairs of unit-free vanishing points in the reference view of orthogonal
+    directions.
+    """
 
     reconstruction: Reconstruction
     frame: ReferenceFrame
     constraints: ConicConstraints
     unknown: SolverUnknowns
+    orthogonal: F64 | None = None
+
+
+@dataclass(frozen=True)
+class PlaneCandidates:
+    """Candidate planes at infinity (B, 3), best first, with orthogonal directions as in the scene."""
+
+    planes: F64
+    orthogonal: F64 | None = None
 
 
 def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> ProjectiveScene:
@@ -310,15 +321,3 @@ def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> 
     frame = normalized_frame(reconstruction, prior)
     constraints, unknown = conic_constraints(frame, prior), solver_unknowns(frame, prior)
     return ProjectiveScene(reconstruction, frame, constraints, unknown)
-
-
-@dataclass(frozen=True)
-class PlaneCandidates:
-    """Candidate planes at infinity (B, 3), best first.
-
-    ``orthogonal`` (M, 2, 3) are pairs of unit-free vanishing points in the reference view of orthogonal
-    directions.
-    """
-
-    planes: F64
-    orthogonal: F64 = field(default_factory=lambda: np.zeros((0, 2, 3)))

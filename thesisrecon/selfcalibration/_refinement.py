@@ -26,6 +26,28 @@ def weighted_entries(M: F64) -> F64:
     return np.asarray(M[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT, dtype=np.float64)
 
 
+def quadratic_rows(x: F64, y: F64) -> F64:
+    """Return rows (..., n (n + 1) / 2) with r . q = x' Q y for the upper triangle q of a symmetric Q."""
+    pairs = zip(*np.triu_indices(x.shape[-1]), strict=True)
+    terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in pairs]
+    return np.stack(terms, axis=-1)
+
+
+def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -> F64:
+    """Return the entries (B, R, 6) of K K' / |K K'| - P Q P' / |P Q P'| (Pollefeys et al., IJCV 32(1), 1999).
+
+    For cameras [A | a], unit-free K (B, R, 3, 3) with those of the reference (B, 3, 3), and planes (B, 3).
+    """
+    C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
+    difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
+    return weighted_entries(difference)
+
+
+def _unit(conic: F64) -> F64:
+    norm = np.sqrt(np.sum(conic**2, axis=(-2, -1), keepdims=True))
+    return np.asarray(conic / np.maximum(norm, 1e-300))
+
+
 @dataclass(frozen=True)
 class RotationCriterion:
     """Robust distance of the upgraded cameras from scaled rotations.
@@ -136,12 +158,7 @@ def _solve_batch(N: F64, g: F64) -> F64:
 
 
 def refine_hypotheses(
-    criterion: RotationCriterion,
-    frame: ReferenceFrame,
-    theta: F64,
-    *,
-    iterations: int = 25,
-    planes_only: bool = False,
+    criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, *, planes_only: bool = False
 ) -> tuple[F64, F64]:
     """Refine hypotheses (p, log f) (B, 3 + G) at once; return them with their costs (B,)."""
 
@@ -158,7 +175,7 @@ def refine_hypotheses(
         lambda x: criterion.cost(frame, x[:, :3], x[:, 3:]),
         lambda x: np.concatenate([x[:, :3], np.clip(x[:, 3:], -4.0, 5.4)], axis=1),
         theta,
-        iterations,
+        25,
         _Schedule(1e-3, 5.0, 1e8, 1e-10, skip_nonfinite=False),
     )
 

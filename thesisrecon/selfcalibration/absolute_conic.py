@@ -21,13 +21,18 @@ from thesisrecon.selfcalibration._frame import (
     ReferenceFrame,
     SolverUnknowns,
 )
-from thesisrecon.selfcalibration._refinement import minimize_batch, numerical_jacobian
-from thesisrecon.selfcalibration.quadric import dual_image_residuals, quadratic_rows
+from thesisrecon.selfcalibration._refinement import (
+    dual_image_residuals,
+    minimize_batch,
+    numerical_jacobian,
+    quadratic_rows,
+)
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ENTRY_WEIGHT = np.array([1.0 if a == b else np.sqrt(2.0) for a, b in _PAIRS])
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _DESCENTS = 3
+_REWEIGHTINGS = 4
 
 
 def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
@@ -192,9 +197,7 @@ class _ImageConic:
         return bool(s[4] > 1e-7 * max(s[0], 1e-3) and s[4] > 2.0 * s[5])
 
 
-def solve_conic(
-    H: F64, constraints: ConicConstraints, *, orthogonal: F64 | None = None, iterations: int = 4
-) -> _ImageConic:
+def solve_conic(H: F64, constraints: ConicConstraints, *, orthogonal: F64 | None = None) -> _ImageConic:
     """Solve for the image of the absolute conic by SVD, reweighted by the estimated focal lengths.
 
     Parameters
@@ -205,8 +208,6 @@ def solve_conic(
         Prior knowledge of the cameras.
     orthogonal : ndarray (M, 2, 3), optional
         Pairs of vanishing points in the reference view of orthogonal directions: x' w y = 0.
-    iterations : int
-        Number of reweighted solutions.
 
     Returns
     -------
@@ -224,10 +225,10 @@ def solve_conic(
     """
     focals = np.ones((1, len(H)))
     conic = _ImageConic(np.eye(3), np.zeros(6))
-    for _ in range(iterations):
+    for _ in range(_REWEIGHTINGS):
         rows = _conic_equations(H[None], constraints, focals)[0]
         back = np.array([focals[0, constraints.first[constraints.reference]]] * 2 + [1.0])
-        if orthogonal is not None and len(orthogonal):
+        if orthogonal is not None:
             pairs = orthogonal / back
             x, y = np.swapaxes(pairs / np.linalg.norm(pairs, axis=-1, keepdims=True), 0, 1)
             rows = np.concatenate([rows, quadratic_rows(x, y)])
@@ -263,7 +264,7 @@ class LinearAbsoluteConic:
     With a constant K and no other prior the equations are w* = H w* H', else those of :func:`solve_conic`.
     """
 
-    def calibrations(self, scene: ProjectiveScene, plane: F64, orthogonal: F64 | None = None) -> F64:
+    def calibrations(self, scene: ProjectiveScene, plane: F64) -> F64:
         """Compute the calibrations for a plane at infinity.
 
         Parameters
@@ -272,8 +273,6 @@ class LinearAbsoluteConic:
             Cameras and prior.
         plane : ndarray (3,)
             Plane p.
-        orthogonal : ndarray (M, 2, 3), optional
-            Pairs of vanishing points in the reference view of orthogonal directions.
 
         Returns
         -------
@@ -288,13 +287,12 @@ class LinearAbsoluteConic:
         frame, constraints = scene.frame, scene.constraints
         H = _homographies(frame, plane)
         one_camera = bool((constraints.first == constraints.first[0]).all())
-        given = orthogonal is not None and len(orthogonal) > 0
-        if one_camera and np.isinf(constraints.std).all() and not given:
+        if one_camera and np.isinf(constraints.std).all() and scene.orthogonal is None:
             dual, s = dual_conic_of_constant_camera(H)
             definite = (np.linalg.eigvalsh(dual) > 0).all()
             conic = _ImageConic(np.asarray(np.linalg.inv(dual)) if definite else dual, s)
         else:
-            conic = solve_conic(H, constraints, orthogonal=orthogonal)
+            conic = solve_conic(H, constraints, orthogonal=scene.orthogonal)
         if not conic.determined:
             raise _undetermined_failure(frame, H, conic)
         if not conic.definite:
@@ -321,12 +319,7 @@ class FixedPlaneQuadric:
     focal_range: tuple[float, float] = (0.3, 10.0)
     starts: int = 9
 
-    def calibrations(
-        self,
-        scene: ProjectiveScene,
-        plane: F64,
-        orthogonal: F64 | None = None,  # noqa: ARG002 - one signature for both methods
-    ) -> F64:
+    def calibrations(self, scene: ProjectiveScene, plane: F64) -> F64:
         """Compute the calibrations for a plane at infinity.
 
         Parameters
@@ -335,8 +328,6 @@ class FixedPlaneQuadric:
             Cameras and prior.
         plane : ndarray (3,)
             Plane p.
-        orthogonal : ndarray (M, 2, 3), optional
-            Not used.
 
         Returns
         -------

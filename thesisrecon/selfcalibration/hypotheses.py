@@ -20,6 +20,7 @@ from thesisrecon.selfcalibration._candidates import (
     candidates_from_parameters,
     distinct_candidates,
     group_focals_from_planes,
+    group_log_focals,
     select_candidate,
 )
 from thesisrecon.selfcalibration._frame import (
@@ -74,11 +75,7 @@ class HypothesesAndRefinement:
 
     @as_stage_failure
     def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
     ) -> SelfCalibration:
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = normalized_frame(reconstruction, prior)
@@ -102,7 +99,7 @@ class HypothesesAndRefinement:
         """Return the best distinct candidates, refined over all unknown intrinsics."""
         return [
             minimize_quadric(
-                frame, unknown, candidate.plane, candidate.log_focals(frame)[frame.group],
+                frame, unknown, candidate.plane, group_log_focals(frame, candidate.K)[frame.group],
                 method="hypotheses and nonlinear quadric", loss_scale=self.criterion.scale,
             )
             for candidate in distinct_candidates(frame, candidates, self.max_full_refined)

@@ -20,8 +20,7 @@ from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import IdentifiabilityReport, Reconstruction, Upgrade
-from thesisrecon.selfcalibration._frame import build_frame
-from thesisrecon.selfcalibration.critical_motions import (
+from thesisrecon.selfcalibration._critical_motions import (
     OPTICAL_AXIS,
     PARALLEL_AXES,
     PLANAR,
@@ -34,6 +33,7 @@ from thesisrecon.selfcalibration.critical_motions import (
     nearest_critical_motion,
     projective_infinity_shifts,
 )
+from thesisrecon.selfcalibration._frame import build_frame
 
 # A focal length with a larger relative standard deviation is undetermined.
 MAX_FOCAL_STD = 0.15
@@ -135,7 +135,7 @@ def check_identifiability(
     Returns
     -------
     IdentifiabilityReport
-        ``evidence`` holds the measures of :data:`~thesisrecon.selfcalibration.critical_motions.TOLERANCES`,
+        ``evidence`` holds the measures of critical motions,
         ``focal_long_sides`` (median), ``focal_std_rel`` (worst view), ``focal_std_rel_median``,
         ``focal_std_rel_free`` (median, free aspect ratio and principal point), ``principal_point_std_free``
         (long sides), ``rotation_significance``, ``excess_equations`` and ``noise_px``.
@@ -241,10 +241,10 @@ def _bundle_problem(
 ) -> _Problem | None:
     """Return upgraded cameras and points with a subset of their observations; None with too few of them."""
     views = np.flatnonzero(reconstruction.registered)
-    cameras, X, usable = _metric_frame(reconstruction, upgrade, views)
-    index = _usable_observations(reconstruction, cameras, X, usable)
-    t, total = reconstruction.tracks, len(index)
-    index = index[_subsample(t.point_index[index], np.bincount(t.point_index[index], minlength=t.n_points))]
+    R, T, X, usable = _metric_frame(reconstruction, upgrade, views)
+    t, index = reconstruction.tracks, _usable_observations(reconstruction, R, T, X, usable)
+    total = len(index)
+    index = index[_subsample(t.point_index[index])]
     seen = np.isin(views, t.view_index[index])
     if len(index) < 4 * len(views) + 20 or seen.sum() < 3:
         return None
@@ -255,7 +255,7 @@ def _bundle_problem(
     intrinsics = np.column_stack([upgrade.K[views, 0, 0], mean[:, 1:5], np.zeros(len(views))])
     own = np.arange(len(views), dtype=np.int64)
     return _Problem(
-        MetricCameras(cameras.R[seen], cameras.t[seen], intrinsics, own, prior.shared[views]), X[points],
+        MetricCameras(R[seen], T[seen], intrinsics, own, prior.shared[views]), X[points],
         Observations(np.searchsorted(views, t.view_index[index]), point.astype(np.int64), t.xy[index]),
         IntrinsicsPrior.unshared(mean, std), max(reconstruction.sigma_px, 1e-3), len(index) / max(total, 1),
         reconstruction.sizes[views].max(axis=1).astype(np.float64), views,
@@ -277,38 +277,33 @@ def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
     return noise * float(np.sqrt(2.0 * len(index) / max(left, 1)))
 
 
-def _usable_observations(reconstruction: Reconstruction, cameras: MetricCameras, X: F64, usable: B8) -> I64:
+def _usable_observations(reconstruction: Reconstruction, R: F64, T: F64, X: F64, usable: B8) -> I64:
     """Return inliers of finite points in front of their cameras, at least two per point and ten per view."""
     t, views = reconstruction.tracks, np.flatnonzero(reconstruction.registered)
     index = np.flatnonzero(
         reconstruction.inlier & reconstruction.registered[t.view_index] & usable[t.point_index]
     )
     place = np.searchsorted(views, t.view_index[index])
-    depth = np.einsum("kj,kj->k", cameras.R[place, 2], X[t.point_index[index]]) + cameras.t[place, 2]
+    depth = np.einsum("kj,kj->k", R[place, 2], X[t.point_index[index]]) + T[place, 2]
     index = index[depth > 1e-6]
     index = index[np.bincount(t.view_index[index], minlength=t.n_views)[t.view_index[index]] >= 10]
     seen = np.bincount(t.point_index[index], minlength=t.n_points)
     return np.asarray(index[seen[t.point_index[index]] >= 2], dtype=np.int64)
 
 
-def _subsample(point: I64, seen: I64) -> I64:
+def _subsample(point: I64) -> I64:
     """Return about ``_MAX_OBSERVATIONS`` places, of points spread evenly over track length."""
     if len(point) <= _MAX_OBSERVATIONS:
         return np.arange(len(point))
-    numbers = np.unique(point)
-    step = len(point) / _MAX_OBSERVATIONS
-    order = numbers[np.argsort(-seen[numbers], kind="stable")]
+    numbers, seen = np.unique(point, return_counts=True)
+    order = numbers[np.argsort(-seen, kind="stable")]
     # Every k-th track rather than the longest ones, which may lie in one corner of the scene.
-    wanted = order[np.unique(np.arange(0, len(order), step).astype(np.int64))]
-    chosen = np.zeros(int(point.max()) + 1, dtype=bool)
-    chosen[wanted] = True
-    return np.flatnonzero(chosen[point])
+    chosen = np.unique(np.arange(0, len(order), len(point) / _MAX_OBSERVATIONS).astype(np.int64))
+    return np.flatnonzero(np.isin(point, order[chosen]))
 
 
-def _metric_frame(
-    reconstruction: Reconstruction, upgrade: Upgrade, views: I64
-) -> tuple[MetricCameras, F64, B8]:
-    """Return upgraded poses of the registered views, points (N, 3), and which points are finite."""
+def _metric_frame(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) -> tuple[F64, F64, F64, B8]:
+    """Return R and t of the upgraded views, points (N, 3), and which points are finite."""
     P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)
     Q = np.linalg.inv(upgrade.K[views]) @ P
     Q *= np.where(np.linalg.det(Q[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
@@ -322,8 +317,7 @@ def _metric_frame(
     # A point far behind the others is uninformative and distorts every scale.
     usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
     t = Q[:, :, 3] / S.mean(axis=1)[:, None]
-    empty = MetricCameras(U @ Vt, t / spread, np.zeros((0, 6)), np.zeros(0, dtype=np.int64))
-    return empty, X / spread, usable
+    return U @ Vt, t / spread, X / spread, usable
 
 
 def _report(

@@ -40,6 +40,8 @@ from thesisrecon.selfcalibration._refinement import RotationCriterion, central_d
 from thesisrecon.selfcalibration.hypotheses import plane_from_focals
 
 _ROOT2 = np.sqrt(2.0)
+# Number of planes to refine for each calibration.
+_MAX_PLANES = 8
 # Residual of a good pair, against which priors are weighed.
 _NOISE = 0.01
 
@@ -204,9 +206,7 @@ class KruppaEquations:
         return [float(grid[k]) for k in minima[np.argsort(cost[minima], kind="stable")][: self.starts]]
 
 
-def _plane_for_focals(
-    frame: ReferenceFrame, criterion: RotationCriterion, log_f: F64, *, max_refined: int = 8
-) -> tuple[F64, float]:
+def _plane_for_focals(frame: ReferenceFrame, criterion: RotationCriterion, log_f: F64) -> tuple[F64, float]:
     """Return the best plane (3,) for known log focal lengths (G,) and its cost; NaN and inf if there is none.
 
     Starts from the reference with every other camera and both signs.
@@ -219,7 +219,7 @@ def _plane_for_focals(
     if not len(planes):
         return np.full(3, np.nan), np.inf
     theta = np.concatenate([planes, np.repeat(log_f[None], len(planes), axis=0)], axis=1)
-    order = np.argsort(criterion.cost(frame, theta[:, :3], theta[:, 3:]), kind="stable")[:max_refined]
+    order = np.argsort(criterion.cost(frame, theta[:, :3], theta[:, 3:]), kind="stable")[:_MAX_PLANES]
     theta, cost = refine_hypotheses(criterion, frame, theta[order], planes_only=True)
     best = int(np.nan_to_num(cost, nan=np.inf).argmin())
     return theta[best, :3], float(cost[best])

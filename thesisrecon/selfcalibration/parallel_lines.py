@@ -15,11 +15,12 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Image
+from thesisrecon.selfcalibration._cheirality import CheiralityRegion
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, ReferenceFrame
 from thesisrecon.selfcalibration._line_segments import LineSegments
 from thesisrecon.selfcalibration._refinement import minimize_batch
-from thesisrecon.selfcalibration.cheirality import CheiralityRegion
 
 # Segments within this many tolerances of a direction are not offered to another one.
 _NEAR_TOLERANCES = 4.0
@@ -84,7 +85,7 @@ def _propose_vanishing_points(
     while len(found) < max_points and len(left.half) >= 5:
         weight = left.half / left.half.sum()
         first, second = (rng.choice(len(weight), samples, p=weight) for _ in range(2))
-        lines = np.cross(_homogeneous(left.middle), np.column_stack([left.along, np.zeros(len(left.half))]))
+        lines = np.cross(homogenize(left.middle), np.column_stack([left.along, np.zeros(len(left.half))]))
         v = np.cross(lines[first], lines[second])
         v = v[np.linalg.norm(v, axis=1) > 1e-9]
         if not len(v):
@@ -101,10 +102,6 @@ def _propose_vanishing_points(
             ~mine & (np.abs(left.endpoint_distances_px(best[None])) > _NEAR_TOLERANCES * tolerance_px)
         )
     return np.array(found).reshape(-1, 3)
-
-
-def _homogeneous(xy: F64) -> F64:
-    return np.column_stack([xy, np.ones(len(xy))])
 
 
 def _nearest_to_lines(lines: F64, weight: F64) -> F64:
@@ -161,13 +158,12 @@ def _find_parallel_directions(
 def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
     """Return points (B, 4) of all pairs of vanishing points that nearly lie on each other's epipolar line."""
     i, j, v1, v2 = [], [], [], []
-    for a in range(len(P)):
-        for b in range(a + 1, len(P)):
-            first, second = np.indices((len(proposals[a]), len(proposals[b]))).reshape(2, -1)
-            i.append(np.full(len(first), a))
-            j.append(np.full(len(first), b))
-            v1.append(proposals[a][first])
-            v2.append(proposals[b][second])
+    for a, b in combinations(range(len(P)), 2):
+        first, second = np.indices((len(proposals[a]), len(proposals[b]))).reshape(2, -1)
+        i.append(np.full(len(first), a))
+        j.append(np.full(len(first), b))
+        v1.append(proposals[a][first])
+        v2.append(proposals[b][second])
     pair = np.column_stack([np.concatenate(i), np.concatenate(j)])
     v = np.stack([np.concatenate(v1), np.concatenate(v2)], axis=1)
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
@@ -206,13 +202,11 @@ def _refine_plane(
     kept, noise = direction >= 0, _FIRST_NOISE_PX
     for _ in range(4):
         plane, v = _fit_plane(frame, segments.subset(kept), direction[kept], (plane, v), noise)
-        distances = np.abs(
-            _plane_residuals(frame, segments, np.maximum(direction, 0), plane[None], v[None])[0]
-        )
+        residuals = _plane_residuals(frame, segments, np.maximum(direction, 0), plane[None], v[None])
+        distances = np.abs(residuals[0])
         noise = max(1.4826 * float(np.median(distances[direction >= 0])), _MIN_NOISE_PX)
         trimmed = (direction >= 0) & (distances <= 2.5 * noise)
-        counts = np.bincount(direction[trimmed], minlength=len(v))
-        if counts.min() < _MIN_SEGMENTS:
+        if np.bincount(direction[trimmed], minlength=len(v)).min() < _MIN_SEGMENTS:
             break
         kept = trimmed
     return plane, v, noise
@@ -336,7 +330,9 @@ class ParallelLines:
             If neither points nor images were given.
         """
         if self.points is not None:
-            return self._from_points(scene.frame, self.points)
+            X = _points_at_infinity(scene.frame, self.points)
+            v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
+            return PlaneCandidates(_plane_through_points(X)[None], self._orthogonal(v))
         if len(self.images) != len(scene.reconstruction.P):
             raise ValueError(
                 "ParallelLines needs vanishing points, or an image for each of the "
@@ -344,15 +340,8 @@ class ParallelLines:
             )
         return self._from_images(scene, rng)
 
-    def _from_points(self, frame: ReferenceFrame, given: VanishingPoints) -> PlaneCandidates:
-        X = _points_at_infinity(frame, given)
-        plane = _plane_through_points(X)
-        v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
-        return PlaneCandidates(plane[None], self._orthogonal(v))
-
-    def _orthogonal(self, v: F64) -> F64:
-        pairs = list(combinations(range(3), 2)) if self.orthogonal_directions else []
-        return np.array([[v[a], v[b]] for a, b in pairs]).reshape(-1, 2, 3)
+    def _orthogonal(self, v: F64) -> F64 | None:
+        return v[[(0, 1), (0, 2), (1, 2)]] if self.orthogonal_directions else None
 
     def _from_images(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         frame = scene.frame

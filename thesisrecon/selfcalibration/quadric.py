@@ -29,32 +29,20 @@ from thesisrecon.selfcalibration._frame import (
     normalized_frame,
     solver_unknowns,
 )
-from thesisrecon.selfcalibration._refinement import RotationCriterion, central_differences, weighted_entries
+from thesisrecon.selfcalibration._refinement import (
+    RotationCriterion,
+    central_differences,
+    dual_image_residuals,
+    quadratic_rows,
+)
 
 _MIN_NOISE = 1e-9
+_REWEIGHTINGS = 4
 # Maximum number of noise estimates.
 _NOISE_PASSES = 6
 
 
-def quadratic_rows(x: F64, y: F64) -> F64:
-    """Return rows r with r . q = x' Q y for the upper triangle q of a symmetric Q.
-
-    Parameters
-    ----------
-    x, y : ndarray (..., n)
-        Vectors.
-
-    Returns
-    -------
-    ndarray (..., n (n + 1) / 2)
-        Rows, ordered as ``numpy.triu_indices(n)``.
-    """
-    pairs = zip(*np.triu_indices(x.shape[-1]), strict=True)
-    terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in pairs]
-    return np.stack(terms, axis=-1)
-
-
-def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -> F64:
+def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
     """Solve the weighted linear equations of the absolute dual quadric.
 
     Uncertainties: 9 (focal length), 0.2 (aspect), 0.01 (skew), 0.1 (principal point); rows are divided by w33
@@ -66,8 +54,6 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
         Cameras.
     focals : ndarray (B,)
         Normalizing focal lengths.
-    iterations : int
-        Number of reweighted solutions.
 
     Returns
     -------
@@ -93,7 +79,7 @@ def linear_quadric(frame: ReferenceFrame, focals: F64, *, iterations: int = 4) -
     )  # fmt: skip
     nu = np.linalg.norm(w33, axis=-1)
     q = np.zeros((len(focals), 10))
-    for _ in range(iterations):
+    for _ in range(_REWEIGHTINGS):
         weighted = rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]
         A = weighted.reshape(len(focals), -1, 10)
         # SVD of A, since A'A would lose half the digits.
@@ -191,33 +177,6 @@ class LinearQuadric:
         K_std = found.K_std.copy()
         K_std[frame.views[:, None], (0, 1), (0, 1)] = np.nan
         return replace(found, K_std=K_std)
-
-
-def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -> F64:
-    """Compute the entries of K K' / |K K'| - P Q P' / |P Q P'|, off-diagonal ones times sqrt 2.
-
-    Parameters
-    ----------
-    A, a : ndarray (R, 3, 3), (R, 3)
-        Cameras [A | a] in a frame whose reference camera is [I | 0].
-    K, K_reference : ndarray (B, R, 3, 3), (B, 3, 3)
-        Calibrations, and those of the reference camera.
-    plane : ndarray (B, 3)
-        Planes at infinity.
-
-    Returns
-    -------
-    ndarray (B, R, 6)
-        Residuals; their squared sum over a camera is a squared Frobenius norm.
-    """
-    C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
-    difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
-    return weighted_entries(difference)
-
-
-def _unit(conic: F64) -> F64:
-    norm = np.sqrt(np.sum(conic**2, axis=(-2, -1), keepdims=True))
-    return np.asarray(conic / np.maximum(norm, 1e-300))
 
 
 def minimize_quadric(

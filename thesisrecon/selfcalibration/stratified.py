@@ -14,17 +14,13 @@ from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import Candidate, as_stage_failure, select_candidate
-from thesisrecon.selfcalibration._frame import (
-    PlaneCandidates,
-    ProjectiveScene,
-    projective_scene,
-)
-from thesisrecon.selfcalibration._refinement import RotationCriterion
+from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, projective_scene
+from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
-from thesisrecon.selfcalibration.quadric import dual_image_residuals, minimize_quadric
+from thesisrecon.selfcalibration.quadric import minimize_quadric
 
 # Number of closed-form candidates to refine.
 _MAX_REFINED = 3
@@ -77,11 +73,7 @@ class Stratified:
 
     @as_stage_failure
     def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
     ) -> SelfCalibration:
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         scene = projective_scene(reconstruction, prior)
@@ -112,13 +104,13 @@ class Stratified:
         return np.asarray(plane / np.linalg.norm(plane))
 
     def _candidates(self, scene: ProjectiveScene, found: PlaneCandidates) -> list[Candidate]:
-        frame = scene.frame
+        frame, scene = scene.frame, replace(scene, orthogonal=found.orthogonal)
         method = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
         candidates: list[Candidate] = []
         failures: list[StageFailure] = []
         for plane in found.planes:
             try:
-                K = self.calibration.calibrations(scene, plane, found.orthogonal)
+                K = self.calibration.calibrations(scene, plane)
             except StageFailure as failure:
                 failures.append(failure)
                 continue

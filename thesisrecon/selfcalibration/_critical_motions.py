@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 
@@ -66,17 +66,7 @@ _ALTERNATIVE: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class UpgradedCameras:
-    """Metric cameras of a calibration and points.
-
-    Parameters
-    ----------
-    focal : ndarray (V,)
-        Unit-free focal lengths.
-    R, C : ndarray (V, 3, 3), (V, 3)
-        Rotations, world to camera, and camera centres.
-    X : ndarray (N, 3)
-        Points.
-    """
+    """Metric cameras: unit-free focal lengths (V,), R (V, 3, 3), C (V, 3), and points X (N, 3)."""
 
     focal: F64
     R: F64
@@ -90,39 +80,20 @@ class UpgradedCameras:
         return max(float(np.median(np.linalg.norm(centre - self.C, axis=1))), 1e-300)
 
     def infinite_homographies(self) -> F64:
-        """Compute the infinite homographies from the view nearest to the mean rotation.
-
-        Returns
-        -------
-        ndarray (V, 3, 3)
-            Homographies in unit-free pixels.
-        """
-        angles = scipy.spatial.transform.Rotation.from_matrix(
-            self.R @ scipy.spatial.transform.Rotation.from_matrix(self.R).mean().as_matrix().T
-        ).magnitude()
-        middle = int(angles.argmin())
+        """Return the unit-free infinite homographies (V, 3, 3) from the view nearest to the mean rotation."""
+        mean = Rotation.from_matrix(self.R).mean().as_matrix()
+        middle = int(Rotation.from_matrix(self.R @ mean.T).magnitude().argmin())
         K = np.stack([self.focal, self.focal, np.ones_like(self.focal)], axis=1)
         return np.asarray(K[:, :, None] * (self.R @ self.R[middle].T) / K[middle])
 
 
 def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
-    """Compute the measures of :data:`TOLERANCES` and the largest rotation.
-
-    Parameters
-    ----------
-    metric : UpgradedCameras
-        Cameras and points.
-
-    Returns
-    -------
-    dict of str to float
-        Measures by name.
-    """
+    """Return the measures of ``TOLERANCES`` by name, and the largest rotation."""
     axis, angle, spread = _common_rotation_axis(metric.R)
-    H = metric.infinite_homographies()
+    H, offset = metric.infinite_homographies(), metric.C - metric.C.mean(axis=0)
     return {
         "scene_planarity_ratio": _planarity_ratio(metric.X),
-        "centre_spread_over_distance": _centre_spread_rms(metric.C) / metric.distance,
+        "centre_spread_over_distance": _rms(offset) / metric.distance,
         "infinity_shift": _infinite_homography_shift(H, roll=False),
         "infinity_shift_beyond_roll": _infinite_homography_shift(H, roll=True),
         "largest_rotation_deg": angle,
@@ -130,32 +101,15 @@ def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
         "optical_axis_rms_deg": _optical_axis_rms_deg(metric.R),
         "rotation_axis_spread_deg": spread,
         "turntable_residual_over_distance": _turntable_residual(metric, axis) / metric.distance,
-        "axial_translation_over_distance": _axial_translation_rms(metric.C, axis) / metric.distance,
+        "axial_translation_over_distance": _rms((offset @ axis)[:, None]) / metric.distance,
     }
 
 
 def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
-    """Find the nearest critical motion.
+    """Return the nearest critical motion of some measures, and its largest measure over its tolerance.
 
-    Of several motions within tolerance the first in order of what they leave undetermined is chosen; between
-    pure rotation and pure translation the nearer one.
-
-    Parameters
-    ----------
-    measures : mapping of str to float
-        Result of :func:`measure_motion` or :func:`projective_infinity_shifts`.
-
-    Returns
-    -------
-    motion : str
-        Name of the motion.
-    distance : float
-        Largest measure over its tolerance; below 1 the motion is critical.
-
-    Examples
-    --------
-    >>> nearest_critical_motion({"infinity_shift": 0.04, "infinity_shift_beyond_roll": 0.04})
-    ('pure translation', 0.5)
+    Below 1 the motion is critical. Of several motions within tolerance the first in order of what they leave
+    undetermined is chosen; between pure rotation and pure translation the nearer one.
     """
     near: dict[str, float] = {}
     for name, needed in _MEASURES_OF.items():
@@ -199,21 +153,11 @@ def _dehomogenized(x: F64) -> F64:
 
 
 def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
-    """Compute lower bounds of the shifts of points at infinity from projective cameras alone.
+    """Return lower bounds of the shifts of points at infinity from projective cameras [A | a] alone.
 
     The plane at infinity is chosen such that the cameras come nearest to having no rotation: A_i - a_i p' =
     diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]], linear in p, g, k, h. Small shifts are
     necessary but not sufficient for a camera without rotation.
-
-    Parameters
-    ----------
-    A, a : ndarray (V, 3, 3), (V, 3)
-        Cameras [A | a] in unit-free pixels, one of them [I | 0].
-
-    Returns
-    -------
-    dict of str to float
-        ``infinity_shift`` and ``infinity_shift_beyond_roll``.
     """
     identity = np.zeros((3, 3, 3))
     identity[0, 0, 0] = identity[0, 1, 1] = identity[1, 2, 2] = identity[2, 1, 0] = 1.0
@@ -238,7 +182,7 @@ def _common_rotation_axis(R: F64) -> tuple[F64, float, float]:
     """
     i, j = np.triu_indices(len(R), 1)
     relative = R[j].swapaxes(1, 2) @ R[i]
-    vectors = scipy.spatial.transform.Rotation.from_matrix(relative).as_rotvec()
+    vectors = Rotation.from_matrix(relative).as_rotvec()
     value, vector = np.linalg.eigh(vectors.T @ vectors / len(vectors))
     angle = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
     return vector[:, 2], angle, float(np.degrees(np.sqrt(max(value[1], 0.0))))
@@ -247,7 +191,7 @@ def _common_rotation_axis(R: F64) -> tuple[F64, float, float]:
 def _rotation_rms_deg(R: F64) -> float:
     """Return the rms rotation angle between all pairs of views."""
     i, j = np.triu_indices(len(R), 1)
-    angle = scipy.spatial.transform.Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
+    angle = Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 
@@ -259,14 +203,8 @@ def _optical_axis_rms_deg(R: F64) -> float:
     return float(np.degrees(np.sqrt(np.mean(np.arctan2(sine, cosine) ** 2))))
 
 
-def _centre_spread_rms(C: F64) -> float:
-    """Return the rms distance of the camera centres (V, 3) from their mean."""
-    return float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
-
-
-def _axial_translation_rms(C: F64, axis: F64) -> float:
-    """Return the rms translation of the camera centres (V, 3) along a unit direction."""
-    return float(np.sqrt(np.mean(((C - C.mean(axis=0)) @ axis) ** 2)))
+def _rms(vectors: F64) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
@@ -279,17 +217,17 @@ def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
     places = np.einsum("vab,vb->va", seen, metric.C)
     coefficients, right = seen - seen.mean(axis=0), places - places.mean(axis=0)
     c = np.linalg.lstsq(coefficients.reshape(-1, 3), right.ravel(), rcond=1e-9)[0]
-    return float(np.sqrt(np.mean(np.sum((right - coefficients @ c) ** 2, axis=1))))
+    return _rms(right - coefficients @ c)
 
 
-def _planarity_ratio(X: F64, *, inlier_ratio: float = 0.95) -> float:
+def _planarity_ratio(X: F64) -> float:
     """Return the rms thickness of points (N, 3) about their best plane over their rms extent in it.
 
-    ``inlier_ratio`` of the points are kept, nearest to the centre and then to the plane.
+    95 % of the points are kept, nearest to the centre and then to the plane.
     """
 
     def nearest(distance: F64) -> I64:
-        return np.argsort(distance, kind="stable")[: max(int(inlier_ratio * len(distance)), 4)]
+        return np.argsort(distance, kind="stable")[: max(int(0.95 * len(distance)), 4)]
 
     for _ in range(3):
         X = X[nearest(np.linalg.norm(X - np.median(X, axis=0), axis=1))]
