@@ -5,8 +5,7 @@ import pytest
 
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import rasterize, sample_texture
-from thesisrecon.records import TexturedMesh
-from thesisrecon.views.render import Light, Shading, _average_blocks, _shade, _shade_points, _vertex_normals
+from thesisrecon.views.render import Light, Shading, _average_blocks, _shade
 from thesisrecon.views.warping import DIRECTIONS, STRETCH, fill_holes, forward_map, sample
 
 SIZE = (31, 23)
@@ -248,24 +247,21 @@ def unit(vectors):
 
 
 def shaded(color, points, normals, eye, shading):
-    """The plain twin of ``shade_points``: Lambert's law and Blinn's highlight."""
+    """The plain twin of ``shade_points``: Lambert's law."""
     normals, to_eye = unit(normals), unit(eye - points)
     normals = normals * np.where((normals * to_eye).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    light, shine = np.full_like(color, shading.ambient), np.zeros_like(color)
+    light = np.full_like(color, shading.ambient)
     for lamp in shading.lights:
         if lamp.direction is not None:
             to_lamp = unit(np.tile(np.asarray(lamp.direction), (len(points), 1)))
         else:
             to_lamp = unit(np.asarray(lamp.position) - points)
         cosine = np.maximum((normals * to_lamp).sum(axis=1), 0.0)[:, None]
-        half = np.maximum((normals * unit(to_lamp + to_eye)).sum(axis=1), 0.0)[:, None]
         light += cosine * lamp.color
-        shine += 255.0 * shading.specular * (cosine > 0.0) * half**shading.shininess * np.array(lamp.color)
-    return np.asarray(color * light + shine)
+    return np.asarray(color * light)
 
 
-@pytest.mark.parametrize("specular", [0.0, 0.4])
-def test_light_is_that_of_the_formulas(specular):
+def test_light_is_that_of_the_formulas():
     rng = np.random.default_rng(0)
     color, points, normals = (
         rng.uniform(0, 255, (500, 3)),
@@ -275,23 +271,11 @@ def test_light_is_that_of_the_formulas(specular):
     normals[:5] = 0.0
     lamps = (Light(direction=(1.0, 2.0, -3.0), color=(0.5, 0.6, 0.2)), Light(position=(0.3, 0.1, -4.0)))
     for lights in ((), lamps[:1], lamps):
-        shading = Shading(ambient=0.2, lights=lights, specular=specular, shininess=7.0)
+        shading = Shading(ambient=0.2, lights=lights)
         eye = np.array([0.1, -0.2, -3.0])
         seen = color.astype(np.float32)
         _shade(seen, points.astype(np.float32), normals.astype(np.float32), eye, shading)
         np.testing.assert_allclose(seen, shaded(color, points, normals, eye, shading), atol=0.02)
-
-
-def test_normals_are_means_by_area():
-    rng = np.random.default_rng(1)
-    vertices, faces = rng.normal(size=(40, 3)), rng.integers(0, 40, (90, 3))
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros((40, 3))
-    np.add.at(total, faces.ravel(), np.repeat(across, 3, axis=0))
-    np.testing.assert_allclose(_vertex_normals(TexturedMesh(vertices, faces)), unit(total), atol=1e-12)
-    alone = TexturedMesh(np.zeros((2, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert (_vertex_normals(alone) == 0.0).all()
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
@@ -314,7 +298,7 @@ def test_values_of_vertices_and_corners_are_interpolated_alike():
     values = rng.uniform(size=(30, 4)).astype(np.float32)
     assert (raster.face >= 0).mean() > 0.2
     np.testing.assert_array_equal(raster.interpolate(values, faces), raster.interpolate(values[faces]))
-    part = raster.rows(10, 20)
+    part = raster[10:20]
     np.testing.assert_array_equal(part.interpolate(values[faces]), raster.interpolate(values[faces])[10:20])
 
 
@@ -334,10 +318,3 @@ def test_bytes_and_floats_of_a_texture_are_sampled_alike():
     plain = (1 - t) * ((1 - s) * T[top, left] + s * T[top, left + 1])
     plain += t * ((1 - s) * T[top + 1, left] + s * T[top + 1, left + 1])
     np.testing.assert_allclose(seen[0], np.where(drawn[..., None] < 0, 0.0, plain), atol=1e-2)
-
-
-def test_a_colour_without_lights_is_dimmed_alone():
-    color = np.full((2, 3), 100, dtype=np.float32)
-    points, normals = np.zeros((2, 3), dtype=np.float32), np.ones((2, 3), dtype=np.float32)
-    _shade_points(color, points, normals, np.array([0.0, 0, -1]), np.zeros((0, 7)), (0.5, 0.0, 1.0))
-    np.testing.assert_allclose(color, 50.0)

@@ -232,11 +232,6 @@ def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
     -------
     ndarray (N, 2)
         Points beyond the largest radius that the distortion reaches have no inverse and are not changed.
-
-    Examples
-    --------
-    >>> undistort(np.array([[1.1, 0.0]]), 0.1).round(9).tolist()
-    [[1.0, 0.0]]
     """
     distorted = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     k = np.atleast_1d(distortion)

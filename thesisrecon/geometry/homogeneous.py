@@ -127,12 +127,6 @@ def normalizing_transform(xy: F64) -> F64:
     References
     ----------
     Hartley, "In Defense of the Eight-Point Algorithm", PAMI 19(6), 1997.
-
-    Examples
-    --------
-    >>> T = normalizing_transform(np.array([[0.0, 0.0], [4.0, 0.0]]))
-    >>> (T @ [4.0, 0.0, 1.0]).round(3).tolist()
-    [1.414, 0.0, 1.0]
     """
     require_finite("normalizing_transform", xy)
     centroid = xy.mean(axis=0)

@@ -14,7 +14,8 @@ from thesisrecon.geometry.two_view import epipoles, unit_norm
 def image_from_plane(P: F64, plane: F64) -> F64:
     """Return H_Pi = M - m pi' (3.29), which maps the point (x, -pi'x) of the plane (pi, 1) to its image.
 
-    H_Pi is singular if the plane contains the camera centre. For [I 0] it is the identity (3.32).
+    H_Pi is singular if the plane contains the camera centre. For [I 0] it is the identity (3.32); the camera
+    beside it is [M m] = [H_Pi + e2 pi', e2] with the epipole e2 = m (3.36-3.40).
 
     Parameters
     ----------
@@ -45,13 +46,6 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
     -------
     ndarray (3, 3)
         Singular if the plane contains the second centre.
-
-    Examples
-    --------
-    >>> P1, P2 = np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])
-    >>> H = plane_homography(P1, P2, np.array([0.0, 0.0, 1.0, -2.0]))
-    >>> np.allclose(H / H[2, 2], [[1.0, 0.0, -0.5], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    True
     """
     P1, P2, plane = (checked_unit(array, "plane_homography") for array in (P1, P2, plane))
     centre = checked_unit(camera_centre(P1), "plane_homography, for the centre of its first camera,")
@@ -105,20 +99,3 @@ def homography_from_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
     _, e2 = epipoles(F)
     H = -cross_matrix(e2) @ F
     return H if plane is None else H + np.outer(e2, plane)
-
-
-def camera_from_homography(H: F64, e2: F64, plane: F64) -> F64:
-    """Return P2 = [H + e2 pi', e2] (3.40) beside P1 = [I 0]; pi = 0 for the plane W = 0 (3.37).
-
-    Parameters
-    ----------
-    H, e2 : ndarray (3, 3) and (3,)
-        Homography and epipole in view 2, of their true ratio of scales.
-    plane : ndarray (3,)
-        The plane (pi, 1) of the homography.
-
-    Returns
-    -------
-    ndarray (3, 4)
-    """
-    return np.hstack([H + np.outer(e2, plane), e2[:, None]])

@@ -16,7 +16,6 @@ References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -27,6 +26,9 @@ from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, requi
 
 _Two = tuple[float, float]
 _Four = tuple[float, float, float, float]
+_PencilCost = tuple[float, float, float, float, float, float, float]
+"""Cost G x^2 / (1 + kappa x^2) + (n0 + n1 x)^2 / (E0 + 2 E1 x + E2 x^2) of a member x of a pencil, in n0, n1,
+E0, E1, E2, G, kappa."""
 
 _DEGREE = 6
 _MONOTONE = 3.0
@@ -108,18 +110,6 @@ def _form(B: F64, p0: float, p1: float, q0: float, q1: float) -> float:
     return value
 
 
-class _PencilCost(NamedTuple):
-    """Cost G x^2 / (1 + kappa x^2) + (n0 + n1 x)^2 / (E0 + 2 E1 x + E2 x^2) of a member x of a pencil."""
-
-    n0: float
-    n1: float
-    E0: float
-    E1: float
-    E2: float
-    G: float
-    kappa: float
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _stationary_polynomial(cost: _PencilCost, c: F64) -> None:
     """Fill c (7,) with half the numerator of the derivative of the cost."""
@@ -177,7 +167,7 @@ def _best_in_sector(own: _Two, B: F64, Q: float, D: float, other: _Two, E: F64, 
     n1 *= h
     E0, E1, E2 = _form(E, q0, q1, q0, q1), h * _form(E, q0, q1, p0, p1), h * h * _form(E, p0, p1, p0, p1)
     G, kappa = Q * h * h, D * h * h
-    cost = _PencilCost(n0, n1, E0, E1, E2, G, kappa)
+    cost = (n0, n1, E0, E1, E2, G, kappa)
     _stationary_polynomial(cost, c)
     bend = 2.0 * abs(c[2]) + 3.0 * abs(c[3]) + 4.0 * abs(c[4]) + 5.0 * abs(c[5]) + 6.0 * abs(c[6])
     if proper and c[1] > _MONOTONE * bend:
@@ -344,13 +334,6 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     Returns
     -------
     xy1, xy2 : ndarray (N, 2)
-
-    Examples
-    --------
-    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    >>> xy1, xy2 = correct_matches(F, np.array([[10.0, 20.0]]), np.array([[5.0, 22.0]]))
-    >>> xy1.round(6).tolist(), xy2.round(6).tolist()
-    ([[10.0, 21.0]], [[5.0, 21.0]])
     """
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     require_shapes("correct_matches", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))

@@ -61,8 +61,20 @@ def _halve_image(image: F32) -> F32:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _resample_image(image: F32, width: int, height: int) -> F32:
-    """Sample (H, W) bilinearly at the pixel centres of a ``height`` x ``width`` grid over the same area."""
+def resample(image: F32, width: int, height: int) -> F32:
+    """Resize an image by bilinear interpolation; smooth it before if it shrinks.
+
+    Parameters
+    ----------
+    image : ndarray (H, W) of float32
+        Image.
+    width, height : int
+        New size, px.
+
+    Returns
+    -------
+    ndarray (height, width) of float32
+    """
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
     out = np.empty((height, width), np.float32)
     left = np.empty(width, np.int64)
@@ -138,25 +150,6 @@ def halve(image: F32) -> F32:
     if min(image.shape) < 2:
         raise ValueError(f"halve needs at least 2 x 2 pixels; got shape {image.shape}")
     return _halve_image(image)
-
-
-def resample(image: F32, width: int, height: int) -> F32:
-    """Resize an image by bilinear interpolation; smooth it before if it shrinks.
-
-    Parameters
-    ----------
-    image : ndarray (H, W) of float32
-        Image.
-    width, height : int
-        New size, px.
-
-    Returns
-    -------
-    ndarray (height, width) of float32
-    """
-    if width < 1 or height < 1:
-        raise ValueError(f"resample needs a size of at least 1 x 1; got {width} x {height}")
-    return _resample_image(image, width, height)
 
 
 @njit(cache=True, nogil=True)

@@ -8,14 +8,6 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import normalizing_transform, require_finite
 
 
-def _dlt_rows(X: F64, xy: F64) -> F64:
-    """DLT rows, X (..., M, 4), xy (..., M, 2) -> (..., 2 M, 12): u p3'X - p1'X and v p3'X - p2'X."""
-    zero = np.zeros_like(X)
-    first = np.concatenate([-X, zero, xy[..., :1] * X], axis=-1)
-    second = np.concatenate([zero, -X, xy[..., 1:] * X], axis=-1)
-    return np.concatenate([first, second], axis=-2)
-
-
 def resect_linear(X: F64, xy: F64) -> F64:
     """Estimate cameras by the direct linear transform, least algebraic residual.
 
@@ -44,7 +36,11 @@ def resect_linear(X: F64, xy: F64) -> F64:
     flat = xy.reshape(-1, 2)
     T = normalizing_transform(flat)
     conditioned = xy * T[0, 0] + T[:2, 2]
-    A = _dlt_rows(X, conditioned)
+    # Rows u p3'X - p1'X and v p3'X - p2'X.
+    zero = np.zeros_like(X)
+    first = np.concatenate([-X, zero, conditioned[..., :1] * X], axis=-1)
+    second = np.concatenate([zero, -X, conditioned[..., 1:] * X], axis=-1)
+    A = np.concatenate([first, second], axis=-2)
     p = np.linalg.eigh(A.swapaxes(-1, -2) @ A)[1][..., 0]
     P = np.linalg.inv(T) @ p.reshape(*p.shape[:-1], 3, 4)
     return np.asarray(P / np.linalg.norm(P, axis=(-2, -1), keepdims=True))
@@ -88,7 +84,15 @@ def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
         A1 = 4 * (-q * (1 + q) * cb + 2 * a_b * cc**2 * cb - (1 - (a2 + c2) / b2) * ca * cc)
         A0 = (1 + q) ** 2 - 4 * a_b * cc**2
     v, sample = _real_quartic_roots(np.stack([A4, A3, A2, A1, A0], axis=1))
-    return _poses_from_ratio(X, rays, v, sample)
+    X, rays, q, b2, ca, cb, cc = (array[sample] for array in (X, rays, q, b2, ca, cb, cc))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = ((q - 1) * v**2 - 2 * q * cb * v + 1 + q) / (2 * (cc - v * ca))
+        s1 = np.sqrt(b2 / (1 + v**2 - 2 * v * cb))
+    Y = np.stack([s1, u * s1, v * s1], axis=1)[:, :, None] * rays
+    good = np.isfinite(Y).all(axis=(1, 2)) & (u > 0)
+    X, Y, sample = X[good], Y[good], sample[good]
+    R = _triad(Y) @ _triad(X).swapaxes(1, 2)
+    return R, Y.mean(axis=1) - np.einsum("bij,bj->bi", R, X.mean(axis=1)), sample
 
 
 def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
@@ -101,22 +105,6 @@ def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
     real = good[:, None] & (np.abs(roots.imag) < 1e-4 * (1.0 + np.abs(roots.real))) & (roots.real > 0)
     sample, which = np.nonzero(real)
     return np.asarray(roots.real[sample, which], dtype=np.float64), sample.astype(np.int64)
-
-
-def _poses_from_ratio(X: F64, rays: F64, v: F64, sample: I64) -> tuple[F64, F64, I64]:
-    """Distances along the rays, then the rotation that takes the space triangle to the camera triangle."""
-    X, rays = X[sample], rays[sample]
-    a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
-    ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        q = (a2 - c2) / b2
-        u = ((q - 1) * v**2 - 2 * q * cb * v + 1 + q) / (2 * (cc - v * ca))
-        s1 = np.sqrt(b2 / (1 + v**2 - 2 * v * cb))
-    Y = np.stack([s1, u * s1, v * s1], axis=1)[:, :, None] * rays
-    good = np.isfinite(Y).all(axis=(1, 2)) & (u > 0)
-    X, Y, sample = X[good], Y[good], sample[good]
-    R = _triad(Y) @ _triad(X).swapaxes(1, 2)
-    return R, Y.mean(axis=1) - np.einsum("bij,bj->bi", R, X.mean(axis=1)), sample
 
 
 def _triad(X: F64) -> F64:

@@ -1,17 +1,7 @@
 """Section 6.3: triangulation of space points by five methods with one entry point, :func:`triangulate`.
 
-============== ===== ================================== ==================================================
-method         views criterion                          use
-============== ===== ================================== ==================================================
-``linear``     any   algebraic residual                 starting values; sufficient for small noise
-``iterated``   any   nearly the reprojection error      as linear, independent of the scales of cameras
-``midpoint``   any   distances to the rays in space     metric frames only
-``polynomial`` two   reprojection error, global minimum best for two views, in any frame
-``optimal``    any   reprojection error, local minimum  best for more views, in any frame
-============== ===== ================================== ==================================================
-
-Near an epipole ``optimal`` may end in a higher minimum than ``polynomial``. Points with fewer than two
-observations are zeros, all others have unit norm (mid-points X4 = 1). See docs/triangulation.md.
+Points with fewer than two observations are zeros, all others have unit norm (mid-points X4 = 1). Near an
+epipole "optimal" may end in a higher minimum than "polynomial". docs/triangulation.md compares the methods.
 
 References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 """
@@ -19,7 +9,7 @@ References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numba import njit
@@ -35,14 +25,6 @@ _AT_REST = 1e-6
 """Relative change of all depths at which the iterated linear method has converged."""
 _PARALLEL = 1e-14
 """Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
-
-
-class _WeightedObservations(NamedTuple):
-    """Observations sorted by point and the weight of their two equations."""
-
-    view: I64
-    xy: F64
-    weight: F64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -127,7 +109,7 @@ def _jacobi_least(R: F64, x: F64) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _least_algebraic(
-    P: F64, obs: _WeightedObservations, first: int, last: int, R: F64, row: F64, x: F64
+    P: F64, obs: tuple[I64, F64, F64], first: int, last: int, R: F64, row: F64, x: F64
 ) -> None:
     """Fill x (4,) with the least sum of (w (u p3'x - p1'x))^2 + (w (v p3'x - p2'x))^2; R, row are scratch."""
     view, xy, weight = obs
@@ -166,7 +148,7 @@ def _triangulate_each_linear(
     """
     R, row, x, y = np.zeros((4, 4)), np.empty(4), np.empty(4), np.empty(4)
     weight = np.empty(len(xy))
-    obs = _WeightedObservations(view, xy, weight)
+    obs = (view, xy, weight)
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
         X[j] = 0.0

@@ -194,19 +194,9 @@ class Raster:
         _interpolate(self.face, self.weights, faces, np.ascontiguousarray(values, dtype=np.float32), out)
         return out
 
-    def rows(self, first: int, last: int) -> Raster:
-        """Return the rows ``first`` to ``last`` - 1, without a copy.
-
-        Parameters
-        ----------
-        first, last : int
-            Rows.
-
-        Returns
-        -------
-        Raster
-        """
-        return Raster(self.depth[first:last], self.face[first:last], self.weights[first:last])
+    def __getitem__(self, rows: slice) -> Raster:
+        """Return some rows, without a copy."""
+        return Raster(self.depth[rows], self.face[rows], self.weights[rows])
 
 
 def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) -> Raster:

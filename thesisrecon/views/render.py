@@ -1,7 +1,4 @@
-"""Rendering of a mesh from any camera, in colour and depth (thesis, section 2.6).
-
-Lighting follows Lambert's law with a Blinn highlight. Each kernel has a NumPy twin in the tests.
-"""
+"""Rendering of a mesh from any camera, in colour and depth (thesis, section 2.6)."""
 
 from __future__ import annotations
 
@@ -28,41 +25,28 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _shade_points(
-    color: F32, points: F32, normals: F32, eye: F64, lamps: F64, surface: tuple[float, float, float]
-) -> None:
-    """Shade colours (P, 3), 0 to 255, in place; normals are flipped towards the eye.
+def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lamps: F64, ambient: float) -> None:
+    """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye.
 
     ``lamps`` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
-    ``surface``: ambient light, strength and exponent of the highlight.
     """
-    ambient, specular, shininess = surface
+    light = np.empty(3)
     for p in range(color.shape[0]):
         px, py, pz = points[p, 0], points[p, 1], points[p, 2]
         nx, ny, nz = _unit(normals[p, 0], normals[p, 1], normals[p, 2])
         ex, ey, ez = _unit(eye[0] - px, eye[1] - py, eye[2] - pz)
         if nx * ex + ny * ey + nz * ez < 0.0:
             nx, ny, nz = -nx, -ny, -nz
-        light_r = light_g = light_b = ambient
-        shine_r = shine_g = shine_b = 0.0
+        light[:] = ambient
         for k in range(lamps.shape[0]):
             at = lamps[k, 0]
             lx, ly, lz = _unit(lamps[k, 1] - at * px, lamps[k, 2] - at * py, lamps[k, 3] - at * pz)
             cosine = nx * lx + ny * ly + nz * lz
-            if cosine <= 0.0:
-                continue
-            light_r += cosine * lamps[k, 4]
-            light_g += cosine * lamps[k, 5]
-            light_b += cosine * lamps[k, 6]
-            if specular > 0.0:
-                hx, hy, hz = _unit(lx + ex, ly + ey, lz + ez)
-                shine = 255.0 * specular * max(nx * hx + ny * hy + nz * hz, 0.0) ** shininess
-                shine_r += shine * lamps[k, 4]
-                shine_g += shine * lamps[k, 5]
-                shine_b += shine * lamps[k, 6]
-        color[p, 0] = np.float32(color[p, 0] * light_r + shine_r)
-        color[p, 1] = np.float32(color[p, 1] * light_g + shine_g)
-        color[p, 2] = np.float32(color[p, 2] * light_b + shine_b)
+            if cosine > 0.0:
+                for c in range(3):
+                    light[c] += cosine * lamps[k, 4 + c]
+        for c in range(3):
+            color[p, c] = np.float32(color[p, c] * light[c])
 
 
 @njit(cache=True, nogil=True)
@@ -114,7 +98,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Shading:
-    """Ambient light, light sources and a highlight (Blinn 1977). Both sides of a surface are lit alike.
+    """Ambient light and light sources. Both sides of a surface are lit alike.
 
     Parameters
     ----------
@@ -122,14 +106,10 @@ class Shading:
         Ambient light.
     lights : tuple of Light
         Light sources.
-    specular, shininess : float
-        Strength and exponent of the highlight.
     """
 
     ambient: float = 0.3
     lights: tuple[Light, ...] = ()
-    specular: float = 0.0
-    shininess: float = 30.0
 
 
 def _vertex_normals(mesh: TexturedMesh) -> F64:
@@ -210,7 +190,7 @@ def render(
         # A few rows at a time keep intermediate arrays in cache.
         for first in range(rows[0], rows[1], STRIP):
             last = min(first + STRIP, rows[1])
-            part = fine.rows(samples * first, samples * last)
+            part = fine[samples * first : samples * last]
             color = _colors(surface, part)
             if shading is not None:
                 _light(surface, part, color, camera.centre, shading)
@@ -264,5 +244,4 @@ def _light(surface: _Surface, raster: Raster, color: F32, eye: F64, shading: Sha
 def _shade(color: F32, points: F32, normals: F32, eye: F64, shading: Shading) -> None:
     """Shade the colours (P, 3) of surface points in place."""
     lamps = np.array([light._row for light in shading.lights], dtype=np.float64).reshape(-1, 7)
-    surface = (float(shading.ambient), float(shading.specular), float(shading.shininess))
-    _shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lamps, surface)
+    _shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lamps, float(shading.ambient))
