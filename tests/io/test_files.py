@@ -4,16 +4,13 @@ import errno
 import json
 import os
 import pickle
-import resource
-import subprocess
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
-from thesisrecon.io._exports import read_cameras, write_point_cloud
+from thesisrecon.io._exports import read_cameras
 from thesisrecon.io._files import (
     is_partial,
     link,
@@ -31,40 +28,9 @@ from thesisrecon.io._files import (
 from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints, write_colmap_model
 from validation.studies.robustness import disk_ends, remount, small_disk
 
-MANY = np.zeros((20_000, 3))
-
 
 def entries(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-@contextmanager
-def no_larger_than(size):
-    """Limit the size of files, which acts like a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-@contextmanager
-def read_only(folder):
-    """Make a folder read-only; for root by an attribute, since permissions do not apply."""
-    if os.geteuid():
-        folder.chmod(0o500)
-        yield
-        folder.chmod(0o700)
-        return
-    try:
-        subprocess.run(["chattr", "+i", str(folder)], check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("root may write everywhere, and folders cannot be marked as immutable here")
-    try:
-        yield
-    finally:
-        subprocess.run(["chattr", "-i", str(folder)], check=True)
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
@@ -77,17 +43,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, number):
     assert entries(tmp_path) == before
     assert str(refused.value) == f"{path} cannot be written: {os.strerror(number)}; {REMEDIES[number]}"
     assert isinstance(refused.value, UsageError)
-
-
-def test_a_file_that_grows_too_large_leaves_nothing_of_itself(tmp_path):
-    """The system itself cuts it off in the middle."""
-    (tmp_path / "points.ply").write_bytes(b"before")
-    with no_larger_than(100_000):
-        with pytest.raises(OutputError, match=r"File too large; .*ulimit"):
-            write_point_cloud(tmp_path / "points.ply", MANY, np.ones(MANY.shape, np.uint8))
-        with pytest.raises(OutputError, match="File too large"):
-            write_text(tmp_path / "new.txt", "x" * 200_000)
-    assert entries(tmp_path) == {"points.ply": b"before"}
 
 
 def test_each_file_of_a_model_is_whole_or_absent(tmp_path):
@@ -118,17 +73,6 @@ def test_a_disk_that_is_full_or_read_only(tmp_path):
                 link(disk / "a.json", disk / "deep" / "a.json")
     except PermissionError as error:
         pytest.skip(str(error))
-
-
-def test_a_folder_where_nothing_can_be_made(tmp_path):
-    write_text(tmp_path / "a.txt", "before")
-    with read_only(tmp_path):
-        for write in (write_text, write_json):
-            with pytest.raises(OutputError, match=r"not permitted|denied"):
-                write(tmp_path / "a.txt", "after")
-        with pytest.raises(OutputError, match="make the place writable, or choose another one"):
-            link(tmp_path / "a.txt", tmp_path / "b.txt")
-    assert entries(tmp_path) == {"a.txt": b"before"}
 
 
 def test_a_file_stands_where_a_folder_belongs(tmp_path):

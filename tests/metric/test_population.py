@@ -63,35 +63,26 @@ def test_the_spread_is_that_of_the_values_beyond_their_noise_and_the_error_of_th
     assert estimate_spread(np.zeros(1), np.ones(1), np.ones(1)) == np.inf
 
 
+def prior_of(value, kind, shared, std=1e-3):
+    std = np.full(value.shape, std)
+    return estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, np.array(kind)), shared)
+
+
 def test_one_zoomed_camera_does_not_pull_the_rest():
     rng = np.random.default_rng(3)
-    std = np.full((9, 8), 0.001)
     value = 0.001 * rng.normal(size=(9, 8))
     value[4, 0] += 0.4
-    shared = np.tile(np.arange(9)[:, None], (1, 8))
-    found = estimate_hierarchical_prior(
-        PerCameraEstimates(value, std, 0.0 * std, np.zeros(9, dtype=np.int64)), shared
-    )
+    found = prior_of(value, [0] * 9, np.tile(np.arange(9)[:, None], (1, 8)))
     np.testing.assert_array_equal(found.kind, np.where(np.arange(9) == 4, -1, 0))
     assert found.spread[0, 0] < 0.005
-    assert find_outliers(value[:, 0], std[:, 0]).sum() == 1
+    assert find_outliers(value[:, 0], np.full(9, 0.001)).sum() == 1
 
 
 def test_nothing_is_shrunk_if_all_is_shared_or_too_few_are_of_one_kind():
-    value, std = np.zeros((4, 8)), np.full((4, 8), 0.01)
-    kind = np.zeros(4, dtype=np.int64)
-    own = np.tile(np.arange(4)[:, None], (1, 8))
-    assert (
-        estimate_hierarchical_prior(
-            PerCameraEstimates(value, std, 0.0 * std, kind), np.zeros((4, 8), dtype=np.int64)
-        )
-        is None
-    )
-    assert (
-        estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, np.array([0, 0, 1, 2])), own)
-        is None
-    )
-    assert estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, kind), own) is not None
+    value, own = np.zeros((4, 8)), np.tile(np.arange(4)[:, None], (1, 8))
+    assert prior_of(value, [0] * 4, np.zeros_like(own), std=0.01) is None
+    assert prior_of(value, [0, 0, 1, 2], own, std=0.01) is None
+    assert prior_of(value, [0] * 4, own, std=0.01) is not None
 
 
 def test_a_badly_determined_focal_is_shrunk_and_named():
@@ -104,10 +95,6 @@ def test_a_badly_determined_focal_is_shrunk_and_named():
     assert "shrunk towards the other cameras" in narrow.source
     assert "shrunk" not in wide.source
     assert "1 sigma" in narrow.source
-    for interval in (
-        i for views in (alone, together) for of_view in views.intrinsics for i in of_view.values()
-    ):
-        assert "x 1.0 " not in interval.source or "covariance" not in interval.source
     for result in (alone, together):
         for view, intervals in enumerate(result.intrinsics):
             focal = intervals["focal_px"]
@@ -126,10 +113,10 @@ def test_zoomed_photographs_keep_their_own_focals():
 
 def test_kinds_of_different_sizes_have_spreads_of_their_own():
     rng = np.random.default_rng(5)
-    value, std = np.zeros((12, 8)), np.full((12, 8), 1e-3)
+    value = np.zeros((12, 8))
     value[:6, 0], value[6:, 0] = 0.001 * rng.normal(size=6), 0.2 * rng.normal(size=6)
     value[:6, 3], value[6:, 3] = 20.0 * rng.normal(size=6), 0.001 * rng.normal(size=6)
     own = np.tile(np.arange(12)[:, None], (1, 8))
-    found = estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, np.repeat([0, 1], 6)), own)
+    found = prior_of(value, np.repeat([0, 1], 6), own)
     assert found.spread[0, 0] < 0.005 < 0.05 < found.spread[6, 0]
     assert found.spread[6, 3] < 0.005 < 5.0 < found.spread[0, 3]

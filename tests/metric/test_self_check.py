@@ -40,16 +40,13 @@ def true_model(scene, prior):
     return retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
 
 
-def calibration_of(scene):
-    return SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
-
-
 def doubts_of(model, scene):
     intervals = [
         {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 1.0, "")}
         for g in model.cameras.group
     ]
-    return self_check(model, calibration_of(scene), intervals, sigmas=SIGMAS)
+    calibration = SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
+    return self_check(model, calibration, intervals, sigmas=SIGMAS)
 
 
 def setting(**known):
