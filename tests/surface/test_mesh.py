@@ -112,12 +112,6 @@ def test_small_meshes_are_unchanged_and_colours_are_averaged(sphere):
     assert (small.colors[small.vertices[:, 1] < -0.2] == (20, 60, 10)).all()
 
 
-def test_the_same_mesh_gives_the_same_bytes(sphere):
-    one, two = simplify_mesh(sphere, 800), simplify_mesh(sphere, 800)
-    assert one.vertices.tobytes() == two.vertices.tobytes()
-    assert one.faces.tobytes() == two.faces.tobytes()
-
-
 def test_a_mesh_of_nothing_but_one_place_becomes_empty():
     point = TexturedMesh(np.zeros((9, 3)), np.arange(9).reshape(3, 3))
     assert len(simplify_mesh(point, 2).faces) <= 2

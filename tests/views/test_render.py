@@ -55,7 +55,7 @@ def test_vertex_colours_run_from_corner_to_corner():
     assert (seen[..., 2] == 0).all()
 
 
-def test_light_falls_by_the_cosine_and_shines_towards_the_eye():
+def test_light_falls_by_the_cosine():
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
 
     def brightness(**shading):
@@ -66,9 +66,9 @@ def test_light_falls_by_the_cosine_and_shines_towards_the_eye():
     assert np.abs(brightness(ambient=0.0, lights=(slanted,)) - 100).max() <= 1
     behind = Light(direction=(0.0, 0.0, 1.0))
     assert brightness(ambient=0.0, lights=(behind,)).max() == 0.0
-    lamp = brightness(ambient=0.0, lights=(Light(position=(0.0, 0.0, 0.0)),), specular=0.5)
-    assert lamp[23, 31] == lamp.max() == 255
-    assert lamp[0, 0] < 200
+    lamp = brightness(ambient=0.0, lights=(Light(position=(0.0, 0.0, 0.0)),))
+    assert lamp[23, 31] == lamp.max() == 200
+    assert lamp[0, 0] < 180
 
 
 def test_nothing_is_seen_where_nothing_is():
@@ -100,12 +100,6 @@ def test_wrong_calls_are_refused():
         render(wall(colors=np.zeros((1, 3), np.uint8)), camera)
     with pytest.raises(ValueError, match="either a direction or a position"):
         Light()
-    with pytest.raises(ValueError, match="at least 1 x 1"):
-        Camera(K, np.eye(3), np.zeros(3), (0, 5))
-    with pytest.raises(ValueError, match="finite"):
-        Camera(K * np.nan, np.eye(3), np.zeros(3), SIZE)
-    with pytest.raises(ValueError, match="needs K"):
-        Camera(K[:2], np.eye(3), np.zeros(3), SIZE)
 
 
 SPHERE_SIZE = (160, 120)
@@ -129,16 +123,6 @@ def test_from_its_own_camera_the_surface_shows_the_photograph_and_its_depth(angl
     np.testing.assert_allclose(seen.depth[seen.valid], depth_map.depth[seen.valid], rtol=1e-4)
     apart = np.abs(seen.color.astype(int) - photograph(depth_map).rgb)[seen.valid]
     assert apart.max() <= 1
-
-
-def test_averaged_pixels_are_those_of_the_photograph_but_for_its_finest_detail():
-    depth_map = sphere_map(0, looking_at_origin(0.3, -1.0, 3.5))
-    seen = render(textured_surface(depth_map), Camera.from_matrix(depth_map.P, SPHERE_SIZE), samples=2)
-    inside = np.isfinite(depth_map.depth)
-    for _ in range(3):
-        inside[1:-1, 1:-1] &= inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]
-    apart = np.abs(seen.color.astype(int) - photograph(depth_map).rgb)[inside]
-    assert np.mean(apart) < 1.0
 
 
 def test_from_between_two_photographs_the_model_has_the_colours_of_the_scene():

@@ -255,12 +255,9 @@ def test_a_half_turn_is_not_a_small_rotation():
     [
         (np.diag([1.0, 1.0, -1.0]), np.zeros(3), None, "det -1"),
         (np.eye(3) + 0.01, np.zeros(3), None, "off by"),
-        (np.eye(2), np.zeros(3), None, "got shape"),
         (np.full((3, 3), np.nan), np.zeros(3), None, "finite"),
         (np.eye(3), np.zeros(2), None, "three finite numbers"),
-        (np.eye(3), np.array([0.0, np.inf, 0.0]), None, "three finite numbers"),
         (np.eye(3), np.zeros(3), np.diag([-1.0, 1.0, 1.0]), "positive focals"),
-        (np.eye(3), np.zeros(3), np.full((3, 3), 1.0), "positive focals"),
         (np.eye(3), np.zeros(3), np.eye(4), "got shape"),
     ],
 )

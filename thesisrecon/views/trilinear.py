@@ -97,14 +97,9 @@ class CalibratedPair:
         """Centre (3,) of the second camera in the frame of the first."""
         return np.asarray(-self.R.T @ self.t)
 
+    @property
     def swapped(self) -> CalibratedPair:
-        """Return the same cameras in the other order.
-
-        Returns
-        -------
-        CalibratedPair
-            The pair with the first and second camera exchanged.
-        """
+        """The same cameras in the other order."""
         return CalibratedPair(self.K2, self.K1, self.R.T, self.centre2)
 
 
@@ -160,7 +155,7 @@ def pair_from_fundamental(
     require_finite("pair_from_fundamental", F, xy1, xy2)
     _require_intrinsics(K1)
     _require_intrinsics(K2)
-    _require_theirs(F, xy1, xy2)
+    _require_matches_of(F, xy1, xy2)
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
     candidates = (_decompose_small if small_rotation else _decompose)(E / np.linalg.norm(E))
@@ -212,7 +207,7 @@ def _ratio_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
     return float(np.mean((first > 0.0) & (second > 0.0)))
 
 
-def _require_theirs(F: F64, xy1: F64, xy2: F64) -> None:
+def _require_matches_of(F: F64, xy1: F64, xy2: F64) -> None:
     """Reject matches that do not fit F, and matches without parallax."""
     distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
     extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
@@ -342,14 +337,9 @@ class VirtualTensor:
             design[i, :, i] = -self.P2[:, 3]
         return np.asarray(np.linalg.lstsq(design.reshape(9, 4), self.T.reshape(9, 3), rcond=None)[0].T)
 
+    @property
     def swapped(self) -> VirtualTensor:
-        """Return the tensor <2, 1, 3> in the frame of the swapped pair.
-
-        Returns
-        -------
-        VirtualTensor
-            The tensor with the roles of the first two images exchanged.
-        """
+        """The tensor <2, 1, 3> in the frame of the swapped pair."""
         change = np.linalg.inv(np.vstack([self.P2, np.eye(4)[3]]))
         return VirtualTensor(_tensor(change[:3], self.P3 @ change), change[:3], self.K)
 

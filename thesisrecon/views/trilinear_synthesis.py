@@ -119,7 +119,7 @@ def _complete_correspondence(
                 f"no pixel of image {side + 1} has a known correspondence",
                 "choose images that overlap more",
             )
-    pairs = pair, pair.swapped()
+    pairs = pair, pair.swapped
     sure = [np.where(known[side][..., None], places[side], np.nan) for side in (0, 1)]
     own = [seed_of_two(one, first=True) for one in pairs]
     inverse_depth = [_transfer_image(own[side], sure[side])[1] for side in (0, 1)]
@@ -232,7 +232,7 @@ class TensorSynthesis:
             If the camera sees almost nothing of the scene.
         """
         seed = seed_of_two(self.pair)
-        moved = [s.moved(camera.rotation, camera.translation, K=camera.K) for s in (seed, seed.swapped())]
+        moved = [s.moved(camera.rotation, camera.translation, K=camera.K) for s in (seed, seed.swapped)]
         step = _surface_step(moved[0], self.places[0])
         layers = [self._layer(side, moved[side], camera.size, step, threads) for side in (0, 1)]
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])

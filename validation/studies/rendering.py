@@ -62,7 +62,7 @@ def psnr_db(mesh: TexturedMesh, view: PinholeView) -> tuple[float, float]:
 
 def times(mesh: TexturedMesh, camera: Camera, repeats: int) -> list[Metric]:
     """Time one frame with the texture as it is and with a headlight, on one thread and on two."""
-    lamp = Shading(lights=(Light(position=(0.0, 0.0, 0.0)),), specular=0.2)
+    lamp = Shading(lights=(Light(position=(0.0, 0.0, 0.0)),))
     seconds = least_seconds(
         {
             f"{light}, {threads} thread{'s' * (threads > 1)}": partial(
