@@ -27,7 +27,7 @@ from thesisrecon.numerics._reduced_solvers import (
     fill_band,
 )
 from thesisrecon.numerics._schur import BundleSystem, CameraPrior, build_layout
-from thesisrecon.numerics.block_scatter import _point_blocks, block_scatter
+from thesisrecon.numerics.block_scatter import block_scatter
 from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
 from thesisrecon.numerics.losses import LOSS_CODES, LOSSES
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
@@ -360,16 +360,3 @@ def test_noise_that_neighbours_share_is_seen():
     field = np.sin(np.einsum("kab,kb->ka", wave[block.view], block.xy / 150.0))
     _, scatter = _scatter(block, block.xy + 0.3 * SIGMA * rng.normal(size=field.shape) + SIGMA * field)
     assert scatter.overdispersion > 2.0
-
-
-def test_blocks_are_of_neighbours_and_of_equal_size():
-    rng = np.random.default_rng(3)
-    X, used = rng.normal(size=(500, 3)) * [5.0, 1.0, 1.0], rng.random(500) < 0.9
-    block = _point_blocks(X, used)
-    assert (block[~used] == -1).all()
-    counts = np.bincount(block[used])
-    assert len(counts) == 32
-    assert counts.min() > 0.8 * counts.mean()
-    within = np.mean([np.var(X[block == b], axis=0).sum() for b in range(32)])
-    assert within < 0.3 * np.var(X, axis=0).sum()
-    assert _point_blocks(X[:20], np.ones(20, bool)).max() == 0
