@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.views._warping import DIRECTIONS, distances_to_known
 from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, camera_at, seed_of_two
 from thesisrecon.views.trilinear_synthesis import (
     _complete_correspondence,
     _extrapolate_inverse_depth,
     prepare_synthesis,
 )
-from thesisrecon.views.warping import DIRECTIONS, distances_to_known
 
 SIZE = (160, 120)
 

@@ -19,7 +19,7 @@ from thesisrecon.views._interpolation_kernels import (
     filter_extrapolated_by_median,
     intermediate_positions,
 )
-from thesisrecon.views.warping import fill_holes, forward_map, sample
+from thesisrecon.views._warping import fill_holes, forward_map, sample
 
 SHRINK = 0.8
 """Factor by which the quadrilateral is reduced until it lies in front of both cameras."""

@@ -18,8 +18,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.zbuffer import run_in_strips
+from thesisrecon.views._warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, VirtualTensor, seed_of_two
-from thesisrecon.views.warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 
 SURFACE_PX = 1.0
 """Largest difference of disparity between neighbouring pixels of one surface."""

@@ -7,8 +7,8 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.geometry.camera_matrix import camera_centre, decompose_camera
 from thesisrecon.geometry.two_view import estimate_homography, homography_residuals
+from thesisrecon.views._warping import sample
 from thesisrecon.views.interpolation import InterpolatedPair
-from thesisrecon.views.warping import sample
 from validation.scenes.fixtures import Pose
 
 

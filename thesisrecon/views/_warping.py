@@ -296,18 +296,7 @@ DIRECTIONS = np.array(
 
 
 def distances_to_known(inverse_depth: F32) -> I16:
-    """Count the steps from each pixel to the next known one in each of the sixteen directions.
-
-    Parameters
-    ----------
-    inverse_depth : ndarray (H, W) of float32
-        NaN if unknown.
-
-    Returns
-    -------
-    ndarray (16, H, W)
-        0 at known pixels, -1 if there is none.
-    """
+    """Steps (16, H, W) from each pixel to the next known one by direction; 0 at known pixels, -1 for none."""
     distance = np.empty((len(DIRECTIONS), *inverse_depth.shape), dtype=np.int16)
     _count_steps(inverse_depth, DIRECTIONS, distance)
     return distance
@@ -321,29 +310,13 @@ def forward_map(
     step: float = np.inf,
     threads: int = 1,
 ) -> tuple[F32, F32]:
-    """Compute which position of an image each pixel of another view shows.
+    """Position of an image that each pixel of another view shows, and its inverse depth; NaN for none.
 
-    Pixels are corners of small triangles in which positions are interpolated. Neighbours belong to one
-    surface if they come at most 3 px apart and their inverse depth differs by at most ``step``; at
-    discontinuities a pixel covers half a pixel to each side. Back faces are not drawn.
-
-    Parameters
-    ----------
-    target_xy : ndarray (h, w, 2)
-        Position of each pixel in the view, NaN for none.
-    inverse_depth : ndarray (h, w)
-        Larger values are in front, in any unit (a disparity, for example); NaN for none.
-    size : tuple of int
-        Width and height of the view.
-    step : float
-        Largest difference of inverse depth of neighbours on one surface.
-    threads : int
-        Number of threads; the result does not depend on it.
-
-    Returns
-    -------
-    source, front : ndarray (H, W, 2), (H, W) of float32
-        Position in the image and inverse depth, NaN where nothing lands.
+    ``target_xy`` (h, w, 2): position of each pixel in the view, NaN for none; ``inverse_depth`` (h, w):
+    larger values are in front, in any unit (a disparity, for example). Pixels are corners of small triangles
+    in which positions are interpolated. Neighbours belong to one surface if they come at most 3 px apart and
+    their inverse depth differs by at most ``step``; at discontinuities a pixel covers half a pixel to each
+    side. Back faces are not drawn.
     """
     target = np.ascontiguousarray(target_xy, dtype=np.float64)
     near = np.ascontiguousarray(inverse_depth, dtype=np.float32)
@@ -355,21 +328,9 @@ def forward_map(
 
 
 def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
-    """Sample an image by cubic convolution; bilinear beside the border and beside NaN pixels.
+    """Sample an image (h, w, C) at pixels (H, W, 2) by cubic convolution, bilinear beside the border and NaN.
 
-    Parameters
-    ----------
-    image : array_like (h, w, C)
-        Levels.
-    source_xy : ndarray (H, W, 2)
-        Positions in pixels.
-    threads : int
-        Number of threads.
-
-    Returns
-    -------
-    ndarray (H, W, C) of float32
-        Samples, NaN at NaN positions and more than half a pixel outside.
+    Samples are NaN at NaN positions and more than half a pixel outside.
     """
     levels = np.ascontiguousarray(image, dtype=np.float32)
     out = np.empty((*source_xy.shape[:2], levels.shape[2]), dtype=np.float32)
@@ -378,22 +339,10 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
 
 
 def fill_holes(rgb: F32, inverse_depth: F32, *, step: float) -> F32:
-    """Fill holes with the background around them, since what was occluded is background.
+    """Fill holes (NaN inverse depth) with the background around them, since what was occluded is background.
 
-    Of the nearest known pixels in sixteen directions those count whose inverse depth is at most ``step``,
-    or 0.4 of its range, above the smallest. Their colours are averaged with weights 1 / distance^2.
-
-    Parameters
-    ----------
-    rgb, inverse_depth : ndarray (H, W, C), (H, W) of float32
-        Levels and inverse depth; NaN of the latter marks a hole.
-    step : float
-        Tolerance of inverse depth.
-
-    Returns
-    -------
-    ndarray (H, W, C) of float32
-        The image; NaN where no direction leads to a known pixel.
+    Of the nearest known pixels in sixteen directions those count whose inverse depth is at most ``step``, or
+    0.4 of its range, above the smallest. Their colours are averaged with weights 1 / distance^2.
     """
     filled = rgb.copy()
     distance = distances_to_known(inverse_depth)
