@@ -87,8 +87,8 @@ class MetricBundleResult:
         Projection minus observation in the caller's order.
     cost, initial_cost : float
         1/2 sum rho in units of the given sigma, priors included.
-    iterations, converged : int, bool
-        Linear solves, and whether the loop converged.
+    iterations : int
+        Linear solves.
     intrinsics_covariance : ndarray (G, C, C)
         Zero for entries that do not move, and without ``covariance``.
     pose_covariance : ndarray (V, 6, 6), optional
@@ -104,7 +104,6 @@ class MetricBundleResult:
     cost: float
     initial_cost: float
     iterations: int
-    converged: bool
     intrinsics_covariance: F64
     pose_covariance: F64 | None
     sigma_px: float
@@ -252,7 +251,7 @@ def refine_metric_bundle(
         covariances = _covariances(problem, solution.state, noise, scale)
     return MetricBundleResult(
         refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), solution.cost,
-        solution.initial_cost, solution.iterations, solution.converged, *covariances, sigma,
+        solution.initial_cost, solution.iterations, *covariances, sigma,
     )  # fmt: skip
 
 
