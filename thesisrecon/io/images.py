@@ -64,19 +64,10 @@ _budget = MemoryBudget(MAX_DECODED_BYTES)
 
 
 @dataclass(frozen=True)
-class DecodedImage:
-    """An image that was read.
+class _DecodedImage:
+    """An image at working size, a hash of its pixels and original size, and a warning for the user or "".
 
-    Parameters
-    ----------
-    image : Image
-        Pixels at working size.
-    digest : str
-        Hash of the pixels and the original size.
-    exif_focal_px : float
-        Focal length from EXIF in original pixels, NaN = unknown.
-    note : str
-        Warning for the user, or empty.
+    ``exif_focal_px`` is the focal length from EXIF in original pixels, NaN = unknown.
     """
 
     image: Image
@@ -91,13 +82,13 @@ class ImageSet:
 
     Parameters
     ----------
-    decoded : tuple of DecodedImage
-        Usable images, sorted by name.
+    decoded : tuple
+        Usable images with their hashes, EXIF focal lengths and notes, sorted by name.
     refused : dict
         Name -> reason of the other files.
     """
 
-    decoded: tuple[DecodedImage, ...]
+    decoded: tuple[_DecodedImage, ...]
     refused: dict[str, str]
 
     @property
@@ -247,7 +238,7 @@ def read_images(
     """
     items = _named_items(source)
 
-    def read(item: tuple[str, Any]) -> DecodedImage | str:
+    def read(item: tuple[str, Any]) -> _DecodedImage | str:
         try:
             return _read(*item, max_size_px)
         except UnusableImage as refusal:
@@ -255,7 +246,7 @@ def read_images(
 
     results = list(map_all(read, items))
     refused = {name: r for (name, _), r in zip(items, results, strict=True) if isinstance(r, str)}
-    distinct: dict[str, DecodedImage] = {}
+    distinct: dict[str, _DecodedImage] = {}
     for decoded in (r for r in results if not isinstance(r, str)):
         first = distinct.setdefault(decoded.digest, decoded)
         if first is not decoded:
@@ -294,15 +285,15 @@ def _names(names: Iterable[str]) -> list[str]:
     return list(taken)
 
 
-def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
+def _read(name: str, item: Any, max_size_px: int) -> _DecodedImage:
     """Read an image, refuse small and blank ones, and hash the content."""
     if isinstance(item, Path):
         decoded = _decode(name, item, max_size_px)
     elif isinstance(item, Image):
-        decoded = DecodedImage(item, "")
+        decoded = _DecodedImage(item, "")
     else:
         stored = image_from_array(item)
-        decoded = DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), "")
+        decoded = _DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), "")
     rgb = decoded.image.rgb
     if min(rgb.shape[:2]) < MIN_SIDE:
         raise UnusableImage(
@@ -315,7 +306,7 @@ def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
     return replace(decoded, digest=content.hexdigest()[:32])
 
 
-def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
+def _decode(name: str, path: Path, max_size_px: int) -> _DecodedImage:
     # Special files are refused: reading a pipe or a device may never end.
     try:
         found = path.stat()
@@ -351,7 +342,7 @@ def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
         ) from None
 
 
-def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> DecodedImage:
+def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> _DecodedImage:
     # Cameras store a preview as a second frame of a JPEG (MPO).
     several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
     focal_35mm, transform = _exif(file)
@@ -360,7 +351,7 @@ def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> Dec
     known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
     focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
     image = Image(name, resized_to(stored, max_size_px), stored.size)
-    return DecodedImage(image, "", focal, "only the first frame is used" if several else "")
+    return _DecodedImage(image, "", focal, "only the first frame is used" if several else "")
 
 
 def _too_large(file: PIL.Image.Image, needed: int) -> str:

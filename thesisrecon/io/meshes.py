@@ -1,6 +1,6 @@
-"""Mesh files: GLB for browsers, OBJ with MTL and PNG for modelling programs, PLY with vertex colours.
+"""Surface models as GLB files; their structure is checked before they are parsed.
 
-A GLB can be read again; its structure is checked before it is parsed. trimesh is imported on demand: it takes
+trimesh is imported on demand: it takes
 longer to import than the rest of the package.
 """
 
@@ -11,7 +11,7 @@ import json
 import math
 import struct
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -113,36 +113,45 @@ def _require_tree(nodes: list[dict[str, Any]]) -> None:
 
 
 def write_mesh(path: Path, mesh: TexturedMesh) -> None:
-    """Write a mesh with float32 coordinates in the format of its suffix.
+    """Write a mesh as GLB, with its texture, or its vertex colours if it has none, and float32 coordinates.
 
-    GLB and OBJ hold the texture, or the vertex colours if there is none; OBJ adds ``NAME.mtl`` and
-    ``NAME.png``. PLY holds vertex colours only. A GLB is rotated by 180 degrees about x, since the y axis of
-    glTF points up and that of cameras down.
+    It is rotated by 180 degrees about x, since the y axis of glTF points up and that of cameras down.
 
     Parameters
     ----------
     path : Path
-        Ends in ``.glb``, ``.obj`` or ``.ply``.
+        The file.
     mesh : TexturedMesh
         The mesh.
 
     Raises
     ------
-    ValueError
-        For another suffix.
     OutputError
         If the file cannot be written.
     """
-    kind = path.suffix.lower()
-    if kind == ".glb":
-        write_atomically(path, _trimesh(mesh, gltf_axes=True).export(file_type="glb"))
-    elif kind == ".ply":
-        bare = TexturedMesh(mesh.vertices, mesh.faces, colors=mesh.colors)
-        write_atomically(path, _trimesh(bare, gltf_axes=False).export(file_type="ply"))
-    elif kind == ".obj":
-        _write_obj(path, mesh)
+    import trimesh
+    from trimesh.visual import material as materials
+    from trimesh.visual import texture as textures
+
+    if mesh.texture is None or mesh.uv is None:
+        colors = None
+        if mesh.colors is not None:
+            colors = np.column_stack([mesh.colors, np.full(len(mesh.colors), 255, dtype=np.uint8)])
+        vertices, faces = mesh.vertices * _HALF_TURN, mesh.faces
+        made: Any = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
     else:
-        raise ValueError(f"a mesh is written as .glb, .obj or .ply; got {path.name}")
+        vertices, faces, uv = _split_seams(mesh)
+        packed = io.BytesIO()
+        PIL.Image.fromarray(mesh.texture).save(packed, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+        # trimesh gives these no types.
+        new_material: Any = materials.PBRMaterial
+        new_visual: Any = textures.TextureVisuals
+        material = new_material(
+            baseColorTexture=PIL.Image.open(packed), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+        )
+        visual = new_visual(uv=_normalized(uv, mesh.texture), material=material)
+        made = trimesh.Trimesh(vertices * _HALF_TURN, faces, visual=visual, process=False)
+    write_atomically(path, made.export(file_type="glb"))
 
 
 def read_mesh(path: Path) -> TexturedMesh:
@@ -153,7 +162,7 @@ def read_mesh(path: Path) -> TexturedMesh:
     Parameters
     ----------
     path : Path
-        Ends in ``.glb``.
+        The file.
 
     Returns
     -------
@@ -162,14 +171,10 @@ def read_mesh(path: Path) -> TexturedMesh:
 
     Raises
     ------
-    ValueError
-        For another suffix.
     UsageError
         If the file is absent, damaged, refers to other files or holds no mesh; memory stays within a multiple
         of the sizes of the file and its texture.
     """
-    if path.suffix.lower() != ".glb":
-        raise ValueError(f"a mesh is read from .glb; got {path.name}")
     if not path.is_file():
         raise UsageError(f"there is no mesh {path}")
     import trimesh
@@ -239,50 +244,3 @@ def _texels(uv: F64, texture: np.ndarray) -> F64:
     """The inverse of :func:`_normalized`."""
     height, width = texture.shape[:2]
     return np.column_stack([uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5])
-
-
-def _trimesh(mesh: TexturedMesh, *, gltf_axes: bool) -> Any:
-    import trimesh
-    from trimesh.visual import material as materials
-    from trimesh.visual import texture as textures
-
-    turn = _HALF_TURN if gltf_axes else np.ones(3)
-    if mesh.texture is None or mesh.uv is None:
-        colors = None
-        if mesh.colors is not None:
-            colors = np.column_stack([mesh.colors, np.full(len(mesh.colors), 255, dtype=np.uint8)])
-        return trimesh.Trimesh(mesh.vertices * turn, mesh.faces, vertex_colors=colors, process=False)
-    vertices, faces, uv = _split_seams(mesh)
-    image = PIL.Image.fromarray(mesh.texture)
-    if gltf_axes:
-        packed = io.BytesIO()
-        image.save(packed, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
-        image = cast(PIL.Image.Image, PIL.Image.open(packed))
-    # trimesh gives these no types.
-    new_material: Any = materials.PBRMaterial
-    new_visual: Any = textures.TextureVisuals
-    material = new_material(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
-    visual = new_visual(uv=_normalized(uv, mesh.texture), material=material)
-    return trimesh.Trimesh(vertices * turn, faces, visual=visual, process=False)
-
-
-def _write_obj(path: Path, mesh: TexturedMesh) -> None:
-    lines = [f"mtllib {path.stem}.mtl", "usemtl model"] if mesh.texture is not None else []
-    if mesh.texture is not None and mesh.uv is not None:
-        vertices, faces, uv = _split_seams(mesh)
-        lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices]
-        lines += [f"vt {u:.7f} {v:.7f}" for u, v in _normalized(uv, mesh.texture)]
-        lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in faces + 1]
-        picture = io.BytesIO()
-        PIL.Image.fromarray(mesh.texture).save(picture, "PNG")
-        write_atomically(path.with_suffix(".png"), picture.getvalue())
-        write_atomically(
-            path.with_suffix(".mtl"),
-            f"newmtl model\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {path.stem}.png\n".encode(),
-        )
-    else:
-        rgb = np.zeros((len(mesh.vertices), 0)) if mesh.colors is None else mesh.colors / 255.0
-        rows = np.column_stack([mesh.vertices, rgb])
-        lines += ["v " + " ".join(f"{value:.7g}" for value in row) for row in rows]
-        lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + 1]
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
