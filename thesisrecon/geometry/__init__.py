@@ -1,7 +1,5 @@
-"""Chapter 3: projective geometry as pure functions of arrays.
+"""Chapter 3: projective geometry as pure functions of arrays, transform or camera first: ``project(P, X)``.
 
-===================== ============================================================================
-section               module
 ===================== ============================================================================
 3.2                   ``homogeneous``
 3.3, 3.4.1-3.4.5      ``strata``: transforms of every entity, the four groups, their invariants
@@ -12,8 +10,6 @@ section               module
 3.6.3                 ``three_view``: the trifocal tensor
 6.3                   ``triangulation``, ``optimal_triangulation`` (two views)
 6.4                   ``resection``
+images, meshes        ``raster`` resamples images, ``zbuffer`` renders meshes
 ===================== ============================================================================
-
-``similarity`` aligns two metric models, ``raster`` resamples images, ``zbuffer`` renders meshes. Arguments
-are ordered transform or camera first, then points: ``project(P, X)``.
 """

@@ -295,10 +295,6 @@ def cheirality(P: F64, X: F64) -> F64:
     -------
     ndarray (N,)
 
-    References
-    ----------
-    Hartley, "Chirality", IJCV 26(1), 1998.
-
     Examples
     --------
     >>> X = np.array([[0.0, 0.0, 2.0, 1.0], [0.0, 0.0, -2.0, 1.0]])

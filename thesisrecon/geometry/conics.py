@@ -176,7 +176,7 @@ def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
     Parameters
     ----------
     image : ndarray (3, 3)
-        Omega, or omega* if ``is_dual``, of any scale and sign.
+        Omega, or omega* if ``is_dual``, of any scale and sign. An indefinite one is of no real camera.
     is_dual : bool
         Whether the image is omega*.
 
@@ -184,11 +184,6 @@ def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
     -------
     ndarray (3, 3)
         K, upper triangular, positive focal lengths, K33 = 1.
-
-    Raises
-    ------
-    ValueError
-        The conic is not definite: no real camera has this image.
     """
     if not np.isfinite(image).all() or not (is_dual or np.linalg.cond(image) < 1e15):
         raise ValueError("calibration_from_image needs a finite invertible conic")

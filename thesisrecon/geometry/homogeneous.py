@@ -168,7 +168,6 @@ def pixel_conditioning(xy: F64) -> F64:
     Returns
     -------
     ndarray (3, 3)
-        Of scale 1 if all pixels are equal, I without pixels.
     """
     if len(xy) == 0:
         return np.eye(3)

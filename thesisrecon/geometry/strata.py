@@ -46,7 +46,6 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
     Returns
     -------
     ndarray
-        Of the shape of ``entity``.
 
     Examples
     --------
@@ -78,11 +77,6 @@ def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
     Returns
     -------
     {"projective", "affine", "metric", "euclidean"}
-
-    Examples
-    --------
-    >>> group_of(np.diag([2.0, 2.0, 2.0, 1.0])), group_of(np.diag([1.0, 2.0, 2.0, 1.0]))
-    ('metric', 'affine')
     """
     if G.shape != (4, 4) or not np.isfinite(G).all() or not np.linalg.cond(G) < 1e14:
         raise ValueError(f"group_of needs a finite invertible (4, 4) matrix; got shape {G.shape}")
@@ -180,17 +174,13 @@ def cross_ratio(X: F64) -> float:
     Parameters
     ----------
     X : ndarray (4, d)
-        Homogeneous points of any scale, d = 2, 3 or 4; a point may be the base point X' itself (l infinite).
+        Homogeneous collinear points of any scale, d = 2, 3 or 4, at most two of them equal; a point may be
+        the base point X' itself (l infinite).
 
     Returns
     -------
     float
         Inf if X1 = X4 or X2 = X3.
-
-    Raises
-    ------
-    ValueError
-        The points are not collinear, or three of them are equal.
     """
     if X.ndim != 2 or X.shape[0] != 4 or not np.isfinite(X).all():
         raise ValueError(f"cross_ratio needs four finite points (4, d); got {X.shape}")

@@ -13,7 +13,7 @@ from numba import njit
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 
-SLACK = 1e-7
+_SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
 _NEAR = 1e-6
 """Nearest depth that is drawn, relative to the depth of the farthest vertex."""
@@ -52,9 +52,9 @@ def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int
         else:
             slope, constant = -slope_sum, 1.0 / near - constant_sum
         if slope > 0.0:
-            low = max(low, -constant / slope - SLACK)
+            low = max(low, -constant / slope - _SLACK)
         elif slope < 0.0:
-            high = min(high, -constant / slope + SLACK)
+            high = min(high, -constant / slope + _SLACK)
         elif constant < 0.0:
             return 0, 0
     if not low <= high:
@@ -82,13 +82,13 @@ def _rasterize_rows(
         if p[0, 2] > near and p[1, 2] > near and p[2, 2] > near:
             y0, y1, y2 = p[0, 1] / p[0, 2], p[1, 1] / p[1, 2], p[2, 1] / p[2, 2]
             top, bottom = min(y0, y1, y2), max(y0, y1, y2)
-            if bottom < first - SLACK or top > last:
+            if bottom < first - _SLACK or top > last:
                 continue
             x0, x1, x2 = p[0, 0] / p[0, 2], p[1, 0] / p[1, 2], p[2, 0] / p[2, 2]
-            if max(x0, x1, x2) < -SLACK or min(x0, x1, x2) > width:
+            if max(x0, x1, x2) < -_SLACK or min(x0, x1, x2) > width:
                 continue
-            first = max(first, int(np.ceil(top - SLACK)))
-            last = min(last, int(np.floor(bottom + SLACK)) + 1)
+            first = max(first, int(np.ceil(top - _SLACK)))
+            last = min(last, int(np.floor(bottom + _SLACK)) + 1)
             if first >= last:
                 continue
         if not _inverse(p, inverse):
@@ -216,9 +216,7 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
     Raster
     """
     if not camera.is_pinhole:
-        raise ValueError(
-            "Rendering needs a camera without distortion: undistort the image or drop the distortion"
-        )
+        raise ValueError("Rendering needs a camera without distortion: undistort the image first")
     width, height = camera.size
     seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
     near = _NEAR * max(float(np.abs(seen[:, 2]).max(initial=0.0)), 1e-300)
