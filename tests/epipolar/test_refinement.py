@@ -43,15 +43,14 @@ def test_epipoles_at_infinity_and_on_axes_are_reached(and_columns, epipole):
     assert angle_between(chart.matrix(chart.parameters(F)), F) < 1e-12
 
 
-def test_every_map_has_the_tangent_of_its_matrix():
+def test_every_map_gives_rank_two_and_its_parameters_back():
     rows = [_RowMap(*key) for key in itertools.product(range(3), range(6))]
     both = [_RowMap(*key) for key in itertools.product(range(3), range(4), range(3))]
     for chart in [*rows, *both]:
         parameters = np.random.default_rng(chart.fixed).normal(size=7)
-        assert np.linalg.svd(chart.matrix(parameters), compute_uv=False)[2] < 1e-15, chart
-        for step, tangent in zip(1e-6 * np.eye(7), chart.tangent(parameters).T, strict=True):
-            ends = chart.matrix(parameters + step) - chart.matrix(parameters - step)
-            np.testing.assert_allclose(ends.ravel() / 2e-6, tangent, atol=1e-8, err_msg=str(chart))
+        F = chart.matrix(parameters)
+        assert np.linalg.svd(F, compute_uv=False)[2] < 1e-15, chart
+        np.testing.assert_allclose(chart.parameters(F), parameters, atol=1e-9, err_msg=str(chart))
 
 
 @BOTH

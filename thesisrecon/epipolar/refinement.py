@@ -121,34 +121,15 @@ class _RowMap:
 
     def matrix(self, parameters: F64) -> F64:
         """F of its parameters (7,), rank 2, unit norm."""
-        L, B, R = self._factors(parameters)
-        return unit_norm(L @ B @ R)
-
-    def tangent(self, parameters: F64) -> F64:
-        """Derivatives (9, 7) of the unit vec(F) by the parameters."""
-        L, B, R = self._factors(parameters)
-        entries = np.delete(np.eye(B.size), self.fixed, axis=0).reshape(-1, *B.shape)
-        rows = np.zeros((2, 3, 2))
-        rows[[0, 1], self.row, [0, 1]] = 1.0
-        parts = [L @ entries @ R, rows @ B @ R]
-        if self.column is not None:
-            columns = np.zeros((2, 2, 3))
-            columns[[0, 1], [0, 1], self.column] = 1.0
-            parts.append(L @ B @ columns)
-        T, f = np.concatenate(parts).reshape(7, 9).T, (L @ B @ R).ravel()
-        norm = np.linalg.norm(f)
-        return np.asarray((T - np.outer(f, f @ T) / norm**2) / norm)
-
-    def _independent(self, F: F64) -> F64:
-        rows = np.delete(F, self.row, axis=0)
-        return (rows if self.column is None else np.delete(rows, self.column, axis=1)).ravel()
-
-    def _factors(self, parameters: F64) -> tuple[F64, F64, F64]:
         n = 5 if self.column is None else 3
         B = np.insert(parameters[:n], self.fixed, 1.0).reshape(2, -1)
         L = np.insert(np.eye(2), self.row, parameters[n : n + 2], axis=0)
         R = np.eye(3) if self.column is None else np.insert(np.eye(2), self.column, parameters[5:], axis=1)
-        return L, B, R
+        return unit_norm(L @ B @ R)
+
+    def _independent(self, F: F64) -> F64:
+        rows = np.delete(F, self.row, axis=0)
+        return (rows if self.column is None else np.delete(rows, self.column, axis=1)).ravel()
 
 
 def refine_by_rows(
@@ -180,19 +161,12 @@ def refine_by_rows(
     current = check_start(F, frame).reshape(3, 3)
     for _ in range(MAPS_TRIED):
         chart = _RowMap.best_for(current, and_columns=and_columns)
-        current = _minimize_in(chart, current, points, _CRITERIA[criterion])
+
+        def residuals(p: F64, chart: _RowMap = chart) -> F64:
+            f = chart.matrix(p).ravel()
+            return np.asarray(residuals_and_derivatives(f, points, _CRITERIA[criterion])[0])
+
+        current = chart.matrix(minimize_residuals(residuals, chart.parameters(current)).x)
         if _RowMap.best_for(current, and_columns=and_columns) == chart:
             break
     return frame.matrix_in_pixels(current.ravel())
-
-
-def _minimize_in(chart: _RowMap, start: F64, points: F64, criterion: int) -> F64:
-    def residuals(p: F64) -> F64:
-        r: F64 = residuals_and_derivatives(chart.matrix(p).ravel(), points, criterion)[0]
-        return r
-
-    def jacobian(p: F64) -> F64:
-        J: F64 = residuals_and_derivatives(chart.matrix(p).ravel(), points, criterion)[1]
-        return J @ chart.tangent(p)
-
-    return chart.matrix(minimize_residuals(residuals, chart.parameters(start), jacobian=jacobian).x)
