@@ -55,7 +55,9 @@ def picture(k):
 
 
 def refused(answer):
-    return {entry["name"]: entry["reason"] for entry in answer.summary["refused"]}
+    refused = {entry["name"]: entry["reason"] for entry in answer.summary["refused"]}
+    assert answer.refused == refused
+    return refused
 
 
 def test_one_image(folder, reconstruct):

@@ -145,7 +145,6 @@ def made_up_run(*, names=None, points=1500, seed=4):
 def projective_run():
     """The same run as it is when the user asked to end after the projective reconstruction."""
     data = made_up_run()
-    assert data.metric is not None
     before = data.metric.reconstruction
     undistorted = dataclasses.replace(before, stratum="projective", K=None, distortion=None)
     return dataclasses.replace(data, metric=None, colors=None, reconstruction=undistorted, until="projective")

@@ -37,9 +37,7 @@ from thesisrecon.report._figures import (
 
 def test_the_scene_is_valid_json_with_escaped_names():
     data = made_up_run(names=["<b>one</b>.jpg", "two&.jpg", "three.jpg"], points=200)
-    assert data.metric is not None
     scene = build_scene(data.metric.reconstruction)
-    assert scene is not None
     figure = scene_figure(scene, [p.name for p in data.images], data.colors)
     json.dumps(figure, allow_nan=False)
     points, lines, marks = figure["data"]
@@ -106,7 +104,6 @@ def test_the_lines_pass_through_the_numbered_matches():
         dataclasses.replace(data.images[v], rgb=rgb) for v, rgb in zip((pair.i, pair.j), flat, strict=True)
     )
     drawn = draw_pair(pair, first, second)
-    assert drawn is not None
     pixels = np.asarray(opened(drawn.uri)).astype(int)
     s = 640 / max(SIZE)
     chosen = _spread_matches(pair.xy1, len(HUES))
@@ -124,7 +121,6 @@ def test_a_pair_without_matches_is_no_error():
     pair = data.pairs[0]
     empty = dataclasses.replace(pair, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
     drawn = draw_pair(empty, data.images[0], data.images[1])
-    assert drawn is not None
     assert opened(drawn.uri).size == (drawn.width, drawn.height)
     assert min(drawn.width, drawn.height) > 100
 
@@ -152,7 +148,6 @@ def test_spread_matches_are_different_and_far_apart():
 def test_odd_pictures_have_thumbnails(shape):
     image = dataclasses.replace(made_up_run(points=50).images[0], rgb=np.zeros(shape, dtype=np.uint8))
     drawn = thumbnail(image, 3)
-    assert drawn is not None
     assert opened(drawn.uri).size == (drawn.width, drawn.height)
     assert drawn.width >= drawn.height >= 1
 
@@ -255,12 +250,10 @@ def test_parallel_cameras_and_cameras_that_look_down_have_an_up():
 
 def test_strays_are_left_out_and_many_points_are_thinned():
     data = made_up_run(points=600)
-    assert data.metric is not None
     before = data.metric.reconstruction
     X = before.X.copy()
     X[5, :3] = 1e5
     scene = build_scene(dataclasses.replace(before, X=X), max_points=200)
-    assert scene is not None
     assert 150 <= len(scene.points) <= 200
     assert 5 not in scene.index
     assert (scene.high - scene.low).max() < 20
@@ -268,9 +261,7 @@ def test_strays_are_left_out_and_many_points_are_thinned():
 
 def test_the_pyramids_point_at_the_scene():
     data = made_up_run(points=300)
-    assert data.metric is not None
     scene = build_scene(data.metric.reconstruction)
-    assert scene is not None
     assert scene.views.tolist() == list(range(8))
     gaze = scene.corners.mean(axis=1) - scene.centres
     towards = scene.points.mean(axis=0) - scene.centres
@@ -282,16 +273,13 @@ def test_the_pyramids_point_at_the_scene():
 
 def test_nothing_registered_gives_no_scene():
     data = made_up_run(points=50)
-    assert data.metric is not None
     nothing = np.zeros_like(data.metric.reconstruction.registered)
     assert build_scene(dataclasses.replace(data.metric.reconstruction, registered=nothing)) is None
 
 
 def test_a_scene_without_points_still_shows_its_cameras():
     data = made_up_run(points=50)
-    assert data.metric is not None
     nothing = np.zeros_like(data.metric.reconstruction.valid)
     scene = build_scene(dataclasses.replace(data.metric.reconstruction, valid=nothing))
-    assert scene is not None
     assert len(scene.points) == 0
     assert len(scene.centres) == 8

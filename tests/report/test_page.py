@@ -101,7 +101,6 @@ def test_names_are_text_everywhere():
     for name in EVIL:
         assert html.escape(name, quote=True).replace("&quot;", "&#34;").replace("&#x27;", "&#39;") in page
     block = re.search(r'<script type="application/json" id="figures">(.*?)</script>', page, re.S)
-    assert block is not None
     figures = json.loads(block.group(1))
     assert figures["matrix-figure"]["data"][0]["x"][0] == "1 · " + html.escape(EVIL[0])
 
@@ -127,7 +126,6 @@ def test_a_projective_camera_is_not_called_registered(page):
 
 def test_the_caption_states_omitted_points():
     data = made_up_run(points=200)
-    assert data.metric is not None
     assert "All 200 points are shown." in render_report(data)
     X = data.metric.reconstruction.X.copy()
     X[0, :3] = 1e6
@@ -209,8 +207,6 @@ def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
     assert structure.handlers == []
     assert structure.tags.count("img") == 8 + 7 + 3
     assert structure.tags.count("option") == 8 + 1
-    assert data.model is not None
-    assert data.model.texture is not None
     texels = f"{data.model.texture.shape[1]} × {data.model.texture.shape[0]} texels"
     for text in (texels, "27.3 dB", "0.912", html.escape(SPHERE_NAMES[2])):
         assert text in page
@@ -262,7 +258,6 @@ def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page():
 
 def test_the_table_of_cameras_has_a_column_for_every_estimate():
     data = made_up_run()
-    assert data.metric is not None
     square = {
         "aspect": IntrinsicInterval(1.0, 0.0, "assumed"),
         "skew_px": IntrinsicInterval(0.0, 0.0, "assumed"),
@@ -321,7 +316,6 @@ def test_one_turns_through_the_pictures(browser, tmp_path):
 
 def test_the_metric_reconstruction_goes_before_the_projective_one():
     data, early = made_up_run(points=100), projective_run()
-    assert data.metric is not None
     assert data.best_reconstruction is data.metric.reconstruction
     assert early.best_reconstruction is early.reconstruction
     assert dataclasses.replace(early, reconstruction=None).best_reconstruction is None
@@ -329,7 +323,6 @@ def test_the_metric_reconstruction_goes_before_the_projective_one():
 
 def test_intrinsics_are_reported_in_pixels_of_the_file():
     data = made_up_run(points=100)  # worked at a quarter of the size
-    assert data.metric is not None
     working, original = data.metric.intrinsics[0], data.original_intrinsics[0]
     assert original["focal_px"].value == pytest.approx(4 * working["focal_px"].value)
     assert original["focal_px"].std == pytest.approx(4 * working["focal_px"].std)
@@ -344,13 +337,11 @@ def test_intrinsics_are_reported_in_pixels_of_the_file():
 
 def test_the_residuals_are_the_noise_that_was_added():
     data = made_up_run(points=1500)
-    assert data.metric is not None
     reconstruction = data.metric.reconstruction
     distances = reprojection_distances(reconstruction)
     assert len(distances[-1]) == 0  # the last view is not registered
     assert sum(map(len, distances)) == len(used_observations(reconstruction))
     summary = summarize_distances(np.concatenate(distances))
-    assert summary is not None
     # Two independent coordinates make a Rayleigh distribution: RMS sqrt(2) sigma, median sigma sqrt(2 ln 2).
     assert summary.rms_px == pytest.approx(np.sqrt(2) * NOISE_PX, rel=0.03)
     assert summary.median_px == pytest.approx(np.sqrt(2 * np.log(2)) * NOISE_PX, rel=0.03)
@@ -358,7 +349,6 @@ def test_the_residuals_are_the_noise_that_was_added():
 
 def test_only_inliers_of_registered_views_and_valid_points_count():
     data = made_up_run(points=200)
-    assert data.metric is not None
     before = data.metric.reconstruction
     after = dataclasses.replace(before, valid=np.arange(200) < 100)
     used = used_observations(after)
@@ -372,7 +362,6 @@ def test_without_distortion_the_projective_residuals_grow_by_what_it_moved():
     reconstruction = projective_run().reconstruction
     assert reconstruction is not None
     summary = summarize_distances(np.concatenate(reprojection_distances(reconstruction)))
-    assert summary is not None
     assert summary.rms_px > 2 * NOISE_PX
 
 

@@ -92,29 +92,23 @@ def _depth_maps(result: RunResult) -> list[dict[str, Any]] | None:
 
 
 def _model(result: RunResult) -> dict[str, Any] | None:
-    mesh = result.mesh
+    mesh, held = result.mesh, result.held_out
     if mesh is None:
         return None
-    texture = None if mesh.texture is None else [mesh.texture.shape[1], mesh.texture.shape[0]]
+    compared = None
+    if held is not None:
+        compared = {
+            "name": result.images[held.view].name,
+            "psnr_db": held.psnr_db if np.isfinite(held.psnr_db) else None,
+            "ssim": held.ssim,
+            "compared_fraction": held.share,
+        }
     return {
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
-        "texture_px": texture,
-        "held_out": _held_out(result),
+        "texture_px": None if mesh.texture is None else [mesh.texture.shape[1], mesh.texture.shape[0]],
+        "held_out": compared,
         "untextured_fraction": None if mesh.untextured is None else float(mesh.untextured.mean()),
-    }
-
-
-def _held_out(result: RunResult) -> dict[str, Any] | None:
-    """Return the comparison of the model with a held-out image."""
-    held = result.held_out
-    if held is None:
-        return None
-    return {
-        "name": result.images[held.view].name,
-        "psnr_db": held.psnr_db if np.isfinite(held.psnr_db) else None,
-        "ssim": held.ssim,
-        "compared_fraction": held.share,
     }
 
 
