@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from thesisrecon.arrays import F64, I64
 
@@ -81,8 +81,8 @@ class UpgradedCameras:
 
     def infinite_homographies(self) -> F64:
         """Return the unit-free infinite homographies (V, 3, 3) from the view nearest to the mean rotation."""
-        mean = Rotation.from_matrix(self.R).mean().as_matrix()
-        middle = int(Rotation.from_matrix(self.R @ mean.T).magnitude().argmin())
+        mean = scipy.spatial.transform.Rotation.from_matrix(self.R).mean().as_matrix()
+        middle = int(scipy.spatial.transform.Rotation.from_matrix(self.R @ mean.T).magnitude().argmin())
         K = np.stack([self.focal, self.focal, np.ones_like(self.focal)], axis=1)
         return np.asarray(K[:, :, None] * (self.R @ self.R[middle].T) / K[middle])
 
@@ -182,7 +182,7 @@ def _common_rotation_axis(R: F64) -> tuple[F64, float, float]:
     """
     i, j = np.triu_indices(len(R), 1)
     relative = R[j].swapaxes(1, 2) @ R[i]
-    vectors = Rotation.from_matrix(relative).as_rotvec()
+    vectors = scipy.spatial.transform.Rotation.from_matrix(relative).as_rotvec()
     value, vector = np.linalg.eigh(vectors.T @ vectors / len(vectors))
     angle = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
     return vector[:, 2], angle, float(np.degrees(np.sqrt(max(value[1], 0.0))))
@@ -191,7 +191,7 @@ def _common_rotation_axis(R: F64) -> tuple[F64, float, float]:
 def _rotation_rms_deg(R: F64) -> float:
     """Return the rms rotation angle between all pairs of views."""
     i, j = np.triu_indices(len(R), 1)
-    angle = Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
+    angle = scipy.spatial.transform.Rotation.from_matrix(R[j] @ R[i].swapaxes(1, 2)).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
@@ -158,7 +158,9 @@ def example_frame(n: int = 6, f: float = 1.2) -> tuple[ReferenceFrame, F64]:
     """Return ``n`` exact cameras of focal length ``f`` and the plane at infinity p (3,), for the examples."""
     rng = np.random.default_rng(0)
     K, p = np.diag([f, f, 1.0]), np.array([0.1, -0.2, 0.3])
-    R = Rotation.from_rotvec(0.4 * rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]).as_matrix()
+    R = scipy.spatial.transform.Rotation.from_rotvec(
+        0.4 * rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]
+    ).as_matrix()
     a = rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]
     A = K @ R @ np.linalg.inv(K) + a[:, :, None] * p
     unit, group = np.tile(np.eye(3), (n, 1, 1)), np.zeros(n, dtype=np.int64)
