@@ -46,6 +46,17 @@ from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, U
 MIN_CHANGE = 0.002
 """Share of observations that change sides below which the rounds end."""
 START_ROUNDS = 3
+MAX_ROUNDS = 4
+"""Final rounds of triangulation and adjustment."""
+NOISE_FLOOR_PX = 0.02
+"""Lower bound of the estimated noise."""
+MAX_ROTATION_RESIDUAL = 0.3
+"""Upgraded cameras further from a scaled rotation (norm of 3 C C' / tr(C C') - I) are resected again."""
+MODEL_FLOOR_REL = 1e-3
+"""Floor of standard deviations, relative to the focal length, if the data show lack of fit: pixels are square
+to one or two parts in a thousand."""
+UNDETERMINED_REL = 0.1
+"""Focal lengths that their own matches determine worse than this (95 %, relative) are reported."""
 LAST_ITERATIONS = 25
 """Zoomed images lie in a long valley of the cost: the last adjustment must reach its bottom."""
 NO_COMMON_POINTS = "shares no points with the model"
@@ -59,35 +70,18 @@ class MetricRefinement:
     ----------
     outlier_sigmas : tuple of float
         Residual gates of the early and the late rounds in noise sigmas.
-    noise_floor_px : float
-        Lower bound of the estimated noise.
     min_angle_deg : float
         Smallest triangulation angle of a point.
     min_points : int
         Points of the model that a missing camera must see.
-    max_rotation_residual : float
-        Upgraded cameras further from a scaled rotation (Frobenius norm of 3 C C' / tr(C C') - I) are
-        resected again.
-    rounds : int
-        Maximum number of final rounds of triangulation and adjustment.
     lens_std : float
         Prior standard deviation about 0 of k2 and k3 of a camera with several images; 0 fixes them at 0.
-    model_floor_rel : float
-        Floor of the stated standard deviations, relative to the focal length, if the data show lack of fit
-        (pixels are square to one or two parts in a thousand).
-    undetermined_rel : float
-        Focal lengths that their own matches determine worse than this (95 %, relative) are reported.
     """
 
     outlier_sigmas: tuple[float, float] = (12.0, 7.0)
-    noise_floor_px: float = 0.02
     min_angle_deg: float = 0.05
     min_points: int = 15
-    max_rotation_residual: float = 0.3
-    rounds: int = 4
     lens_std: float = 0.02
-    model_floor_rel: float = 1e-3
-    undetermined_rel: float = 0.1
 
     def refine(
         self,
@@ -98,7 +92,7 @@ class MetricRefinement:
         rng: np.random.Generator,
     ) -> MetricResult:
         """See `thesisrecon.config.MetricRefiner.refine`."""
-        adjustment = BundleAdjustment(prior, self.lens_std, self.noise_floor_px)
+        adjustment = BundleAdjustment(prior, self.lens_std, NOISE_FLOOR_PX)
         trials = [self._start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:
@@ -121,7 +115,7 @@ class MetricRefinement:
             model,
             scatter,
             adjustment.row_prior(model),
-            floor_rel=self.model_floor_rel,
+            floor_rel=MODEL_FLOOR_REL,
             shrinkage=shrinkage,
             noise_inflation=adjustment.inflation,
         )
@@ -130,7 +124,7 @@ class MetricRefinement:
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
         views = np.flatnonzero(model.registered).tolist()
-        warnings = shrinkage.warnings(views, self.undetermined_rel / 1.96) + sharing.warnings
+        warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
         final = _as_reconstruction(model, reasons)
         return MetricResult(final, intervals, check, not failed_checks, tuple(failed_checks), warnings)
 
@@ -142,7 +136,7 @@ class MetricRefinement:
         Projective inliers fit any principal point: all are kept at first, the principal point is free, and
         the gate narrows as the residuals shrink.
         """
-        model = upgraded_model(reconstruction, upgrade, adjustment.prior, self.max_rotation_residual)
+        model = upgraded_model(reconstruction, upgrade, adjustment.prior, MAX_ROTATION_RESIDUAL)
         if model is None:
             return None
         early, _ = self.outlier_sigmas
@@ -162,7 +156,7 @@ class MetricRefinement:
         """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
         model = self._iterate_inliers(model, adjustment)
         scatter = adjustment.scatter(model)
-        own = per_camera_estimates(model, adjustment, scatter, self.model_floor_rel)
+        own = per_camera_estimates(model, adjustment, scatter, MODEL_FLOOR_REL)
         assert model.cameras.shared is not None
         hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
         if hierarchical is None:
@@ -177,7 +171,7 @@ class MetricRefinement:
     def _iterate_inliers(self, model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:
         """Adjust and triangulate until the inliers stay the same, then adjust to convergence."""
         late, angle = self.outlier_sigmas[1], np.radians(self.min_angle_deg)
-        for _ in range(self.rounds):
+        for _ in range(MAX_ROUNDS):
             before = model.inlier
             model = adjustment.run(model, iterations=10)[0]
             model = retriangulate_tracks(model, sigmas=late, min_angle=angle)
