@@ -61,10 +61,8 @@ def match_images(
 
     Raises
     ------
-    UsageError
-        If a file does not exist.
-    StageFailure
-        If the images cannot be read, do not match or show no parallax.
+    UsageError, StageFailure
+        If a file does not exist or cannot be read; if the images do not match or show no parallax.
     """
     config = config or PipelineConfig()
     read = [read_image(source, max_size_px=config.images.max_size_px) for source in (image1, image2)]
@@ -83,7 +81,7 @@ def prepare_trilinear_views(
     Parameters
     ----------
     found : MatchedImages
-        Of :func:`match_images`.
+        Result of :func:`match_images`.
     K : array_like (3, 3) or (2, 3, 3), optional
         Intrinsics of both images, in pixels of the given images. If None, the prior of ``config.intrinsics``;
         without a focal length there, a typical one: the views are then correct up to a projective

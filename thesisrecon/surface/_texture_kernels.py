@@ -173,7 +173,7 @@ def grow_colors(texture: U8, drawn: B8) -> None:
 
 @njit(cache=True, nogil=True)
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
-    """Extrapolate faces to adjacent empty texels, as far as their barycentric coordinates allow.
+    """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``.
 
     ``corners`` (M, 3, 3): in homogeneous texels; ``face`` (H, W), -1 for none, and ``weights`` (H, W, 2) of
     corners 1 and 2 are updated from the left, right, upper or lower neighbour.
