@@ -11,7 +11,7 @@ from thesisrecon.geometry.homogeneous import normalizing_transform, require_fini
 def resect_linear(X: F64, xy: F64) -> F64:
     """Estimate cameras by the direct linear transform, least algebraic residual.
 
-    Coplanar points leave a family, of which some member is returned.
+    Coplanar points leave a family of cameras; some member is returned.
 
     Parameters
     ----------
