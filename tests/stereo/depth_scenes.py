@@ -87,22 +87,28 @@ def _reconstruction(P, lens, depths, seed):
     pixel = np.stack([rng.integers(4, SIZE[0] - 4, 400), rng.integers(4, SIZE[1] - 4, 400)], axis=1)
     M = np.linalg.inv(P[0, :, :3])
     X = M @ (homogenize(pixel.astype(np.float64)).T * depths[0][pixel[:, 1], pixel[:, 0]] - P[0, :, 3:])
-    X = X.T
-    K = calibration()
-    view, point, seen_at = [], [], []
-    for v, camera in enumerate(P):
-        xy = project(camera, X)
+    return observed_points(P, depths, X.T, lens)
+
+
+def observed_points(P, depths, X, lens):
+    """A metric reconstruction of points X (N, 3), observed by every view whose depth map shows them."""
+    K = np.stack([decompose_camera(camera)[0] for camera in P])
+    views, points, seen_at = [], [], []
+    for k, (camera, depth) in enumerate(zip(P, depths, strict=True)):
         z = X @ camera[2, :3] + camera[2, 3]
-        at = np.clip(np.rint(xy), 0, np.array(SIZE) - 1).astype(np.int64)
-        good = np.all((xy > 0) & (xy < np.array(SIZE) - 1), axis=1) & (z > 0)
-        good &= np.abs(depths[v][at[:, 1], at[:, 0]] / z - 1.0) < 0.02
-        k = np.flatnonzero(good)
-        view.append(np.full(len(k), v))
-        point.append(k)
-        normalized = (xy[k] - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-        seen_at.append(distort(normalized, lens) @ K[:2, :2].T + K[:2, 2])
-    views, points = np.concatenate(view), np.concatenate(point)
-    order = np.lexsort((views, points))
-    tracks = Tracks(views[order], points[order], np.concatenate(seen_at)[order], len(P), len(X))
-    lenses = {"K": np.tile(K, (len(P), 1, 1)), "distortion": np.tile(lens, (len(P), 1))}
-    return reconstruction_of(P, SIZE, X=homogenize(X), tracks=tracks, **lenses)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = project(camera, X)
+        limit = np.array(depth.shape[::-1]) - 1.0
+        inside = (z > 0) & np.all((xy >= 0) & (xy <= limit), axis=1)
+        at = np.where(inside[:, None], np.rint(xy), 0).astype(np.int64)
+        n = np.flatnonzero(inside & (np.abs(depth[at[:, 1], at[:, 0]] / np.where(z > 0, z, 1) - 1) < 0.02))
+        views.append(np.full(len(n), k))
+        points.append(n)
+        normalized = (xy[n] - K[k, :2, 2]) @ np.linalg.inv(K[k, :2, :2]).T
+        seen_at.append(distort(normalized, lens) @ K[k, :2, :2].T + K[k, :2, 2])
+    view, point = np.concatenate(views), np.concatenate(points)
+    order = np.lexsort((view, point))
+    tracks = Tracks(view[order], point[order], np.concatenate(seen_at)[order], len(P), len(X))
+    sizes = np.array([depth.shape[::-1] for depth in depths])
+    distortion = np.tile(lens, (len(P), 1))
+    return reconstruction_of(P, sizes, X=homogenize(X), tracks=tracks, K=K, distortion=distortion)

@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tests.stereo.depth_scenes import Walled
-from tests.synthetic import reconstruction_of, texture
+from tests.stereo.depth_scenes import Walled, observed_points
+from tests.synthetic import texture
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import camera_from_centre, decompose_camera, project
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.records import Image, Tracks
+from thesisrecon.records import Image
 
 PER_UNIT = 60.0
 """Texels a unit of length."""
@@ -126,27 +126,4 @@ def sparse(P, depths, rectangles, points, rng):
             away_from_it = (u < 0) | (u > 1) | (v < 0) | (v > 1)
             X = X[away_from_it]
         found.append(X)
-    X = np.concatenate(found)
-    view, point, seen_at = [], [], []
-    for k, (camera, depth) in enumerate(zip(P, depths, strict=True)):
-        z = X @ camera[2, :3] + camera[2, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            xy = project(camera, X)
-        limit = np.array(depth.shape[::-1]) - 1.0
-        inside = (z > 0) & np.all((xy >= 0) & (xy <= limit), axis=1)
-        at = np.where(inside[:, None], np.rint(xy), 0).astype(np.int64)
-        n = np.flatnonzero(inside & (np.abs(depth[at[:, 1], at[:, 0]] / np.where(z > 0, z, 1) - 1) < 0.02))
-        view.append(np.full(len(n), k))
-        point.append(n)
-        seen_at.append(xy[n])
-    sizes = np.array([d.shape[::-1] for d in depths])
-    seen = (np.concatenate(part) for part in (view, point, seen_at))
-    return with_points(P, sizes, X, *seen)
-
-
-def with_points(P, sizes, X, view, point, xy):
-    """A metric reconstruction of points X (N, 3) with observations (K,)."""
-    order = np.lexsort((view, point))
-    tracks = Tracks(view[order], point[order], xy[order], len(P), len(X))
-    K = np.stack([decompose_camera(p)[0] for p in P])
-    return reconstruction_of(P, sizes, X=homogenize(X), tracks=tracks, K=K)
+    return observed_points(P, depths, np.concatenate(found), np.zeros(3))

@@ -210,14 +210,8 @@ def pair_of_cameras(
     """Prepare a pair of metric cameras, see :func:`thesisrecon.stereo.rectification.rectify_cameras`."""
     none = np.empty((0, 2))
     matches = _checked_call(none if xy1 is None else xy1, none if xy2 is None else xy2, size1, size2)
-    P = np.stack([np.asarray(P1, dtype=np.float64), np.asarray(P2, dtype=np.float64)])
-    if P.shape != (2, 3, 4):
-        raise ValueError(f"rectification needs two cameras (3, 4); got {P.shape[1:]}")
-    require_finite("rectification", P)
-    det = np.linalg.det(P[:, :, :3])
-    if not (np.abs(det) > 1e-14 * np.linalg.norm(P[:, :, :3], axis=(1, 2)) ** 3).all():
-        raise ValueError("rectification needs finite cameras; the left part of one is singular")
-    P = P * np.sign(det)[:, None, None]
+    P = np.stack([P1, P2])
+    P = P * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
     centres = _centres(P)
     apart = float(np.linalg.norm(centres[1] - centres[0]))
     if not apart > 1e-12 * (1.0 + float(np.abs(centres).max())):
@@ -239,9 +233,8 @@ def _centres(P: F64) -> F64:
 
 
 def _checked_call(xy1: F64, xy2: F64, size1: Size, size2: Size) -> tuple[F64, F64]:
-    for size in (size1, size2):
-        if min(size) < 2:
-            raise ValueError(f"an image must have at least 2 x 2 px; got {size}")
+    if min(*size1, *size2) < 2:
+        raise ValueError(f"an image must have at least 2 x 2 px; got {size1} and {size2}")
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
         raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")

@@ -256,7 +256,7 @@ def rectify_cameras(
     Raises
     ------
     ValueError
-        If an array has the wrong shape or a camera is not finite.
+        If an array has the wrong shape or an image is too small.
     StageFailure
         If the pair cannot be rectified.
     """
