@@ -113,5 +113,3 @@ def test_points_and_camera_centres_are_written(tmp_path):
     assert (vertices["rgb"][-8:] == [255, 0, 0]).all()
     assert (vertices["rgb"][:-8] == 77).all()
     np.testing.assert_allclose(vertices["xyz"][:-8], affine.X[near, :3], rtol=1e-5)
-    write_affine(tmp_path / "none.ply", None, colours)
-    assert not (tmp_path / "none.ply").exists()
