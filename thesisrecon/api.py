@@ -61,11 +61,7 @@ __all__ = [
 
 
 def match_rectified(
-    left: ImageInput,
-    right: ImageInput,
-    *,
-    max_disparity_px: float,
-    config: PipelineConfig | None = None,
+    left: ImageInput, right: ImageInput, *, max_disparity_px: float, config: PipelineConfig | None = None
 ) -> DisparityMap:
     """Compute the disparity map of a rectified pair (2.5).
 

@@ -65,11 +65,7 @@ def interpolated_sequence(
 
     names = [image.name for image in images]
     violations = [_violating(leg) for leg in legs]
-    metadata = {
-        "images": names,
-        "violating_monotonicity": violations,
-        "known": [leg.known for leg in legs],
-    }
+    metadata = {"images": names, "violating_monotonicity": violations, "known": [leg.known for leg in legs]}
     captions = tuple(
         ", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights
     )

@@ -31,10 +31,7 @@ def _cached(
 
 
 def _sizes_of(reconstruction: Reconstruction) -> dict[str, int]:
-    return {
-        "registered": int(reconstruction.registered.sum()),
-        "points": int(reconstruction.valid.sum()),
-    }
+    return {"registered": int(reconstruction.registered.sum()), "points": int(reconstruction.valid.sum())}
 
 
 def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:

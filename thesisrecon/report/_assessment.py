@@ -68,7 +68,7 @@ def assess(data: ReportData) -> Assessment:
 
 
 def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
-    """Key facts of a run, as far as available: cameras, intrinsics, residuals, points and time."""
+    """Key facts of a run, if available: cameras, intrinsics, residuals, points and time."""
     facts = [_registered(data)]
     if data.metric is not None:
         facts += _intrinsic_facts(data)

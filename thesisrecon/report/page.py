@@ -10,9 +10,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,22 +44,9 @@ from thesisrecon.report._drawing import (
     embed_jpeg,
     thumbnail,
 )
-from thesisrecon.report._figures import (
-    MAX_POINTS,
-    build_scene,
-    histograms,
-    pair_matrix_figure,
-    scene_figure,
-)
+from thesisrecon.report._figures import MAX_POINTS, build_scene, histograms, pair_matrix_figure, scene_figure
 from thesisrecon.report._viewer import viewer_data
-from thesisrecon.report.data import (
-    ReportData,
-    reprojection_distances,
-    summarize_distances,
-)
-
-if TYPE_CHECKING:
-    import jinja2
+from thesisrecon.report.data import ReportData, reprojection_distances, summarize_distances
 
 _FRAME_SIDE_PX, _FRAME_QUALITY = 960, 85
 """Of the frames on a strip page; the files beside it have full size and quality."""
@@ -79,12 +66,30 @@ _INTRINSICS = {
 _ALWAYS_SHOWN = ("focal_px", "principal_x_px", "principal_y_px", "k1")
 
 
-def template_environment() -> jinja2.Environment:
-    """Create a Jinja environment that escapes all text, with no undefined names and no NaN in JSON.
+def render_page(
+    template: str,
+    scripts: Sequence[str],
+    *,
+    filters: Mapping[str, Callable[..., str]] | None = None,
+    **content: Any,
+) -> str:
+    """Render a page: text is escaped, names are defined, JSON has no NaN, and only these scripts run.
+
+    Parameters
+    ----------
+    template : str
+        Text of the Jinja template; ``style``, ``scripts`` and ``hashes`` are given.
+    scripts : sequence of str
+        Texts of all scripts of the page, which the content security policy lists by their hashes.
+    filters : mapping, optional
+        Name -> filter of the template.
+    **content
+        Variables of the template.
 
     Returns
     -------
-    jinja2.Environment
+    str
+        HTML.
     """
     import jinja2
 
@@ -93,7 +98,11 @@ def template_environment() -> jinja2.Environment:
     )
     # NaN is not JSON: the script of the page could not parse it.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    return environment
+    environment.filters.update(filters or {})
+    digests = (hashlib.sha256(script.encode("utf-8")).digest() for script in scripts)
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+    given = {"style": page_resource("style.css"), "scripts": scripts, "hashes": hashes or "'none'"}
+    return environment.from_string(template).render(**given, **content)
 
 
 def page_resource(name: str) -> str:
@@ -123,24 +132,6 @@ def plotly_script() -> str:
     return str(get_plotlyjs()).replace("</script", "<\\/script")
 
 
-def script_hashes(scripts: Sequence[str]) -> str:
-    """Compute the content-security-policy sources of scripts.
-
-    Parameters
-    ----------
-    scripts : sequence of str
-        Texts of the scripts.
-
-    Returns
-    -------
-    str
-        Space-separated hashes, or 'none'.
-    """
-    digests = (hashlib.sha256(script.encode("utf-8")).digest() for script in scripts)
-    found = [f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests]
-    return " ".join(found) or "'none'"
-
-
 def strip_page(
     title: str, frames: Sequence[tuple[str, NDArray[np.uint8]]], *, notes: Sequence[str] = ()
 ) -> str:
@@ -164,15 +155,8 @@ def strip_page(
         raise ValueError("a strip page needs at least one frame")
     script = page_resource("strip.js")
     shown = [{"caption": caption, "image": _embedded(rgb)} for caption, rgb in frames]
-    template = template_environment().from_string(page_resource("strip.html.j2"))
-    return template.render(
-        title=title,
-        frames=shown,
-        notes=list(notes),
-        style=page_resource("style.css"),
-        script=script,
-        hashes=script_hashes([script]),
-    )
+    template = page_resource("strip.html.j2")
+    return render_page(template, [script], title=title, frames=shown, notes=list(notes), script=script)
 
 
 def _embedded(rgb: NDArray[np.uint8]) -> str:
@@ -204,11 +188,11 @@ def render_report(data: ReportData) -> str:
     model = _model(data)
     figure_scripts = [plotly_script(), page_resource("page.js")] if figures else []
     model_scripts = [page_resource("viewer.js")] if model is not None else []
-    environment = template_environment()
-    environment.filters.update(grouped=grouped, decimals=decimals, significant=significant)
-    environment.globals.update(count_of=count_of)
-    template = environment.from_string(page_resource("template.html.j2"))
-    return template.render(
+    return render_page(
+        page_resource("template.html.j2"),
+        [*figure_scripts, *model_scripts],
+        filters={"grouped": grouped, "decimals": decimals, "significant": significant},
+        count_of=count_of,
         data=data,
         assessment=assess(data),
         facts=key_facts(data, overall),
@@ -229,10 +213,8 @@ def render_report(data: ReportData) -> str:
         warnings=_warnings(data),
         self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
         summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
-        style=page_resource("style.css"),
         figure_scripts=figure_scripts,
         model_scripts=model_scripts,
-        script_hashes=script_hashes((*figure_scripts, *model_scripts)),
         histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
     )
 

@@ -152,7 +152,7 @@ class RunDirectory:
 
     @contextmanager
     def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
-        """Lock the folder for a run of this identity, as far as it is known before the images are read.
+        """Lock the folder for a run; ``identity`` is what is known of it before the images are read.
 
         A ``UsageError`` if it cannot be written, is in use, or holds other files or another run.
         """

@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon.io._files import write_text
-from thesisrecon.report.page import page_resource, plotly_script, script_hashes, template_environment
+from thesisrecon.report.page import plotly_script, render_page
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
@@ -47,25 +47,20 @@ def _page(analysis: Analysis, tables: Sequence[str]) -> str:
     figures = {p["id"]: p["figure"] for section in sections for p in section["plots"]}
     scripts = [plotly_script(), (HARNESS / "page.js").read_text(encoding="utf-8")] if figures else []
     failures = [r for r in analysis.rows if r.failure]
-    return (
-        template_environment()
-        .from_string((HERE / "page.html.j2").read_text(encoding="utf-8"))
-        .render(
-            title=plan.study.title,
-            words=plan.study.words,
-            facts=_facts(analysis),
-            findings=_findings(analysis),
-            warnings=analysis.warnings,
-            sections=sections,
-            failures=_failures(failures),
-            versions=list(plan.versions.items()),
-            tables=tables,
-            figures=figures,
-            scripts=scripts,
-            hashes=script_hashes(scripts),
-            style=page_resource("style.css"),
-            version=__version__,
-        )
+    return render_page(
+        (HERE / "page.html.j2").read_text(encoding="utf-8"),
+        scripts,
+        title=plan.study.title,
+        words=plan.study.words,
+        facts=_facts(analysis),
+        findings=_findings(analysis),
+        warnings=analysis.warnings,
+        sections=sections,
+        failures=_failures(failures),
+        versions=list(plan.versions.items()),
+        tables=tables,
+        figures=figures,
+        version=__version__,
     )
 
 

@@ -14,7 +14,7 @@ import PIL.Image
 from thesisrecon import __version__
 from thesisrecon.errors import counted
 from thesisrecon.io._files import write_text
-from thesisrecon.report.page import page_resource, plotly_script, script_hashes, template_environment
+from thesisrecon.report.page import plotly_script, render_page
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, key_of, slug
 from validation.harness.results import Change, Results, Row
 
@@ -82,9 +82,10 @@ def _page(
 ) -> str:
     figures = {plot["id"]: plot["figure"] for section in sections for plot in section["plots"]}
     scripts = [plotly_script(), (HERE / "page.js").read_text(encoding="utf-8")] if figures else []
-    jinja = template_environment()
-    jinja.filters["short"] = short
-    return jinja.from_string((HERE / "page.html.j2").read_text(encoding="utf-8")).render(
+    return render_page(
+        (HERE / "page.html.j2").read_text(encoding="utf-8"),
+        scripts,
+        filters={"short": short},
         title=title,
         links=links,
         verdict=verdict,
@@ -94,9 +95,6 @@ def _page(
         environment=environment,
         changes=changes,
         figures=figures,
-        scripts=scripts,
-        hashes=script_hashes(scripts),
-        style=page_resource("style.css"),
         version=__version__,
     )
 
