@@ -21,13 +21,7 @@ from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.pair_selection import (
-    AllPairs,
-    ListedPairs,
-    MapAll,
-    OverlapEstimate,
-    SequenceWindow,
-)
+from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, MapAll, OverlapEstimate, SequenceWindow
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement
@@ -134,12 +128,7 @@ class PairSelector(Protocol):
         """
 
     def select(
-        self,
-        names: Sequence[str],
-        features: Sequence[Features],
-        *,
-        map_all: MapAll,
-        rng: np.random.Generator,
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
     ) -> PairChoice:
         """Select pairs of images.
 
@@ -333,11 +322,7 @@ class SelfCalibrator(Protocol):
     """Self-calibration of a projective reconstruction (chapter 7)."""
 
     def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
     ) -> SelfCalibration:
         """Upgrade a projective reconstruction to a metric one.
 
