@@ -10,8 +10,7 @@ from tests.synthetic import texture
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.stereo import rectification
-from thesisrecon.stereo._epipolar_pair import pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo._frames import MAX_GROWTH, MAX_SHRINK
+from thesisrecon.stereo._epipolar_pair import MAX_GROWTH, MAX_SHRINK, pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo.planar import (
     PlanarRectification,
     common_orientation,

@@ -17,13 +17,15 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.stereo._epipolar_pair import MIN_MATCHES, EpipolarPair, plane_from_angle
-from thesisrecon.stereo._frames import (
+from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
+    MIN_MATCHES,
+    EpipolarPair,
     common_crop,
     disparity_gradients,
     frame_size,
     homography_jacobians,
+    plane_from_angle,
     singular_values,
 )
 from thesisrecon.stereo.resampling import Rectification

@@ -11,8 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.stereo._epipolar_pair import MIN_MATCHES, EpipolarPair, EpipolarPencil, HalfLines, chords
-from thesisrecon.stereo._frames import MAX_SHRINK, common_crop, disparity_gradients, frame_size
+from thesisrecon.stereo._epipolar_pair import (
+    MAX_SHRINK,
+    MIN_MATCHES,
+    EpipolarPair,
+    EpipolarPencil,
+    HalfLines,
+    chords,
+    common_crop,
+    disparity_gradients,
+    frame_size,
+)
 from thesisrecon.stereo.resampling import Rectification
 
 ANGLES = 4096

@@ -10,8 +10,15 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.stereo._epipolar_pair import EpipolarPair, Size, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo._frames import disparity_bounds, disparity_gradients, singular_values
+from thesisrecon.stereo._epipolar_pair import (
+    EpipolarPair,
+    Size,
+    disparity_bounds,
+    disparity_gradients,
+    pair_of_cameras,
+    pair_of_fundamental,
+    singular_values,
+)
 from thesisrecon.stereo.planar import common_orientation, hartley, loop_zhang, minimum_distortion
 from thesisrecon.stereo.polar import PolarRectification, polar
 from thesisrecon.stereo.resampling import Rectification
