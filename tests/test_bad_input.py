@@ -55,9 +55,7 @@ def picture(k):
 
 
 def refused(answer):
-    refused = {entry["name"]: entry["reason"] for entry in answer.summary["refused"]}
-    assert answer.refused == refused
-    return refused
+    return {entry["name"]: entry["reason"] for entry in answer.summary["refused"]}
 
 
 def test_one_image(folder, reconstruct):

@@ -1,10 +1,12 @@
 import dataclasses
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
-from thesisrecon.records import DegeneracyReport, IntrinsicInterval
+from thesisrecon.records import DegeneracyReport, IntrinsicInterval, RunResult
 from thesisrecon.report._assessment import (
     _interval_text,
     _named_number,
@@ -16,6 +18,7 @@ from thesisrecon.report._assessment import (
     plus_minus,
 )
 from thesisrecon.report.data import ResidualSummary
+from thesisrecon.report.summary import summarize
 
 TIME = "Computing time"
 
@@ -97,3 +100,13 @@ def test_pairs_that_leave_their_geometry_open_are_counted():
     note = key_facts(early, None)[1].note
     assert f"; {sum(pair.accepted for pair in pairs)} pairs with degenerate epipolar geometry" in note
     assert "degenerate" not in key_facts(run, None)[1].note
+
+
+def test_refused_images_are_those_without_a_camera():
+    data = made_up_run(points=100)
+    result = RunResult(Path(), data.images, data.unread, (), (), np.zeros(9, int), {}, metric=data.metric)
+    assert list(result.refused) == ["notes.jpg", data.images[-1].name]
+    assert result.refused[data.images[-1].name].startswith("only 14 matches")
+    listed = summarize(result)["refused"]
+    assert {entry["name"]: entry["reason"] for entry in listed} == result.refused
+    assert dataclasses.replace(result, metric=None).refused == data.unread
