@@ -14,7 +14,7 @@ from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
-from thesisrecon.report.data import ReportData
+from thesisrecon.report._data import ReportData
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.simplification import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas

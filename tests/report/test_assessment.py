@@ -17,8 +17,8 @@ from thesisrecon.report._assessment import (
     key_facts,
     plus_minus,
 )
-from thesisrecon.report.data import ResidualSummary
-from thesisrecon.report.summary import summarize
+from thesisrecon.report._data import ResidualSummary
+from thesisrecon.report._summary import summarize
 
 TIME = "Computing time"
 

@@ -16,8 +16,13 @@ from tests.report.synthetic import NOISE_PX, SPHERE_NAMES, Witness, made_up_run,
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.records import Image, IntrinsicInterval, TexturedMesh
+from thesisrecon.report._data import (
+    ReportData,
+    reprojection_distances,
+    summarize_distances,
+    used_observations,
+)
 from thesisrecon.report._figures import _BINS, _common_limit_px, _histogram_shares
-from thesisrecon.report.data import ReportData, reprojection_distances, summarize_distances, used_observations
 from thesisrecon.report.page import render_report, strip_page
 
 EVIL = [

@@ -20,9 +20,9 @@ from thesisrecon.io.colmap_model import write_colmap_model
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.records import Reconstruction, RunResult, TexturedMesh
-from thesisrecon.report.data import ReportData
+from thesisrecon.report._data import ReportData
+from thesisrecon.report._summary import point_colors, summarize
 from thesisrecon.report.page import render_report
-from thesisrecon.report.summary import point_colors, summarize
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.runtime._run_state import Run
 from thesisrecon.runtime.run import Until

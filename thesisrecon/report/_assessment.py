@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon.errors import counted
 from thesisrecon.records import IntrinsicInterval, TexturedMesh, TwoView
-from thesisrecon.report.data import ReportData, ResidualSummary
+from thesisrecon.report._data import ReportData, ResidualSummary
 
 Level = Literal["good", "doubt", "open", "bad"]
 _THIN = "\u202f"  # narrow no-break space

@@ -33,6 +33,7 @@ from thesisrecon.report._assessment import (
     plus_minus,
     significant,
 )
+from thesisrecon.report._data import ReportData, reprojection_distances, summarize_distances
 from thesisrecon.report._drawing import (
     DIFFERENCE_LIMIT,
     SCALE,
@@ -46,7 +47,6 @@ from thesisrecon.report._drawing import (
 )
 from thesisrecon.report._figures import MAX_POINTS, build_scene, histograms, pair_matrix_figure, scene_figure
 from thesisrecon.report._viewer import viewer_data
-from thesisrecon.report.data import ReportData, reprojection_distances, summarize_distances
 
 _FRAME_SIDE_PX, _FRAME_QUALITY = 960, 85
 """Of the frames on a strip page; the files beside it have full size and quality."""

@@ -26,37 +26,7 @@ from thesisrecon.records import (
 
 @dataclass(frozen=True)
 class ReportData:
-    """Content of ``report.html``, for a run that succeeded, stopped early or failed.
-
-    Parameters
-    ----------
-    title : str
-        Name of the run, usually of its image folder.
-    images, reports : tuple of Image, tuple of StageReport
-        The V views, and one report per stage, in order.
-    config_text, summary, version : str, mapping, str
-        The configuration as TOML, the content of ``summary.json`` and the version of thesisrecon.
-    unread : mapping
-        File name -> reason of files that are not views.
-    pairs, pair_choice : sequence of TwoView, PairChoice
-        Matched pairs, accepted or not, and how they were selected.
-    reconstruction, metric : Reconstruction, MetricResult
-        Projective reconstruction, and the result of the metric stage, which takes precedence.
-    colors : ndarray (N, 3) uint8
-        Colours of the metric points, valid or not.
-    affine : Reconstruction
-        Affine stratum with the same points.
-    model : TexturedMesh
-        Surface in the coordinates of ``metric``; 150,000 faces with 2048 x 2048 texels add about 6 MB.
-    depth_maps : mapping
-        View -> depth (H, W) float32, NaN = unknown; a long side of 400 px is enough.
-    held_out : HeldOut
-        Comparison of the model with an image that did not texture it.
-    until : str
-        Last stage that was requested, None = all.
-    failure : StageFailure
-        Why the run failed.
-    """
+    """Content of ``report.html``, for a run that succeeded, stopped early or failed."""
 
     title: str
     images: tuple[Image, ...]
@@ -64,17 +34,17 @@ class ReportData:
     config_text: str
     summary: Mapping[str, object]
     version: str
-    unread: Mapping[str, str] = field(default_factory=dict)
+    unread: Mapping[str, str] = field(default_factory=dict)  # file name -> reason
     pairs: Sequence[TwoView] = ()
     pair_choice: PairChoice | None = None
-    reconstruction: Reconstruction | None = None
+    reconstruction: Reconstruction | None = None  # projective; ``metric`` takes precedence
     metric: MetricResult | None = None
-    colors: U8 | None = None
-    affine: Reconstruction | None = None
-    model: TexturedMesh | None = None
-    depth_maps: Mapping[int, F32] = field(default_factory=dict)
+    colors: U8 | None = None  # (N, 3) of the metric points, valid or not
+    affine: Reconstruction | None = None  # with the same points
+    model: TexturedMesh | None = None  # 150,000 faces with 2048 x 2048 texels add about 6 MB
+    depth_maps: Mapping[int, F32] = field(default_factory=dict)  # a long side of 400 px is enough
     held_out: HeldOut | None = None
-    until: str | None = None
+    until: str | None = None  # last stage that was requested, None = all
     failure: StageFailure | None = None
 
     @property
@@ -95,19 +65,7 @@ class ReportData:
 
 
 def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> IntrinsicInterval:
-    """Convert an intrinsic from working to original pixels, undoing (x + 0.5) scale - 0.5.
-
-    Parameters
-    ----------
-    name, interval : str, IntrinsicInterval
-        Its key (only names that end in ``_px`` are converted) and its value at working size.
-    scale : float
-        Working over original size.
-
-    Returns
-    -------
-    IntrinsicInterval
-    """
+    """Convert an intrinsic whose name ends in ``_px`` to original pixels, undoing (x + 0.5) scale - 0.5."""
     if not name.endswith("_px"):
         return interval
     shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0
@@ -125,35 +83,16 @@ class ResidualSummary:
 
 
 def used_observations(reconstruction: Reconstruction) -> I64:
-    """Return the observations that a reconstruction explains.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Of any stratum.
-
-    Returns
-    -------
-    ndarray (U,)
-        Numbers of the inliers of registered views and valid points.
-    """
+    """Numbers (U,) of the inliers of registered views and valid points."""
     r, tracks = reconstruction, reconstruction.tracks
     used = r.inlier & r.registered[tracks.view_index] & r.valid[tracks.point_index]
     return np.flatnonzero(used).astype(np.int64)
 
 
 def reprojection_distances(reconstruction: Reconstruction) -> list[F64]:
-    """Compute the residual lengths |observed - reprojected| of every view.
+    """Residual lengths |observed - reprojected| (px) per view, empty if it is not registered.
 
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Of any stratum.
-
-    Returns
-    -------
-    list of ndarray
-        Distances (px) per view, empty if it is not registered; points on its principal plane are left out.
+    Points on the principal plane of a view are left out.
     """
     used = used_observations(reconstruction)
     views = reconstruction.tracks.view_index[used]
@@ -183,17 +122,7 @@ def _predicted_pixels(reconstruction: Reconstruction, i: int, X: F64) -> F64:
 
 
 def summarize_distances(distances: F64) -> ResidualSummary | None:
-    """Summarize distances; None without any.
-
-    Parameters
-    ----------
-    distances : ndarray (N,)
-        Pixels.
-
-    Returns
-    -------
-    ResidualSummary or None
-    """
+    """Summarize distances (N,) in pixels; None without any."""
     if len(distances) == 0:
         return None
     median, q95 = np.quantile(distances, [0.5, 0.95])

@@ -9,23 +9,13 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.records import Image, Reconstruction, RunResult
-from thesisrecon.report.data import in_original_pixels, reprojection_distances, used_observations
+from thesisrecon.report._data import in_original_pixels, reprojection_distances, used_observations
 
 
 def summarize(result: RunResult) -> dict[str, Any]:
-    """Summarize the results of a run.
+    """Content of ``summary.json`` without times and settings; None for stages that did not run.
 
     Lengths are in original pixels, (x + 0.5) / scale - 0.5; ``..._working_px`` are in pixels at working size.
-
-    Parameters
-    ----------
-    result : RunResult
-        Any run, finished or not.
-
-    Returns
-    -------
-    dict
-        Content of ``summary.json`` without times and settings; None for stages that did not run.
     """
     best = result.metric.reconstruction if result.metric is not None else result.projective
     working = reprojection_distances(best) if best is not None else [np.zeros(0) for _ in result.images]
@@ -143,18 +133,7 @@ def _median(distances: F64) -> float | None:
 
 
 def point_colors(reconstruction: Reconstruction, images: tuple[Image, ...]) -> NDArray[np.uint8]:
-    """Average the colours of the observations of each point.
-
-    Parameters
-    ----------
-    reconstruction, images : Reconstruction, tuple of Image
-        N points in V views.
-
-    Returns
-    -------
-    ndarray (N, 3) uint8
-        RGB; mid-grey without observations.
-    """
+    """Average colours (N, 3) of the observations of each point; mid-grey without observations."""
     used = used_observations(reconstruction)
     tracks = reconstruction.tracks
     view, point = tracks.view_index[used], tracks.point_index[used]
