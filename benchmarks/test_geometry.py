@@ -12,13 +12,13 @@ from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres_bundle import CeresOptions, bundle_adjuster
 from validation.references.colmap_model import colmap_model
 from validation.references.fundamental import SOLVERS
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.streets import SIZE, make_walk
 from validation.scenes.two_views import make_two_views
-from validation.studies.bundle import FOCAL_K1
 
 MATCHES, SIGMA_PX, FRAME = 1000, 0.5, (1280.0, 960.0)
 POINTS = 2000

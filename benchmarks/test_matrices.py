@@ -26,8 +26,8 @@ from validation.references.geometry import (
     poselib_three_points,
 )
 from validation.references.triangulation import colmap_points
+from validation.scenes.triangulation import beside, cameras_of
 from validation.scenes.two_views import make_two_views
-from validation.studies.triangulation import beside, cameras_of
 
 Call = Callable[..., Any]
 RADIAL = np.array([-0.1, 0.02, 0.001])

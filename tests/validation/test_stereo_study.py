@@ -6,8 +6,8 @@ import pytest
 from tests.synthetic import texture
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
+from validation.metrics.depth import bad_pixels
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
-from validation.studies.stereo import DEFAULT, THESIS, bad_pixels, check_pair
 
 LIMITS_PCT = {"Tsukuba": (3.13, 4.1), "Teddy": (8.4, 14.0), "Cones": (4.1, 10.5), "Motorcycle": (5.6, 16.0)}
 """Of pixels off by more than one: OpenCV's better mode for the default, the literature's scanline program for
@@ -56,15 +56,3 @@ def test_pixels_hidden_by_the_square_or_beyond_the_image_are_not_judged():
     assert not judged[20:40, 36:40].any()
     assert judged[20:40, 40:60].all()
     assert judged[:20, 5:].all()
-
-
-def test_rows_of_a_pair_name_every_method():
-    rows, maps = check_pair(small_pair(), 1)
-    off = rows[0]
-    assert off.name == "off by more than 1 px"
-    assert set(off.values) == set(maps)
-    assert off.values[DEFAULT] is not None
-    assert off.values[DEFAULT] < 3.0
-    assert off.values[THESIS] is not None
-    assert off.values[THESIS] < 3.0
-    assert all(value is not None and value > 0.0 for value in rows[6].values.values())

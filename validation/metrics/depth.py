@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
-from thesisrecon.records import DepthMap, Reconstruction
+from thesisrecon.records import DepthMap, DisparityMap, Reconstruction
 from validation.metrics.similarity import Similarity, estimate_similarity
 from validation.scenes.real import Scene, load_fixture_depth
+from validation.scenes.stereo import StereoPair
 
 SAME = 0.01
 """Maximum relative depth error of a correct depth, and between views of the same point."""
@@ -163,3 +164,10 @@ def coloured(share: F64) -> U8:
     stops = np.linspace(0.0, 1.0, len(NEAR_TO_FAR))
     rgb = [np.interp(np.clip(share, 0.0, 1.0), stops, NEAR_TO_FAR[:, k]) for k in range(3)]
     return np.stack(rgb, axis=-1).astype(np.uint8)
+
+
+def bad_pixels(disparity: F32, pair: StereoPair, limit_px: float) -> float:
+    """Return the percentage of judged pixels off by more than ``limit_px``, holes filled along the row."""
+    filled = DisparityMap(disparity, np.zeros_like(disparity), 0.0).filled()
+    error = np.abs(filled - pair.truth)[pair.judged]
+    return float(100.0 * np.mean(~(error <= limit_px)))

@@ -33,7 +33,6 @@ from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_s
 MODULES = {
     "ablation-cost": "timing",
     "benchmark-table": "timing",
-    "bundle": "bundle",
     "calibration-coverage": "calibration_parts",
     "calibration-real": "calibration_real",
     "critical-motions": "critical_motions",
@@ -65,13 +64,11 @@ MODULES = {
     "rendering": "rendering",
     "self-check": "self_check",
     "selfcalibration": "selfcalibration",
-    "stereo": "stereo",
     "stop-anywhere": "robustness",
     "stratified": "selfcalibration",
     "subsets": "subsets",
     "surfaces": "surfaces",
     "tensor-views": "tensor_views",
-    "triangulation": "triangulation",
 }
 """Name of a study -> the module of this folder that holds its function."""
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"

@@ -13,8 +13,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place
+from validation.metrics.depth import bad_pixels
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
-from validation.studies.stereo import bad_pixels
 
 
 @dataclass(frozen=True)

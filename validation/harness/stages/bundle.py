@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
@@ -21,10 +22,13 @@ from validation.metrics.record import Metric
 from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
 from validation.references.ceres_covariance import ceres_covariances
 from validation.scenes.streets import SIZE, make_walk
-from validation.studies.bundle import FOCAL_K1, LOSS_PX, WITH_CENTRE, model_as_bundle, perturbed_model
 
 OURS, CERES = "ours", "Ceres"
 STREET = "street"
+FOCAL_K1 = np.array([True, False, False, False, False, True])
+WITH_CENTRE = np.array([True, False, False, True, True, True])
+LOSS_PX = 0.2
+"""Scale of the robust losses: about twice the noise of the images, so that they take effect."""
 
 
 class BundleStage:
@@ -198,3 +202,35 @@ def _covariance_metrics(scene: str, outcomes: Mapping[str, Outcome]) -> list[Met
 def _off(a: F64, b: F64) -> float:
     std = np.sqrt(np.diagonal(b, axis1=-2, axis2=-1))
     return float((np.abs(a - b) / (std[..., :, None] * std[..., None, :])).max())
+
+
+def model_as_bundle(model: Reconstruction) -> tuple[MetricCameras, F64, Observations]:
+    """Return cameras with the intrinsics of the first, the points and the observations of a saved model."""
+    assert model.K is not None
+    assert model.distortion is not None
+    R, t = _poses(model)
+    K = model.K[0]
+    row = [K[0, 0], 1.0, 0.0, K[0, 2], K[1, 2], float(model.distortion[0, 0])]
+    seen = Observations(model.tracks.view_index, model.tracks.point_index, model.tracks.xy)
+    X = model.X[:, :3] / model.X[:, 3:]
+    return MetricCameras(R, t, np.array([row]), np.zeros(len(R), dtype=np.int64)), X, seen
+
+
+def perturbed_model(
+    model: Reconstruction, rng: np.random.Generator
+) -> tuple[MetricCameras, F64, Observations]:
+    """Set the focal length 2 % off and move poses and points by 0.3 % of the scene."""
+    exact, X, seen = model_as_bundle(model)
+    R, t = exact.R, exact.t
+    scale = float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
+    turn = Rotation.from_rotvec(0.003 * rng.normal(size=t.shape)).as_matrix()
+    row = exact.intrinsics * [1.02, 1.0, 1.0, 1.0, 1.0, 1.0]
+    moved = t + 0.003 * scale * rng.normal(size=t.shape)
+    cameras = MetricCameras(turn @ R, moved, row, exact.group)
+    return cameras, X + 0.003 * scale * rng.normal(size=X.shape), seen
+
+
+def _poses(model: Reconstruction) -> tuple[F64, F64]:
+    assert model.K is not None
+    poses = np.linalg.inv(model.K) @ model.P
+    return poses[:, :, :3], poses[:, :, 3]

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F32
+from thesisrecon.arrays import F32, U8
+from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.metrics.depth import bad_pixels
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
-from validation.studies.stereo import bad_pixels, picture
 
 OURS, THESIS, SEMI_GLOBAL = "ours", "ours (thesis)", "ours (semi-global)"
 MATCHERS: dict[str, SemiGlobalMatching | MaximumLikelihoodScanline] = {
@@ -102,7 +103,7 @@ class DisparityStage(Stage):
         maps = {n: k[0] for n, k in kept.items() if k is not None}
         place = options.place(self.name, scene)
         shown = [name for name in (THESIS, OURS, THREE_WAY) if name in maps]
-        PIL.Image.fromarray(picture(pair, maps, shown)).save(place / "maps.png")
+        PIL.Image.fromarray(_picture(pair, maps, shown)).save(place / "maps.png")
         words = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
         notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", words)], notes=notes)
@@ -154,3 +155,28 @@ def _match(method: str, pair: StereoPair) -> F32:
 def _read(outcome: Outcome) -> tuple[F32, float]:
     with np.load(Path(outcome.place) / "disparity.npz") as kept:
         return kept["disparity"], float(kept["seconds"])
+
+
+def _picture(pair: StereoPair, maps: Mapping[str, F32], names: Sequence[str]) -> U8:
+    """Draw truth and maps in colours; below each map the errors above 1 px (yellow) and 2 px (red)."""
+    top = [pair.left, _colors(pair.truth, pair.disparities)]
+    dark = (pair.left // 3 + 50).astype(np.uint8)
+    low = [dark, np.where(pair.judged[..., None], np.uint8(200), dark)]
+    for name in names:
+        top.append(_colors(maps[name], pair.disparities))
+        shown = dark.copy()
+        filled = DisparityMap(maps[name], np.zeros_like(maps[name]), 0.0).filled()
+        error = np.nan_to_num(np.abs(filled - pair.truth), nan=np.inf)
+        shown[pair.judged & (error > 1.0)] = (255, 255, 0)
+        shown[pair.judged & (error > 2.0)] = (255, 0, 0)
+        low.append(shown)
+    return np.concatenate([np.concatenate(top, axis=1), np.concatenate(low, axis=1)])
+
+
+def _colors(disparity: F32, largest: int) -> U8:
+    share = np.nan_to_num(np.clip(disparity / largest, 0.0, 1.0))
+    colors = np.stack(
+        [np.clip(2.0 * share - 0.5, 0, 1), np.sin(np.pi * share), np.clip(1.2 - 1.6 * share, 0, 1)]
+    )
+    colors[:, ~np.isfinite(disparity)] = 0.0
+    return np.asarray(255.0 * np.moveaxis(colors, 0, 2), dtype=np.uint8)

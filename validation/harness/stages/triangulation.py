@@ -19,7 +19,7 @@ from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, 
 from validation.metrics.record import Metric
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.rigs import Rig
-from validation.studies.triangulation import SCENES, cameras_of, frame_of, squared_distances
+from validation.scenes.triangulation import SCENES, cameras_of, frame_of, squared_distances
 
 OURS = "ours (polynomial, optimal)"
 DESCENT = 40
