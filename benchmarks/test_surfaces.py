@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
 from validation.references.open3d_surfaces import OpenTsdf
-from validation.studies.rendering import courtyard
+from validation.scenes.nine_views import read_rgb
+from validation.scenes.real import load_fixture_depth, load_fixture_scene
 
 STEP = 2
 
@@ -17,15 +19,21 @@ STEP = 2
 @pytest.fixture(scope="module")
 def depths() -> tuple[list[DepthMap], list[PinholeView]]:
     """Every second pixel of four true depth maps of the courtyard, and the colours there."""
-    maps, views = courtyard()
+    scene = load_fixture_scene("courtyard")
+    assert scene.K is not None
+    assert scene.R is not None
+    assert scene.C is not None
     small, colours = [], []
-    for one, view in zip(maps[4:8], views[4:8], strict=True):
-        P = np.diag([1.0 / STEP, 1.0 / STEP, 1.0]) @ one.P
-        part = np.s_[::STEP, ::STEP]
-        small.append(DepthMap(one.view, P, one.depth[part], one.std[part], one.views[part]))
-        stride = view.rgb.shape[0] // small[-1].depth.shape[0]
-        rgb = np.ascontiguousarray(view.rgb[::stride, ::stride])
-        colours.append(PinholeView(one.view, P, rgb, np.ones(rgb.shape[:2], dtype=bool)))
+    for view in range(4, 8):
+        depth, stride = load_fixture_depth(view)
+        step = stride * STEP
+        K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ scene.K[view]
+        P = camera_from_centre(K, scene.R[view], scene.C[view])
+        part = depth[::STEP, ::STEP].astype(np.float32)
+        std, seen = np.full(part.shape, 0.001, np.float32), np.full(part.shape, 3, np.uint8)
+        small.append(DepthMap(view, P, part, std, seen))
+        rgb = np.ascontiguousarray(read_rgb(scene.image_paths[view])[::step, ::step])
+        colours.append(PinholeView(view, P, rgb, np.ones(rgb.shape[:2], dtype=bool)))
     return small, colours
 
 

@@ -20,14 +20,10 @@ from validation.studies.epipolar_methods import (
     OWN,
     RAW,
     Method,
-    Result,
     Setting,
     make_trial,
     measure,
-    merged,
-    read_results,
     run_methods,
-    write_results,
 )
 from validation.studies.runner import run_study
 
@@ -98,20 +94,6 @@ def test_a_method_without_a_result_is_counted():
     assert "1 none" in epipolar_methods.report([result])
 
 
-def test_results_are_kept_and_renewed(tmp_path, clean):
-    path = tmp_path / "new" / "results.json"
-    write_results(path, list(clean.values()))
-    assert read_results(path) == list(clean.values())
-    newer = Result(GOLD, Setting(1.0, 60), False, 1.0, 1.0, 1.0, 0, 1)
-    other = Result(GOLD, Setting(1.0, 70), False, 1.0, 1.0, 1.0, 0, 1)
-    together = merged(read_results(path), [newer, other])
-    assert len(together) == len(clean) + 1
-    assert newer in together
-    assert together[-1] == other
-    table = epipolar_methods.report(together)
-    assert all(f"| {label} |" in table for label in clean)
-
-
 def test_pairs_of_the_cube_share_more_than_a_face():
     sequence = make_cube()
     pairs = cube_pairs(sequence)
@@ -149,13 +131,9 @@ def test_tables_and_plot_of_the_cube(tmp_path, capsys):
     assert 'src="http' not in page
 
 
-def test_the_command_states_if_the_bound_was_reached(tmp_path, capsys):
-    out = tmp_path / "r.json"
-    base = ["--trials", "30", "--points", "100", "--noise", "0.5", "--wrong", "0", "--results", str(out)]
+def test_the_command_states_if_the_bound_was_reached(capsys):
+    base = ["--trials", "30", "--points", "100", "--noise", "0.5", "--wrong", "0"]
     assert run_study("epipolar-methods", [*base, "--methods", NORMALISED]) == 0
-    code = run_study("epipolar-methods", [*base, "--methods", GOLD])
-    normalised, gold = read_results(out)
-    assert (normalised.method, gold.method) == (NORMALISED, GOLD)
-    assert code == (gold.rms_ratio > epipolar_methods.ALLOWED)
-    assert "RMS (median)" in capsys.readouterr().out
+    run_study("epipolar-methods", [*base, "--methods", GOLD])
+    assert capsys.readouterr().out.count("RMS (median)") == 2
     assert set(epipolar_cube.CUBE_METHODS) <= {m.name for m in OWN}

@@ -12,7 +12,7 @@ from validation.harness.gates import read_gates
 from validation.harness.process import own_cores
 from validation.harness.records import ReportOptions
 from validation.harness.results import collect
-from validation.harness.scenes import PHOTOGRAPHS, available_scenes
+from validation.harness.scenes import IMAGE_SCENES, available_scenes
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES
 
@@ -66,4 +66,4 @@ def test_every_gate_holds(gate, results):
 
 
 def test_every_set_of_photographs_has_its_gates():
-    assert {scene_of(gate) for gate in GATES.values()} >= {*PHOTOGRAPHS, *ALWAYS}
+    assert {scene_of(gate) for gate in GATES.values()} >= {*IMAGE_SCENES, *ALWAYS}

@@ -94,10 +94,8 @@ def small_tree(root):
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("", encoding="utf-8")
     (package / "inner.py").write_text("VALUE = 1\n", encoding="utf-8")
-    (package / "middle.py").write_text(
-        "from package import inner\nfrom numba import njit\n", encoding="utf-8"
-    )
-    (package / "outer.py").write_text("import package.middle\nfrom numba import njit\n", encoding="utf-8")
+    (package / "middle.py").write_text("from package import inner\n@kernel\n", encoding="utf-8")
+    (package / "outer.py").write_text("import package.middle\n@kernel\n", encoding="utf-8")
     (package / "python.py").write_text("import package.outer\n", encoding="utf-8")
     (package / "alone.py").write_text("import math\n", encoding="utf-8")
     return package

@@ -104,7 +104,9 @@ def test_cells_cross_at_one_pixel_and_the_most_cameras():
 
 def test_the_report_crosses_at_one_pixel_and_adds_other_noises_over_cameras():
     places = [(1.0, 3), (1.0, 27), (0.5, 3), (0.5, 27), (2.0, 27)]
-    text = report([Trial("cloud", "zooming", s, v, 0, "linear-quadric", 0.2, 6.0, True, 1.0) for s, v in places])
+    text = report(
+        [Trial("cloud", "zooming", s, v, 0, "linear-quadric", 0.2, 6.0, True, 1.0) for s, v in places]
+    )
     cross, other = text.split("\n\n")
     assert "| 3 cameras, 1 px | 27 cameras, 1 px | 27 cameras, 0.5 px | 27 cameras, 2 px |" in cross
     assert other.startswith("| cloud, zooming, 0.5 px | 3 cameras, 0.5 px | 27 cameras, 0.5 px |")

@@ -1,24 +1,18 @@
 """Chapter 5: distance of every F estimator from the KCR bound, and its processor time.
 
-``epipolar-methods`` gives all methods the same synthetic matches. It reports the root mean square (and the
-median) over trials of the RMS distance of the exact points to their epipolar lines over the KCR bound. An
-efficient estimator has the ratio 1; its median is then about 0.95, because seven parameters carry the error.
-``epipolar-speed`` compares processor times with OpenCV, PoseLib and COLMAP. OpenCV's robust methods get our
-confidence 0.9999 and 20000 iterations, the others their defaults. All threads count: set
-OPENBLAS_NUM_THREADS=1.
+All methods get the same synthetic matches. A cell is the root mean square (and the median) over trials of the
+RMS distance of the exact points to their epipolar lines over the KCR bound. An efficient estimator has the
+ratio 1; its median is then about 0.95, because seven parameters carry the error. OpenCV's robust methods get
+our confidence 0.9999 and 20000 iterations, the others their defaults. Set OPENBLAS_NUM_THREADS=1.
 """
 
 from __future__ import annotations
 
-import json
-import platform
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,11 +26,9 @@ from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
 from thesisrecon.epipolar.refinement import Criterion, refine_by_rows, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import symmetric_residuals
-from thesisrecon.io._files import write_text
-from validation.metrics.epipolar import rms_epipolar_distance
 from validation.metrics.record import Metric
 from validation.references.fundamental import OURS, SOLVERS, opencv_eight_point
-from validation.references.libraries import PACKAGES, one_thread
+from validation.references.libraries import one_thread
 from validation.scenes.two_views import make_two_views
 from validation.studies.runner import Part, Rows, pick, text_table
 
@@ -291,40 +283,12 @@ def _table(results: Sequence[Result], head: Callable[[Setting], str], cell: Call
     )
 
 
-def read_results(path: Path) -> list[Result]:
-    """Read the results of an earlier run."""
-    rows = json.loads(path.read_text(encoding="utf-8"))["results"]
-    return [Result(**{**row, "setting": Setting(**row["setting"])}) for row in rows]
-
-
-def write_results(path: Path, results: Sequence[Result]) -> None:
-    """Write results with the machine and the versions of the libraries."""
-    versions = {"opencv": version(PACKAGES["cv2"]), "poselib": version("poselib")}
-    made = {"machine": platform.machine(), "python": platform.python_version(), **versions}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = {"made_with": made, "results": [asdict(r) for r in results]}
-    write_text(path, json.dumps(content, indent=1))
-
-
-def merged(old: Sequence[Result], new: Sequence[Result]) -> list[Result]:
-    """Return ``old`` with rows replaced by ``new``, in the order of settings and methods."""
-    rows = {(r.label, r.setting): r for r in (*old, *new)}
-    place = {m.name: k for k, m in enumerate(METHODS)}
-
-    def order(r: Result) -> tuple[float, ...]:
-        s = r.setting
-        return s.wrong, s.sigma_px, s.n, place.get(r.method, len(place)), r.matched_threshold
-
-    return sorted(rows.values(), key=order)
-
-
 def epipolar_methods_study(
     trials: int = 500,
     points: Sequence[int] = (30, 100, 1000),
     noise: Sequence[float] = (0.5, 1.0, 2.0),
     wrong: Sequence[float] = (0.0, WRONG),
     methods: Sequence[str] | None = None,
-    results: Path | None = None,
 ) -> Iterator[Part]:
     """Compare every estimator of F with the KCR bound."""
     names = pick(methods, [m.name for m in METHODS])
@@ -335,59 +299,13 @@ def epipolar_methods_study(
         for sigma in ([WRONG_NOISE_PX] if share else noise)
         for n in points
     ]
-    found = read_results(results) if results and results.exists() else []
+    found: list[Result] = []
     for setting in settings:
         block = run_methods([setting], chosen, trials)
-        found = merged(found, block)
-        if results:
-            write_results(results, found)
+        found += block
         rows = Rows(f"n = {setting.n}, {setting.sigma_px:g} px", DEFAULT)
         for r in block:
             if r.method in (GOLD, DEFAULT) and not (r.matched_threshold or setting.wrong):
                 rows.append(Metric(rows.scene, r.method, "", {OURS: r.rms_ratio}, OURS, ALLOWED))
         yield rows
     yield report(found)
-
-
-# ---------------------------------------------------------------- speed
-
-SPEED_NOISE_PX = 0.5
-ACCURATE, POSELIB = "USAC_ACCURATE", "PoseLib"
-TIMED = (OURS, ACCURATE, POSELIB, "USAC_ACCURATE default", "USAC_MAGSAC", "FM_RANSAC", "COLMAP")
-"""Ours is held against the second and third; the others are reported."""
-
-
-def check_speed(outliers: float, n: int, trials: int) -> list[Metric]:
-    """Measure median milliseconds and median RMS distances of exact matches (px); warm, one thread."""
-    one_thread()
-    milliseconds: dict[str, list[float]] = {name: [] for name in TIMED}
-    errors: dict[str, list[float]] = {name: [] for name in TIMED}
-    for seed in range(-1, trials):
-        rng = np.random.default_rng(abs(seed))
-        scene = make_two_views(Configuration.GENERAL, n, rng)
-        xy1, xy2 = (xy + rng.normal(0.0, SPEED_NOISE_PX, xy.shape) for xy in (scene.xy1, scene.xy2))
-        wrong = rng.random(n) < outliers
-        xy2[wrong] = rng.uniform((0.0, 0.0), SIZE, (int(wrong.sum()), 2))
-        for name in TIMED:
-            start = time.process_time()
-            F = SOLVERS[name](xy1, xy2, THRESHOLD_PX, max(seed, 0))[0]
-            elapsed = 1e3 * (time.process_time() - start)
-            if seed >= 0:
-                milliseconds[name].append(elapsed)
-                errors[name].append(rms_epipolar_distance(F, np.hstack([scene.xy1, scene.xy2])))
-    time_ms = {name: float(np.median(values)) for name, values in milliseconds.items()}
-    error_px = {name: float(np.median(values)) for name, values in errors.items()}
-    failed = {name: float(np.sum(np.array(values) > THRESHOLD_PX)) for name, values in errors.items()}
-    rows = Rows(f"{100.0 * outliers:.0f} % outliers, n = {n}", OURS)
-    rows.add("time", time_ms, "ms", at_most=min(time_ms[ACCURATE], 0.5 * time_ms[POSELIB]))
-    rows.add("median error", error_px, "px", at_most=min(error_px[ACCURATE], error_px[POSELIB]))
-    rows.add(f"runs > {THRESHOLD_PX:g} px, of {trials}", failed)
-    for name, values in (("time", time_ms), ("median error", error_px)):
-        rows.add(f"{name} of ours over theirs", {m: values[OURS] / value for m, value in values.items()})
-    return rows
-
-
-def epipolar_speed_study(trials: int = 20) -> Iterator[Part]:
-    """Compare processor time and accuracy of F with OpenCV, PoseLib and COLMAP."""
-    for outliers in (0.1, 0.3, 0.5, 0.7):
-        yield check_speed(outliers, 1000, trials)

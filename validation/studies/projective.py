@@ -1,9 +1,7 @@
-"""Chapter 6: factorisation, the first pair of cameras, and a real turntable.
+"""Chapter 6: factorisation and a real turntable.
 
 ``factorization``: distance of a core of views from the truth after each start of chapter 6, before and after
 bundle adjustment, by noise; cameras, residuals and time of both methods on real images (matched once in OUT).
-``initial-cameras``: the conditioning of the second camera, the points that the plane at infinity separates
-from the others, and the effect on linear triangulation.
 ``dinosaur``: our cameras and the published ones are measured alike. Every track is triangulated from all its
 observations with one robust loss, for the cameras as given and after a projective bundle adjustment with that
 loss. An observation is right if either set of cameras explains it, so rejecting observations gains nothing.
@@ -18,22 +16,16 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.config import ProjectiveReconstructor
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
-from thesisrecon.geometry.camera_matrix import compose_camera, project
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, pixel_from_unit
-from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
-from thesisrecon.geometry.triangulation import triangulate, triangulate_observations
-from thesisrecon.geometry.two_view import canonical_cameras, epipoles, unit_norm
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.numerics.partial_bundle import refine_points
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.projective.factorization import Factorization, depths_from_fundamentals, factorize
 from thesisrecon.projective.incremental import IncrementalProjective
-from thesisrecon.projective.initial_pair import initial_cameras
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 from thesisrecon.runtime.run import stream
 from validation.metrics.record import Metric
@@ -217,93 +209,6 @@ def residual_rms_px(model: Reconstruction) -> float:
     return float(np.sqrt(np.mean(np.sum((xh[:, :2] / xh[:, 2:] - t.xy[k]) ** 2, axis=1))))
 
 
-# ---------------------------------------------------------------- initial cameras
-
-SIZES = np.array([[1280, 960], [1280, 960]])
-FOCALS_PX = (800.0, 1600.0, 3200.0)
-SIGMA_PX, PAIR_POINTS = 0.5, 200
-IDENTITY, ROTATION = "nearest to the identity", "nearest to a rotation"
-KINDS = ("small turn", "30 degrees apart", "on its side", "upside down", "forward")
-MAX_CONDITION, MAX_BEYOND_PCT = 3.0, 2.0
-
-
-def make_pair(kind: str, focal_px: float, rng: np.random.Generator) -> F64:
-    """Draw noisy matches (2, N, 2) of points about 5 units away; ``kind`` sets the second camera."""
-    K = np.array([[focal_px, 0.0, 639.5], [0.0, focal_px, 479.5], [0.0, 0.0, 1.0]])
-    X = rng.uniform([-1.2, -1.2, 3.8], [1.2, 1.2, 6.2], (PAIR_POINTS, 3))
-    turn, centre = rng.normal(0.0, 0.1, 3), rng.normal(size=3) * [1.0, 0.3, 0.3]
-    R = Rotation.from_rotvec(turn)
-    if kind == "30 degrees apart":
-        R, centre = R * Rotation.from_rotvec([0.0, -0.5, 0.0]), np.array([2.5, 0.2, 0.5])
-    if kind == "forward":
-        centre = np.array([0.05, 0.02, 1.5])
-    roll_deg = {"on its side": 90.0, "upside down": 180.0}.get(kind, 0.0)
-    rotation = (Rotation.from_euler("z", roll_deg, degrees=True) * R).as_matrix()
-    P = compose_camera(
-        np.stack([K, K]), np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), -rotation @ centre])
-    )
-    return np.stack([project(camera, X) for camera in P]) + SIGMA_PX * rng.normal(size=(2, PAIR_POINTS, 2))
-
-
-def nearest_identity(F: F64) -> F64:
-    """Return cameras (2, 3, 4) in pixels whose plane brings M = -[e2]x F + e2 v' nearest to a multiple of I.
-
-    v = trace(-[e2]x F) / 2 e2. A trace near 0 would leave M nearly singular and is replaced.
-    """
-    T = pixel_from_unit(SIZES)
-    F = unit_norm(T[1].T @ F @ T[0])
-    _, e2 = epipoles(F)
-    M = -cross_matrix(e2) @ F
-    half, size = float(np.trace(M)) / 2.0, float(np.linalg.norm(M)) / np.sqrt(2.0)
-    multiple = half if abs(half) > 0.1 * size else size
-    return T @ np.stack(canonical_cameras(F, plane=multiple * e2))
-
-
-def nearest_rotation(F: F64, xy: F64) -> F64:
-    """Return the initial cameras (2, 3, 4) of the pipeline."""
-    none = np.zeros(0, dtype=np.int64)
-    pair = TwoView(0, 1, F, SIGMA_PX, none, none, xy[0], xy[1], np.zeros((0, 2, 2)), 0, 0.0, True)
-    return np.stack(initial_cameras(pair, SIZES))
-
-
-def measure_cameras(P: F64, xy: F64) -> tuple[float, float, float]:
-    """Measure the frame of two initial cameras.
-
-    Return the condition number of the second camera in normalised pixels, the percentage of points beyond
-    the plane at infinity, and the RMS residual of linear triangulation over the least one.
-    """
-    T = pixel_from_unit(SIZES)
-    M = np.linalg.inv(T[1]) @ P[1, :, :3] @ np.linalg.inv(P[0, :, :3]) @ T[0]
-    X, best = triangulate(P, xy, method="linear"), triangulate_polynomial(P, xy)
-    side = np.sign(X[:, 3] * (X @ P[0, 2]))
-    beyond = 50.0 * (1.0 - abs(float(side.mean())))
-    return float(np.linalg.cond(M)), beyond, _rms_px(P, X, xy) / _rms_px(P, best, xy)
-
-
-def _rms_px(P: F64, X: F64, xy: F64) -> float:
-    return float(np.sqrt(np.mean((np.stack([project(camera, X) for camera in P]) - xy) ** 2)))
-
-
-def check_kind(kind: str, trials: int) -> list[Metric]:
-    """Measure the worst condition number and the means of the others over focal lengths and trials."""
-    found: dict[str, list[tuple[float, float, float]]] = {IDENTITY: [], ROTATION: []}
-    for focal_px in FOCALS_PX:
-        for seed in range(trials):
-            xy = make_pair(kind, focal_px, np.random.default_rng(seed))
-            F = estimate_fundamental(xy[0], xy[1], seed=seed).F
-            found[IDENTITY].append(measure_cameras(nearest_identity(F), xy))
-            found[ROTATION].append(measure_cameras(nearest_rotation(F, xy), xy))
-    worst, mean = (
-        {name: reduce(values, axis=0) for name, values in found.items()} for reduce in (np.max, np.mean)
-    )
-    rows = Rows(kind, ROTATION)
-    rows.add("condition number, worst", {n: float(v[0]) for n, v in worst.items()}, at_most=MAX_CONDITION)
-    beyond = {n: float(v[1]) for n, v in mean.items()}
-    rows.add("points beyond the plane, mean", beyond, "%", at_most=MAX_BEYOND_PCT)
-    rows.add("linear over least residual, mean", {n: float(v[2]) for n, v in mean.items()})
-    return rows
-
-
 OURS, PUBLISHED = "thesisrecon", "published cameras"
 # ---------------------------------------------------------------- the dinosaur
 
@@ -415,12 +320,6 @@ def factorization_study(out: Path, trials: int = 30, scenes: Sequence[str] = SCE
         yield check_noise(sigma_px, trials)
     for scene in scenes_here(scenes):
         yield check_images(scene, out / scene.name)
-
-
-def initial_cameras_study(trials: int = 12) -> Iterator[Part]:
-    """Compare two planes at infinity of the initial cameras (3.42): nearest to identity or rotation."""
-    for kind in KINDS:
-        yield check_kind(kind, trials)
 
 
 def dinosaur_study(seed: int = 0) -> Iterator[Part]:

@@ -9,13 +9,12 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import PIL.Image
-import plotly.graph_objects as go
 
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
@@ -32,7 +31,6 @@ from thesisrecon.views.trilinear import (
 from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
 from validation.metrics.pictures import picture_metrics, psnr_db, ssim
 from validation.metrics.record import Metric
-from validation.metrics.timing import time_of_a_frame
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photograph
 from validation.scenes.nine_views import dissolved
@@ -42,12 +40,7 @@ from validation.studies.runner import Part, text_table
 
 VIEWS = (6, 7)
 """Views of the courtyard: 11 degrees and 1.3 m apart, the scene 3 to 9 m away."""
-ALONG = (-1.0, -0.5, -0.25, 0.25, 0.5, 0.75, 1.25, 1.5, 2.0)
-OFF = (0.1, 0.25, 0.5, 1.0)
 DIRECTIONS = {"up": (0.0, -1.0, 0.0), "ahead": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0)}
-FRAME_SIZE, FRAME_S = (1000, 700), 1.0
-BORDER_PX = 50
-"""Columns of views beyond the baseline that no image shows."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +51,6 @@ class Place:
     off: float = 0.0
     direction: str = "along"
 
-    @property
-    def distance(self) -> float:
-        """Distance from the nearest place between the images in baselines."""
-        return float(np.hypot(max(-self.s, self.s - 1.0, 0.0), self.off))
-
     def of(self, pair: CalibratedPair) -> VirtualCamera:
         """Return the camera for this pair."""
         camera = camera_at(pair, self.s, sizes=(SIZE, SIZE))
@@ -72,10 +60,10 @@ class Place:
         return replace(camera, translation=camera.translation - step)
 
 
-def places_of_courtyard() -> Iterator[Place]:
-    """Give places along the baseline and off its middle in three directions."""
-    yield from (Place(s) for s in ALONG)
-    yield from (Place(0.5, off, direction) for direction in DIRECTIONS for off in OFF)
+PLACES = (
+    *(Place(s) for s in (-1.0, -0.5, -0.25, 0.25, 0.5, 0.75, 1.25, 1.5, 2.0)),
+    *(Place(0.5, off, direction) for direction in DIRECTIONS for off in (0.1, 0.25, 0.5, 1.0)),
+)
 
 
 @dataclass(frozen=True)
@@ -87,13 +75,11 @@ class CourtyardTruth:
     images: tuple[U8, U8]
     places: tuple[F32, F32]
 
-    @property
     def pair(self) -> CalibratedPair:
-        """True cameras in baselines."""
+        """Return the true cameras in baselines."""
         one, two = self.poses
-        return CalibratedPair(
-            one.K, two.K, two.R @ one.R.T, two.R @ (one.C - two.C) / np.linalg.norm(two.C - one.C)
-        )
+        t = two.R @ (one.C - two.C) / np.linalg.norm(two.C - one.C)
+        return CalibratedPair(one.K, two.K, two.R @ one.R.T, t)
 
     def pose(self, camera: VirtualCamera) -> Pose:
         """Return the pose of a virtual camera in the world."""
@@ -143,7 +129,7 @@ def measure_courtyard(out: Path) -> list[Measured]:
     K, guess = truth.poses[0].K, default_intrinsics(SIZE)
     matches = found.pair.xy1, found.pair.xy2
     pairs = {
-        "all true": truth.pair,
+        "all true": truth.pair(),
         "true K": pair_from_fundamental(found.pair.F, *matches, K1=K, K2=K),
         "guessed K": pair_from_fundamental(found.pair.F, *matches, K1=guess, K2=guess),
     }
@@ -158,8 +144,8 @@ def measure_courtyard(out: Path) -> list[Measured]:
         for name, pair in pairs.items()
     }
     rows = []
-    for place in places_of_courtyard():
-        wanted = courtyard_image(truth.world, truth.pose(place.of(truth.pair)))
+    for place in PLACES:
+        wanted = courtyard_image(truth.world, truth.pose(place.of(truth.pair())))
         shown = []
         for name, views in ready.items():
             picture = views.render(place.of(views.pair), threads=2)
@@ -176,7 +162,7 @@ def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tup
     y, x = np.indices(truth.places[0].shape[:2])[:, ::8, ::8].reshape(2, -1).astype(np.float64)
     matches = truth.places[0][::8, ::8].reshape(-1, 2).astype(np.float64)
     both = []
-    for cameras in (truth.pair, pair):
+    for cameras in (truth.pair(), pair):
         camera = place.of(cameras)
         tensor = seed_of_two(cameras).moved(camera.rotation, camera.translation, K=camera.K)
         both.append(tensor.transfer(np.stack([x, y], axis=1), matches)[0])
@@ -184,42 +170,6 @@ def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tup
     apart = np.linalg.norm(both[1] - both[0], axis=1)[inside]
     apart = apart[np.isfinite(apart)]
     return float(np.median(apart)), float(np.quantile(apart, 0.9))
-
-
-def linear_range(rows: list[Measured], method: str) -> tuple[float, float]:
-    """Return the range and the slope of the displacement beyond the ends of the baseline.
-
-    The range (baselines) ends where the median displacement departs by 10 % from proportion; the slope is in
-    px a baseline.
-    """
-    ends = sorted((r.place.distance, r.off_px[0]) for r in rows if r.method == method and r.place.s > 1.0)
-    slope = ends[0][1] / ends[0][0]
-    reach = 0.0
-    for distance, off in ends:
-        if abs(off / distance - slope) > 0.1 * slope:
-            break
-        reach = distance
-    return reach, slope
-
-
-def draw(rows: list[Measured]) -> go.Figure:
-    """Plot PSNR over the distance from the baseline."""
-    figure = go.Figure()
-    for method in dict.fromkeys(row.method for row in rows):
-        for direction in ("along", *DIRECTIONS):
-            chosen = [r for r in rows if r.method == method and r.place.direction == direction]
-            figure.add_scatter(
-                x=[r.place.s - 1.0 if direction == "along" else r.place.off for r in chosen],
-                y=[r.psnr for r in chosen],
-                name=f"{method}, {direction}",
-                mode="lines+markers",
-                customdata=[r.off_px for r in chosen],
-                hovertemplate="%{x} baselines: %{y:.1f} dB, displaced by %{customdata[0]:.2f} px",
-            )
-    figure.update_layout(
-        xaxis_title="baselines beyond the second image, or off the middle", yaxis_title="PSNR, dB"
-    )
-    return figure
 
 
 def save_beside(path: Path, pictures: list[U8]) -> None:
@@ -268,33 +218,11 @@ def measure_fountain(out: Path) -> list[Metric]:
     return picture_metrics("fountain-P11, 5 from 4 and 6", pictures, wanted)
 
 
-def measure_time(repeats: int) -> Metric:
-    """Time a frame of 1000 x 700 px from images of that size."""
-    truth = courtyard()
-    width, height = FRAME_SIZE
-    images = tuple(picture[:height, :width] for picture in truth.images)
-    places = tuple(part[:height, :width] for part in truth.places)
-    views = prepare_synthesis(truth.pair, (images[0], images[1]), (places[0], places[1]))
-    camera = replace(camera_at(truth.pair, 0.4, sizes=(FRAME_SIZE, FRAME_SIZE)))
-    draw_frame = partial(views.render, camera, threads=2)
-    return time_of_a_frame("courtyard, 1000 x 700", draw_frame, repeats=repeats, target_s=FRAME_S)
-
-
-Name = Literal["fountain", "courtyard", "time"]
-
-
 def tensor_views_study(
-    out: Path, parts: Sequence[Name] = ("fountain", "courtyard", "time"), repeats: int = 5
+    out: Path, parts: Sequence[Literal["fountain", "courtyard"]] = ("fountain", "courtyard")
 ) -> Iterator[Part]:
-    """Compare views by the trilinear tensor with the truth; OUT gets the images and a plot."""
+    """Compare views by the trilinear tensor with the truth; OUT gets the images."""
     if "fountain" in parts:
         yield measure_fountain(out)
-    if "time" in parts:
-        yield [measure_time(repeats)]
     if "courtyard" in parts:
-        measured = measure_courtyard(out)
-        yield courtyard_table(measured)
-        for method in ("true K", "guessed K"):
-            reach, slope = linear_range(measured, method)
-            yield f"{method}: {slope:.2f} px a baseline beyond, linear to {reach:g} baselines"
-        draw(measured).write_html(out / "tensor-views.html", include_plotlyjs=True)
+        yield courtyard_table(measure_courtyard(out))
