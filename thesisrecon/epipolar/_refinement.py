@@ -8,9 +8,9 @@ EPIPOLAR_DISTANCE (5.6) or REPROJECTION (HZ, algorithm 11.3).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics.levenberg_marquardt import solve_damped
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
@@ -21,7 +21,7 @@ BLOCK = 128
 UNBOUNDED = 1e150
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
     """Derivatives of at most BLOCK residuals by F, columns of ``D`` (11, BLOCK); returns the cost.
 
@@ -73,7 +73,7 @@ def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delt
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def _reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: F64) -> float:
     """As :func:`_weighted_derivatives` for the distances r to the nearest exact match.
 
@@ -110,7 +110,7 @@ def _reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D:
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64) -> float:
     """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by F; returns the cost.
 
@@ -145,7 +145,7 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
     return cost
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64, F64]:
     """Signed residuals (N,) of a criterion and their derivatives (N, 9) by F."""
     r, J, D = np.empty(len(points)), np.empty((len(points), 9)), np.empty((11, BLOCK))
@@ -162,7 +162,7 @@ def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64,
     return r, J
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fundamental_from_orthonormal(U: F64, V: F64, phi: float, f: F64) -> None:
     """Write F = U diag(cos phi, sin phi, 0) V' to ``f``."""
     c, s = np.cos(phi), np.sin(phi)
@@ -171,7 +171,7 @@ def fundamental_from_orthonormal(U: F64, V: F64, phi: float, f: F64) -> None:
             f[3 * i + j] = c * U[i, 0] * V[j, 0] + s * U[i, 1] * V[j, 1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def orthonormal_tangent(U: F64, V: F64, phi: float, B: F64) -> None:
     """Write the derivatives of F by rotations of U (3), of V (3) and by phi to ``B`` (9, 7)."""
     c, s = np.cos(phi), np.sin(phi)
@@ -187,7 +187,7 @@ def orthonormal_tangent(U: F64, V: F64, phi: float, B: F64) -> None:
             B[m, 6] = c * U[i, 1] * V[j, 1] - s * U[i, 0] * V[j, 0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rotate_columns(U: F64, a: F64, out: F64) -> None:
     """Compute out = U exp([a]x) by Rodrigues' formula."""
     angle = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
@@ -205,7 +205,7 @@ def _rotate_columns(U: F64, a: F64, out: F64) -> None:
         out[i, 2] = u2 + p * c2 + q * d2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
     """Write U and V of the nearest matrix of rank 2 and return phi."""
     u, s, vt = np.linalg.svd(f.reshape((3, 3)))
@@ -214,7 +214,7 @@ def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
     return float(np.arctan2(s[1], s[0]))
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def refine(
     f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
 ) -> tuple[float, int]:

@@ -10,10 +10,10 @@ that scales both images alike, so Sampson distances are pixels times that scale.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._refinement import SAMPSON, refine
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics.ransac import draw_sample, required_samples
 
 LANES = 32
@@ -31,7 +31,7 @@ Three = tuple[float, float, float]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@kernel(inline="always", error_model="numpy")
 def _basis_transform(
     xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, xd: float, yd: float
 ) -> Nine:
@@ -45,13 +45,13 @@ def _basis_transform(
     return a * a0, a * a1, a * a2, b * b0, b * b1, b * b2, c * c0, c * c1, c * c2
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@kernel(inline="always", error_model="numpy")
 def _apply_transform(T: Nine, x: float, y: float) -> Three:
     """T (x, y, 1)'."""
     return T[0] * x + T[1] * y + T[2], T[3] * x + T[4] * y + T[5], T[6] * x + T[7] * y + T[8]
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@kernel(inline="always", error_model="numpy")
 def _basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, float]:
     """Coefficients of F13, F21, F23, F31, F32 in v' F u = 0, with F12 minus their sum."""
     first = v[0] * u[1]
@@ -64,7 +64,7 @@ def _basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, flo
     )
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@kernel(inline="always", error_model="numpy")
 def _determinant(a: Three, b: Three, c: Three) -> float:
     """Determinant of the matrix with columns a, b, c."""
     value: float = (
@@ -75,7 +75,7 @@ def _determinant(a: Three, b: Three, c: Three) -> float:
     return value
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
 def solve_seven_point_batch(X: F64, Y: F64) -> None:
     """Write the pencils and cubics of LANES samples to ``Y`` (ROWS, LANES); not finite if degenerate.
 
@@ -118,7 +118,7 @@ def solve_seven_point_batch(X: F64, Y: F64) -> None:
         Y[51, k], Y[52, k], Y[53, k] = m2 * inverse, m1 * inverse, m0 * inverse
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     """Real roots of x^3 + a x^2 + b x + c: one by Newton, the others from the remaining quadratic.
 
@@ -150,7 +150,7 @@ def _newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     return 3
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
     """Return whether the seven matches of a lane can be in front of both cameras of the member ``g`` (6,).
 
@@ -178,7 +178,7 @@ def _oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
     """Write F = T2' G T1 as a unit vector to ``f``, G from the entries ``g`` (6,); False if not finite."""
     norm = 0.0
@@ -196,7 +196,7 @@ def _leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def seven_point_batch_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
     """Write the F (3, 9) of a solved sample that satisfy the oriented constraint; returns their number.
 
@@ -211,7 +211,7 @@ def seven_point_batch_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
     return found
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@kernel(inline="always", error_model="numpy")
 def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared Sampson distance, the summand of (5.4)."""
     a0 = f[0] * x1 + f[1] * y1 + f[2]
@@ -223,7 +223,7 @@ def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> floa
     return squared
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def sampson_distances(f: F64, points: F64) -> F64:
     """Sampson distances (N,) >= 0 of all points."""
     r = np.empty(len(points))
@@ -232,7 +232,7 @@ def sampson_distances(f: F64, points: F64) -> F64:
     return r
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
     """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and the number with r < gate.
 
@@ -253,7 +253,7 @@ def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tup
     return total, inside
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def truncated_score(
     f: F64, columns: F64, gate: float, give_up: float, evidence: tuple[float, float]
 ) -> tuple[float, int, int]:
@@ -278,7 +278,7 @@ def truncated_score(
     return total / n, int(inliers), n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
     """Log likelihood ratios wrong : right of a point inside and outside the gate.
 
@@ -291,7 +291,7 @@ def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
     return np.log(wrong / right), np.log((1.0 - wrong) / (1.0 - right))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
     """Write the samples of the rows of ``uniforms`` (B <= LANES, 7) as columns of ``X`` (28, LANES)."""
     sample = np.empty(7, np.int64)
@@ -302,7 +302,7 @@ def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
                 X[4 * m + c, lane] = points[sample[m], c]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _refine_best(points: F64, columns: F64, gate: float, state: F64, F: F64) -> None:
     """Refine the best F on at most 300 points with twice the gate and keep the better of the two."""
     f = F.copy()
@@ -313,7 +313,7 @@ def _refine_best(points: F64, columns: F64, gate: float, state: F64, F: F64) -> 
         F[:] = f
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search_fundamental(
     points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
 ) -> int:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
@@ -20,6 +19,7 @@ from thesisrecon.epipolar._planes import DominantPlane, find_dominant_plane, fun
 from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.precision import epipolar_distance_std
+from thesisrecon.kernels import kernel
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
 NEIGHBOURS = 5
@@ -51,7 +51,7 @@ MAX_ERROR_PX = 1.0
 CONTRADICTED, MAX_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _select_distinct(
     order: I64, agree: F64, weights: F64, overlap: float, chosen: I64, count: int, most: int
 ) -> int:
@@ -79,7 +79,7 @@ def _select_distinct(
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
     """Fraction of the nearest neighbours of each chosen point that lie on the plane and contradict it.
 

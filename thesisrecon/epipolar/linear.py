@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar._frame import MIN_PX, PairFrame, as_matches, check_matches
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import enforce_rank_two, unit_norm
+from thesisrecon.kernels import kernel
 
 # Ratio of the eighth to the first singular value below which F is undetermined.
 UNDETERMINED_REL = 1e-12
@@ -114,14 +114,7 @@ def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
     return np.array([frame.matrix_in_pixels(f) for f in solutions[:count]]).reshape(count, 3, 3)
 
 
-@njit(
-    cache=True,
-    nogil=True,
-    inline="always",
-    error_model="numpy",
-    fastmath={"reassoc", "contract"},
-    forceinline=True,
-)
+@kernel(inline="always", error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def _reflect(v: F64, start: int, scale: float, x: F64) -> None:
     """Apply x <- (I - scale v v') x with v zero before ``start``."""
     dot = 0.0
@@ -132,7 +125,7 @@ def _reflect(v: F64, start: int, scale: float, x: F64) -> None:
         x[r] -= dot * v[r]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
 def _null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
     """Orthonormal basis ``pencil`` (2, 9) of the null space of the seven equations (5.1); False if dependent.
 
@@ -164,7 +157,7 @@ def _null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _det3(f: F64) -> float:
     """Determinant of a 3 x 3 matrix given as a vector of 9."""
     value: float = (
@@ -175,7 +168,7 @@ def _det3(f: F64) -> float:
     return value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mixed_det3(f: F64, g: F64) -> float:
     """trace(adj(f) g), the coefficient of a in det(f + a g)."""
     value: float = (
@@ -192,7 +185,7 @@ def _mixed_det3(f: F64, g: F64) -> float:
     return value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     """Real roots of x^3 + a x^2 + b x + c in closed form, double roots once, polished by Newton steps."""
     Q = (a * a - 3.0 * b) / 9.0
@@ -224,7 +217,7 @@ def _cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _singular_members(pencil: F64, F: F64) -> int:
     """Write the members ``F`` (3, 9) with determinant 0 of a pencil (2, 9); returns their number, 0 to 3.
 
@@ -258,7 +251,7 @@ def _singular_members(pencil: F64, F: F64) -> int:
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def seven_point(points: F64, sample: I64, F: F64) -> int:
     """Compute the fundamental matrices through seven matches, also of nearly degenerate samples.
 

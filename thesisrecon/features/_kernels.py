@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.kernels import kernel
 
 # Sums may be reordered; assuming no NaN would break the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@kernel(fastmath=FAST)
 def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: float) -> F32:
     """Compute the corner response R (H, W) of section 4.2.1, zero where windows leave the image.
 
@@ -57,7 +57,7 @@ def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: flo
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@kernel(fastmath=FAST, forceinline=True)
 def _slopes(image: F32, derivative: F32, y: int, out: F32) -> None:
     """Row y of the derivatives of ``image`` along x and y, from column ``len(derivative) // 2`` on."""
     reach, width = derivative.size // 2, image.shape[1]
@@ -73,7 +73,7 @@ def _slopes(image: F32, derivative: F32, y: int, out: F32) -> None:
             across[x] += weight * below[x]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@kernel(fastmath=FAST, forceinline=True)
 def _add_products(slope: F32, reach: int, out: F32) -> None:
     gx, gy = slope[0, reach:], slope[1, reach:]
     xx, xy, yy = out[0, reach:], out[1, reach:], out[2, reach:]
@@ -83,7 +83,7 @@ def _add_products(slope: F32, reach: int, out: F32) -> None:
         yy[x] += gy[x] * gy[x]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@kernel(fastmath=FAST, forceinline=True)
 def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
     a, b, c = moment[0], moment[1], moment[2]
     if trace_weight == 0.0:
@@ -95,7 +95,7 @@ def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
             out[x] = a[x] * c[x] - b[x] * b[x] - trace_weight * trace * trace
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[F64, F32]:
     """Local maxima of R: positions (N, 2) refined by least-squares quadratic surfaces, and responses (N,)."""
     height, width = response.shape
@@ -117,7 +117,7 @@ def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[
     return xy[:n].copy(), value[:n].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_maximum(response: F32, x: int, y: int) -> bool:
     # > on one side and >= on the other: a plateau of two pixels gives one corner.
     v = response[y, x]
@@ -133,7 +133,7 @@ def _is_maximum(response: F32, x: int, y: int) -> bool:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
     gx = gy = gxx = gyy = gxy = 0.0
     for k in range(-1, 2):
@@ -156,7 +156,7 @@ def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
     return dx, dy
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@kernel(fastmath=FAST)
 def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
     """Squared distances (N,) to the nearest corner whose response times robustness is larger."""
     n = len(xy)
@@ -175,7 +175,7 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@kernel(fastmath=FAST)
 def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
     """Square patches (N, side^2) of an image, clamped, rotated by ``angle`` (N,) rad, sampled bilinearly."""
     height, width = image.shape
@@ -196,7 +196,7 @@ def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
     """Of the indices ``order`` those at least ``distance`` from every corner selected before."""
     kept = np.empty(len(order), np.int64)

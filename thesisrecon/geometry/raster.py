@@ -8,16 +8,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.kernels import kernel
 
 # Sums may be reordered; the flag "nnan" would remove the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@kernel(fastmath=FAST)
 def _convolve_separable(image: F32, taps: F32) -> F32:
     """Convolve (H, W) with symmetric taps (2 r + 1,) along both axes, the border repeated."""
     height, width = image.shape
@@ -41,7 +41,7 @@ def _convolve_separable(image: F32, taps: F32) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@kernel(fastmath=FAST)
 def _halve_image(image: F32) -> F32:
     """Downsample to (H // 2, W // 2) with the taps (1, 3, 3, 1) / 8, centred between the merged pixels."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
@@ -60,7 +60,7 @@ def _halve_image(image: F32) -> F32:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@kernel(fastmath=FAST)
 def resample(image: F32, width: int, height: int) -> F32:
     """Resize an image by bilinear interpolation; smooth it before if it shrinks.
 
@@ -152,7 +152,7 @@ def halve(image: F32) -> F32:
     return _halve_image(image)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cubic_weights(fraction: float, weights: NDArray[Any]) -> None:
     """Fill in the weights of four pixels for cubic convolution with a = -1/2.
 
@@ -173,7 +173,7 @@ def cubic_weights(fraction: float, weights: NDArray[Any]) -> None:
     weights[3] = (0.5 * fraction - 0.5) * fraction * fraction
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weighted_median(values: F32, weights: F64, order: I64, half: float) -> float:
     """Return the smallest value up to which the weights sum to ``half``.
 

@@ -12,11 +12,11 @@ import math
 from typing import Literal, get_args
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
 _PASSES = 10
@@ -27,7 +27,7 @@ _PARALLEL = 1e-14
 """Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _insert_row(R: F64, row: F64) -> None:
     """Rotate one more row (4,) into the triangle R (4, 4) (Givens); R'R grows by row row'."""
     for c in range(4):
@@ -42,7 +42,7 @@ def _insert_row(R: F64, row: F64) -> None:
             row[k] = cosine * row[k] - sine * above
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _least_singular_vector(R: F64, x: F64) -> None:
     """Fill x (4,) with the unit vector of least |R x|, R (4, 4) upper triangular.
 
@@ -74,7 +74,7 @@ def _least_singular_vector(R: F64, x: F64) -> None:
     _jacobi_least(R, x)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _jacobi_least(R: F64, x: F64) -> None:
     """Fill x (4,) with the unit vector of least |R x| by one-sided Jacobi rotations (Hestenes)."""
     A, V = R.copy(), np.eye(4)
@@ -107,7 +107,7 @@ def _jacobi_least(R: F64, x: F64) -> None:
     x[:] = V[:, best]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _least_algebraic(
     P: F64, obs: tuple[I64, F64, F64], first: int, last: int, R: F64, row: F64, x: F64
 ) -> None:
@@ -123,7 +123,7 @@ def _least_algebraic(
     _least_singular_vector(R, x)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
     """Return the sum of squared reprojection errors of one point, infinite or NaN in a focal plane."""
     cost = 0.0
@@ -136,7 +136,7 @@ def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _triangulate_each_linear(
     P: F64, scale: F64, start: I64, view: I64, xy: F64, passes: int, tolerance: float, X: F64
 ) -> None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
+from thesisrecon.kernels import kernel
 
 _SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
@@ -19,7 +19,7 @@ _NEAR = 1e-6
 """Nearest depth that is drawn, relative to the depth of the farthest vertex."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _inverse(p: F64, inverse: F64) -> bool:
     """Invert the matrix whose columns are the rows of p (3, 3); False if it is singular."""
     for i in range(3):
@@ -39,7 +39,7 @@ def _inverse(p: F64, inverse: F64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int]:
     """Return the first and last + 1 pixel of row y with positive barycentric coordinates and depth."""
     low, high = 0.0, width - 1.0
@@ -62,7 +62,7 @@ def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int
     return int(np.ceil(low)), int(np.floor(high)) + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rasterize_rows(
     corners: F64, near: float, rows: tuple[int, int], depth: F32, face: I64, weights: F32
 ) -> None:
@@ -109,7 +109,7 @@ def _rasterize_rows(
                     weights[y, x, 1] = np.float32(w2 / over_depth)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _interpolate(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> None:
     """Fill out (H, W, C) where there is a face with the values (N, C) of the vertices of ``faces``."""
     for y in range(face.shape[0]):
@@ -124,7 +124,7 @@ def _interpolate(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> 
                 out[y, x, k] = a * values[i, k] + b * values[j, k] + c * values[l, k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
     """Sample a texture bilinearly, clamped to its border.
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.matching._prepared import (
     FAST,
     SAMPLES,
@@ -49,7 +49,7 @@ FINE_SHIFT = 1.0
 MAX_STD = 0.12
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _align_windows(
     view1: tuple[F32, I64, float],
     view2: tuple[F32, I64, float],
@@ -103,7 +103,7 @@ def _align_windows(
     return xy2, affine, score
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _read_template(
     pixels: F32, level: I64, to_level: float, place: tuple[F64, float], border: F32, out: tuple[F32, F32]
 ) -> bool:
@@ -144,7 +144,7 @@ def _read_template(
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@kernel(fastmath=FAST, forceinline=True)
 def _project_out_gain_and_bias(gradient: F32, template: F32, norm: float) -> None:
     """Scale a gradient like the template and remove its components along a constant and the template."""
     total = np.float32(0.0)
@@ -160,7 +160,7 @@ def _project_out_gain_and_bias(gradient: F32, template: F32, norm: float) -> Non
         gradient[n] -= along * template[n]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _normal_matrix(gradient: F32) -> F64:
     """Inner products of the derivatives."""
     unknowns = len(gradient)
@@ -171,7 +171,7 @@ def _normal_matrix(gradient: F32) -> F64:
     return normal
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _iterate(
     level2: tuple[F32, I64, float],
     template: tuple[F32, F32, F64, F32],
@@ -211,7 +211,7 @@ def _iterate(
     return value
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tuple[F64, float]) -> F64:
     """Step of all unknowns; ``prior`` = change of the map so far (updated) and its standard deviation."""
     moved, affine_std = prior
@@ -232,7 +232,7 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
     return delta
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
     """Compose the map x2(x) = xy + a x with the inverse of the step of the template, in place."""
     if len(delta) == 6:

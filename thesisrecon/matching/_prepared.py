@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.geometry.raster import halve, resample
+from thesisrecon.kernels import kernel
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
 # Sums may be reordered; assuming no NaN would break the bounds checks.
@@ -23,14 +23,14 @@ SAMPLES = SIDE * SIDE
 PYRAMID_LEVELS = 4
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pyramid_level(scale: float, base: float, count: int) -> int:
     """Level whose pixel size is nearest to ``scale`` px (logarithmic); ``base`` = pixel size of level 0."""
     k = int(np.floor(np.log2(scale / base) + 0.5))
     return min(max(k, 0), count - 1)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@kernel(fastmath=FAST, forceinline=True)
 def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, side: int, out: F32) -> bool:
     """Sample a square window bilinearly to ``out`` (side^2,); False if it leaves the image.
 
@@ -63,7 +63,7 @@ def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, 
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@kernel(fastmath=FAST, forceinline=True)
 def normalize_window(window: F32) -> float:
     """Subtract the mean and divide by the norm in place; return the norm.
 
@@ -88,7 +88,7 @@ def normalize_window(window: F32) -> float:
     return float(norm)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@kernel(fastmath=FAST, forceinline=True)
 def dot(a: F32, b: F32) -> float:
     """Inner product of two float32 vectors."""
     total = np.float32(0.0)
@@ -97,7 +97,7 @@ def dot(a: F32, b: F32) -> float:
     return float(total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, side: int = SIDE) -> F32:
     """Normalised upright windows (N, side^2) of the corners at their scale; zero outside the image."""
     out = np.zeros((len(xy), side * side), np.float32)
@@ -112,7 +112,7 @@ def _corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, 
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def affine_determinant(a: F64) -> float:
     """Determinant of a local affine map, 0 if it is implausible (mirrored, or scaled by more than five)."""
     determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.records import Seeds
 
 BLOCK = 256
@@ -18,7 +18,7 @@ NEIGHBOURS, TOLERANCE = 10, 0.3
 REACH_PX = 4.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
     """Best column (B,) of each row of correlations (B, N), its value (B,) and the second best (B,) elsewhere.
 
@@ -46,7 +46,7 @@ def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F3
     return index, value, second_best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _update_column_best(correlation: F32, first_row: int, value: F32, index: I64) -> None:
     """Update the best row ``index`` (N,) of each column and its ``value`` (N,)."""
     for b in range(correlation.shape[0]):

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.kernels import kernel
 from thesisrecon.matching._alignment import align_matches, strongest_distinct
 from thesisrecon.matching._prepared import (
     SAMPLES,
@@ -38,7 +38,7 @@ ROUNDS = 3
 PRIOR_SHARE = 0.05
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
     """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its neighbouring matches (N, K).
 
@@ -87,7 +87,7 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
     return affine, position, spread
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: tuple[F64, float]) -> F64:
     """Correction (3, 2) of the prior map, transposed, above the translation, by weighted least squares."""
     distance2, mean2 = near
@@ -120,7 +120,7 @@ def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: t
     return correction
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _match_guided(
     view1: tuple[F32, I64, float],
     corners1: tuple[F64, F32],
@@ -172,7 +172,7 @@ def _match_guided(
     return index, score, second_best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _corners_in_band(
     xy1: F64,
     search: tuple[F64, float],
@@ -212,7 +212,7 @@ def _corners_in_band(
     return found
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _warp_windows(
     view1: tuple[F32, I64, float],
     corner: tuple[F64, float],
@@ -242,7 +242,7 @@ def _warp_windows(
                 ready[t] = normalize_window(window[t]) > 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> float:
     """Largest of the correlations ``seen`` of corners ``near`` that lie ``apart`` from the best; -1: none."""
     second_best = np.float32(-1.0)

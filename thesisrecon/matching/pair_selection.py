@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.errors import UsageError
+from thesisrecon.kernels import kernel
 from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.records import Features, PairChoice, Seeds
 
@@ -266,7 +266,7 @@ def _connecting_pairs(chosen: I64, order: F64) -> I64:
     return np.column_stack([tree.row[new], tree.col[new]]).astype(np.int64).reshape(-1, 2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> int:
     """Largest number of other matches predicted by the similarity of one match.
 

@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.matching._alignment import align_matches
 from thesisrecon.matching._prepared import (
     SIDE,
@@ -22,7 +22,7 @@ from thesisrecon.matching._prepared import (
 from thesisrecon.records import Features, Image, Matches
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _displacement_weight(a: F64, b: F64, closeness: float) -> float:
     """Lambda of figure 4.4: direction x length x distance of two displacements (2,) px.
 
@@ -37,14 +37,14 @@ def _displacement_weight(a: F64, b: F64, closeness: float) -> float:
     return float(max(cosine, 0.0) * (shorter / longer) * closeness)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _relative_difference_weight(a: F64, b: F64, apart: float, tolerance: float) -> float:
     """Lambda exp(-1/2 (|a - b| / (tolerance apart + 1 px))^2) of displacements of corners ``apart`` px."""
     strain = np.hypot(a[0] - b[0], a[1] - b[1]) / (tolerance * apart + 1.0)
     return float(np.exp(-0.5 * strain * strain))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _strength_of_match(
     correlation: F32,
     xy: tuple[F64, F64],
@@ -73,7 +73,7 @@ def _strength_of_match(
     return index, strength
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_candidates(
     correlation: F32, position: F64, xy2: F64, search: tuple[float, int, float], held: I64
 ) -> int:
@@ -95,7 +95,7 @@ def _best_candidates(
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _neighbours_agree(
     correlation: F32,
     xy: tuple[F64, F64],

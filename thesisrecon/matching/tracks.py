@@ -6,16 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.matching._alignment import align_corners
 from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Tracks, TwoView
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
     """First corner (N,) of the set of each corner after uniting along ``edges`` (E, 2) in their order.
 
@@ -69,7 +69,7 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
     return root
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64) -> tuple[F64, F64]:
     """Chain x2 = xy2 + A (x1 - xy1) along the edges, breadth-first from the middle observations.
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._kernels import invert_cholesky_3x3, multiply_transposed_3x3
 from thesisrecon.numerics._observations import Jacobians
 
@@ -62,7 +62,7 @@ class _Elimination(NamedTuple):
     g: F64
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def eliminate_points(
     first: int,
     last: int,
@@ -85,7 +85,7 @@ def eliminate_points(
 # A call with these arrays costs more than a point, so the loops over points are inside.
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_points(
     first: int,
     last: int,
@@ -123,7 +123,7 @@ def _sum_points(
                 left.residual[k - left.first, i] = J.residual[k, i] - t0 * g0 - t1 * g1 - t2 * g2
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@kernel(forceinline=True)
 def _add_views(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
@@ -158,7 +158,7 @@ def _add_views(
                     _add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
 
 
-@njit(cache=True, nogil=True, inline="always", fastmath={"contract"}, forceinline=True)
+@kernel(inline="always", fastmath={"contract"}, forceinline=True)
 def _add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float, q11: float) -> None:
     """Add left' Q right to S (C, C) for left, right (2, C)."""
     C = S.shape[0]
@@ -169,7 +169,7 @@ def _add_block(S: F64, left: F64, right: F64, q00: float, q01: float, q10: float
             S[a, b] += p0 * right[0, b] + p1 * right[1, b]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_common(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
@@ -212,7 +212,7 @@ def _add_common(
         _add_corner(column[:n], E[: e - s], p, left.g[j - first], J.residual[s:e], ends)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather_common(
     s: int, e: int, J_E: F64, view_index: I64, common: I64, E: F64, column: I64, slot: I64
 ) -> int:
@@ -241,7 +241,7 @@ def _gather_common(
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[F64, F64, F64, F64]) -> None:
     """Add the common columns of one point to (corner, rhs, diagonal, gradient) of the border."""
     corner, rhs, diagonal, gradient = ends
@@ -263,7 +263,7 @@ def _add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[
                 corner[column[d], column[c]] += total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def substitute_points(
     first: int, last: int, camera_step: F64, J: Jacobians, index: BlockIndex, points: PointSums, step: F64
 ) -> None:
@@ -294,7 +294,7 @@ def substitute_points(
             step[j, a] = -(V[a, 0] * t0 + V[a, 1] * t1 + V[a, 2] * t2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
     """Fill the share (K, 2) of each coordinate's variance that its point's unknowns absorb, B V^-1 B'."""
     M = np.empty((3, 3))
@@ -314,7 +314,7 @@ def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
                 leverage[k, i] = t0 * t0 + t1 * t1 + t2 * t2 if held else 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_pairs(start: I64, view: I64, block: I64, seen: B8) -> None:
     """Mark the pairs of blocks whose views observe a common point."""
     for j in range(len(start) - 1):
@@ -326,7 +326,7 @@ def mark_pairs(start: I64, view: I64, block: I64, seen: B8) -> None:
                         seen[v, block[view[m]]] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def revert_crossing_points(
     start: I64, view_index: I64, row_before: F64, row_after: F64, X_before: F64, X_after: F64
 ) -> None:

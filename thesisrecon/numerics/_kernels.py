@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64
+from thesisrecon.kernels import kernel
 
 TINY = 1e-12
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def loss_value(code: int, s: float, delta: float) -> float:
     """Evaluate rho(s)."""
     d2 = delta * delta
@@ -25,7 +25,7 @@ def loss_value(code: int, s: float, delta: float) -> float:
     return s
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def loss_weight(code: int, s: float, delta: float) -> float:
     """Evaluate rho'(s)."""
     d2 = delta * delta
@@ -38,7 +38,7 @@ def loss_weight(code: int, s: float, delta: float) -> float:
     return 1.0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def loss_curvature(code: int, s: float, delta: float) -> float:
     """Evaluate 1 + 2 s rho'' / rho', the fraction of the curvature along a residual that its loss leaves."""
     u = s / (delta * delta)
@@ -51,7 +51,7 @@ def loss_curvature(code: int, s: float, delta: float) -> float:
     return 1.0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def away_from_zero(w: float) -> float:
     """Move a projective depth off 0, so that a point in the focal plane gets a huge residual."""
     if w >= 0.0:
@@ -59,7 +59,7 @@ def away_from_zero(w: float) -> float:
     return min(w, -TINY)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def invert_cholesky_3x3(
     m00: float, m10: float, m20: float, m11: float, m21: float, m22: float, out: F64
 ) -> bool:
@@ -84,7 +84,7 @@ def invert_cholesky_3x3(
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
     """Invert a symmetric positive matrix by Cholesky factorisation."""
     positive = invert_cholesky_3x3(M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2], root)
@@ -92,7 +92,7 @@ def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
     return positive
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def multiply_transposed_3x3(L: F64, out: F64) -> None:
     """Fill ``out`` with L' L."""
     for a in range(3):

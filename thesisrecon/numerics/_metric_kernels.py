@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._kernels import away_from_zero, loss_curvature, loss_value, loss_weight
 from thesisrecon.numerics._observations import Jacobians, Weighting
 from thesisrecon.numerics.observations import Observations
@@ -30,7 +30,7 @@ class MetricModel(NamedTuple):
     X: F64
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
     """Return R x + t."""
     return (
@@ -40,7 +40,7 @@ def _in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
     """Return the pixel of a point in the camera frame, w away from 0; q is a row of intrinsics."""
     a, b = x0 / w, x1 / w
@@ -51,7 +51,7 @@ def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
     return q[0] * a * d + q[2] * b * d + q[3], q[0] * q[1] * b * d + q[4]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_metric(model: MetricModel, obs: Observations) -> F64:
     """Return residuals (K, 2), projection minus observation, px."""
     residual = np.empty((len(obs.xy), 2))
@@ -64,7 +64,7 @@ def project_metric(model: MetricModel, obs: Observations) -> F64:
     return residual
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> float:
     """Return 1/2 sum rho of the residuals."""
     cost = 0.0
@@ -77,7 +77,7 @@ def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> 
     return 0.5 * cost
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
     """Apply x -> exp(w) x + d in the camera frames after the poses; ``step`` (V, 6) = (w, d)."""
     for v in range(len(t)):
@@ -98,7 +98,7 @@ def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
             t_out[v, c] += step[v, 3 + c]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def linearize_metric(
     model: MetricModel, obs: Observations, weighting: Weighting, own: I64, common: I64, J: Jacobians
 ) -> float:
@@ -147,7 +147,7 @@ def linearize_metric(
     return 0.5 * cost
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
     """Fill D (2, 10): derivatives of the pixel by eight intrinsics and the normalised point, times root."""
     f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]

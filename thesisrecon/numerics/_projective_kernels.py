@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._kernels import away_from_zero, loss_value, loss_weight
 from thesisrecon.numerics._observations import Jacobians, Weighting
 from thesisrecon.numerics.observations import Observations
@@ -32,7 +32,7 @@ class UnitState(NamedTuple):
         return cls(P, X, vP, bP, vX, bX)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tangent_reflectors(p: F64, v: F64, beta: F64) -> None:
     """Fill Householder vectors and factors that take unit rows to -+e0; columns 1.. span tangent spaces."""
     for i in range(p.shape[0]):
@@ -45,7 +45,7 @@ def tangent_reflectors(p: F64, v: F64, beta: F64) -> None:
         beta[i] = 2.0 / norm if norm > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
     """Move unit rows along their tangent spaces: normalise(p + H[:, 1:] step); signs are kept."""
     d = p.shape[1]
@@ -65,7 +65,7 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
             out[i, c] /= norm if norm > 0.0 else 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_projective(P: F64, X: F64, obs: Observations) -> F64:
     """Return residuals (K, 2), projection minus observation; P (V, 3, 4), X (N, 4)."""
     residual = np.empty((len(obs.xy), 2))
@@ -79,7 +79,7 @@ def project_projective(P: F64, X: F64, obs: Observations) -> F64:
     return residual
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def linearize_projective(state: UnitState, obs: Observations, weighting: Weighting, J: Jacobians) -> float:
     """Fill weighted residuals and their Jacobians, A (K, 2, 11) and B (K, 2, 3); return the cost.
 
@@ -125,7 +125,7 @@ def linearize_projective(state: UnitState, obs: Observations, weighting: Weighti
     return 0.5 * cost
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def projective_cost(state: UnitState, obs: Observations, weighting: Weighting) -> float:
     """Return 1/2 sum rho of the residuals."""
     cost = 0.0

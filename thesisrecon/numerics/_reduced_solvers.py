@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._elimination import ReducedSums
 from thesisrecon.numerics.levenberg_marquardt import solve_positive
 
@@ -20,7 +20,7 @@ BAND_COST = 2.0
 SMALL = 600
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
     """Copy blocks (n, C, C) of views row[i] <= column[i] to the upper triangle of S (D, D)."""
     C = blocks.shape[1]
@@ -31,7 +31,7 @@ def _fill_dense(blocks: F64, row: I64, column: I64, S: F64) -> None:
                 S[r + a, c + b] = blocks[i, a, b]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
     """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) is the block of two views."""
     C, b = blocks.shape[1], len(pair)
@@ -42,7 +42,7 @@ def add_diagonal(blocks: F64, pair: I64, corner: F64, values: F64) -> None:
         corner[c, c] += values[b * C + c]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None:
     """Copy blocks to band[j, i - j] = S[i, j] (D, width + 1), views in the order ``place`` (b,)."""
     C = blocks.shape[1]
@@ -54,7 +54,7 @@ def fill_band(blocks: F64, row: I64, column: I64, place: I64, band: F64) -> None
                 band[low, high - low] = blocks[i, a, b]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def invert_band(L: F64, Z: F64) -> None:
     """Fill the entries inside the band of (L L')^-1 by the recursion of Takahashi (1973); L[j, i - j]."""
     D, width = L.shape

@@ -8,9 +8,9 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import F64
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics.losses import LOSSES, loss_code
 
 State = TypeVar("State")
@@ -195,7 +195,7 @@ def solve_positive(A: F64, b: F64) -> F64 | None:
     return None if info != 0 or not np.isfinite(x).all() else np.asarray(x).reshape(b.shape)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
     """Solve (H + damping diag H) step = -g by Cholesky factorisation, inside kernels.
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F64
+from thesisrecon.kernels import kernel
 
 # Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise.
 TAIL, _SEPARATION = 4.0, 12.0
@@ -25,7 +25,7 @@ _BISECTIONS = 20
 _HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
     """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood.
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import (
@@ -15,6 +14,7 @@ from thesisrecon.geometry.homogeneous import (
     require_shapes,
     whitening_transform,
 )
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._kernels import away_from_zero, invert_positive_3x3, loss_value, loss_weight
 from thesisrecon.numerics._metric_kernels import (
     MetricModel,
@@ -53,7 +53,7 @@ class _PointOptions(NamedTuple):
     keep_cheirality: bool
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _point_cost(P: F64, x: F64, view_index: I64, xy: F64, options: _PointOptions) -> tuple[float, int]:
     """Return 1/2 sum rho of one point's observations and the number of cameras it lies behind."""
     code, delta = options.loss_code, options.delta
@@ -71,7 +71,7 @@ def _point_cost(P: F64, x: F64, view_index: I64, xy: F64, options: _PointOptions
     return 0.5 * cost, behind
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _linearize_point(
     P: F64,
     x: F64,
@@ -112,7 +112,7 @@ def _linearize_point(
                 H[m, n] += weight * (J[0, m + 1] * J[0, n + 1] + J[1, m + 1] * J[1, n + 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, options: _PointOptions) -> None:
     """Refine every unit point of X (N, 4) in place by Levenberg-Marquardt in its tangent space."""
     H, M, Mi, root = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.kernels import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def draw_sample(uniforms: F64, n: int, out: I64) -> None:
     """Turn uniform random numbers into distinct sorted indices; every subset is equally likely.
 
@@ -33,7 +33,7 @@ def draw_sample(uniforms: F64, n: int, out: I64) -> None:
         out[place] = index
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def required_samples(inlier_ratio: float, sample_size: int, confidence: float, largest: int) -> int:
     """Return the number of samples of which one is free of outliers with probability ``confidence``.
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.arrays import F32, I16, I32, U8, U16
+from thesisrecon.kernels import kernel
 
 LEVELS = 4
 """Integer steps of one grey level: resampled images have fractional levels."""
@@ -129,7 +129,7 @@ def estimate_noise(image: StereoImage) -> float:
     return 1.4826 * median / 6.0 / LEVELS
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count_ones(word: np.int32) -> np.uint32:
     """Population count in a form that the compiler replaces by one instruction."""
     x = np.uint32(word)
@@ -140,7 +140,7 @@ def _count_ones(word: np.int32) -> np.uint32:
     return np.uint32(np.uint32(x * np.uint32(0x01010101)) >> np.uint32(24))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
     """Convert grey levels (H, W, K), NaN = no pixel, to integer channels (K, H, W) and their sum (H, W).
 
@@ -163,13 +163,13 @@ def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
             grey[y, x] = total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare(centre: I16, other: I16, bits: I32) -> None:
     for x in range(len(centre)):
         bits[x] = np.int32(bits[x] << 1) | np.int32(other[x] < centre[x])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def census(grey: I16, bits: I32) -> None:
     """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre."""
     height, width = grey.shape
@@ -188,7 +188,7 @@ def census(grey: I16, bits: I32) -> None:
                     _compare(grey[y], padded[dy, dx : dx + width], bits[y])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_difference(a: I16, b: I16, total: I16) -> None:
     for x in range(len(total)):
         apart = np.int16(a[x] - b[x])
@@ -196,13 +196,13 @@ def _add_difference(a: I16, b: I16, total: I16) -> None:
         total[x] = np.int16(total[x] + apart)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hamming(a: I32, b: I32, out: I16) -> None:
     for x in range(len(out)):
         out[x] = np.int16(_count_ones(np.int32(a[x] ^ b[x])))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(bits: I16, colour: I16, known: U8, weights: I16, outside: np.uint8, out: U8) -> None:
     """Combine Hamming distance and truncated colour difference."""
     of_bit, of_level, cap = weights[0], weights[1], weights[2]
@@ -214,13 +214,13 @@ def _join(bits: I16, colour: I16, known: U8, weights: I16, outside: np.uint8, ou
         out[x] = np.uint8(cost) if inside != 0 else outside
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _both(a: U8, b: U8, out: U8) -> None:
     for x in range(len(out)):
         out[x] = a[x] & b[x]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _row_costs(
     y: int, left: CostFeatures, right: CostFeatures, first: int, weights: I16, outside: np.uint8, out: U8
 ) -> None:
@@ -250,7 +250,7 @@ def _row_costs(
         _join(differing[:n], total[:n], known[:n], weights, outside, out[q, lo:hi])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
     for x in range(len(mask)):
         apart = np.int16(a[x] - b[x])
@@ -259,7 +259,7 @@ def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
         mask[x] = before if apart <= tolerance else np.uint8(0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> None:
     """Cross-shaped support arms of all pixels (Zhang, Lu and Lafruit 2009).
 
@@ -285,7 +285,7 @@ def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> N
                     _alike(channels[k, y, lo:hi], channels[k, y + dy, lo + dx : hi + dx], tolerance, mask)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_five_bytes(values: tuple[U8, U8, U8, U8, U8], masks: tuple[U8, U8, U8, U8], out: U16) -> None:
     far_l, left, here, right, far_r = values
     mask_l, mask_far_l, mask_r, mask_far_r = masks
@@ -295,7 +295,7 @@ def _sum_five_bytes(values: tuple[U8, U8, U8, U8, U8], masks: tuple[U8, U8, U8, 
         out[x] = np.uint16(total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_five(
     values: tuple[U16, U16, U16, U16, U16], masks: tuple[U16, U16, U16, U16], share: F32, out: U8
 ) -> None:
@@ -309,7 +309,7 @@ def _sum_five(
         out[x] = np.uint8(np.int32(np.float32(total) * share[x] + np.float32(0.5)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_along_row(padded: U8, masks: U8, y: int, out: U16) -> None:
     """Sums (W,) of the costs over the horizontal arms of row y; ``padded`` (W + 2 ARM,)."""
     n = len(out)
@@ -320,7 +320,7 @@ def _sum_along_row(padded: U8, masks: U8, y: int, out: U16) -> None:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mean_along_column(ring: U16, y: int, masks: U16, share: F32, out: U8) -> None:
     """Means (W,) over the vertical arms; ``ring`` (2 ARM + 1, W) holds row y at y modulo its length."""
     n = len(ring)
@@ -332,13 +332,13 @@ def _mean_along_column(ring: U16, y: int, masks: U16, share: F32, out: U8) -> No
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _widen_mask(mask: U8, out: U16) -> None:
     for x in range(len(out)):
         out[x] = np.uint16(np.uint16(mask[x]) * np.uint16(257))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shares(counts: U16, y: int, masks: U16, share: F32) -> None:
     """1 / size of the support region of every pixel of row y."""
     n = len(counts)
@@ -351,7 +351,7 @@ def _shares(counts: U16, y: int, masks: U16, share: F32) -> None:
         share[x] = np.float32(1.0) / np.float32(total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cost_volume(
     left: CostFeatures,
     right: CostFeatures,
@@ -390,7 +390,7 @@ def cost_volume(
             _mean_along_column(ring[q], y, wide, share, volume[y, q])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_squares(a: I16, b: I16, sign: int, out: I32) -> None:
     """Add (``sign`` 1) or subtract (-1) the squared differences of two rows (W,)."""
     for x in range(len(out)):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, U8
+from thesisrecon.kernels import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> None:
     """Inverse depths and standard deviations (H, W) from correspondences (H, W, 2), ``sigma`` in pixels.
 
@@ -35,7 +35,7 @@ def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> N
                 std[v, u] = sigma[v, u] * w / np.sqrt(square)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def fuse_inverse_depths(
     rho: F32, std: F32, gate: float, out: F32, out_std: F32, support: U8, conflicts: U8
 ) -> None:
@@ -79,13 +79,13 @@ def fuse_inverse_depths(
             out[v, u], out_std[v, u] = mean, np.sqrt(max(spread, 1.0) / weights)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _agree(a: float, sa: float, b: float, sb: float, gate: float) -> bool:
     # A comparison with NaN is false.
     return (a - b) * (a - b) <= gate * gate * (sa * sa + sb * sb)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive: U8, support: U8) -> None:
     """Update the one-dimensional Kalman filter of every pixel (H, W) in place.
 
@@ -112,7 +112,7 @@ def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive
                 alive[v, u] = 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def count_agreement(
     own: tuple[F32, F32], to: F64, other: tuple[F32, F32], back: F64, limits: F64, agree: U8, contradict: U8
 ) -> None:
@@ -156,7 +156,7 @@ def count_agreement(
                     agree[v, u] += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def splat_depths(depth: F32, to: F64, out: F32) -> None:
     """Project depths to the nearest pixels of another view, keeping the smaller depth.
 
@@ -178,7 +178,7 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
                     out[q, p] = w
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def surface_continuation(
     rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8
 ) -> None:

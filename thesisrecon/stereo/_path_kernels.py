@@ -7,9 +7,9 @@ on transposed blocks.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import I16, U8, U64
+from thesisrecon.kernels import kernel
 
 Word8 = tuple[np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64]
 
@@ -24,7 +24,7 @@ ODD_PAIRS = np.uint64(0x0000FFFF0000FFFF)
 ODD_FOURS = np.uint64(0x00000000FFFFFFFF)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _adapt_P2(a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
     for x in range(len(out)):
         apart = np.float32(a[x]) - np.float32(b[x])
@@ -33,7 +33,7 @@ def _adapt_P2(a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.
         out[x] = np.uint8(least if p2 < least else p2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
     """Penalties P2 (4, H, W) from the left, upper, upper left and upper right neighbour of each pixel.
 
@@ -51,7 +51,7 @@ def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.flo
             _adapt_P2(grey[y, : width - 1], above[1:], largest, least, scale, out[3, y, : width - 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _extend(cost: U8, before: tuple[U8, U8, U8], base: U8, p2: U8, P1: np.uint8, path: U8, least: U8) -> None:
     """Path costs of one disparity: L = C + min(L'(d), L'(d +- 1) + P1, min L' + P2) - min L'.
 
@@ -73,7 +73,7 @@ def _extend(cost: U8, before: tuple[U8, U8, U8], base: U8, p2: U8, P1: np.uint8,
         least[x] = value if value < so_far else so_far
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _extend_row(
     cost: U8, before: U8, base: U8, p2: U8, settings: tuple[np.uint8, int, U8], path: U8, least: U8
 ) -> None:
@@ -101,7 +101,7 @@ def _extend_row(
             least[x] = min(least[x], cost[q, x])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _start_row(cost: U8, path: U8, least: U8) -> None:
     least[:] = 255
     for q in range(len(cost)):
@@ -111,19 +111,19 @@ def _start_row(cost: U8, path: U8, least: U8) -> None:
             least[x] = min(least[x], value)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(values: U8, total: U8) -> None:
     for x in range(len(total)):
         total[x] = np.uint8(total[x] + values[x])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _copy(source: U8, out: U8) -> None:
     for x in range(len(out)):
         out[x] = source[x]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shifted(p2: U8, shift: int, out: U8) -> None:
     """Shift a row of penalties by ``shift`` columns, zeros outside."""
     width = len(p2)
@@ -133,7 +133,7 @@ def _shifted(p2: U8, shift: int, out: U8) -> None:
         _copy(p2[a - shift : b - shift], out[a:b])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> None:
     """Sum the path costs from above, ``shift`` columns aside, and the opposite ones, to ``total`` (N, D, W).
 
@@ -161,13 +161,13 @@ def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> Non
             _add(path[q], total[y, q])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _swap(a: np.uint64, b: np.uint64, shift: np.uint64, mask: np.uint64) -> tuple[np.uint64, np.uint64]:
     apart = ((a >> shift) ^ b) & mask
     return a ^ (apart << shift), b ^ apart
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _transposed(rows: Word8) -> Word8:
     """Transpose 8 x 8 bytes, one row per word: swap bytes, then pairs, then groups of four."""
     one, two, four = np.uint64(8), np.uint64(16), np.uint64(32)
@@ -187,21 +187,21 @@ def _transposed(rows: Word8) -> Word8:
     return a, b, c, d, e, f, g, h
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _load(words: U64, first: int, column: int) -> Word8:
     """Words of eight rows from ``first`` on."""
     part = words[first : first + 8, column]
     return part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _store(square: Word8, words: U64, first: int, column: int) -> None:
     part = words[first : first + 8, column]
     part[0], part[1], part[2], part[3] = square[0], square[1], square[2], square[3]
     part[4], part[5], part[6], part[7] = square[4], square[5], square[6], square[7]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _transpose_rows(source: U8, out: U8) -> None:
     """Transpose (N, D, W) to (W', D, N'), N <= BLOCK; W' and N' are the next multiples of 8.
 
@@ -223,7 +223,7 @@ def _transpose_rows(source: U8, out: U8) -> None:
                     _store(_transposed(_load(tile, y, x >> 3)), plane, start + x, y >> 3)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _transpose_back(source: U8, out: U8) -> None:
     """Inverse of :func:`_transpose_rows`."""
     rows, n, width = out.shape
@@ -246,7 +246,7 @@ def scratch_size(height: int, disparities: int, width: int) -> int:
     return (width + 7) // 8 * 8 * disparities * ((min(height, BLOCK) + 7) // 8 * 8)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
     """Sum the minimal costs of all paths that end in a pixel of costs (H, D, W), two at a time.
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import B8, F32, I16, U8, U16
+from thesisrecon.kernels import kernel
 from thesisrecon.stereo._cost import LEVELS, StereoImage, add_squares
 
 UNREACHED = np.uint16(65535)
@@ -27,7 +27,7 @@ MIN_NEIGHBOURS = 5
 """Known neighbours required to fill a pinhole."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keep_best(total: U16, q: np.int16, best: U16, index: I16) -> None:
     for x in range(len(best)):
         # Loads precede the selections: a load inside one would prevent vectorisation.
@@ -36,7 +36,7 @@ def _keep_best(total: U16, q: np.int16, best: U16, index: I16) -> None:
         best[x] = value if value < least else least
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keep_second_best(total: U16, q: np.int16, index: I16, second: U16) -> None:
     """Least total of a disparity that is not adjacent to the best one."""
     for x in range(len(second)):
@@ -47,19 +47,19 @@ def _keep_second_best(total: U16, q: np.int16, index: I16, second: U16) -> None:
         second[x] = value if value < least else least
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _set_sum(a: U8, b: U8, out: U16) -> None:
     for x in range(len(out)):
         out[x] = np.uint16(np.uint16(a[x]) + np.uint16(b[x]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_bytes(values: U8, total: U16) -> None:
     for x in range(len(total)):
         total[x] = np.uint16(total[x] + np.uint16(values[x]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tuple[U16, I16]) -> None:
     """Least totals and their disparities for both images, and the second best totals of the left one."""
     n, width = total.shape
@@ -76,7 +76,7 @@ def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tupl
         _keep_second_best(total[q], np.int16(q), index, second)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32], half: float) -> None:
     """Select the best disparity of every pixel from path sums (P, N, D, W), rows from ``start`` on.
 
@@ -111,7 +111,7 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
             right[y, x] = np.float32(first + index_r[x]) if index_r[x] >= 0 else np.float32(np.nan)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
     """Set disparities to NaN that differ from their partner's by more than ``limits[0]``.
 
@@ -129,7 +129,7 @@ def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> Non
                 left[y, x] = np.nan
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> None:
     """Set the confidence to 0 where no disparity is known; halve it where one was filled in.
 
@@ -145,7 +145,7 @@ def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F
             confidence[y, x] = np.float32(0.0) if np.isnan(disparity[y, x]) else confidence[y, x] * share
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
     """Mean of (I(x + 1) - I(x - 1))^2 over channels and a square window, (H, W); zeros outside the image."""
     n, height, width = channels.shape
@@ -168,7 +168,7 @@ def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
                 out[y, x] = np.float32(total) * share
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
     """Set connected regions to NaN that have fewer than ``smallest`` pixels, or too few ``textured`` ones.
 
@@ -212,7 +212,7 @@ def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: in
                 flat[queue[k]] = np.nan
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
     """Fill unknown pixels that have ``least`` known ones among 8 neighbours with their median, (H, W)."""
     height, width = disparity.shape
@@ -242,7 +242,7 @@ def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
             out[y, x] = np.float32(0.5) * (around[(n - 1) // 2] + around[n // 2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather_similar(centre: F32, other: F32, step: np.float32, total: F32, count: F32) -> None:
     for x in range(len(centre)):
         value, summed, counted = other[x], total[x], count[x]
@@ -252,7 +252,7 @@ def _gather_similar(centre: F32, other: F32, step: np.float32, total: F32, count
         count[x] = counted + (np.float32(1.0) if similar else np.float32(0.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
     """Mean of the disparities in a square window that differ from the centre by at most ``step``, (H, W)."""
     height, width = disparity.shape

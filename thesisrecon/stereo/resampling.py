@@ -7,10 +7,10 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64
 from thesisrecon.geometry.raster import cubic_weights
+from thesisrecon.kernels import kernel
 
 MAX_TAPS = 24
 """Limit of the filter width: reductions by more than 6 alias."""
@@ -20,7 +20,7 @@ STRIP_ROWS = 64
 """Rows whose positions are held in memory at a time."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cubic(x: float) -> float:
     """Cubic convolution kernel of Keys with a = -1/2, third-order accurate."""
     x = abs(x)
@@ -31,7 +31,7 @@ def _cubic(x: float) -> float:
     return 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
     """Weights of the pixels around ``at`` with the kernel ``spread`` times as wide; first pixel and count."""
     reach = min(2.0 * spread, 0.5 * MAX_TAPS - 1.0)
@@ -46,7 +46,7 @@ def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
     return first, count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spread(xy: F64, i: int, j: int, axis: int) -> float:
     """Distance of the neighbours of ``xy[i, j]`` along an axis of the image, at least 1."""
     i1 = i + 1 if i + 1 < xy.shape[0] else i - 1
@@ -58,7 +58,7 @@ def _spread(xy: F64, i: int, j: int, axis: int) -> float:
     return np.sqrt(squared) if squared > NOT_SHRUNK * NOT_SHRUNK else 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_image(image: F32, xy: F64, out: F32) -> None:
     """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C).
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
+from thesisrecon.kernels import kernel
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import (
     LEVELS,
@@ -48,13 +48,13 @@ SIGNIFICANT = 30.0
 """Nats above the minimum from which the probability is taken as 0."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_row(values: I32, out: I32) -> None:
     for x in range(len(out)):
         out[x] = np.int32(out[x] + values[x])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _squared_differences(y: int, left: I16, right: I16, first: int, out: I32) -> None:
     """Squared differences (D, W) of row y of (K, H, W) summed over channels, 0 outside the image."""
     n, _, width = left.shape
@@ -67,7 +67,7 @@ def _squared_differences(y: int, left: I16, right: I16, first: int, out: I32) ->
                 add_squares(right[k, y, lo - d : hi - d], left[k, y, lo:hi], 1, out[q, lo:hi])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _window_costs(columns: I32, lo: int, hi: int, radius: int, scale: float, out: I32) -> None:
     """Sums of ``columns`` (W,) over 2 radius + 1 columns, border columns repeated, in steps of ``scale``."""
     total = 0
@@ -78,7 +78,7 @@ def _window_costs(columns: I32, lo: int, hi: int, radius: int, scale: float, out
         total += int(columns[min(x + radius + 1, hi - 1)]) - int(columns[max(x - radius, lo)])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _trace_back(states: U8, last: tuple[int, int, int], first: int, left: I32, right: I32) -> None:
     i, q, state = last
     while i > 0 and i - (q + first) > 0:
@@ -95,7 +95,7 @@ def _trace_back(states: U8, last: tuple[int, int, int], first: int, left: I32, r
         state = before
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _least(matched: int, left_occluded: int, right_occluded: int) -> tuple[int, int]:
     best, state = matched, MATCHED
     state = LEFT_OCCLUDED if left_occluded < best else state
@@ -104,7 +104,7 @@ def _least(matched: int, left_occluded: int, right_occluded: int) -> tuple[int, 
     return min(right_occluded, best), state
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _enter_column(
     i: int,
     first: int,
@@ -145,7 +145,7 @@ def _enter_column(
         states[q] = traced
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_row(
     costs: I32,
     first: int,
@@ -193,7 +193,7 @@ def _solve_row(
         _trace_back(states, last, first, left, right)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _posterior(costs: I32, first: int, found: I32, likelihood: F64, out: F32) -> None:
     """Probability (W,) of the disparities found, or adjacent ones, among the whole range.
 
@@ -217,7 +217,7 @@ def _posterior(costs: I32, first: int, found: I32, likelihood: F64, out: F32) ->
         out[x] = np.float32(near / total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _forbid(valid_left: U8, valid_right: U8, first: int, costs: I32) -> None:
     n, width = costs.shape
     for q in range(n):
@@ -227,7 +227,7 @@ def _forbid(valid_left: U8, valid_right: U8, first: int, costs: I32) -> None:
                 costs[q, x] = NO_MATCH
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_rows(
     left: tuple[I16, U8],
     right: tuple[I16, U8],

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numba import njit
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._depth_grid import GRAZING_DEG, max_depth_slope, same_surface
@@ -24,7 +24,7 @@ STEP = 5.0
 """Standard deviations of a significant depth step."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root_of(parent: I64, k: int) -> int:
     """Root of k in a union-find forest, with path halving."""
     while parent[k] != k:
@@ -33,7 +33,7 @@ def _root_of(parent: I64, k: int) -> int:
     return k
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(parent: I64, a: int, b: int) -> None:
     """Union of the trees of a and b under the smaller root."""
     a, b = _root_of(parent, a), _root_of(parent, b)
@@ -43,7 +43,7 @@ def _join(parent: I64, a: int, b: int) -> None:
         parent[a] = b
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _number_coefficients(first: I64, columns: int, start: I64, linked: I64, coefficient: I64) -> int:
     """Number a coefficient for every node and connected set of pieces within its sixteen cells.
 
@@ -81,7 +81,7 @@ def _number_coefficients(first: I64, columns: int, start: I64, linked: I64, coef
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _within(first: I64, columns: int, k: int, p0: int, p1: int, q0: int, q1: int) -> bool:
     """Whether piece k lies in a cell of rows p0 .. p1 and columns q0 .. q1."""
     found = False
@@ -90,7 +90,7 @@ def _within(first: I64, columns: int, k: int, p0: int, p1: int, q0: int, q1: int
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sum_squares(
     piece: I64, value: F64, weight: F64, basis: F64, cell: int, matrix: F64, right_side: F64
 ) -> None:
@@ -113,7 +113,7 @@ def sum_squares(
                     matrix[k, m, n] += wb * b[n]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int, value: F64) -> None:
     """Evaluate the spline at all pixels, NaN for pixels without a piece."""
     height, width = piece.shape

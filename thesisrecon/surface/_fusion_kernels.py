@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64, U8
+from thesisrecon.kernels import kernel
 
 SIDE = 8
 """Voxels per side of a block."""
@@ -28,7 +28,7 @@ class MapSamples(NamedTuple):
     slope: float
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def touched_blocks(
     samples: MapSamples, rays: F64, centre: F64, reach: float, edge: float, marked: U8
 ) -> None:
@@ -57,7 +57,7 @@ def touched_blocks(
                     marked[i, j, k] = 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def integrate_view(
     blocks: I64, voxel: float, P: F64, surface: MapSamples, truncation: float, value: F32, weight: F32
 ) -> None:
@@ -101,7 +101,7 @@ def integrate_view(
                     weight[b, i, j, k] = np.float32(total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[float, tuple[int, int], float]:
     """Depth at (u, v), the row and column it is taken from, and its weight.
 
@@ -134,7 +134,7 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
     return depth[row, column], (row, column), WEIGHT_BEYOND
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _find(place: I64, i: int, j: int, k: int) -> int:
     """Number of the block at grid voxel (i, j, k), -1 if there is none."""
     if i < 0 or j < 0 or k < 0:
@@ -145,7 +145,7 @@ def _find(place: I64, i: int, j: int, k: int) -> int:
     return int(place[bi, bj, bk])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def place_vertices(blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64) -> int:
     """Place one vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
 
@@ -182,7 +182,7 @@ def place_vertices(blocks: I64, place: I64, value: F32, weight: F32, vertex: I64
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mean_crossing(corner: F64, point: F64) -> None:
     """Mean of the zeros on the twelve edges of a cell with values ``corner`` (8,) at x + 2 y + 4 z."""
     point[:] = 0.0
@@ -202,7 +202,7 @@ def _mean_crossing(corner: F64, point: F64) -> None:
         point[d] /= crossed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def join_vertices(
     blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64, faces: I64
 ) -> int:
@@ -245,7 +245,7 @@ def join_vertices(
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _squared(points: F64, a: int, b: int) -> float:
     total = 0.0
     if max(a, b) < points.shape[0]:
@@ -254,7 +254,7 @@ def _squared(points: F64, a: int, b: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ring(place: I64, vertex: I64, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
     """Vertices of the four cells around an edge from voxel ``at``; False if one is missing."""
     second, third = (axis + 1) % 3, (axis + 2) % 3

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.geometry.raster import weighted_median
+from thesisrecon.kernels import kernel
 
 
 class ViewSurface(NamedTuple):
@@ -27,7 +27,7 @@ class ViewSurface(NamedTuple):
     gain: F32
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> None:
     """Diffuse ``spread`` (M, V) over neighbouring faces by one step, among the views with a ``share``.
 
@@ -48,7 +48,7 @@ def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> 
                 out[m, v] = np.float32(keep) * share[m, v] + part * total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, color: F32) -> None:
     """Observe points in one view: weights (pixels per area times trust) and colours times the gain.
 
@@ -92,7 +92,7 @@ def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, co
             color[n, k] = np.float32((top + t * (bottom - top)) * gain[k])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sort_weighted(values: F32, weights: F64, order: I64) -> tuple[int, float]:
     """Sort the values (V,) of positive weight by index into ``order``; return their number and weight."""
     count, total = 0, 0.0
@@ -108,7 +108,7 @@ def _sort_weighted(values: F32, weights: F64, order: I64) -> tuple[int, float]:
     return count, total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
     """Blend the colours (V, N, 3) of points; those without positive ``weight`` (V, N) stay in ``out``.
 
@@ -147,7 +147,7 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
             out[n, k] = np.float32(mean[k] / total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def grow_colors(texture: U8, drawn: B8) -> None:
     """Extend the drawn texels by the mean of their neighbours."""
     height, width = drawn.shape
@@ -171,7 +171,7 @@ def grow_colors(texture: U8, drawn: B8) -> None:
                     texture[y, x, k] = int(total[k] / count + 0.5)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
     """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``.
 

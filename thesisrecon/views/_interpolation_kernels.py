@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64
 from thesisrecon.geometry.raster import weighted_median
+from thesisrecon.kernels import kernel
 
 ONE_SURFACE_PX = 1.0
 """Neighbouring disparities that differ by more belong to different surfaces."""
@@ -17,7 +17,7 @@ NEAR = 2
 """Radius of the median over guessed pixels."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def disparity_from_rectified(
     maps: tuple[F32, F32], H: F64, rows: tuple[int, int], places: F64, disparity: F32, sure: F32
 ) -> None:
@@ -54,7 +54,7 @@ def disparity_from_rectified(
             sure[y, x] = confidence[near_y, near_x] if inside else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def filter_extrapolated_by_colour(
     levels: F32, disparity: F32, sure: F32, rows: tuple[int, int], limits: tuple[float, float], out: F32
 ) -> None:
@@ -91,7 +91,7 @@ def filter_extrapolated_by_colour(
                 out[y, x] = weighted_median(values[:n], weights[:n], np.argsort(values[:n]), 0.5 * total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
     """Replace disparities of confidence 0 by the median of their neighbours."""
     height, width = disparity.shape
@@ -111,7 +111,7 @@ def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, in
                 out[y, x] = np.sort(values[:n])[n // 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def intermediate_positions(
     places: F64, disparity: F32, share: float, G: F64, rows: tuple[int, int], target: F64
 ) -> None:
@@ -127,7 +127,7 @@ def intermediate_positions(
                 target[y, x] = np.nan
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _at(values: F32, source: F32, y: int, x: int) -> float:
     """The value (h, w) of the pixel nearest to the source (H, W, 2) of a pixel."""
     v = min(max(int(np.rint(source[y, x, 1])), 0), values.shape[0] - 1)
@@ -135,7 +135,7 @@ def _at(values: F32, source: F32, y: int, x: int) -> float:
     return float(values[v, u])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def blend(
     colors: tuple[F32, F32],
     fronts: tuple[F32, F32],

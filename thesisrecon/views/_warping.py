@@ -7,12 +7,12 @@ depth of each pixel is compared, which gives the same image in any order.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, F64, I16, I32
 from thesisrecon.geometry.raster import cubic_weights
 from thesisrecon.geometry.zbuffer import run_in_strips
+from thesisrecon.kernels import kernel
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
@@ -25,7 +25,7 @@ STRETCH = 3.0
 """Neighbouring pixels of one surface come at most this far apart (px)."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _joined(target: F64, inverse_depth: F32, a: tuple[int, int], b: tuple[int, int], limits: F64) -> bool:
     """Whether two neighbouring pixels belong to one surface; False if one has no position."""
     # Comparisons with NaN are false.
@@ -34,7 +34,7 @@ def _joined(target: F64, inverse_depth: F32, a: tuple[int, int], b: tuple[int, i
     return bool(near and abs(dx) <= limits[1] and abs(dy) <= limits[1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw_triangle(
     target: F64,
     inverse_depth: F32,
@@ -72,7 +72,7 @@ def _draw_triangle(
             source[y, x, 1] = ya + b * (yb - ya) + c * (yc - ya)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _slope(
     target: F64, inverse_depth: F32, at: tuple[int, int], step: tuple[int, int], limits: F64, out: F64
 ) -> int:
@@ -89,7 +89,7 @@ def _slope(
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw_footprint(
     surface: tuple[F64, F32],
     at: tuple[int, int],
@@ -133,7 +133,7 @@ def _draw_footprint(
             source[y, x, 1] = min(max(at[0] + v, 0.0), inverse_depth.shape[0] - 1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _outside_rows(target: F64, a: tuple[int, int], reach: float, rows: tuple[int, int]) -> bool:
     """Whether four pixels lie farther above or below the rows than a pixel of one surface reaches."""
     least, most = np.inf, -np.inf
@@ -145,7 +145,7 @@ def _outside_rows(target: F64, a: tuple[int, int], reach: float, rows: tuple[int
     return bool(most < rows[0] - reach - 1.0 or least > rows[1] + reach)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw_surface(
     target: F64, inverse_depth: F32, limits: F64, rows: tuple[int, int], source: F32, front: F32
 ) -> None:
@@ -190,7 +190,7 @@ def _draw_surface(
                 _draw_footprint((target, inverse_depth), a, limits, rows, (source, front))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
     """Sample rows of an image by cubic convolution; bilinear beside the border, NaN beside NaN."""
     height, width, channels = image.shape
@@ -224,7 +224,7 @@ def _sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None
                 out[y, x, c] = value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.float32:
     """Bilinear, of the border pixel beyond it."""
     x1, y1 = min(x0 + 1, image.shape[1] - 1), min(y0 + 1, image.shape[0] - 1)
@@ -234,7 +234,7 @@ def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.floa
     return np.float32(top + t * (bottom - top))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
     """Count the ``steps`` (K, 2) (down, right) from each pixel to the next known one, ``distance`` (K, H, W).
 
@@ -257,7 +257,7 @@ def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
                     distance[k, y, x] = -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_from_behind(rgb: F32, inverse_depth: F32, steps: I32, distance: I16, step: float, out: F32) -> None:
     """Fill holes with the background around, see :func:`fill_holes`."""
     colors = np.empty(rgb.shape[2])

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import Raster, rasterize, run_in_strips, sample_texture
+from thesisrecon.kernels import kernel
 from thesisrecon.records import RenderedView, TexturedMesh
 
 STRIP = 16
@@ -18,13 +18,13 @@ BARE = (200, 200, 200)
 """Colour of a mesh without texture and vertex colours."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
     length = max(np.sqrt(x * x + y * y + z * z), 1e-20)
     return x / length, y / length, z / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lamps: F64, ambient: float) -> None:
     """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye.
 
@@ -49,7 +49,7 @@ def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lamps: F64, a
             color[p, c] = np.float32(color[p, c] * light[c])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: U8) -> None:
     """Average blocks of ``samples`` x ``samples`` pixels; those with negative ``drawn`` are background."""
     total = np.empty(3, dtype=np.float32)

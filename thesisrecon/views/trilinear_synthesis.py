@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8, F32, F64, I16, I32, U8
@@ -18,6 +17,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.zbuffer import run_in_strips
+from thesisrecon.kernels import kernel
 from thesisrecon.views._warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, VirtualTensor, seed_of_two
 
@@ -31,7 +31,7 @@ MIN_SEEN = 0.05
 """Minimum share of the image that must show the scene."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_depth: F32) -> None:
     """Transfer the pixels of rows from ``first`` to the third view, see :meth:`VirtualTensor.transfer`."""
     height, width = inverse_depth.shape
@@ -64,7 +64,7 @@ def _transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_de
             inverse_depth[row, column] = (l0 * a0 + l1 * a1 + l2 * a2) / w
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _extrapolate_inverse_depth(
     inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
 ) -> None:
@@ -92,7 +92,7 @@ def _extrapolate_inverse_depth(
                     out[y, x] = rho
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _occludes(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> bool:
     """Whether a pixel at an inverse depth lies in front of what the other image shows there."""
     u = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2] + rho * P2[0, 3]

@@ -88,7 +88,7 @@ def compiled_from(root: Path, file: str) -> list[Path]:
 
 def has_kernels(path: Path) -> bool:
     """Return whether a module defines compiled functions."""
-    return "njit" in path.read_text(encoding="utf-8")
+    return "@kernel" in path.read_text(encoding="utf-8")
 
 
 def _reached(root: Path, file: str, passes: Callable[[Path], bool]) -> list[Path]:

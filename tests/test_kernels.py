@@ -1,0 +1,110 @@
+"""The cache of compiled kernels: keyed by all code of a kernel, safe against kills and concurrent runs."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+CALLEE = """
+from thesisrecon.kernels import kernel
+
+OFFSET = 1.0
+
+@kernel(fastmath={"reassoc", "contract", "nsz"})  # the order of a set changes with PYTHONHASHSEED
+def inner(x):
+    '''Add an offset.'''
+    return x + OFFSET
+"""
+CALLER = """
+from callee import inner
+from thesisrecon.kernels import kernel
+
+@kernel
+def outer(x):
+    return 2.0 * inner(x)
+"""
+RUN = """
+import sys, caller
+value = caller.outer(3.0)
+print(value, sum(caller.outer.stats.cache_hits.values()))
+"""
+
+
+def run_in(folder, code=RUN, **variables):
+    environment = {**os.environ, "THESISRECON_KERNEL_CACHE": str(folder / "cache"), **variables}
+    environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(Path(__file__).parent.parent)])
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+@pytest.fixture
+def package(tmp_path):
+    (tmp_path / "callee.py").write_text(CALLEE, encoding="utf-8")
+    (tmp_path / "caller.py").write_text(CALLER, encoding="utf-8")
+    return tmp_path
+
+
+def edit(file, old, new):
+    text = file.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def test_a_second_process_compiles_nothing(package):
+    assert run_in(package) == ["8.0", "0"]
+    assert run_in(package, PYTHONHASHSEED="7") == ["8.0", "1"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "value"), [("x + OFFSET", "x - OFFSET", "4.0"), ("= 1.0", "= 2.0", "10.0")]
+)
+def test_an_edit_of_a_called_function_or_its_constant_recompiles_the_caller(package, old, new, value):
+    run_in(package)
+    edit(package / "callee.py", old, new)
+    assert run_in(package) == [value, "0"]
+
+
+def test_an_edit_of_a_comment_or_a_moved_function_recompiles_nothing(package):
+    run_in(package)
+    edit(package / "callee.py", "Add an offset.", "Add a constant.")
+    edit(package / "caller.py", "\n@kernel", "\n# further down\n\n@kernel")
+    assert run_in(package) == ["8.0", "1"]
+
+
+def test_a_damaged_entry_is_compiled_again(package):
+    run_in(package)
+    for entry in (package / "cache").iterdir():
+        entry.write_bytes(entry.read_bytes()[:-7])
+    assert run_in(package) == ["8.0", "0"]
+    assert run_in(package) == ["8.0", "1"]
+
+
+def test_a_folder_that_cannot_be_written_costs_only_the_cache(package):
+    (package / "cache").write_text("a file in the place of the folder", encoding="utf-8")
+    assert run_in(package) == ["8.0", "0"]
+
+
+def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(package):
+    run_in(package)
+    killed = """
+        import os, caller
+        from thesisrecon import kernels
+        kernels.CompileResult._reduce = lambda result: os._exit(9)
+        caller.outer(3)
+        """
+    with pytest.raises(AssertionError):
+        run_in(package, textwrap.dedent(killed))
+    assert run_in(package, RUN.replace("3.0", "3")) == ["8.0", "0"]
+
+
+
+def test_two_processes_at_once_compile_once(package):
+    with ThreadPoolExecutor() as pool:
+        done = list(pool.map(lambda _: run_in(package), range(3)))
+    assert [value for value, _ in done] == ["8.0"] * 3
+    assert sorted(hits for _, hits in done) == ["0", "1", "1"]
