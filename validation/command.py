@@ -19,7 +19,7 @@ from validation.harness.page import write_pages
 from validation.harness.process import own_cores
 from validation.harness.records import ReportOptions
 from validation.harness.results import Results, collect, compare, read_results, write_results
-from validation.harness.scenes import load_photographs
+from validation.harness.scenes import load_images
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
 
@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
         other = read_results(parsed.against) if getattr(parsed, "against", None) else None
         gates = read_gates()
         for name in options.folders:
-            load_photographs(name, options)
+            load_images(name, options)
     except (ValueError, StageFailure) as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2

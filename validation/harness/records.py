@@ -115,12 +115,14 @@ class Stage(Protocol):
     name: str
     title: str
     definition: str
+    scenes: tuple[str, ...] = ()
 
-    def takes(self, scene: str, options: ReportOptions) -> bool: ...
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return scene in self.scenes
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]: ...
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the default)
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return ()
 
     def run(self, task: Task, options: ReportOptions) -> None: ...

@@ -22,7 +22,7 @@ from validation.scenes.real import (
 )
 from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 
-PHOTOGRAPHS = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
+IMAGE_SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
 QUICK = ("courtyard", "boards", "cloud", "street", "Tsukuba")
 SYNTHETIC = ("boards", "cloud", "street")
 """Synthetic scenes, generated on demand: images of a chessboard; points seen by a few
@@ -32,7 +32,7 @@ cameras; a walk of cameras."""
 def available_scenes(*, quick: bool) -> tuple[str, ...]:
     """Return the scenes whose files are on this machine."""
     root = data_root()
-    found = [name for name in PHOTOGRAPHS if name == "courtyard" or real_folder(name) is not None]
+    found = [name for name in IMAGE_SCENES if name == "courtyard" or real_folder(name) is not None]
     found += [name for name in STEREO_PAIRS if stereo_folder(name) is not None]
     found += SYNTHETIC
     if root is not None and (root / "kusvod2").is_dir():
@@ -40,12 +40,12 @@ def available_scenes(*, quick: bool) -> tuple[str, ...]:
     return tuple(name for name in found if not quick or name in QUICK)
 
 
-def is_photographs(name: str, options: ReportOptions) -> bool:
+def has_images(name: str, options: ReportOptions) -> bool:
     """Return whether a scene is a set of images of one scene."""
-    return name in PHOTOGRAPHS or name in options.folders
+    return name in IMAGE_SCENES or name in options.folders
 
 
-def load_photographs(name: str, options: ReportOptions) -> Scene:
+def load_images(name: str, options: ReportOptions) -> Scene:
     """Return the images of a scene with their truth, if known.
 
     A folder of the user holds images, or images/ with them; its truth is ``cameras.json`` (as in
@@ -61,9 +61,7 @@ def load_photographs(name: str, options: ReportOptions) -> Scene:
 
 def truth_of(scene: Scene) -> TrueCameras | None:
     """Return the true cameras of a scene, or None."""
-    if scene.K is None or scene.R is None or scene.C is None:
-        return None
-    return TrueCameras(scene.K, scene.R, scene.C)
+    return TrueCameras(*scene.cameras) if scene.has_truth else None
 
 
 def _own_scene(folder: Path, name: str) -> Scene:

@@ -8,14 +8,14 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from validation.harness.canaries import read_refused
-from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
+from validation.harness.records import Outcome, ReportOptions, Stage, Task
 from validation.references.libraries import refuse
 
 JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
@@ -40,16 +40,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _judge(options: ReportOptions, stage: Stage, scene: str) -> None:
+    """Store the judgement with the messages of the methods that failed."""
     place = options.place(stage.name, scene)
     record = json.loads((place / OUTCOMES).read_text(encoding="utf-8"))
     outcomes = {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in record.items()}
     judgement = stage.judge(scene, outcomes, options)
-    text = json.dumps(_plain(judgement), default=_plain_number)
-    write_text(place / JUDGEMENT, text)
-
-
-def _plain(judgement: Judgement) -> dict[str, Any]:
-    return asdict(judgement)
+    failures = [f"{name}: {outcome.failure}." for name, outcome in outcomes.items() if not outcome.ok]
+    judgement = replace(judgement, notes=[*judgement.notes, *failures])
+    write_text(place / JUDGEMENT, json.dumps(asdict(judgement), default=_plain_number))
 
 
 def _plain_number(value: Any) -> Any:

@@ -154,7 +154,11 @@ def depth_range(depths: Sequence[F32 | F64]) -> tuple[float, float]:
 def depth_colours(depth: F32 | F64, limits: tuple[float, float]) -> U8:
     """(H, W, 3): inverse depth between two ``limits``, near red, far blue, unknown black."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = (1.0 / depth.astype(np.float64) - limits[0]) / (limits[1] - limits[0])
+        return error_colours((1.0 / depth.astype(np.float64) - limits[0]) / (limits[1] - limits[0]))
+
+
+def error_colours(share: F64) -> U8:
+    """(H, W, 3): 0 blue to 1 red, unknown black."""
     known = np.isfinite(share)
     return np.where(known[..., None], coloured(np.where(known, share, 0.0)), 0).astype(np.uint8)
 

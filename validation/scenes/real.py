@@ -43,6 +43,13 @@ class Scene:
         """Return whether the cameras are known."""
         return self.C is not None
 
+    @property
+    def cameras(self) -> tuple[F64, F64, F64]:
+        """Return K, R and C; ``ValueError`` if they are not known."""
+        if self.K is None or self.R is None or self.C is None:
+            raise ValueError(f"the cameras of {self.name} are not known")
+        return self.K, self.R, self.C
+
 
 def data_root() -> Path | None:
     """The folder of real images: THESISRECON_DATA, else ../shared/data beside the repository, None when

@@ -43,7 +43,7 @@ class Darts:
         config,
         scene,
         seed,
-        place,  # noqa: ARG002 (a dart needs no folder)
+        place,
     ):
         mark(self.log, f"row {scene} {seed} {self.aim:g}")
         time.sleep(self.pause_s)

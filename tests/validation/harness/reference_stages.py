@@ -1,7 +1,5 @@
 """A stage with one method for each reference library, through its adapter, on a few points."""
 
-# ruff: noqa: ARG002 (the stage takes what a stage takes, and ignores most of it)
-
 import numpy as np
 
 from thesisrecon.records import TexturedMesh

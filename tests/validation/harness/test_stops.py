@@ -32,7 +32,7 @@ with with_resume_advice("begin again"):
 class HangingStage(ToyStage):
     """All its methods hang."""
 
-    def methods(self, scene, options):  # noqa: ARG002
+    def methods(self, scene, options):
         return ("hanging",)
 
 

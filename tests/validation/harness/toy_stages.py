@@ -1,7 +1,5 @@
 """A stage with references that do all that a reference may do: answer, be missing, fail, crash, hang."""
 
-# ruff: noqa: ARG002 (a toy takes what a stage takes, and ignores most of it)
-
 import json
 import os
 import shutil

@@ -60,7 +60,7 @@ class CalibrationOverNoise:
         config: PipelineConfig,
         scene: str,
         seed: int,
-        place: Place,  # noqa: ARG002 (nothing is written)
+        place: Place,
     ) -> Mapping[str, float]:
         rig, projective = _drawn(Cell(scene, self.mode, self.noise_px, self.views), seed)
         prior, rng = assumptions(rig, self.mode), np.random.default_rng(seed)

@@ -28,6 +28,6 @@ class FunctionTask:
         config: PipelineConfig,
         scene: str,
         seed: int,
-        place: Place,  # noqa: ARG002 (a function writes nothing)
+        place: Place,
     ) -> Mapping[str, float]:
         return self.function(config, scene, seed)

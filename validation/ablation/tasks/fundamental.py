@@ -59,16 +59,16 @@ class FundamentalOfCube:
     def scene_key(self, scene: str) -> str:
         return scene
 
-    def unavailable(self, scene: str) -> set[str]:  # noqa: ARG002 (there is one)
+    def unavailable(self, scene: str) -> set[str]:
         """Without noise there is no bound."""
         return set() if self.noise_px > 0.0 else {"over_bound"}
 
     def run(
         self,
         config: PipelineConfig,
-        scene: str,  # noqa: ARG002 (there is one)
+        scene: str,
         seed: int,
-        place: Place,  # noqa: ARG002 (nothing is written)
+        place: Place,
     ) -> Mapping[str, float]:
         rng = np.random.default_rng((seed, round(1e3 * self.noise_px), round(1e3 * self.outliers)))
         chosen = rng.choice(len(_pairs()), self.pairs, replace=False)

@@ -59,7 +59,7 @@ class PairsOfPhotographs:
         config: PipelineConfig,
         scene: str,
         seed: int,
-        place: Place,  # noqa: ARG002 (nothing is written)
+        place: Place,
     ) -> Mapping[str, float]:
         name, _, first = scene.rpartition("/")
         i = int(first)

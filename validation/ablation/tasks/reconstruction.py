@@ -19,7 +19,7 @@ from thesisrecon.runtime.run import Until
 from thesisrecon.settings import tables_from_config
 from validation.ablation.study import Measure, Place
 from validation.harness.records import ReportOptions
-from validation.harness.scenes import PHOTOGRAPHS, load_photographs, truth_of
+from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
 from validation.scenes.real import Scene
 
@@ -121,11 +121,11 @@ class Reconstruction:
 def _load(scene: str) -> Scene:
     """The images of a scene by its name or its folder; :class:`UsageError` if there are none."""
     folder = Path(scene)
-    named = {} if scene in PHOTOGRAPHS or not folder.is_dir() else {scene: str(folder)}
-    if scene not in PHOTOGRAPHS and not named:
-        raise UsageError(f"{unknown_word('scene', scene, PHOTOGRAPHS)}; a folder of images is one too")
+    named = {} if scene in IMAGE_SCENES or not folder.is_dir() else {scene: str(folder)}
+    if scene not in IMAGE_SCENES and not named:
+        raise UsageError(f"{unknown_word('scene', scene, IMAGE_SCENES)}; a folder of images is one too")
     try:
-        return load_photographs(scene, ReportOptions(Path(), (), (), named))
+        return load_images(scene, ReportOptions(Path(), (), (), named))
     except ValueError as error:
         raise UsageError(str(error)) from None
 

@@ -40,8 +40,8 @@ class RectifiedPairs:
         self,
         config: PipelineConfig,
         scene: str,
-        seed: int,  # noqa: ARG002 (nothing is random here)
-        place: Place,  # noqa: ARG002 (nothing is written)
+        seed: int,
+        place: Place,
     ) -> Mapping[str, float]:
         pair = _pair(scene)
         if not isinstance(config.dense, MultiViewStereo):

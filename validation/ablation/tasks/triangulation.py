@@ -67,10 +67,10 @@ class TriangulationOverNoise:
 
     def run(
         self,
-        config: PipelineConfig,  # noqa: ARG002 (the methods are pure functions)
+        config: PipelineConfig,
         scene: str,
         seed: int,
-        place: Place,  # noqa: ARG002 (nothing is written)
+        place: Place,
     ) -> Mapping[str, float]:
         if SCENES[scene][1] > 2 and self.method == POLYNOMIAL:
             raise ValueError("the polynomial method is one of two views")

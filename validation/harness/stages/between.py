@@ -13,6 +13,7 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.view_interpolation import prepare_rectified_pair
 from thesisrecon.views.trilinear import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.stages._shared import OURS, Values, row
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
@@ -31,8 +32,7 @@ from validation.scenes.nine_views import (
     synthesis_of_disparities,
 )
 
-Measure = Callable[[U8, U8], float]
-OURS, TRUE, DISSOLVE = "ours", "true disparities", "cross-dissolve"
+TRUE, DISSOLVE = "true disparities", "cross-dissolve"
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 BY_TENSOR = " (tensor)"
 TENSOR = OURS + BY_TENSOR
@@ -51,10 +51,10 @@ class BetweenStage(Stage):
         "The tensor also computes 1 and 7, a quarter of the baseline beyond the ends."
     )
 
-    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
+    def takes(self, scene: str, options: ReportOptions) -> bool:
         return scene == "Cones" and load_cones() is not None
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         sources = (OURS, THREE_WAY, HH, TRUE)
         tensors = (OURS,) if options.gates_only else sources
         return (*sources, DISSOLVE, *(source + BY_TENSOR for source in tensors))
@@ -67,55 +67,44 @@ class BetweenStage(Stage):
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         cones = _cones()
         made = {name: _read(outcome) for name, outcome in outcomes.items()}
-        judged = Judged(cones, made)
-        peak = judged.mean(psnr_db)
+
+        def mean(measure: Callable[[U8, U8], float]) -> Values:
+            """Over the views between the inputs; None if they are missing."""
+            return {
+                name: float(np.mean([measure(images[k], cones.images[k]) for k in BETWEEN]))
+                if images
+                else None
+                for name, images in made.items()
+            }
+
+        peak, words = mean(psnr_db), "mean over images 3, 4 and 5"
         sgbm = max((v for n in (THREE_WAY, HH) if (v := peak[n]) is not None), default=None)
-        words = "mean over images 3, 4 and 5"
         metrics = [
-            Metric(scene, "PSNR", "dB", peak, OURS, at_most=False, definition=words),
-            Metric(scene, "SSIM", "", judged.mean(ssim), OURS, at_most=False, definition=words),
-            *(
-                _over(scene, f"{what}PSNR over {name}", peak[method], other)
-                for what, method in (("", OURS), ("tensor: ", TENSOR))
-                for name, other in (("the better SGBM", sgbm), ("cross-dissolve", peak[DISSOLVE]))
-            ),
-            *(judged.view(scene, k) for k in (*BETWEEN, *BEYOND)),
+            row(scene, "PSNR", "dB", peak, words, more=True),
+            row(scene, "SSIM", "", mean(ssim), words, more=True),
         ]
-        return Judgement(
-            metrics,
-            pictures=_beside(options.place(self.name, scene), cones, made),
-            notes=[f"{n}: {o.failure}." for n, o in outcomes.items() if not o.ok],
-        )
+        for what, method in (("", OURS), ("tensor: ", TENSOR)):
+            for name, other in (("the better SGBM", sgbm), ("cross-dissolve", peak[DISSOLVE])):
+                ours = peak[method]
+                over = None if ours is None or other is None else ours - other
+                difference = "difference of the means"
+                metrics.append(row(scene, f"{what}PSNR over {name}", "dB", over, difference, more=True))
+        metrics += [_of_view(scene, k, cones, made) for k in (*BETWEEN, *BEYOND)]
+        return Judgement(metrics, pictures=_beside(options.place(self.name, scene), cones, made))
 
 
-class Judged:
-    """Computed views of each method and the real images."""
-
-    def __init__(self, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> None:
-        self.cones, self.made = cones, made
-
-    def mean(self, measure: Measure) -> dict[str, float | None]:
-        """Return the mean over the views between the inputs by method; None if one is missing."""
-        return {
-            name: float(np.mean([measure(pictures[k], self.cones.images[k]) for k in BETWEEN]))
-            if pictures
-            else None
-            for name, pictures in self.made.items()
-        }
-
-    def view(self, scene: str, k: int) -> Metric:
-        """Return the row of one view."""
-        beyond = k in BEYOND
-        shown = slice(BORDER_PX, -BORDER_PX) if beyond else slice(None)
-        wanted = self.cones.images[k][:, shown]
-        values: dict[str, float | None] = {
-            name: psnr_db(pictures[k][:, shown], wanted) if k in pictures else None
-            for name, pictures in self.made.items()
-            if not beyond or BY_TENSOR in name
-        }
-        words = f"without {BORDER_PX} columns at the borders" if beyond else "of this view alone"
-        judged = TENSOR if beyond else OURS
-        return Metric(scene, f"PSNR, view {k}", "dB", values, judged, at_most=False, definition=words)
+def _of_view(scene: str, k: int, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> Metric:
+    """Return the row of one view."""
+    beyond = k in BEYOND
+    shown = slice(BORDER_PX, -BORDER_PX) if beyond else slice(None)
+    wanted = cones.images[k][:, shown]
+    values: Values = {
+        name: psnr_db(images[k][:, shown], wanted) if k in images else None
+        for name, images in made.items()
+        if not beyond or BY_TENSOR in name
+    }
+    words = f"without {BORDER_PX} columns at the borders" if beyond else "of this view alone"
+    return row(scene, f"PSNR, view {k}", "dB", values, words, more=True, judged=TENSOR if beyond else OURS)
 
 
 def _beside(place: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> list[Picture]:
@@ -131,11 +120,6 @@ def _beside(place: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]])
 def _difference(picture: U8, wanted: U8) -> U8:
     apart = 4.0 * (picture.astype(np.float32) - wanted)
     return np.asarray(np.clip(128.0 + apart, 0.0, 255.0), dtype=np.uint8)
-
-
-def _over(scene: str, name: str, peak: float | None, other: float | None) -> Metric:
-    over = None if peak is None or other is None else peak - other
-    return Metric(scene, name, "dB", {OURS: over}, OURS, at_most=False, definition="difference of the means")
 
 
 def _cones() -> NineViews:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,16 +13,16 @@ from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bund
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import Reconstruction
-from validation.harness.records import Judgement, Outcome, ReportOptions, Task
-from validation.harness.scenes import is_photographs, load_photographs
-from validation.harness.stages.cameras import OURS as OUR_CAMERAS
-from validation.harness.stages.cameras import read_model
+from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
+from validation.harness.scenes import has_images, load_images
+from validation.harness.stages._shared import OURS, each, ratio, read_arrays, row
+from validation.harness.stages.cameras import our_model
 from validation.metrics.record import Metric
 from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
 from validation.references.ceres_covariance import ceres_covariances
 from validation.scenes.streets import SIZE, make_walk
 
-OURS, CERES = "ours", "Ceres"
+CERES = "Ceres"
 STREET = "street"
 FOCAL_K1 = np.array([True, False, False, False, False, True])
 WITH_CENTRE = np.array([True, False, False, True, True, True])
@@ -31,7 +30,7 @@ LOSS_PX = 0.2
 """Scale of the robust losses: about twice the noise of the images, so that they take effect."""
 
 
-class BundleStage:
+class BundleStage(Stage):
     """The same problem, start and loss for all methods."""
 
     name = "bundle"
@@ -45,13 +44,13 @@ class BundleStage:
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return scene == STREET or is_photographs(scene, options)
+        return scene == STREET or has_images(scene, options)
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         return (OURS, CERES)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the same for both)
-        return (("cameras", OUR_CAMERAS),)
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return (("cameras", OURS),)
 
     def run(self, task: Task, options: ReportOptions) -> None:
         place = options.place(task.stage, task.scene, task.method)
@@ -60,42 +59,28 @@ class BundleStage:
         np.savez(place / "covariances.npz", poses=poses, camera=camera)
         if task.scene == STREET:
             return
-        cameras, X, seen, size = _problem(task.scene, options)
-        adjusted, points, seconds = _adjust(task.method, cameras, X, seen, size)
-        np.savez(
-            place / "adjusted.npz",
-            R=adjusted.R,
-            t=adjusted.t,
-            intrinsics=adjusted.intrinsics,
-            X=points,
-            seconds=seconds,
-        )
+        adjusted, X, seconds = _adjust(task.method, *_problem(task.scene, options))
+        R, t, intrinsics = adjusted.R, adjusted.t, adjusted.intrinsics
+        np.savez(place / "adjusted.npz", R=R, t=t, intrinsics=intrinsics, X=X, seconds=seconds)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
+        covariances = _covariance_metrics(scene, outcomes)
         if scene == STREET:
-            return Judgement(_covariance_metrics(scene, outcomes), notes=notes)
+            return Judgement(covariances)
         cameras, _, seen, _ = _problem(scene, options)
-        kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
-        costs = {n: None if k is None else _cost(k, cameras.group, seen) for n, k in kept.items()}
-        focals = {n: None if k is None else float(k["intrinsics"][0, 0]) for n, k in kept.items()}
-        seconds = {n: None if k is None else float(k["seconds"]) for n, k in kept.items()}
-        ours, ceres = costs[OURS], costs[CERES]
-        over = ours / ceres - 1.0 if ours is not None and ceres else None
-        notes.append(f"{2 * len(seen.xy)} residuals.")
-        cost_words = "1/2 sum of rho(r^2), soft L1 at 0.2 px"
-        return Judgement(
-            [
-                Metric(scene, "cost", "px^2", costs, OURS, definition=cost_words),
-                Metric(
-                    scene, "cost above Ceres", "", {OURS: over}, OURS, definition="ratio of costs minus 1"
-                ),
-                Metric(scene, "focal length", "px", focals, OURS, definition="of the first camera"),
-                Metric(scene, "time", "s", seconds, OURS, definition="processor time of the second run"),
-                *_covariance_metrics(scene, outcomes),
-            ],
-            notes=notes,
-        )
+        found = {name: read_arrays(outcome, "adjusted.npz") for name, outcome in outcomes.items()}
+        costs = each(found, lambda f: _cost(f, cameras.group, seen))
+        over = ratio(costs[OURS], costs[CERES])
+        focals, seconds = each(found, lambda f: f["intrinsics"][0, 0]), each(found, lambda f: f["seconds"])
+        above = None if over is None else over - 1.0
+        metrics = [
+            row(scene, "cost", "px^2", costs, "1/2 sum of rho(r^2), soft L1 at 0.2 px"),
+            row(scene, "cost above Ceres", "", above, "ratio of costs minus 1"),
+            row(scene, "focal length", "px", focals, "of the first camera"),
+            row(scene, "time", "s", seconds, "processor time of the second run"),
+            *covariances,
+        ]
+        return Judgement(metrics, notes=[f"{2 * len(seen.xy)} residuals."])
 
 
 Problem = tuple[MetricCameras, F64, Observations, tuple[int, int]]
@@ -103,9 +88,8 @@ Problem = tuple[MetricCameras, F64, Observations, tuple[int, int]]
 
 def _problem(scene: str, options: ReportOptions) -> Problem:
     """Return the saved model, perturbed."""
-    model = _saved(scene, options)
-    cameras, X, seen = perturbed_model(model, np.random.default_rng(options.seed))
-    return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
+    model, size = _saved(scene, options)
+    return *perturbed_model(model, np.random.default_rng(options.seed)), size
 
 
 def _optimum(scene: str, options: ReportOptions) -> Problem:
@@ -113,25 +97,16 @@ def _optimum(scene: str, options: ReportOptions) -> Problem:
     if scene == STREET:
         walk = make_walk(12, "street", np.random.default_rng(4))
         return walk.cameras, walk.X, walk.seen, SIZE
-    model = _saved(scene, options)
-    cameras, X, seen = model_as_bundle(model)
-    return cameras, X, seen, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
+    model, size = _saved(scene, options)
+    return *model_as_bundle(model), size
 
 
-def _saved(scene: str, options: ReportOptions) -> Reconstruction:
-    photographs = load_photographs(scene, options)
-    outcome = Outcome(options.place("cameras", scene, OUR_CAMERAS))
-    model = read_model(photographs, OUR_CAMERAS, outcome)
-    if model is None:
-        raise ValueError(f"our model of {scene} is missing: run the stage cameras too")
-    return _registered_only(model)
-
-
-def _registered_only(model: Reconstruction) -> Reconstruction:
-    """Return the model if all views have a camera."""
-    if model.registered.all():
-        return model
-    raise ValueError("an image has no camera, so this model is not adjusted")
+def _saved(scene: str, options: ReportOptions) -> tuple[Reconstruction, tuple[int, int]]:
+    """Return our model and the size of its images."""
+    model = our_model(load_images(scene, options), options)
+    if not model.registered.all():
+        raise ValueError("an image has no camera, so this model is not adjusted")
+    return model, (int(model.sizes[0, 0]), int(model.sizes[0, 1]))
 
 
 def _adjust(
@@ -147,11 +122,6 @@ def _adjust(
         fit = refine_metric_bundle(cameras, X, seen, free=FOCAL_K1, options=options)
         seconds = time.process_time() - start
     return fit.cameras, fit.X, seconds
-
-
-def _read(outcome: Outcome) -> dict[str, F64]:
-    with np.load(Path(outcome.place) / "adjusted.npz") as kept:
-        return {name: kept[name] for name in kept.files}
 
 
 def _cost(kept: Mapping[str, F64], group: np.ndarray, seen: Observations) -> float:
@@ -183,19 +153,14 @@ def _covariances(
 
 
 def _covariance_metrics(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    if not all(o.ok for o in outcomes.values()):
-        return [Metric(scene, "largest difference of covariances", "std^2", {OURS: None}, OURS)]
-    covariances = {}
-    for name, outcome in outcomes.items():
-        with np.load(Path(outcome.place) / "covariances.npz") as kept:
-            covariances[name] = (kept["poses"][2:], kept["camera"][None])
-    off = [_off(a, b) for a, b in zip(covariances[OURS], covariances[CERES], strict=True)]
-    what = "entry of the covariances in units of COLMAP's standard deviations, ours minus COLMAP's"
+    ours, ceres = (read_arrays(outcomes[name], "covariances.npz") for name in (OURS, CERES))
+    if ours is None or ceres is None:
+        return [row(scene, "largest difference of covariances", "std^2", None)]
+    poses, camera = _off(ours["poses"][2:], ceres["poses"][2:]), _off(ours["camera"], ceres["camera"])
+    words = "largest entry of the covariances in units of COLMAP's standard deviations, ours minus COLMAP's"
     return [
-        Metric(scene, "covariance of poses", "std^2", {OURS: off[0]}, OURS, definition=f"largest {what}"),
-        Metric(
-            scene, "covariance of intrinsics", "std^2", {OURS: off[1]}, OURS, definition=f"largest {what}"
-        ),
+        row(scene, "covariance of poses", "std^2", poses, words),
+        row(scene, "covariance of intrinsics", "std^2", camera, words),
     ]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,8 +19,9 @@ from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
 from thesisrecon.runtime.run import FOLDERS
 from thesisrecon.settings import config_from_tables
-from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Task
-from validation.harness.scenes import is_photographs, load_photographs, truth_of
+from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
+from validation.harness.scenes import has_images, load_images, truth_of
+from validation.harness.stages._shared import OURS, Values, each, plot, row, scatter
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
@@ -29,7 +29,7 @@ from validation.references.colmap_mapping import Start, map_with_pycolmap
 from validation.references.colmap_matching import match_with_pycolmap
 from validation.scenes.real import Scene
 
-OURS, THESIS, PER_IMAGE = "ours", "ours (thesis)", "ours (a camera each)"
+THESIS, PER_IMAGE = "ours (thesis)", "ours (a camera each)"
 COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, global"
 MATCHES = "COLMAP, matches"
 FIXTURE = "courtyard"
@@ -48,7 +48,7 @@ ROTATION = "median angle after the rotation common to all cameras is taken off"
 SHARE_HELD = "share of focal lengths and principal points whose stated 95 % interval contains the truth"
 
 
-class CamerasStage:
+class CamerasStage(Stage):
     """Reconstruction by ours and by COLMAP without priors on the same images."""
 
     name = "cameras"
@@ -60,14 +60,14 @@ class CamerasStage:
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return is_photographs(scene, options)
+        return has_images(scene, options)
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         if options.gates_only:
             return (OURS, THESIS) if scene == FIXTURE else (OURS, PER_IMAGE)
-        return (
-            (OURS, MATCHES, COLMAP, THESIS) if options.quick else (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
-        )
+        if options.quick:
+            return (OURS, MATCHES, COLMAP, THESIS)
+        return (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         if method == PER_IMAGE:
@@ -75,51 +75,47 @@ class CamerasStage:
         return ((self.name, MATCHES),) if method in MAPPERS else ()
 
     def run(self, task: Task, options: ReportOptions) -> None:
-        scene = load_photographs(task.scene, options)
+        scene = load_images(task.scene, options)
         place = options.place(task.stage, task.scene, task.method)
         if task.method not in SETTINGS:
             _run_colmap(task, scene, options, place)
             return
+        run, config = place / "run", SETTINGS[task.method]
         if task.method == PER_IMAGE:
             # The matches are the same.
-            matched = options.place(self.name, task.scene, OURS) / "run"
-            shutil.copytree(matched, place / "run", dirs_exist_ok=True)
+            shutil.copytree(options.place(self.name, task.scene, OURS) / "run", run, dirs_exist_ok=True)
+        paths, seed = list(scene.image_paths), options.seed
         thesisrecon.reconstruct(
-            list(scene.image_paths),
-            place / "run",
-            config=SETTINGS[task.method],
-            seed=options.seed,
-            threads=1,
-            until="metric",
-            overwrite=True,
+            paths, run, config=config, seed=seed, threads=1, until="metric", overwrite=True
         )
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        photographs = load_photographs(scene, options)
-        models = {m: read_model(photographs, m, o) for m, o in outcomes.items() if m != MATCHES}
-        shared = outcomes.get(MATCHES)
-        metrics = [*_numbers(photographs, models), *_costs(scene, outcomes, shared)]
-        metrics += _before_adjustment(photographs, outcomes.get(OURS))
-        metrics += [*_per_image(photographs, models.get(PER_IMAGE)), *_stated(photographs, outcomes)]
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
-        return Judgement(metrics, plots=_plots(photographs, models), notes=notes)
+        images = load_images(scene, options)
+        models = {m: read_model(images, m, o) for m, o in outcomes.items() if m != MATCHES}
+        metrics = [*_errors(images, models), *_fit(images, models), *_costs(scene, outcomes)]
+        metrics += _before_adjustment(images, outcomes.get(OURS))
+        metrics += [*_per_image(images, models.get(PER_IMAGE)), *_stated(images, outcomes)]
+        return Judgement(metrics, plots=[_plot(images, models)])
 
 
 def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
     """Return the saved model of a method in image order, or None."""
     names = [path.name for path in scene.image_paths]
+    folder = outcome.place / "run" if method in SETTINGS else outcome.place
     try:
-        if method in SETTINGS:
-            return reconstruction_from_colmap(
-                read_colmap_model(outcome.place / "run" / "sparse" / "0"), names=names
-            )
-        folders = sorted(path for path in (outcome.place / "sparse").glob("*") if path.is_dir())
-        if not folders:
-            return None
-        largest = max((read_colmap_model(path) for path in folders), key=lambda model: len(model.images))
-        return reconstruction_from_colmap(largest, names=names)
+        models = [read_colmap_model(path) for path in sorted((folder / "sparse").glob("*")) if path.is_dir()]
+        largest = max(models, key=lambda model: len(model.images), default=None)
+        return None if largest is None else reconstruction_from_colmap(largest, names=names)
     except (StageFailure, OSError):
         return None
+
+
+def our_model(scene: Scene, options: ReportOptions) -> Reconstruction:
+    """Return our saved reconstruction of a scene; ``ValueError`` if missing."""
+    model = read_model(scene, OURS, Outcome(options.place("cameras", scene.name, OURS)))
+    if model is None:
+        raise ValueError(f"our model of {scene.name} is missing: run the stage cameras too")
+    return model
 
 
 def _run_colmap(task: Task, scene: Scene, options: ReportOptions, place: Path) -> None:
@@ -133,50 +129,37 @@ def _run_colmap(task: Task, scene: Scene, options: ReportOptions, place: Path) -
     map_with_pycolmap(images, matched, place, start=start, threads=1, mapper=mapper)
 
 
-def _numbers(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
-    registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
-    words = "share of the images"
-    rows = [Metric(scene.name, "registered", "%", registered, OURS, at_most=False, definition=words)]
-    return [*rows, *_errors(scene, models), *_fit(scene, models)]
-
-
 def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
     """Compare the cameras with the true ones, if known."""
+    registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
+    rows = [row(scene.name, "registered", "%", registered, "share of the images", more=True)]
     truth = truth_of(scene)
     if truth is None:
-        return []
+        return rows
     errors = {n: None if m is None else measure_cameras(m, truth) for n, m in models.items()}
-
-    def row(name: str, unit: str, read: Callable[[CameraErrors], float | None], words: str) -> list[Metric]:
-        values = {n: None if e is None else read(e) for n, e in errors.items()}
-        found = [Metric(scene.name, name, unit, values, OURS, definition=words)]
+    numbers: tuple[tuple[str, str, Callable[[CameraErrors], float | None], str], ...] = (
+        ("focal error", "%", lambda e: e.focal_error_pct, FOCAL),
+        ("principal point error", "px", lambda e: e.principal_point_error_px, PRINCIPAL_POINT),
+        ("centre error", "mm", lambda e: None if e.centre_error is None else 1000.0 * e.centre_error, CENTRE),
+        ("rotation error", "deg", lambda e: e.rotation_error_deg, ROTATION),
+    )
+    for name, unit, read, words in numbers:
+        values: Values = {n: None if e is None else read(e) for n, e in errors.items()}
+        rows.append(row(scene.name, name, unit, values, words))
         if THESIS in values:
-            of_thesis = {OURS: values[THESIS]}
-            found.append(Metric(scene.name, f"{THESIS}: {name}", unit, of_thesis, OURS, definition=words))
-        return found
-
-    return [
-        *row("focal error", "%", lambda e: e.focal_error_pct, FOCAL),
-        *row("principal point error", "px", lambda e: e.principal_point_error_px, PRINCIPAL_POINT),
-        *row("centre error", "mm", _millimetres, CENTRE),
-        *row("rotation error", "deg", lambda e: e.rotation_error_deg, ROTATION),
-    ]
+            rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], words))
+    return rows
 
 
 def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
     """Return reprojection errors and numbers of points."""
     residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
-    points = {n: None if m is None else float(m.valid.sum()) for n, m in models.items()}
-    median = {n: None if r is None else r.median_px for n, r in residuals.items()}
-    seen = {n: r.observations / p if r and (p := points[n]) else None for n, r in residuals.items()}
-
-    def row(name: str, unit: str, values: dict[str, float | None], more: bool, words: str) -> Metric:
-        return Metric(scene.name, name, unit, values, OURS, at_most=not more, definition=words)
-
+    points = each(models, lambda m: m.valid.sum())
+    seen: Values = {n: r.observations / p if r and (p := points[n]) else None for n, r in residuals.items()}
     return [
-        row("reprojection", "px", median, False, REPROJECTION),
-        row("observations a point", "", seen, True, "inlier observations over points"),
-        row("points", "", points, True, "valid points of the model"),
+        row(scene.name, "reprojection", "px", each(residuals, lambda r: r.median_px), REPROJECTION),
+        row(scene.name, "observations a point", "", seen, "inlier observations over points", more=True),
+        row(scene.name, "points", "", points, "valid points of the model", more=True),
     ]
 
 
@@ -184,46 +167,37 @@ def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
     """Evaluate chapters 6 and 7 separately, before the metric stage corrects their errors."""
     if outcome is None or not outcome.ok:
         return []
-    projective = _kept(outcome, "projective")
+    projective = _last_record(outcome, "projective")
     t, P, X = projective.tracks, projective.P, projective.X
     seen = projective.inlier & projective.registered[t.view_index] & projective.valid[t.point_index]
     x = np.einsum("kab,kb->ka", P[t.view_index[seen]], X[t.point_index[seen]])
     residual = float(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[seen], axis=1)))
     words = f"{REPROJECTION}, by the projective model"
-    rows = [Metric(scene.name, "projective reprojection", "px", {OURS: residual}, OURS, definition=words)]
+    rows = [row(scene.name, "projective reprojection", "px", residual, words)]
     if scene.K is None:
         return rows
-    K = _kept(outcome, "selfcalibration").K
+    K = _last_record(outcome, "selfcalibration").K
     known = np.isfinite(K).all(axis=(1, 2)) & (K[:, 0, 0] > 0.0)
     error = float(np.median(focal_errors_pct(K[known], scene.K[known])))
     words = f"{FOCAL}, as self-calibration leaves it"
-    return [
-        *rows,
-        Metric(scene.name, "self-calibrated focal error", "%", {OURS: error}, OURS, definition=words),
-    ]
+    return [*rows, row(scene.name, "self-calibrated focal error", "%", error, words)]
 
 
-def _kept(outcome: Outcome, stage: str) -> Any:
+def _last_record(outcome: Outcome, stage: str) -> Any:
     """Return the last record of a stage of the run."""
     folder = RunDirectory(outcome.place / "run").stage(FOLDERS[stage])
     *_, (item, key) = read_json(folder.path / MANIFEST_FILE)["keys"].items()
     return folder.load(item, key)
 
 
-def _costs(scene: str, outcomes: Mapping[str, Outcome], shared: Outcome | None) -> list[Metric]:
+def _costs(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     """Return processor seconds and memory; COLMAP's mappers include the shared matching."""
-
-    def seconds(name: str, outcome: Outcome) -> float | None:
-        if not outcome.ok:
-            return None
-        return outcome.cpu_s + (shared.cpu_s if shared is not None and name in MAPPERS else 0.0)
-
-    kept = {n: o for n, o in outcomes.items() if n != MATCHES}
-    times = {n: seconds(n, o) for n, o in kept.items()}
-    memory = {n: o.peak_mb if o.ok else None for n, o in kept.items()}
+    done = {n: o if o.ok else None for n, o in outcomes.items() if n != MATCHES}
+    shared = outcomes[MATCHES].cpu_s if MATCHES in outcomes else 0.0
+    times: Values = {n: None if o is None else o.cpu_s + shared * (n in MAPPERS) for n, o in done.items()}
     return [
-        Metric(scene, "time", "s", times, OURS, definition="processor seconds from images to cameras"),
-        Metric(scene, "peak memory", "MB", memory, OURS, definition="of the process"),
+        row(scene, "time", "s", times, "processor seconds from images to cameras"),
+        row(scene, "peak memory", "MB", each(done, lambda o: o.peak_mb), "of the process"),
     ]
 
 
@@ -232,60 +206,35 @@ def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
     if scene.K is None or model is None or model.K is None or not model.registered.any():
         return []
     errors = focal_errors_pct(model.K[model.registered], scene.K[model.registered])
-    words = "|f / f_true - 1| over the images, with independent cameras"
+    words, name = "|f / f_true - 1| over the images, with independent cameras", "focal error, a camera each"
     return [
-        Metric(
-            scene.name,
-            "focal error, a camera each",
-            "%",
-            {OURS: float(np.median(errors))},
-            OURS,
-            definition=f"median {words}",
-        ),
-        Metric(
-            scene.name,
-            "worst focal error, a camera each",
-            "%",
-            {OURS: float(errors.max())},
-            OURS,
-            definition=f"largest {words}",
-        ),
+        row(scene.name, name, "%", float(np.median(errors)), f"median {words}"),
+        row(scene.name, f"worst {name}", "%", float(errors.max()), f"largest {words}"),
     ]
 
 
 def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     """Return self-check results and the coverage of the stated intervals."""
-    records: dict[str, dict[str, Any]] = {}
-    for name in (n for n in SETTINGS if n in outcomes and outcomes[n].ok):
-        text = (outcomes[name].place / "run" / "summary.json").read_text(encoding="utf-8")
-        records[name] = json.loads(text)
-    trusted: dict[str, float | None] = {n: float(bool(t["trusted"])) for n, t in records.items()}
-    silent = {n: float(sum(not r["reason"] for r in t["refused"])) for n, t in records.items()}
+    records: dict[str, Any] = {
+        name: read_json(outcomes[name].place / "run" / "summary.json")
+        for name in SETTINGS
+        if name in outcomes and outcomes[name].ok
+    }
+    trusted = each(records, lambda r: bool(r["trusted"]))
+    silent = each(records, lambda r: sum(not refused["reason"] for refused in r["refused"]))
     rows = [
-        Metric(
-            scene.name, "trusted", "", trusted, OURS, at_most=False, definition="1: passed its self-check"
-        ),
-        Metric(scene.name, "refused without a reason", "", {**silent}, OURS, definition="photographs"),
+        row(scene.name, "trusted", "", trusted, "1: passed its self-check", more=True),
+        row(scene.name, "refused without a reason", "", silent, "images"),
     ]
-    truth = truth_of(scene)
-    if truth is None or not records:
+    if scene.K is None or not records:
         return rows
     for name, where in ((OURS, ""), (PER_IMAGE, ", a camera each")):
         cameras = records.get(name, {}).get("cameras", [])
-        held: dict[str, float | None] = {OURS: _share_held(cameras, truth.K) if cameras else None}
-        widest = {OURS: _widest(cameras)}
+        held = _share_held(cameras, scene.K) if cameras else None
         words = "largest stated standard deviation of a focal length"
         rows += [
-            Metric(
-                scene.name,
-                f"intervals that hold{where}",
-                "%",
-                held,
-                OURS,
-                at_most=False,
-                definition=SHARE_HELD,
-            ),
-            Metric(scene.name, f"widest focal interval{where}", "%", widest, OURS, definition=words),
+            row(scene.name, f"intervals that hold{where}", "%", held, SHARE_HELD, more=True),
+            row(scene.name, f"widest focal interval{where}", "%", _widest(cameras), words),
         ]
     return rows
 
@@ -308,45 +257,16 @@ def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float
     return 100.0 * float(np.mean(held)) if held else None
 
 
-def _millimetres(errors: CameraErrors) -> float | None:
-    return None if errors.centre_error is None else 1000.0 * errors.centre_error
-
-
-def _plots(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Plot]:
+def _plot(scene: Scene, models: Mapping[str, Reconstruction | None]) -> Plot:
     """Plot the focal length of every image by each method, and the true one."""
-    traces: list[dict[str, Any]] = []
-    for name, model in models.items():
-        if model is None:
-            continue
-        focal = _focals(model)
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "name": name,
-                "x": list(range(1, len(focal) + 1)),
-                "y": focal,
-            }
-        )
+    focals = {name: _focals(model) for name, model in models.items() if model is not None}
+    images = range(1, len(scene.image_paths) + 1)
+    traces = [scatter(name, images, focal) for name, focal in focals.items()]
     if scene.K is not None:
         true = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
         marker = {"symbol": "line-ew-open", "size": 18, "color": "#1b2733"}
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "name": "truth",
-                "x": list(range(1, len(true) + 1)),
-                "y": true,
-                "marker": marker,
-            }
-        )
-    layout = {
-        "xaxis": {"title": {"text": "photograph"}},
-        "yaxis": {"title": {"text": "focal length (px)"}},
-        "margin": {"l": 70, "r": 10, "t": 10, "b": 50},
-    }
-    return [Plot("Focal lengths", {"data": traces, "layout": layout})]
+        traces.append(scatter("truth", images, true, marker=marker))
+    return plot("Focal lengths", traces, "image", "focal length (px)")
 
 
 def _focals(model: Reconstruction) -> list[float | None]:

@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.records import Reconstruction
-from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Task, slug
-from validation.harness.scenes import is_photographs, load_photographs
-from validation.harness.stages.cameras import COLMAP, COLMAP_PP, OURS, read_model
+from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task, slug
+from validation.harness.scenes import has_images, load_images
+from validation.harness.stages._shared import OURS, read_arrays, row
+from validation.harness.stages.cameras import COLMAP, COLMAP_PP, read_model
 from validation.metrics.record import Metric
 from validation.metrics.similarity import Similarity, estimate_similarity
 from validation.references.open3d_clouds import refine_by_icp, render_difference
@@ -31,7 +32,7 @@ SAME_PX = 1.0
 """Points of two models are the same if observed within this distance (px)."""
 
 
-class CloudsStage:
+class CloudsStage(Stage):
     """Two clouds of one scene, aligned by their cameras."""
 
     name = "clouds"
@@ -43,18 +44,18 @@ class CloudsStage:
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return is_photographs(scene, options)
+        return has_images(scene, options)
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         return () if options.gates_only else (ICP, PICTURES)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the same for all)
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
 
     def run(self, task: Task, options: ReportOptions) -> None:
         place = options.place(task.stage, task.scene, task.method)
-        photographs = load_photographs(task.scene, options)
-        for name, (mine, other, unit) in _pairs_of_clouds(photographs, _models(photographs, options)).items():
+        images = load_images(task.scene, options)
+        for name, (mine, other, unit) in _pairs_of_clouds(images, _models(images, options)).items():
             if task.method == PICTURES:
                 render_difference(place / f"{slug(name)}.png", mine, other, NEAR_PCT / 100.0 * unit)
                 continue
@@ -62,16 +63,14 @@ class CloudsStage:
             np.savez(place / f"{slug(name)}.npz", transform=transform)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        photographs = load_photographs(scene, options)
-        models = _models(photographs, options)
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
+        images = load_images(scene, options)
+        models = _models(images, options)
         ours = models[OURS]
         if ours is None or (models[COLMAP] is None and models[COLMAP_PP] is None):
             names = ", ".join(name for name, model in models.items() if model is None)
-            return Judgement((), notes=[f"There is no model of {names} to compare.", *notes])
-        metrics: list[Metric] = []
-        plots, pictures = list[Plot](), list[Picture]()
-        clouds = _pairs_of_clouds(photographs, models)
+            return Judgement((), notes=[f"There is no model of {names} to compare."])
+        metrics, plots, pictures = list[Metric](), list[Plot](), list[Picture]()
+        clouds = _pairs_of_clouds(images, models)
         for name, (mine, other, unit) in clouds.items():
             theirs = models[name]
             assert theirs is not None
@@ -81,7 +80,7 @@ class CloudsStage:
             plots.append(_plot(name, mine, other, unit))
             pictures += _pictures(options.place(self.name, scene), name, outcomes.get(PICTURES))
         few = [name for name in (COLMAP, COLMAP_PP) if models[name] is not None and name not in clouds]
-        notes += [f"{name}: too few common cameras to align the clouds." for name in few]
+        notes = [f"{name}: too few common cameras to align the clouds." for name in few]
         return Judgement(metrics, plots, pictures, notes)
 
 
@@ -165,23 +164,11 @@ def _same_points(
         return []
     apart = 100.0 * np.linalg.norm(mine[pairs[:, 0]] - other[pairs[:, 1]], axis=1) / unit
     words = "distance of ours to theirs, for points observed by both within a pixel"
+    most = f"90 % quantile of the {words}"
     return [
-        Metric(
-            scene,
-            f"points shared with {name}",
-            "",
-            {OURS: float(len(pairs))},
-            OURS,
-            at_most=False,
-            definition=words,
-        ),
-        _row(scene, f"shared with {name}: median apart", np.median(apart), f"median {words}"),
-        _row(
-            scene,
-            f"shared with {name}: 90 % within",
-            np.quantile(apart, 0.9),
-            f"90 % quantile of the {words}",
-        ),
+        row(scene, f"points shared with {name}", "", float(len(pairs)), words, more=True),
+        _distance(scene, f"shared with {name}: median apart", np.median(apart), f"median {words}"),
+        _distance(scene, f"shared with {name}: 90 % within", np.quantile(apart, 0.9), most),
     ]
 
 
@@ -198,20 +185,13 @@ def _moved(model: Reconstruction, move: Similarity) -> F64:
 def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float) -> list[Metric]:
     forth, back = (100.0 * cKDTree(b).query(a)[0] / unit for a, b in ((mine, other), (other, mine)))
     share = 100.0 * float(np.mean(forth <= NEAR_PCT))
+    words = "median distance of a point of ours to the nearest"
+    back_words = "median distance of one of their points to the nearest"
+    near = f"share of our points with one of theirs within {NEAR_PCT} %"
     return [
-        _row(scene, f"ours to {name}", np.median(forth), "median distance of a point of ours to the nearest"),
-        _row(
-            scene, f"{name} to ours", np.median(back), "median distance of one of their points to the nearest"
-        ),
-        Metric(
-            scene,
-            f"near {name}",
-            "%",
-            {OURS: share},
-            OURS,
-            at_most=False,
-            definition=f"share of our points with one of theirs within {NEAR_PCT} %",
-        ),
+        _distance(scene, f"ours to {name}", np.median(forth), words),
+        _distance(scene, f"{name} to ours", np.median(back), back_words),
+        row(scene, f"near {name}", "%", share, near, more=True),
     ]
 
 
@@ -219,10 +199,10 @@ def _icp_metrics(
     scene: str, name: str, mine: F64, other: F64, unit: float, outcome: Outcome | None
 ) -> list[Metric]:
     """Return the motion and the inlier share of Open3D's ICP."""
-    if outcome is None or not outcome.ok:
+    found = read_arrays(outcome, f"{slug(name)}.npz")
+    if found is None:
         return []
-    with np.load(outcome.place / f"{slug(name)}.npz") as kept:
-        R, t = kept["transform"][:3, :3], kept["transform"][:3, 3]
+    R, t = found["transform"][:3, :3], found["transform"][:3, 3]
     turn = float(np.degrees(np.linalg.norm(Rotation.from_matrix(R).as_rotvec())))
     middle = np.median(mine, axis=0)
     shift = float(np.linalg.norm(R @ middle + t - middle))
@@ -230,34 +210,28 @@ def _icp_metrics(
     turned = "rotation by which ICP still turns our cloud after the similarity"
     near = "share of our points with a partner after ICP"
     return [
-        Metric(scene, f"ICP to {name}: turn", "deg", {OURS: turn}, OURS, definition=turned),
-        _row(scene, f"ICP to {name}: shift", 100.0 * shift / unit, "shift of the cloud centre"),
-        Metric(scene, f"ICP to {name}: inliers", "%", {OURS: share}, OURS, at_most=False, definition=near),
+        row(scene, f"ICP to {name}: turn", "deg", turn, turned),
+        _distance(scene, f"ICP to {name}: shift", 100.0 * shift / unit, "shift of the cloud centre"),
+        row(scene, f"ICP to {name}: inliers", "%", share, near, more=True),
     ]
 
 
-def _row(scene: str, name: str, value: float, words: str) -> Metric:
-    return Metric(scene, name, "% of distance", {OURS: float(value)}, OURS, definition=words)
+def _distance(scene: str, name: str, value: float, words: str) -> Metric:
+    return row(scene, name, "% of distance", float(value), words)
 
 
 def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
     """Plot both clouds: ours coloured by the distance to theirs, theirs grey."""
     distance = 100.0 * cKDTree(other).query(mine)[0] / unit
-    ours, theirs = _thinned(mine), _thinned(other)
     low, high = np.quantile(mine, [0.02, 0.98], axis=0)
     margin = 0.3 * (high - low).max()
+    shades = np.minimum(distance[_thinned(mine)], 2.0).round(3).tolist()
+    scale = {"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "showscale": True}
+    bar = {"colorbar": {"title": {"text": "% of distance"}}}
     traces = [
-        _trace("ours", mine[ours], {"size": 2, "color": np.minimum(distance[ours], 2.0).round(3).tolist()}),
-        _trace(name, other[theirs], {"size": 1.5, "color": "#9aa5ad"}),
+        _trace("ours", mine, {"size": 2, "color": shades, **scale, **bar}),
+        _trace(name, other, {"size": 1.5, "color": "#9aa5ad"}),
     ]
-    bar = {"title": {"text": "% of distance"}}
-    traces[0]["marker"] |= {
-        "colorscale": "Viridis",
-        "cmin": 0.0,
-        "cmax": 1.0,
-        "showscale": True,
-        "colorbar": bar,
-    }
     axes = {
         f"{axis}axis": {"range": [float(low[k] - margin), float(high[k] + margin)], "visible": False}
         for k, axis in enumerate("xyz")
@@ -268,8 +242,8 @@ def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
 
 
 def _trace(name: str, X: F64, marker: dict[str, Any]) -> dict[str, Any]:
-    digits = 4
-    xyz = {axis: np.round(X[:, k], digits).tolist() for k, axis in enumerate("xyz")}
+    shown = np.round(X[_thinned(X)], 4)
+    xyz = {axis: shown[:, k].tolist() for k, axis in enumerate("xyz")}
     return {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, **xyz}
 
 

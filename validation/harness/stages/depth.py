@@ -10,24 +10,24 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F32
+from thesisrecon.arrays import F32, U8
 from thesisrecon.config import preset
 from thesisrecon.io._files import write_text
 from thesisrecon.io.images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.neighbours import pinhole_view
-from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Task
-from validation.harness.scenes import load_photographs
-from validation.harness.stages.cameras import OURS as OUR_CAMERAS
-from validation.harness.stages.cameras import read_model
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.scenes import load_images
+from validation.harness.stages._shared import OURS, each, row
+from validation.harness.stages.cameras import our_model
 from validation.metrics.depth import (
     Judged,
     JudgedMaps,
     TrueDepth,
-    coloured,
     depth_colours,
     depth_range,
+    error_colours,
     judge_against_points,
     judge_against_truth,
     together,
@@ -37,7 +37,7 @@ from validation.metrics.depth import (
 from validation.metrics.record import Metric
 from validation.scenes.real import Scene, load_fixture_depth
 
-OURS, THESIS = "ours", "ours (thesis)"
+THESIS = "ours (thesis)"
 PRESETS = {OURS: "default", THESIS: "thesis"}
 COURTYARD = "courtyard"
 SCENES = (COURTYARD, "fountain-P11", "Herz-Jesus-P8")
@@ -47,7 +47,7 @@ WORST = 0.02
 """Relative error that is red in the figures."""
 
 
-class DepthStage:
+class DepthStage(Stage):
     """Depth maps of the default and the thesis preset, from our cameras."""
 
     name = "depth"
@@ -69,39 +69,37 @@ class DepthStage:
         whole = scene == COURTYARD and not (options.quick or options.gates_only)
         return (OURS, THESIS) if whole else (OURS,)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:  # noqa: ARG002 (the same for all)
-        return (("cameras", OUR_CAMERAS),)
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return (("cameras", OURS),)
 
     def run(self, task: Task, options: ReportOptions) -> None:
-        photographs = load_photographs(task.scene, options)
-        images, model = images_of(photographs), model_of(photographs, options)
-        stereo = stereo_of(task.method, options)
+        scene = load_images(task.scene, options)
+        images, model = images_of(scene), our_model(scene, options)
+        dense = preset(PRESETS[task.method]).dense
+        assert isinstance(dense, MultiViewStereo)
         start = time.process_time()
-        maps = stereo.map_all(images, model, threads=1)
+        maps = replace(dense, max_side=side_of(options)).map_all(images, model, threads=1)
         seconds = time.process_time() - start
         place = options.place(task.stage, task.scene, task.method)
-        for view, found in maps.items():
-            np.savez(
-                place / f"{view:04d}.npz", P=found.P, depth=found.depth, std=found.std, views=found.views
-            )
+        for view, m in maps.items():
+            np.savez(place / f"{view:04d}.npz", P=m.P, depth=m.depth, std=m.std, views=m.views)
         write_text(place / "seconds.txt", f"{seconds / max(len(maps), 1)}\n")
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        photographs = load_photographs(scene, options)
-        model = model_of(photographs, options)
-        kept = {name: read_maps(o.place) if o.ok else {} for name, o in outcomes.items()}
-        truths = _truths(photographs, kept)
-        judged = {n: together(_judged(maps, photographs, model, truths)) for n, maps in kept.items() if maps}
-        seconds = {
-            n: float((outcomes[n].place / "seconds.txt").read_text()) if maps else None
-            for n, maps in kept.items()
+        images = load_images(scene, options)
+        model = our_model(images, options)
+        found = {name: read_maps(o.place) if o.ok else {} for name, o in outcomes.items()}
+        views = sorted({view for maps in found.values() for view in maps})
+        truths = {view: true_depth(images, view) for view in views} if scene == COURTYARD else {}
+        judged = {
+            name: together(_judged(maps, images, model, truths)) if maps else None
+            for name, maps in found.items()
         }
-        metrics = _metrics(scene, {n: judged.get(n) for n in outcomes})
-        metrics.append(
-            Metric(scene, "time a view", "s", seconds, OURS, definition="processor time, compiling included")
-        )
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
-        return Judgement(metrics, pictures=_pictures(photographs, kept, model, self, options), notes=notes)
+        known = {name: outcomes[name].place if maps else None for name, maps in found.items()}
+        seconds = each(known, lambda place: (place / "seconds.txt").read_text())
+        words = "processor time, compiling included"
+        metrics = [*_metrics(scene, judged), row(scene, "time a view", "s", seconds, words)]
+        return Judgement(metrics, pictures=_pictures(images, found, model, options))
 
 
 def side_of(options: ReportOptions) -> int:
@@ -109,34 +107,19 @@ def side_of(options: ReportOptions) -> int:
     return options.side_px or SIDE_PX
 
 
-def stereo_of(method: str, options: ReportOptions) -> MultiViewStereo:
-    """Return the stereo method of a preset, at the size of this report."""
-    dense = preset(PRESETS[method]).dense
-    assert isinstance(dense, MultiViewStereo)
-    return replace(dense, max_side=side_of(options))
-
-
-def images_of(photographs: Scene) -> list[Image]:
+def images_of(scene: Scene) -> list[Image]:
     """Read the original images in scene order."""
-    read = read_images(list(photographs.image_paths), max_size_px=10_000)
+    read = read_images(list(scene.image_paths), max_size_px=10_000)
     by_name = {image.name: image for image in read.images}
-    return [by_name[path.name] for path in photographs.image_paths]
+    return [by_name[path.name] for path in scene.image_paths]
 
 
-def model_of(photographs: Scene, options: ReportOptions) -> Reconstruction:
-    """Return our saved reconstruction of a scene; ``ValueError`` if missing."""
-    outcome = Outcome(options.place("cameras", photographs.name, OUR_CAMERAS))
-    model = read_model(photographs, OUR_CAMERAS, outcome)
-    if model is None:
-        raise ValueError(f"our model of {photographs.name} is missing: run the stage cameras too")
-    return model
-
-
-def views_of(photographs: Scene, model: Reconstruction, options: ReportOptions) -> dict[int, PinholeView]:
+def views_of(scene: Scene, options: ReportOptions) -> dict[int, PinholeView]:
     """Return undistorted images at depth-map size, by view."""
+    model = our_model(scene, options)
     return {
         i: pinhole_view(image, model, i, max_side=side_of(options))
-        for i, image in enumerate(images_of(photographs))
+        for i, image in enumerate(images_of(scene))
         if model.registered[i]
     }
 
@@ -145,27 +128,26 @@ def read_maps(place: Path) -> dict[int, DepthMap]:
     """Saved depth maps by view."""
     maps = {}
     for file in sorted(Path(place).glob("[0-9]*.npz")):
-        with np.load(file) as kept:
+        with np.load(file) as m:
             view = int(file.stem)
-            maps[view] = DepthMap(view, kept["P"], kept["depth"], kept["std"], kept["views"])
+            maps[view] = DepthMap(view, m["P"], m["depth"], m["std"], m["views"])
     return maps
 
 
-def _truths(photographs: Scene, kept: Mapping[str, Mapping[int, DepthMap]]) -> dict[int, TrueDepth]:
-    """Return the true depths of the views with a map, if known."""
-    if photographs.name != COURTYARD:
-        return {}
-    return {
-        view: true_depth(photographs, view) for view in sorted({v for maps in kept.values() for v in maps})
-    }
+def our_maps(scene: str, options: ReportOptions, method: str = OURS) -> dict[int, DepthMap]:
+    """Return the saved depth maps of this stage; ``ValueError`` without any."""
+    maps = read_maps(options.place("depth", scene, method))
+    if not maps:
+        raise ValueError(f"there are no depth maps of {scene}: run the stage depth too")
+    return maps
 
 
 def _judged(
-    maps: Mapping[int, DepthMap], photographs: Scene, model: Reconstruction, truths: Mapping[int, TrueDepth]
+    maps: Mapping[int, DepthMap], scene: Scene, model: Reconstruction, truths: Mapping[int, TrueDepth]
 ) -> list[Judged]:
     if not truths:
         return [judge_against_points(found, model) for found in maps.values()]
-    scale = true_from_maps(maps, photographs).scale
+    scale = true_from_maps(maps, scene).scale
     return [judge_against_truth(found, truths[view], scale) for view, found in maps.items()]
 
 
@@ -175,75 +157,46 @@ def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric
         if scene == COURTYARD
         else ("sparse points of the view", "depth of the sparse points")
     )
-
-    def row(
-        name: str, unit: str, read: Callable[[JudgedMaps], float], words: str, *, least: bool = False
-    ) -> Metric:
-        values = {n: None if j is None else read(j) for n, j in judged.items()}
-        return Metric(scene, name, unit, values, OURS, at_most=not least, definition=words)
-
+    error = f"median |z / z_true - 1| of all known depths against the {against}"
+    right = f"share of the {of} whose depth is known and right to 1 %, mean of the views"
+    right_known = "share of the known depths that are right to 1 %"
+    ideal = "median error over the stated standard deviation, over 0.6745: 1 is ideal"
+    least = "the least of these shares"
+    rows: tuple[tuple[str, str, Callable[[JudgedMaps], float], str, bool], ...] = (
+        ("depth error, median", "%", lambda j: 100.0 * j.median, error, False),
+        ("within 1 %", "%", lambda j: 100.0 * j.right, right, True),
+        ("within 1 %, worst view", "%", lambda j: 100.0 * j.worst, least, True),
+        ("known", "%", lambda j: 100.0 * j.known, f"share of the {of} that have a depth", True),
+        ("within 1 % of the known", "%", lambda j: 100.0 * j.right_of_known, right_known, True),
+        ("error in deviations", "", lambda j: j.deviations, ideal, False),
+    )
     return [
-        row(
-            "depth error, median",
-            "%",
-            lambda j: 100.0 * j.median,
-            f"median |z / z_true - 1| of all known depths against the {against}",
-        ),
-        row(
-            "within 1 %",
-            "%",
-            lambda j: 100.0 * j.right,
-            f"share of the {of} whose depth is known and right to 1 %, mean of the views",
-            least=True,
-        ),
-        row(
-            "within 1 %, worst view",
-            "%",
-            lambda j: 100.0 * j.worst,
-            "the least of these shares",
-            least=True,
-        ),
-        row("known", "%", lambda j: 100.0 * j.known, f"share of the {of} that have a depth", least=True),
-        row(
-            "within 1 % of the known",
-            "%",
-            lambda j: 100.0 * j.right_of_known,
-            "share of the known depths that are right to 1 %",
-            least=True,
-        ),
-        row(
-            "error in deviations",
-            "",
-            lambda j: j.deviations,
-            "median error over the stated standard deviation, over 0.6745: 1 is ideal",
-        ),
+        row(scene, name, unit, each(judged, read), words, more=more) for name, unit, read, words, more in rows
     ]
 
 
 def _pictures(
-    photographs: Scene,
-    kept: Mapping[str, Mapping[int, DepthMap]],
+    scene: Scene,
+    found: Mapping[str, Mapping[int, DepthMap]],
     model: Reconstruction,
-    stage: DepthStage,
     options: ReportOptions,
 ) -> list[Picture]:
     """Draw two views: image, maps, and, if known, truth and errors."""
-    views = sorted(set.intersection(*(set(maps) for maps in kept.values()))) if kept else []
+    views = sorted(set.intersection(*(set(maps) for maps in found.values()))) if found else []
     chosen = sorted({views[len(views) // 4], views[len(views) // 2]}) if views else []
-    images, place = images_of(photographs), options.place(stage.name, photographs.name)
+    images, place = images_of(scene), options.place(DepthStage.name, scene.name)
     pictures = []
     for view in chosen:
-        photograph = pinhole_view(images[view], model, view, max_side=side_of(options)).rgb
-        maps = {name: found[view] for name, found in kept.items()}
-        limits = depth_range([found.depth for found in maps.values()])
-        rows = [[photograph, *(depth_colours(found.depth, limits) for found in maps.values())]]
+        rgb = pinhole_view(images[view], model, view, max_side=side_of(options)).rgb
+        maps = {name: of_method[view] for name, of_method in found.items()}
+        limits = depth_range([m.depth for m in maps.values()])
+        rows = [[rgb, *(depth_colours(m.depth, limits) for m in maps.values())]]
         words = f"Image, {', then '.join(maps)}: near red, far blue, unknown black."
-        if photographs.name == COURTYARD:
-            scales = {name: true_from_maps(found, photographs).scale for name, found in kept.items()}
+        if scene.name == COURTYARD:
+            scales = {name: true_from_maps(of_method, scene).scale for name, of_method in found.items()}
             true = _true_map(view, next(iter(maps.values())).depth.shape)
             own = depth_colours((true / next(iter(scales.values()))).astype(np.float32), limits)
-            off = [_errors(found, true, scales[name]) for name, found in maps.items()]
-            rows.append([own, *off])
+            rows.append([own, *(_errors(m, true, scales[name]) for name, m in maps.items())])
             words += f" Below the truth, and errors from blue (none) to red ({100.0 * WORST:g} % or more)."
         file = f"view-{view:02d}.png"
         PIL.Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(place / file)
@@ -261,8 +214,7 @@ def _true_map(view: int, shape: Sequence[int]) -> F32:
     return np.asarray(true[np.ix_(y, x)], dtype=np.float32)
 
 
-def _errors(found: DepthMap, true: F32, scale: float) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+def _errors(found: DepthMap, true: F32, scale: float) -> U8:
     with np.errstate(invalid="ignore"):
         off = np.abs(scale * found.depth.astype(np.float64) / true - 1.0) / WORST
-    known = np.isfinite(off)
-    return np.where(known[..., None], coloured(np.where(known, off, 0.0)), 0).astype(np.uint8)
+    return error_colours(off)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import PIL.Image
@@ -14,13 +13,13 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.stages._shared import OURS, each, ratio, read_arrays, row
 from validation.metrics.depth import bad_pixels
-from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
-OURS, THESIS, SEMI_GLOBAL = "ours", "ours (thesis)", "ours (semi-global)"
+THESIS, SEMI_GLOBAL = "ours (thesis)", "ours (semi-global)"
 MATCHERS: dict[str, SemiGlobalMatching | MaximumLikelihoodScanline] = {
     OURS: SemiGlobalMatching(),
     THESIS: MaximumLikelihoodScanline(),
@@ -45,10 +44,9 @@ class DisparityStage(Stage):
         "semi-global matching has block 3, P1 = 216, P2 = 864, and widened images, to see every column."
     )
 
-    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
-        return scene in STEREO_PAIRS
+    scenes = STEREO_PAIRS
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         return (*MATCHERS, THREE_WAY, HH)
 
     def run(self, task: Task, options: ReportOptions) -> None:
@@ -65,61 +63,40 @@ class DisparityStage(Stage):
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         pair = _pair(scene)
-        kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
-
-        def bad(limit: float) -> dict[str, float | None]:
-            return {n: None if k is None else bad_pixels(k[0], pair, limit) for n, k in kept.items()}
-
-        known = {
-            n: None if k is None else float(100.0 * np.isfinite(k[0])[pair.judged].mean())
-            for n, k in kept.items()
-        }
-        spent = {n: None if k is None else 1e3 * k[1] for n, k in kept.items()}
-        wrong = bad(1.0)
+        found = {name: read_arrays(outcome, "disparity.npz") for name, outcome in outcomes.items()}
+        maps: dict[str, F32 | None] = {n: None if f is None else f["disparity"] for n, f in found.items()}
+        wrong = each(maps, lambda d: bad_pixels(d, pair, 1.0))
+        known = each(maps, lambda d: 100.0 * np.isfinite(d)[pair.judged].mean())
+        spent = each(found, lambda f: 1e3 * float(f["seconds"]))
         better = min((v for n in (THREE_WAY, HH) if (v := wrong[n]) is not None), default=None)
-        hidden = {n: None if k is None else _known_though_hidden(k[0], pair) for n, k in kept.items()}
-        error = {n: None if k is None else _surface_error(k[0], pair) for n, k in kept.items()}
-        over_better = {OURS: _ratio(wrong[OURS], better)}
         metrics = [
-            Metric(scene, BAD, "%", wrong, OURS, definition=DEFINITION),
-            Metric(scene, "off by more than 2 px", "%", bad(2.0), OURS, definition=DEFINITION),
-            Metric(scene, "known", "%", known, OURS, at_most=False, definition=KNOWN),
-            Metric(scene, "time", "ms", spent, OURS, definition="processor time, minimum of all runs"),
-            Metric(
-                scene, "bad pixels over the better reference", "", over_better, OURS, definition=OVER_BETTER
-            ),
-            *_of_variants(scene, wrong, known),
-            Metric(scene, "known though hidden", "%", hidden, OURS, definition=HIDDEN),
-            Metric(scene, "error on surfaces", "px", error, OURS, definition=ON_SURFACES),
-            Metric(
+            row(scene, BAD, "%", wrong, DEFINITION),
+            row(
                 scene,
-                "time over SGBM HH",
-                "s / s",
-                {OURS: _ratio(spent[OURS], spent[HH])},
-                OURS,
-                definition=OVER_HH,
+                "off by more than 2 px",
+                "%",
+                each(maps, lambda d: bad_pixels(d, pair, 2.0)),
+                DEFINITION,
             ),
+            row(scene, "known", "%", known, KNOWN, more=True),
+            row(scene, "time", "ms", spent, "processor time, minimum of all runs"),
+            row(scene, "bad pixels over the better reference", "", ratio(wrong[OURS], better), OVER_BETTER),
         ]
-        maps = {n: k[0] for n, k in kept.items() if k is not None}
-        place = options.place(self.name, scene)
-        shown = [name for name in (THESIS, OURS, THREE_WAY) if name in maps]
-        PIL.Image.fromarray(_picture(pair, maps, shown)).save(place / "maps.png")
+        for name in (THESIS, SEMI_GLOBAL):
+            metrics.append(row(scene, f"{name}: {BAD}", "%", wrong[name], DEFINITION))
+            metrics.append(row(scene, f"{name}: known", "%", known[name], KNOWN, more=True))
+        metrics += [
+            row(
+                scene, "known though hidden", "%", each(maps, lambda d: _known_though_hidden(d, pair)), HIDDEN
+            ),
+            row(scene, "error on surfaces", "px", each(maps, lambda d: _surface_error(d, pair)), ON_SURFACES),
+            row(scene, "time over SGBM HH", "s / s", ratio(spent[OURS], spent[HH]), OVER_HH),
+        ]
+        drawn = {name: d for name, d in maps.items() if d is not None}
+        shown = [name for name in (THESIS, OURS, THREE_WAY) if name in drawn]
+        PIL.Image.fromarray(_picture(pair, drawn, shown)).save(options.place(self.name, scene) / "maps.png")
         words = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
-        return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", words)], notes=notes)
-
-
-def _of_variants(
-    scene: str, wrong: Mapping[str, float | None], known: Mapping[str, float | None]
-) -> list[Metric]:
-    """Return the gate numbers of our other variants."""
-    rows = []
-    for name in (THESIS, SEMI_GLOBAL):
-        rows += [
-            Metric(scene, f"{name}: {BAD}", "%", {OURS: wrong[name]}, OURS, definition=DEFINITION),
-            Metric(scene, f"{name}: known", "%", {OURS: known[name]}, OURS, at_most=False, definition=KNOWN),
-        ]
-    return rows
+        return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", words)])
 
 
 def _surface_error(disparity: F32, pair: StereoPair) -> float:
@@ -131,10 +108,6 @@ def _surface_error(disparity: F32, pair: StereoPair) -> float:
 def _known_though_hidden(disparity: F32, pair: StereoPair) -> float:
     hidden = np.isfinite(pair.truth) & ~pair.judged
     return float(100.0 * np.isfinite(disparity)[hidden].mean())
-
-
-def _ratio(a: float | None, b: float | None) -> float | None:
-    return a / b if a is not None and b else None
 
 
 def _pair(scene: str) -> StereoPair:
@@ -150,11 +123,6 @@ def _match(method: str, pair: StereoPair) -> F32:
         return MATCHERS[method].match(pair.left, pair.right, disparity_range=limits).disparity
     one_thread()
     return OpenCVSemiGlobal(method).match(pair.left, pair.right, pair.disparities)
-
-
-def _read(outcome: Outcome) -> tuple[F32, float]:
-    with np.load(Path(outcome.place) / "disparity.npz") as kept:
-        return kept["disparity"], float(kept["seconds"])
 
 
 def _picture(pair: StereoPair, maps: Mapping[str, F32], names: Sequence[str]) -> U8:

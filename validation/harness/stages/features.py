@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,9 @@ from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Image
-from validation.harness.records import Judgement, Outcome, ReportOptions, Task
-from validation.harness.scenes import is_photographs, load_photographs
+from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
+from validation.harness.scenes import has_images, load_images
+from validation.harness.stages._shared import OURS, Values, each, read_arrays, row
 from validation.harness.stages.fundamental import MATCHES
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
@@ -27,7 +27,7 @@ from validation.scenes.real import Scene, load_fixture_depth
 from validation.scenes.real_pairs import RealPair, camera_pairs
 from validation.studies.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
 
-OURS, THESIS, SIFT, HARRIS = "ours", "ours (thesis)", "SIFT", "cv2.cornerHarris"
+THESIS, SIFT, HARRIS = "ours (thesis)", "SIFT", "cv2.cornerHarris"
 FRONT_ENDS = {OURS: "ours", THESIS: "thesis", SIFT: "SIFT"}
 CORNERS = 1000
 REPEATED_PX = 1.5
@@ -38,7 +38,7 @@ WITH_DEPTH = ("courtyard",)
 """Scenes with true depth, which gives the position of a corner in the next image."""
 
 
-class FeaturesStage:
+class FeaturesStage(Stage):
     """Repeatability of corners, and verified matches of front ends."""
 
     name = "features"
@@ -50,7 +50,7 @@ class FeaturesStage:
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return is_photographs(scene, options) and load_photographs(scene, options).has_truth
+        return has_images(scene, options) and load_images(scene, options).has_truth
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         if options.gates_only:
@@ -62,7 +62,7 @@ class FeaturesStage:
         return () if method else (("fundamental", MATCHES),)
 
     def run(self, task: Task, options: ReportOptions) -> None:
-        scene = load_photographs(task.scene, options)
+        scene = load_images(task.scene, options)
         images = read_images(scene.image_paths, max_size_px=MAX_SIZE_PX).images
         place = options.place(task.stage, task.scene, task.method)
         if task.scene in WITH_DEPTH:
@@ -72,21 +72,18 @@ class FeaturesStage:
             np.savez(place / "matches.npz", **_matches(task.method, images, options))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        photographs = load_photographs(scene, options)
-        gaps = _gaps(options)
+        images = load_images(scene, options)
         cache = options.place("fundamental", scene, MATCHES)
-        notes = [f"{n}: {o.failure}." for n, o in outcomes.items() if not o.ok]
+        found = {n: read_arrays(outcomes[n], "matches.npz") if n in outcomes else None for n in FRONT_ENDS}
+        metrics, notes = list[Metric](), list[str]()
         try:
-            truths = {(p.name, g): p for g in gaps for p in camera_pairs(photographs, cache, (g,))}
+            for gap in _gaps(options):
+                metrics += _match_metrics(scene, gap, list(camera_pairs(images, cache, (gap,))), found)
         except NoReference as error:
-            gaps, truths = (), {}
+            metrics = []
             notes.append(f"Matches are not evaluated: true correspondences need SIFT: {error}.")
-        metrics = []
-        for gap in gaps:
-            pairs = [pair for (_, g), pair in truths.items() if g == gap]
-            metrics += _match_metrics(scene, gap, pairs, outcomes)
         if scene in WITH_DEPTH:
-            metrics.append(_repeatability(photographs, outcomes))
+            metrics.append(_repeatability(images, outcomes))
         return Judgement(metrics, notes=notes)
 
 
@@ -117,32 +114,25 @@ def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> 
 
 
 def _match_metrics(
-    scene: str, gap: int, pairs: list[RealPair], outcomes: Mapping[str, Outcome]
+    scene: str, gap: int, pairs: list[RealPair], found: Mapping[str, dict[str, Any] | None]
 ) -> list[Metric]:
-    verified: dict[str, float | None] = {}
-    right: dict[str, float | None] = {}
-    sigma: dict[str, float | None] = {}
-    for name in FRONT_ENDS:
-        if name not in outcomes or not outcomes[name].ok:
-            verified[name] = right[name] = sigma[name] = None
-            continue
-        with np.load(Path(outcomes[name].place) / "matches.npz") as kept:
-            F, inliers, noise = (kept[f"{what}{gap}"] for what in ("F", "inliers", "sigma"))
-        good = np.array([_error(f, pair) < RIGHT_PX for f, pair in zip(F, pairs, strict=True)])
-        verified[name] = float(inliers[good].sum() / len(pairs))
-        right[name] = float(100.0 * good.mean())
-        sigma[name] = float(np.median(noise[good])) if good.any() else None
+    verified: Values = dict.fromkeys(found)
+    right: Values = dict.fromkeys(found)
+    sigma: Values = dict.fromkeys(found)
+    for name, arrays in found.items():
+        if arrays is not None:
+            F, inliers, noise = (arrays[f"{what}{gap}"] for what in ("F", "inliers", "sigma"))
+            good = np.array([_error(f, pair) < RIGHT_PX for f, pair in zip(F, pairs, strict=True)])
+            verified[name] = float(inliers[good].sum() / len(pairs))
+            right[name] = float(100.0 * good.mean())
+            sigma[name] = float(np.median(noise[good])) if good.any() else None
     where = f"(i, i+{gap})"
-
-    def row(name: str, unit: str, values: dict[str, float | None], more: bool, words: str) -> Metric:
-        return Metric(scene, f"{name} {where}", unit, values, OURS, at_most=not more, definition=words)
-
     return [
-        row(f"{THESIS}: verified matches", "", {OURS: verified[THESIS]}, True, VERIFIED),
-        row(f"{THESIS}: noise", "px", {OURS: sigma[THESIS]}, False, NOISE),
-        row("verified matches", "", verified, True, VERIFIED),
-        row("right F", "%", right, True, "share of the pairs whose F is right"),
-        row("noise", "px", sigma, False, NOISE),
+        row(scene, f"{THESIS}: verified matches {where}", "", verified[THESIS], VERIFIED, more=True),
+        row(scene, f"{THESIS}: noise {where}", "px", sigma[THESIS], NOISE),
+        row(scene, f"verified matches {where}", "", verified, VERIFIED, more=True),
+        row(scene, f"right F {where}", "%", right, "share of the pairs whose F is right", more=True),
+        row(scene, f"noise {where}", "px", sigma, NOISE),
     ]
 
 
@@ -152,18 +142,13 @@ def _error(F: F64, pair: RealPair) -> float:
 
 
 def _repeatability(scene: Scene, outcomes: Mapping[str, Outcome]) -> Metric:
-    values: dict[str, float | None] = {}
-    for name, outcome in outcomes.items():
-        if not outcome.ok:
-            values[name] = None
-            continue
-        with np.load(Path(outcome.place) / "corners.npz") as kept:
-            corners = [kept[f"{i}"] for i in range(len(scene.image_paths))]
-        values[name] = 100.0 * _share_repeated(scene, corners)
+    found = {name: read_arrays(outcome, "corners.npz") for name, outcome in outcomes.items()}
+    views = range(len(scene.image_paths))
+    shares = each(found, lambda f: 100.0 * _share_repeated(scene, [f[f"{i}"] for i in views]))
     words = (
         "share of the 1000 strongest corners visible in the next image that are detected there within 1.5 px"
     )
-    return Metric(scene.name, "repeatability", "%", values, OURS, at_most=False, definition=words)
+    return row(scene.name, "repeatability", "%", shares, words, more=True)
 
 
 def _share_repeated(scene: Scene, corners: list[F64]) -> float:
@@ -179,10 +164,7 @@ def _share_repeated(scene: Scene, corners: list[F64]) -> float:
 
 def _transfer(scene: Scene) -> Callable[[int, int, F64], F64]:
     """Transfer points (N, 2) of view i to view j by true depth; only mutually visible ones."""
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
-    K, R, C = scene.K, scene.R, scene.C
+    K, R, C = scene.cameras
     P = compose_camera(K, R, -np.einsum("vab,vb->va", R, C))
     depths = [load_fixture_depth(view, scene.name) for view in range(len(K))]
 

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import preset
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
-from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Task
-from validation.harness.scenes import load_photographs
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.scenes import load_images
+from validation.harness.stages._shared import OURS, Values, each, ratio, read_arrays, row
 from validation.harness.stages.depth import (
     COURTYARD,
-    OURS,
     PRESETS,
     THESIS,
-    model_of,
-    read_maps,
+    our_maps,
     views_of,
 )
 from validation.metrics.depth import coloured, true_from_maps
 from validation.metrics.record import Metric
-from validation.metrics.similarity import Similarity
 from validation.metrics.surfaces import CAPPED, SAMPLES, judge_surface, load_truth
 from validation.references.open3d_surfaces import OpenTsdf, poisson_mesh
 
@@ -39,13 +35,15 @@ WITHIN = (0.2, 0.5, 1.0)
 RED_PCT = 1.0
 """Distance that is red in the figures, in percent of the scene depth."""
 QUICK_SAMPLES = 50_000
+OVER = "mean distance, ours over that of Open3D's grid"
 
 
-class SurfaceStage:
+class SurfaceStage(Stage):
     """One surface of all depth maps."""
 
     name = "surface"
     title = "Surfaces"
+    scenes = (COURTYARD,)
     definition = (
         "Surfaces of the depth maps of the stage above: our default, and Open3D's grid of truncated signed "
         "distances (voxels of 1.5 pixels, as ours) and its Poisson surface (octree of depth 9) of the same "
@@ -55,10 +53,7 @@ class SurfaceStage:
         "Completeness: from what two images show to the surface."
     )
 
-    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
-        return scene == COURTYARD
-
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         return (OURS, TSDF) if options.quick or options.gates_only else (OURS, THESIS, TSDF, POISSON)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
@@ -72,15 +67,11 @@ class SurfaceStage:
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         truth = load_truth()
         samples = QUICK_SAMPLES if options.quick else SAMPLES
-        meshes = {n: _true_mesh(n, o, scene, options) if o.ok else None for n, o in outcomes.items()}
+        meshes = {name: _true_mesh(name, outcome, scene, options) for name, outcome in outcomes.items()}
         judged = {n: None if m is None else judge_surface(m, truth, samples) for n, m in meshes.items()}
-        faces = {n: None if m is None else float(len(m.faces)) for n, m in meshes.items()}
-        metrics = [
-            *_metrics(scene, judged),
-            Metric(scene, "faces", "", faces, OURS, definition="triangles of the surface"),
-        ]
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
-        notes.append(f"The scene is {truth.depth_m:.2f} m deep, the median over all true depth maps.")
+        faces = each(meshes, lambda m: len(m.faces))
+        metrics = [*_metrics(scene, judged), row(scene, "faces", "", faces, "triangles of the surface")]
+        notes = [f"The scene is {truth.depth_m:.2f} m deep, the median over all true depth maps."]
         place, pictures = options.place(self.name, scene), list[Picture]()
         camera = _camera(scene, options)
         for name in SHOWN:
@@ -96,9 +87,7 @@ class SurfaceStage:
 
 
 def _surface(method: str, scene: str, options: ReportOptions) -> TexturedMesh:
-    maps = read_maps(options.place("depth", scene, THESIS if method == THESIS else OURS))
-    if not maps:
-        raise ValueError(f"there are no depth maps of {scene}: run the stage depth too")
+    maps = our_maps(scene, options, THESIS if method == THESIS else OURS)
     ordered = [maps[view] for view in sorted(maps)]
     if method in PRESETS:
         model = preset(PRESETS[method]).model
@@ -106,68 +95,51 @@ def _surface(method: str, scene: str, options: ReportOptions) -> TexturedMesh:
         return model.surface_of(ordered)
     if method == POISSON:
         return poisson_mesh(ordered)
-    photographs = load_photographs(scene, options)
-    views = views_of(photographs, model_of(photographs, options), options)
+    views = views_of(load_images(scene, options), options)
     return OpenTsdf().fuse(ordered, [views[m.view] for m in ordered])
 
 
-def _true_mesh(method: str, outcome: Outcome, scene: str, options: ReportOptions) -> TexturedMesh:
+def _true_mesh(method: str, outcome: Outcome, scene: str, options: ReportOptions) -> TexturedMesh | None:
     """Return the saved surface in the true frame."""
-    align = _true_from_ours(scene, options, THESIS if method == THESIS else OURS)
-    with np.load(Path(outcome.place) / "mesh.npz") as kept:
-        faces = kept["faces"].astype(np.int64)
-        return TexturedMesh(align.apply(kept["vertices"]), faces)
-
-
-def _true_from_ours(scene: str, options: ReportOptions, maps: str) -> Similarity:
-    return true_from_maps(read_maps(options.place("depth", scene, maps)), load_photographs(scene, options))
+    found = read_arrays(outcome, "mesh.npz")
+    if found is None:
+        return None
+    maps = our_maps(scene, options, THESIS if method == THESIS else OURS)
+    align = true_from_maps(maps, load_images(scene, options))
+    return TexturedMesh(align.apply(found["vertices"]), found["faces"].astype(np.int64))
 
 
 def _metrics(scene: str, judged: Mapping[str, tuple[F64, F64] | None]) -> list[Metric]:
-    rows, means = [], dict[str, dict[str, float | None]]()
+    rows, means = [], dict[str, Values]()
     words = {"accuracy": "from the surface to the truth", "completeness": "from the truth to the surface"}
     for side, what in enumerate(words):
-
-        def of(read: Callable[[F64], float], side: int = side) -> dict[str, float | None]:
-            return {n: None if d is None else read(d[side]) for n, d in judged.items()}
-
-        means[what] = of(lambda d: float(np.minimum(d, CAPPED).mean()))
-        median = of(lambda d: float(np.median(d)))
-        rows += [
-            _row(scene, f"{what}, median", "% of depth", median, f"median distance {words[what]}"),
-            _row(scene, f"{what}, mean", "% of depth", means[what], f"mean distance {words[what]}"),
-        ]
+        distances = {n: None if d is None else d[side] for n, d in judged.items()}
+        means[what] = each(distances, lambda d: np.minimum(d, CAPPED).mean())
+        median, where = each(distances, np.median), words[what]
+        rows.append(row(scene, f"{what}, median", "% of depth", median, f"median distance {where}"))
+        rows.append(row(scene, f"{what}, mean", "% of depth", means[what], f"mean distance {where}"))
         for bound in WITHIN:
-            near = of(lambda d, bound=bound: 100.0 * float((d <= bound).mean()))  # type: ignore[misc]
-            name = f"{what}, within {bound} %"
-            definition = f"share of the points {words[what]} within this distance"
-            rows.append(Metric(scene, name, "%", near, OURS, at_most=False, definition=definition))
+            near = {
+                n: None if d is None else 100.0 * float((d <= bound).mean()) for n, d in distances.items()
+            }
+            definition = f"share of the points {where} within this distance"
+            rows.append(row(scene, f"{what}, within {bound} %", "%", near, definition, more=True))
     for what, values in means.items():
-        ours, theirs = values.get(OURS), values.get(TSDF)
-        ratio = ours / theirs if ours is not None and theirs else None
-        definition = "mean distance, ours over that of Open3D's grid"
-        rows.append(_row(scene, f"{what} over Open3D TSDF", "", {OURS: ratio}, definition))
+        over = ratio(values.get(OURS), values.get(TSDF))
+        rows.append(row(scene, f"{what} over Open3D TSDF", "", over, OVER))
     return rows
-
-
-def _row(scene: str, name: str, unit: str, values: Mapping[str, float | None], words: str) -> Metric:
-    return Metric(scene, name, unit, values, OURS, definition=words)
 
 
 def _camera(scene: str, options: ReportOptions) -> Camera:
     """Return the middle true camera at page size."""
-    truth = load_photographs(scene, options)
-    assert truth.K is not None
-    assert truth.R is not None
-    assert truth.C is not None
-    view = len(truth.C) // 2
-    with PIL.Image.open(truth.image_paths[view]) as opened:
+    images = load_images(scene, options)
+    K, R, C = images.cameras
+    view = len(C) // 2
+    with PIL.Image.open(images.image_paths[view]) as opened:
         size = opened.size
-    camera = Camera(truth.K[view], truth.R[view], -truth.R[view] @ truth.C[view], size)
-    return camera.scaled(640.0 / max(size))
+    return Camera(K[view], R[view], -R[view] @ C[view], size).scaled(640.0 / max(size))
 
 
-def _drawn(mesh: TexturedMesh, off_pct: F64, camera: Camera) -> NDArray[np.uint8]:
+def _drawn(mesh: TexturedMesh, off_pct: F64, camera: Camera) -> U8:
     """Render the surface coloured by the vertex errors."""
-    colored = replace(mesh, colors=coloured(off_pct / RED_PCT))
-    return render(colored, camera, background=(245, 247, 250)).color
+    return render(replace(mesh, colors=coloured(off_pct / RED_PCT)), camera, background=(245, 247, 250)).color

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
+from validation.harness.stages._shared import each, plot, read_arrays, row, scatter
 from validation.metrics.record import Metric
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.rigs import Rig
@@ -60,10 +60,9 @@ class TriangulationStage(Stage):
         "frames of space. The optimum is that of the reprojection over all views."
     )
 
-    def takes(self, scene: str, options: ReportOptions) -> bool:  # noqa: ARG002 (the same for all)
-        return scene == "cloud"
+    scenes = ("cloud",)
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         return (OURS, LINEAR, MIDPOINT, ADJUSTED, OPENCV, OPENCV_POLYNOMIAL, COLMAP)
 
     def run(self, task: Task, options: ReportOptions) -> None:
@@ -87,20 +86,19 @@ class TriangulationStage(Stage):
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         problems = list(_problems(options))
-        kept = {name: _read(o) if o.ok else None for name, o in outcomes.items()}
-        metrics = [_adjustment(scene, problems, kept.pop(ADJUSTED, None))]
+        found = {name: read_arrays(outcome, "points.npz") for name, outcome in outcomes.items()}
+        metrics = [_adjustment(scene, problems, found.pop(ADJUSTED, None))]
         for views in (2, 5):
             for projective in (False, True):
-                chosen = [
-                    n for n, p in enumerate(problems) if len(p.P) == views and p.projective == projective
-                ]
-                metrics += _metrics(scene, views, projective, {n: problems[n] for n in chosen}, kept)
-        spent = {n: None if k is None else 1e6 * float(np.median(k["seconds"])) for n, k in kept.items()}
-        metrics.append(
-            Metric(scene, "time a point", "us", spent, OURS, definition="two views, one processor, median")
-        )
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
-        return Judgement(metrics, plots=[_plot(problems, kept)], notes=notes)
+                chosen = {
+                    n: p for n, p in enumerate(problems) if len(p.P) == views and p.projective == projective
+                }
+                where = f"{views} views, {'projective' if projective else 'metric'} frame"
+                metrics += _metrics(scene, where, chosen, found)
+        spent = each(found, lambda f: 1e6 * float(np.median(f["seconds"])))
+        words = "two views, one processor, median"
+        metrics.append(row(scene, "time a point", "us", spent, words, judged=OURS))
+        return Judgement(metrics, plots=[_plot(problems, found)])
 
 
 def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
@@ -114,16 +112,17 @@ def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
     return fit.P, fit.X
 
 
-def _adjustment(scene: str, problems: list[Problem], kept: Mapping[str, F64] | None) -> Metric:
+def _adjustment(scene: str, problems: list[Problem], found: Mapping[str, F64] | None) -> Metric:
     """Return the maximum over the problems."""
     over = []
-    for n, p in enumerate(problems if kept is not None else []):
-        if kept is not None and f"P{n}" in kept:
-            cost = squared_distances(kept[f"P{n}"], kept[f"{n}"], p.xy).sum()
+    for n, p in enumerate(problems if found is not None else []):
+        if found is not None and f"P{n}" in found:
+            cost = squared_distances(found[f"P{n}"], found[f"{n}"], p.xy).sum()
             over.append(float(np.sqrt(cost / squared_distances(p.P, _least_near_truth(p), p.xy).sum()) - 1.0))
     words = "RMS residual of cameras and points over that of the best points with the true cameras, minus 1"
-    value = max(over) if over else None
-    return Metric(scene, "projective adjustment above the truth", "", {OURS: value}, OURS, definition=words)
+    return row(
+        scene, "projective adjustment above the truth", "", max(over, default=None), words, judged=OURS
+    )
 
 
 def _solver(method: str, views: int) -> Method | None:
@@ -155,24 +154,16 @@ def _problems(options: ReportOptions) -> Iterator[Problem]:
                     yield Problem(title, sigma, projective, rig, seen, P, xy, frame)
 
 
-def _read(outcome: Outcome) -> dict[str, F64]:
-    with np.load(Path(outcome.place) / "points.npz") as kept:
-        return {name: kept[name] for name in kept.files}
-
-
 def _metrics(
     scene: str,
-    views: int,
-    projective: bool,
+    where: str,
     problems: Mapping[int, Problem],
-    kept: Mapping[str, Mapping[str, F64] | None],
+    found: Mapping[str, Mapping[str, F64] | None],
 ) -> list[Metric]:
-    frame = "projective frame" if projective else "metric frame"
-    where = f"{views} views, {frame}"
-    best = {n: _least_squared_distances(n, p, kept) for n, p in problems.items()}
+    best = {n: _least_squared_distances(n, p, found) for n, p in problems.items()}
     above: dict[str, float | None] = {}
     apart: dict[str, float | None] = {}
-    for name, answers in kept.items():
+    for name, answers in found.items():
         some = {n: answers[f"{n}"] for n in problems if answers is not None and f"{n}" in answers}
         if not some:
             above[name] = apart[name] = None
@@ -182,33 +173,24 @@ def _metrics(
         above[name] = float(np.sqrt(cost.mean() / least.mean()) - 1.0)
         apart[name] = _median_space_error(problems, some)
     optimum = _median_space_error(problems, {n: _least_near_truth(p) for n, p in problems.items()})
-    over = {name: None if value is None else value / optimum for name, value in apart.items()}
+    over = each(apart, lambda value: value / optimum)
     words = "of the median error in space over that of points found from the truth by descent"
+    residual = "RMS distance to the measured points over that of the optimum, minus 1"
+    distance = "median distance from the true point over its distance from the first camera"
     return [
         *(
-            Metric(scene, f"{title}, {where}", "", {name: over.get(name)}, name, definition=words)
-            for name, title in {
-                OURS: "error in space over the optimum",
-                LINEAR: f"{LINEAR}: error in space over the optimum",
-                MIDPOINT: f"{MIDPOINT}: error in space over the optimum",
-            }.items()
+            row(
+                scene,
+                f"{title}error in space over the optimum, {where}",
+                "",
+                over.get(name),
+                words,
+                judged=name,
+            )
+            for name, title in {OURS: "", LINEAR: f"{LINEAR}: ", MIDPOINT: f"{MIDPOINT}: "}.items()
         ),
-        Metric(
-            scene,
-            f"residual above the optimum, {where}",
-            "",
-            above,
-            OURS,
-            definition="RMS distance to the measured points over that of the optimum, minus 1",
-        ),
-        Metric(
-            scene,
-            f"error in space, {where}",
-            "%",
-            apart,
-            OURS,
-            definition="median distance from the true point over its distance from the first camera",
-        ),
+        row(scene, f"residual above the optimum, {where}", "", above, residual, judged=OURS),
+        row(scene, f"error in space, {where}", "%", apart, distance, judged=OURS),
     ]
 
 
@@ -256,10 +238,10 @@ def _space_errors(problem: Problem, X: F64) -> F64:
     return np.asarray(100.0 * np.nan_to_num(off, nan=np.inf), dtype=np.float64)
 
 
-def _plot(problems: list[Problem], kept: Mapping[str, Mapping[str, F64] | None]) -> Plot:
+def _plot(problems: list[Problem], found: Mapping[str, Mapping[str, F64] | None]) -> Plot:
     """Plot the error in space over noise: two views, metric frame."""
     traces = []
-    for name, answers in kept.items():
+    for name, answers in found.items():
         if answers is None:
             continue
         y = []
@@ -270,12 +252,6 @@ def _plot(problems: list[Problem], kept: Mapping[str, Mapping[str, F64] | None])
                 if p.sigma_px == sigma and not p.projective and len(p.P) == 2 and f"{n}" in answers
             ]
             y.append(float(np.median(np.concatenate(errors))))
-        traces.append(
-            {"type": "scatter", "mode": "lines+markers", "name": name, "x": list(NOISES_PX), "y": y}
-        )
-    layout = {
-        "xaxis": {"title": {"text": "noise (px)"}},
-        "yaxis": {"title": {"text": "median error in space (%)"}, "rangemode": "tozero"},
-        "margin": {"l": 70, "r": 10, "t": 10, "b": 50},
-    }
-    return Plot("Two views, metric frame", {"data": traces, "layout": layout})
+        traces.append(scatter(name, NOISES_PX, y, "lines+markers"))
+    zero = {"rangemode": "tozero"}
+    return plot("Two views, metric frame", traces, "noise (px)", "median error in space (%)", yaxis=zero)

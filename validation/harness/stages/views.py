@@ -16,9 +16,10 @@ from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_blending import prepare_views
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
-from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Task
-from validation.harness.scenes import load_photographs
-from validation.harness.stages.depth import COURTYARD, OURS, model_of, read_maps, views_of
+from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.scenes import load_images
+from validation.harness.stages._shared import OURS, each, row
+from validation.harness.stages.depth import COURTYARD, our_maps, read_maps, views_of
 from validation.metrics.depth import coloured
 from validation.metrics.record import Metric
 from validation.references.open3d_meshes import render_open3d
@@ -45,7 +46,7 @@ class Likeness:
     covered: float
 
 
-class ViewsStage:
+class ViewsStage(Stage):
     """Images are left out one by one."""
 
     name = "views"
@@ -64,19 +65,16 @@ class ViewsStage:
     def takes(self, scene: str, options: ReportOptions) -> bool:
         return scene in SCENES or scene in options.folders
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:  # noqa: ARG002 (the same everywhere)
-        sternest = (OURS, FINE, LEVELLED)
-        return sternest if options.quick or options.gates_only else (OURS, TSDF, FINE, LEVELLED)
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
+        strictest = (OURS, FINE, LEVELLED)
+        return strictest if options.quick or options.gates_only else (OURS, TSDF, FINE, LEVELLED)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return (("depth", OURS), *(((self.name, OURS),) if method == LEVELLED else ()))
 
     def run(self, task: Task, options: ReportOptions) -> None:
-        photographs = load_photographs(task.scene, options)
-        maps = read_maps(options.place("depth", task.scene, OURS))
-        if not maps:
-            raise ValueError(f"there are no depth maps of {task.scene}: run the stage depth too")
-        views = views_of(photographs, model_of(photographs, options), options)
+        maps = our_maps(task.scene, options)
+        views = views_of(load_images(task.scene, options), options)
         place = options.place(task.stage, task.scene, task.method)
         shared = options.place(task.stage, task.scene, OURS)
         for k in _left_out(sorted(maps)):
@@ -88,18 +86,20 @@ class ViewsStage:
             _save(place / f"{k:04d}.png", drawn.color)
             _save(place / f"{k:04d}-covered.png", np.where(drawn.valid, 255, 0).astype(np.uint8))
             if task.method == FINE and not options.quick:
-                _draw_by_open3d(place / f"{k:04d}-own.png", mesh, camera)
+                try:
+                    _save(place / f"{k:04d}-own.png", render_open3d(mesh, camera))
+                except RuntimeError as error:
+                    print(f"Open3D cannot draw here: {error}")
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        photographs = load_photographs(scene, options)
-        views = views_of(photographs, model_of(photographs, options), options)
+        views = views_of(load_images(scene, options), options)
         left_out = _left_out(sorted(read_maps(options.place("depth", scene, OURS))))
         place, pictures = options.place(self.name, scene), list[Picture]()
         found: dict[str, list[Likeness]] = {}
         for k in left_out:
             drawn = _drawn(outcomes, k)
-            likenesses, compared = compare(views[k], drawn)
-            for name, one in likenesses.items():
+            scores, compared = compare(views[k], drawn)
+            for name, one in scores.items():
                 found.setdefault(name, []).append(one)
             shown = {n: drawn[n].color for n in (OURS, FINE) if n in drawn}
             file = f"left-out-{k:02d}.png"
@@ -110,9 +110,8 @@ class ViewsStage:
             )
             pictures.append(Picture(file, f"Image {k + 1}, left out", words))
         names = [*outcomes, *([OWN_PICTURE] if OWN_PICTURE in found else [])]
-        notes = [f"{name}: {o.failure}." for name, o in outcomes.items() if not o.ok]
         numbers = ", ".join(str(k + 1) for k in left_out)
-        notes.append(f"Left out: image{'s' * (len(left_out) > 1)} {numbers}.")
+        notes = [f"Left out: image{'s' * (len(left_out) > 1)} {numbers}."]
         return Judgement(_metrics(scene, {n: _mean(found.get(n)) for n in names}), (), pictures, notes)
 
 
@@ -149,14 +148,6 @@ def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list
     ]
 
 
-def _draw_by_open3d(path: Path, mesh: TexturedMesh, camera: Camera) -> None:
-    """Return Open3D's own rendering, if the machine supports it."""
-    try:
-        _save(path, render_open3d(mesh, camera))
-    except RuntimeError as error:
-        print(f"Open3D cannot draw here: {error}")
-
-
 def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[str, Likeness], B8]:
     """Renderings of one camera, its image, and the compared pixels (H, W): those that all of them
     cover whole."""
@@ -184,15 +175,10 @@ def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView
     return drawn
 
 
-def _likeness(photograph: U8, color: U8, compared: B8, covered: float) -> Likeness:
-    alike = match_exposure(photograph, color, compared)
-    return Likeness(
-        psnr_db(photograph, alike, compared),
-        ssim(photograph, alike, compared),
-        psnr_db(photograph, color, compared),
-        ssim(photograph, color, compared),
-        100.0 * covered,
-    )
+def _likeness(rgb: U8, color: U8, compared: B8, covered: float) -> Likeness:
+    equal = match_exposure(rgb, color, compared)
+    scores = [score(rgb, drawn, compared) for drawn in (equal, color) for score in (psnr_db, ssim)]
+    return Likeness(*[*scores, 100.0 * covered])
 
 
 def _mean(found: Sequence[Likeness] | None) -> Likeness | None:
@@ -202,42 +188,34 @@ def _mean(found: Sequence[Likeness] | None) -> Likeness | None:
 
 
 def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
-    def row(name: str, unit: str, what: str, words: str) -> Metric:
-        values = {n: None if one is None else float(getattr(one, what)) for n, one in found.items()}
-        return Metric(scene, name, unit, values, OURS, at_most=False, definition=words)
-
-    peak = row("PSNR", "dB", "psnr_db", "exposures equalised first; mean over the left-out images")
-    like = row("SSIM", "", "ssim", "exposures equalised first; mean over the left-out images")
-    as_is = "original exposures; mean over the left-out images"
-    return [
-        peak,
-        like,
-        row("PSNR as it is", "dB", "psnr_as_is_db", as_is),
-        row("SSIM as it is", "", "ssim_as_is", as_is),
-        row("covered", "%", "covered", "share of the frame that the model covers whole"),
-        _over(scene, peak, "dB"),
-        _over(scene, like, ""),
-    ]
-
-
-def _over(scene: str, metric: Metric, unit: str) -> Metric:
-    """Return ours minus the best of Open3D's."""
-    theirs = [v for n, v in metric.values.items() if n.startswith("Open3D") and v is not None]
-    ours = metric.values.get(OURS)
-    over = ours - max(theirs) if ours is not None and theirs else None
-    words = f"{metric.name} of ours minus the best of Open3D's"
-    name = f"{metric.name} over Open3D"
-    return Metric(scene, name, unit, {OURS: over}, OURS, at_most=False, definition=words)
+    equal = "exposures equalised first; mean over the left-out images"
+    original = "original exposures; mean over the left-out images"
+    rows = []
+    for name, unit, field, words in (
+        ("PSNR", "dB", "psnr_db", equal),
+        ("SSIM", "", "ssim", equal),
+        ("PSNR as it is", "dB", "psnr_as_is_db", original),
+        ("SSIM as it is", "", "ssim_as_is", original),
+        ("covered", "%", "covered", "share of the frame that the model covers whole"),
+    ):
+        values = each(found, lambda one, field=field: getattr(one, field))  # type: ignore[misc]
+        rows.append(row(scene, name, unit, values, words, more=True))
+    for metric in rows[:2]:
+        theirs = [v for n, v in metric.values.items() if n.startswith("Open3D") and v is not None]
+        ours = metric.values.get(OURS)
+        over = ours - max(theirs) if ours is not None and theirs else None
+        words = f"{metric.name} of ours minus the best of Open3D's"
+        rows.append(row(scene, f"{metric.name} over Open3D", metric.unit, over, words, more=True))
+    return rows
 
 
-def _beside(photograph: U8, shown: Mapping[str, U8], compared: B8) -> U8:
+def _beside(rgb: U8, shown: Mapping[str, U8], compared: B8) -> U8:
     """Draw the image and renderings in a row, exposure-compensated differences below."""
-    empty = np.zeros_like(photograph)
-    above, below = [photograph], [empty]
+    above, below = [rgb], [np.zeros_like(rgb)]
     for color in shown.values():
-        alike = match_exposure(photograph, color, compared)
-        off = np.abs(alike.astype(np.float64) - photograph).mean(axis=2) / RED_LEVELS
-        above.append(alike)
+        equal = match_exposure(rgb, color, compared)
+        off = np.abs(equal.astype(np.float64) - rgb).mean(axis=2) / RED_LEVELS
+        above.append(equal)
         below.append(np.where(compared[..., None], coloured(off), 0).astype(np.uint8))
     return np.concatenate([np.concatenate(above, axis=1), np.concatenate(below, axis=1)])
 
