@@ -13,8 +13,8 @@ from validation.metrics.intervals import IntervalScores, focal_errors_pct, holdi
 from validation.scenes.dinosaur import load_dinosaur
 from validation.scenes.real import Scene, load_real_scene
 from validation.scenes.zoomed import rezoom_scene
-from validation.studies.calibration_parts import keep_observations, one_camera
-from validation.studies.calibration_real import CameraRows, _change_pct, _focal_prior, _pooled
+from validation.studies.calibration_real import CameraRows, _pooled
+from validation.studies.coverage import one_camera
 from validation.studies.main_job import COLMAP, OURS
 from validation.studies.projective import compare, to_metrics
 
@@ -61,14 +61,6 @@ def test_missing_cameras_count_in_pooled_results():
     assert worst.values[OURS] == pytest.approx(0.3)
 
 
-def test_a_change_is_relative_and_unknown_without_a_focal():
-    assert _change_pct(1010.0, 1000.0) == pytest.approx(1.0)
-    assert _change_pct(None, 1000.0) is None
-    reported = _focal_prior(5000.0)(PipelineConfig()).intrinsics
-    assert reported.focal_px == 5000.0
-    assert reported.focal_std_rel == pytest.approx(np.log(5.0))
-
-
 def test_a_value_that_all_views_share_counts_once():
     scores = IntervalScores(np.array([[np.nan] * 3, [1.0] * 3, [1.0] * 3]), np.array([np.nan, 0.1, 0.1]))
     assert one_camera(scores, "shared").z.shape == (1, 3)
@@ -83,14 +75,6 @@ def test_cameras_that_err_together_make_a_share_as_unsure_as_scenes_do():
     assert holding_std(alone, (0,)) == pytest.approx(np.sqrt(0.1 * 0.9 / 99))
     together = [scene(5.0 if n % 10 == 0 else 0.0, 8) for n in range(100)]
     assert holding_std(together, (0,)) == pytest.approx(holding_std(alone, (0,)))
-
-
-def test_points_that_one_photograph_sees_go_with_the_observations_taken():
-    tracks = _reconstruction(_truth()).tracks
-    kept = (tracks.view_index < 2) & ~((tracks.view_index == 0) & (tracks.point_index == 4))
-    less = keep_observations(tracks, kept)
-    assert 4 not in less.point_index
-    assert len(less.xy) == 2 * (tracks.n_points - 1)
 
 
 ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT = 0.5, 3.0

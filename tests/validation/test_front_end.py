@@ -12,19 +12,9 @@ import pytest
 
 from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project_camera
-from thesisrecon.io.images import read_images
-from thesisrecon.records import Features, Image, TwoView
-from validation.scenes.real import load_real_scene
-from validation.studies.front_end import (
-    CONTRADICTS_PX,
-    Copy,
-    disagreement,
-    judge,
-    make_copies,
-    repeatability,
-    score_copy,
-)
-from validation.studies.front_end_pairs import OURS, SIFT, check_pairs, front_ends, measure_pairs
+from thesisrecon.records import TwoView
+from validation.studies.front_end import CONTRADICTS_PX, disagreement, judge
+from validation.studies.front_end_pairs import OURS, SIFT, check_pairs, measure_pairs
 
 # (scene, gap): pairs measured, least ratio of verified matches and largest of sigma, and error of F in px.
 LIMITS = {
@@ -32,8 +22,6 @@ LIMITS = {
     ("fountain-P11", 3): (2, 2.0, 0.62, 0.15),
     ("Herz-Jesus-P8", 3): (2, 2.4, 0.45, 0.2),
 }
-COPIES = {"turned by 45 degrees": 800, "scaled by 0.5": 3000, "times 0.25": 3500}
-"""Least right matches of a copy of a photograph: 931, 3526 and 4146 are reached."""
 
 
 @pytest.mark.real
@@ -49,57 +37,6 @@ def test_pairs_have_more_and_finer_verified_matches_than_sift(scene, gap, tmp_pa
     assert rows["verified, mean of the pairs' ratios to SIFT"] > verified
     assert rows["sigma, mean of the pairs' ratios to SIFT"] < sigma
     assert rows["largest error of F"] < error_px
-
-
-@pytest.mark.real
-def test_copies_of_a_photograph_match_it_where_they_should():
-    scene = load_real_scene("fountain-P11")
-    if scene is None:
-        pytest.skip("the real photographs are not on this machine (THESISRECON_DATA)")
-    image = read_images(scene.image_paths[5:6], max_size_px=1536).images[0]
-    copies = {copy.name: copy for copy in make_copies(image.rgb)}
-    for name, least in COPIES.items():
-        score = score_copy(front_ends()[OURS], image, copies[name])
-        assert score.right > least
-        assert score.right > 0.99 * score.verified
-
-
-@pytest.fixture
-def smooth_picture():
-    y, x = np.mgrid[:90, :140]
-    wave = 100.0 + 60.0 * np.sin(x / 11.0) * np.cos(y / 9.0) + 0.3 * x
-    rgb = np.repeat(np.rint(wave).astype(np.uint8)[..., None], 3, axis=2)
-    return Image("waves", rgb, (140, 90))
-
-
-def test_the_maps_of_copies_give_the_position_of_each_pixel(smooth_picture):
-    names = []
-    for copy in make_copies(smooth_picture.rgb):
-        names.append(copy.name)
-        if copy.name.startswith(("turned", "scaled")):
-            grey, brightness = smooth_picture.rgb[..., 0], copy.rgb[..., 0]
-            for xy in np.array([[70.0, 45.0], [61.0, 38.0], [80.0, 52.0]]):
-                there = copy.copy_from_image[:, :2] @ xy + copy.copy_from_image[:, 2]
-                column, row = np.rint(there).astype(int)
-                # Half a pixel of rounding is worth a few grey levels here, a wrong map tens.
-                assert abs(float(brightness[row, column]) - float(grey[int(xy[1]), int(xy[0])])) < 8.0
-    assert len(names) == 7
-
-
-def test_repeatability_counts_each_corner_once():
-    xy = np.array([[10.0, 10.0], [30.0, 10.0], [50.0, 40.0], [90.0, 10.0]])
-    shift = np.array([[1.0, 0.0, -5.0], [0.0, 1.0, 0.0]])
-    copy = Copy("moved", np.zeros((60, 80, 3), np.uint8), shift)
-
-    def at(places):
-        ones = np.ones(len(places), np.float32)
-        return Features(places, ones, ones)
-
-    # The last corner left the copy; one of the others is found twice there, one not at all.
-    second = np.array([[5.5, 10.0], [5.0, 11.0], [25.0, 10.0], [70.0, 50.0]])
-    share, shown = repeatability(at(xy), at(second), (100, 60), copy)
-    assert shown == 3
-    assert share == pytest.approx(2.0 / 3.0)
 
 
 def _model_and_pair(k1, moved):

@@ -13,8 +13,7 @@ from thesisrecon.views.image_similarity import GREY
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection, rotation_errors_deg
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
 from validation.metrics.pictures import psnr_db, ssim
-from validation.studies.calibration_parts import named, run_trial, without
-from validation.studies.subsets import Matched
+from validation.studies.coverage import named, run_trial
 
 
 def test_psnr_is_that_of_the_mean_square():
@@ -93,15 +92,6 @@ def test_a_camera_is_named_by_a_wide_interval_a_shrunk_value_a_sentence_or_its_a
         result, warnings=("Image #3: its own matches determine the focal length only to 20% (1 sigma)",)
     )
     assert [named(result, view) for view in range(5)] == [False, True, True, True, True]
-
-
-def test_observations_are_taken_from_one_view_with_the_points_they_leave_alone():
-    view, point = np.array([0, 1, 0, 1, 2]), np.array([0, 0, 1, 1, 1])
-    tracks = Tracks(view, point, np.zeros((5, 2)), 3, 2)
-    matched = Matched("small", tracks, (), np.tile([8, 6], (3, 1)), np.ones(3))
-    less = without(matched, np.array([True, False, True, False, False]), 0).tracks
-    assert less.view_index.tolist() == [1, 2]
-    assert less.point_index.tolist() == [1, 1]
 
 
 @pytest.mark.parametrize("cameras", ["shared", "per-image"])

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Literal
 
 import numpy as np
@@ -17,16 +16,15 @@ from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.io.colmap_model import PARAMETER_COUNTS, inconsistency, read_colmap_model
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import PairChoice
 from validation.metrics.record import Metric
 from validation.scenes.many_views import walk
 from validation.studies import fuzz_colmap, growth, perturbation, timing
-from validation.studies.growth import Choice, Cost, Growth, Meter, choose, recall_of, table, to_metrics
+from validation.studies.growth import Cost, Growth, Meter, recall_of, table
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
 from validation.studies.runner import MODULES, load_study, run_studies, run_study, study_parser, text_table
 from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
-from validation.studies.timing import efficiency_rows, ratio_table, ratios_to_ours
+from validation.studies.timing import ratio_table, ratios_to_ours
 
 ROW = Growth(
     "all-pairs", 10, 45, 45, 2, 1.0, 0.0, 9.0, 10.0, None, ((0, 1, True), (0, 2, False), (1, 2, True))
@@ -48,40 +46,6 @@ def test_the_table_names_shares_and_exponents():
     assert "95 of 190 (50 %)" in text
     assert "| 100.0 % | 98.5 % |" in text
     assert "processor time 2.00" in text
-
-
-def test_missed_pairs_are_reported():
-    good, bad = (Choice("a", 100, 30, 20, missed) for missed in ((), (41,)))
-    assert [metric.verdict for metric in to_metrics(good)] == ["reported", "reported", "reached"]
-    row = to_metrics(bad)[-1]
-    assert (row.verdict, row.values["overlap estimate"]) == ("missed", pytest.approx(95.0))
-    assert "41 verified" in row.note
-
-
-class FirstPairOnly:
-    def select(self, names, features, **rest):
-        del names, features, rest
-        return PairChoice(pairs=[(0, 1)], how="the first")
-
-
-def pair(i, j, inliers, accepted):
-    return SimpleNamespace(i=i, j=j, inliers=inliers, accepted=accepted)
-
-
-def test_accepted_pairs_that_were_not_tried_are_missed_and_others_are_not():
-    pairs = (pair(0, 1, 90, True), pair(0, 2, 70, True), pair(1, 2, 40, True), pair(0, 3, 20, False))
-    images = tuple(SimpleNamespace(name=str(n)) for n in range(4))
-    run = SimpleNamespace(images=images, features=(), pairs=pairs)
-    choice = choose("wall", run, 1, FirstPairOnly())
-    assert choice == Choice("wall", possible=4, tried=1, accepted=3, missed=(40, 70))
-    assert abs(choice.recall - 1 / 3) < 1e-12
-    row = to_metrics(choice)[-1]
-    assert row.verdict == "missed"
-    assert row.note == "missed pairs have 40, 70 verified matches"
-
-
-def test_a_set_without_accepted_pairs_misses_none():
-    assert [row.verdict for row in to_metrics(Choice("dark", 6, 3, 0, ()))][-1] == "reached"
 
 
 def matched_scene():
@@ -252,14 +216,6 @@ def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_
     assert next(row for row in rows if row.startswith("| matches, processor s")).endswith("| 1.50 |")
     assert next(row for row in rows if row.startswith("| whole run, peak MB")).endswith("| 1.00 |")
     assert next(row for row in rows if row.startswith("| points")).endswith("| 2.00 |")
-
-
-def test_the_efficiency_is_that_of_two_workers():
-    found = {"one thread": [(10.0, 10.0)], "two processes": [(6.25, 12.5)]}
-    rows = {row.name: row for row in efficiency_rows("a set", found)}
-    assert rows["efficiency by the clock"].values == {"two processes": 0.8}
-    assert rows["efficiency by work"].values == {"two processes": 0.8}
-    assert rows["efficiency by work"].verdict == "missed"
 
 
 def test_shaken_numbers_are_moved_by_their_rounding():

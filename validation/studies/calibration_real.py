@@ -1,8 +1,8 @@
 """Self-calibration of real images beside COLMAP and the truth, without prior knowledge of the cameras.
 
 Either program matches each set once. The later stages run with one camera for all images and with one for
-each; on the images as they are, zoomed and cropped, and reduced to their centres; with wrong initial focal
-lengths; and on parts of the set. OUT keeps all runs, which are not repeated.
+each; on the images as they are, zoomed and cropped, and with every third image reduced to a window. OUT keeps
+all runs, which are not repeated.
 """
 
 from __future__ import annotations
@@ -20,28 +20,24 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Reconstruction, RunResult
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.metrics.cameras import CameraErrors, TrueCameras, measure_cameras
 from validation.metrics.intervals import LEVEL, focal_errors_pct, interval_scores, join_scores
 from validation.metrics.record import Metric
 from validation.references.colmap_mapping import Start, map_with_pycolmap, read_run
 from validation.references.colmap_matching import match_with_pycolmap
 from validation.scenes.real import REAL_SCENES, Scene
-from validation.scenes.zoomed import central_scene, rezoom_scene, windowed_scene
-from validation.studies.calibration_parts import (
+from validation.scenes.zoomed import rezoom_scene, windowed_scene
+from validation.studies.coverage import (
     COLUMNS,
     MIN_HOLDING,
     MODES,
     SUCCESS_PCT,
     Cameras,
     add_intervals,
-    check_parts,
     named,
 )
 from validation.studies.main_job import COLMAP, COLMAP_PP, OURS, centre_mm_of
 from validation.studies.runner import Part, Rows, scenes_here
-
-Config = Callable[[PipelineConfig], PipelineConfig]
 
 
 def truth_of(scene: Scene) -> TrueCameras:
@@ -61,11 +57,10 @@ class Bench:
     threads: int = 2
     seed: int = 0
 
-    def ours(self, cameras: Cameras, change: Config | None = None) -> RunResult | None:
+    def ours(self, cameras: Cameras) -> RunResult | None:
         """Run ours; the images are matched once for all runs. None if it fails."""
         config = PipelineConfig()
         config = replace(config, intrinsics=replace(config.intrinsics, cameras=cameras))
-        config = config if change is None else change(config)
         images = list(self.scene.image_paths)
         try:
             return reconstruct(
@@ -267,7 +262,6 @@ TARGETS = {
 }
 PER_IMAGE_MEDIAN_PCT, PER_IMAGE_WORST_PCT = 0.2, 0.5
 ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT = 0.5, 3.0
-GUESS_CHANGE_PCT = 0.02
 
 
 def check_cameras(bench: Bench) -> Iterator[list[Metric]]:
@@ -286,77 +280,6 @@ def check_cameras(bench: Bench) -> Iterator[list[Metric]]:
         rows.poses(target.centre_mm, target.rotation_deg)
         # A shared camera is one value, inside its interval or not.
         rows.intervals(run, 1.0 if cameras == "shared" else MIN_HOLDING)
-        yield rows
-
-
-def check_guesses(bench: Bench) -> Iterator[list[Metric]]:
-    """Measure the change of the focal length after initial values that are wrong by a factor of five.
-
-    Ours needs no initial value. The nearest equivalents are the weak prior of self-calibration and a user
-    prior that is wrong by its own standard deviation.
-    """
-    assert bench.scene.K is not None
-    true, rows = float(np.median(bench.scene.K[:, 0, 0])), Rows(f"{bench.scene.name}, wrong guesses", OURS)
-    ours = _focal(model_of(bench.ours("shared")))
-    colmap = _focal(bench.colmap("shared", "default", Start()))
-    for word, factor in (("long", 5.0), ("short", 0.2)):
-        start = Start(focal_rel=1.2 * factor)
-        pulled = _focal(model_of(bench.ours("shared", _pulled(factor))))
-        given = _focal(model_of(bench.ours("shared", _focal_prior(factor * true))))
-        theirs = _focal(bench.colmap("shared", f"five-times-too-{word}", start))
-        values = {OURS: _change_pct(pulled, ours), COLMAP: _change_pct(theirs, colmap)}
-        name = f"focal change, default guess five times too {word}"
-        rows.add(name, values, "%", at_most=GUESS_CHANGE_PCT)
-        name = f"focal change, prior five times too {word}, within a factor of five"
-        rows.add(name, {OURS: _change_pct(given, ours)}, "%", at_most=GUESS_CHANGE_PCT)
-    yield rows
-
-
-def _pulled(factor: float) -> Config:
-    """Move the weak prior of the focal length by ``factor``."""
-
-    def change(config: PipelineConfig) -> PipelineConfig:
-        method = config.selfcalibration
-        assert isinstance(method, HypothesesAndRefinement)
-        there = method.criterion.focal_log_mean + float(np.log(factor))
-        criterion = replace(method.criterion, focal_log_mean=there)
-        return replace(config, selfcalibration=replace(method, criterion=criterion))
-
-    return change
-
-
-def _focal_prior(focal_px: float) -> Config:
-    """Set a prior at ``focal_px`` with a standard deviation of a factor of five."""
-
-    def change(config: PipelineConfig) -> PipelineConfig:
-        options = replace(config.intrinsics, focal_px=focal_px, focal_std_rel=float(np.log(5.0)))
-        return replace(config, intrinsics=options)
-
-    return change
-
-
-def _focal(model: Reconstruction | None) -> float | None:
-    if model is None or model.K is None or not model.registered.any():
-        return None
-    return float(np.median(model.K[model.registered, 0, 0]))
-
-
-def _change_pct(value: float | None, reference: float | None) -> float | None:
-    return None if value is None or reference is None else 100.0 * abs(value / reference - 1.0)
-
-
-def check_centre(bench: Bench) -> Iterator[list[Metric]]:
-    """Calibrate the central quarter of every image, at its own size and enlarged."""
-    for zoom in (1.0, 2.0):
-        here = _variant(bench, f"centre-{zoom:g}", partial(central_scene, zoom=zoom))
-        run, models = here.methods("shared")
-        title = f"{bench.scene.name}, central quarter, {'enlarged' if zoom > 1 else 'as it is'}"
-        rows = CameraRows(title, here.scene, models)
-        rows.registered()
-        rows.error("focal error", "%", lambda e: e.focal_error_pct)
-        rows.principal_point()
-        rows.poses()
-        rows.intervals(run, 1.0)
         yield rows
 
 
@@ -404,33 +327,23 @@ def _pooled(title: str, pooled: Mapping[str, list[np.ndarray]]) -> Rows:
     return rows
 
 
-Name = Literal["cameras", "guesses", "centre", "zoom", "wide", "parts"]
-PARTS: tuple[Name, ...] = ("cameras", "guesses", "centre", "zoom", "wide", "parts")
+Name = Literal["cameras", "zoom", "wide"]
 
 
 def calibration_real_study(
     out: Path,
     scenes: Sequence[str] = tuple(REAL_SCENES),
-    parts: Sequence[Name] = PARTS,
+    parts: Sequence[Name] = ("cameras", "zoom", "wide"),
     seeds: Sequence[int] = (0, 1, 2),
     threads: int = 2,
 ) -> Iterator[Part]:
-    """Compare self-calibration of real images with COLMAP and the truth.
-
-    Parameters
-    ----------
-    seeds : sequence of int
-        Seeds of the zoomed sets.
-    """
+    """Compare self-calibration of real images with COLMAP and the truth."""
     for scene in scenes_here(scenes):
         bench = Bench(scene, out / scene.name, threads)
         checks: dict[str, Callable[[Bench], Iterable[list[Metric]]]] = {
             "cameras": check_cameras,
-            "guesses": check_guesses,
-            "centre": check_centre,
             "zoom": partial(check_zoom, seeds=seeds),
             "wide": check_wide,
-            "parts": lambda b: check_parts(b.scene.name, b.ours("shared"), truth_of(b.scene)),
         }
         if scene.has_truth:
             for part in parts:

@@ -163,15 +163,7 @@ def critical_motions_study(
     zoom: Literal["no", "yes", "both"] = "both",
     motions: Sequence[str] | None = None,
 ) -> Iterator[Part]:
-    """Count critical motions that are named and general motions that are not.
-
-    Parameters
-    ----------
-    zoom : str
-        Whether focal lengths differ.
-    motions : sequence of str
-        Names of motions (default: all).
-    """
+    """Count critical motions that are named and general motions that are not."""
     names = pick(motions, [motion.name.lower() for motion in Motion])
     lines, judged = [], list[list[Metric]]()
     with ProcessPoolExecutor(workers) as pool:

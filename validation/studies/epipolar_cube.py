@@ -12,11 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.colors import qualitative
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.precision import fundamental_bound
@@ -194,28 +191,6 @@ def _short(value: float) -> str:
     return f"{value:.0e}" if 0.0 < value < 1e-3 else f"{value:.3g}"
 
 
-def draw(rows: Sequence[CubeRow]) -> go.Figure:
-    """Plot the RMS ratio to the bound over the noise, on logarithmic axes."""
-    figure = go.Figure()
-    for k, name in enumerate(dict.fromkeys(r.method for r in rows)):
-        some = [r for r in rows if r.method == name and r.sigma_px > 0.0]
-        figure.add_scatter(
-            x=[r.sigma_px for r in some],
-            y=[r.ratio for r in some],
-            name=name,
-            mode="lines" if name == BOUND else "lines+markers",
-            line={"color": "black", "dash": "dash"}
-            if name == BOUND
-            else {"color": qualitative.Dark24[k % 24]},
-            marker={"symbol": k % 8, "size": 9},
-        )
-    ticks = sorted({r.sigma_px for r in rows if r.sigma_px > 0.0})
-    figure.update_xaxes(type="log", title="noise of each coordinate, px", tickvals=ticks)
-    figure.update_yaxes(type="log", title="RMS distance of the exact points over the bound", dtick="D2")
-    figure.update_layout(title="The cube sequence: how far each method is from the bound")
-    return figure
-
-
 def report(rows: Sequence[CubeRow]) -> Iterator[str]:
     """Give a Markdown table of methods by noise for each measure."""
     sigmas = list(dict.fromkeys(r.sigma_px for r in rows))
@@ -227,21 +202,13 @@ def report(rows: Sequence[CubeRow]) -> Iterator[str]:
 
 
 def epipolar_cube_study(
-    out: Path,
     noise: Sequence[float] = NOISES_PX,
     every: int = 1,
     methods: Sequence[str] = CUBE_METHODS,
 ) -> Iterator[Part]:
-    """Repeat the thesis' cube study (5.5); OUT gets a plot, cube.html.
-
-    Parameters
-    ----------
-    every : int
-        Take every n-th pair.
-    """
+    """Repeat the thesis' cube study (5.5)."""
     names = pick(methods, [m.name for m in METHODS])
     pairs = cube_pairs(make_cube())[::every]
     rows = run_cube(pairs, [m for m in METHODS if m.name in names], noise)
     yield f"{len(pairs)} pairs of 27 cameras"
     yield from report(rows)
-    draw(rows).write_html(out / "cube.html", include_plotlyjs=True)

@@ -188,17 +188,7 @@ def epipolar_real_study(
     verbose: bool = False,
     cache: Path = CACHE,
 ) -> Iterator[Part]:
-    """Compare F of real images with OpenCV, COLMAP and PoseLib.
-
-    Parameters
-    ----------
-    pairs : sequence of str
-        Names of pairs of kusvod2 (default: all).
-    mutual : bool
-        Keep only mutual best matches in kusvod2.
-    verbose : bool
-        Report every pair of the scenes with cameras.
-    """
+    """Compare F of real images with OpenCV, COLMAP and PoseLib."""
     one_thread()
     names = pick(methods, SOLVERS)
     if "kusvod2" in parts:

@@ -172,19 +172,7 @@ def fuzz_guided(seconds: int, seed: int, folder: Path, memory_mb: int) -> Findin
 def fuzz_colmap_study(
     seconds: int = 600, seed: int = 0, memory: int = 1024, corpus: Path | None = None, plain: bool = False
 ) -> Iterator[Part]:
-    """Fuzz the reader of COLMAP's binary files.
-
-    Parameters
-    ----------
-    seconds : int
-        Duration.
-    memory : int
-        Limit of the reader's process in MB.
-    corpus : Path
-        Folder of inputs that are continued.
-    plain : bool
-        Do not use atheris even if it is installed.
-    """
+    """Fuzz the reader of COLMAP's binary files."""
     if plain or importlib.util.find_spec("atheris") is None:
         findings = fuzz_at_random(seconds, seed)
     else:

@@ -1,4 +1,4 @@
-"""Growth of time and memory with the number of images, and the choice of pairs.
+"""Growth of time and memory with the number of images.
 
 ``growth``: crops of images at random places and zooms are matched, each set in its own process, with all
 pairs and with the overlap estimate. Exponents are slopes of lines fitted to the logarithms; those of time use
@@ -6,8 +6,6 @@ processor time, which other load disturbs less. By default every ten crops show 
 each overlaps with as many others in sets of all sizes.
 ``growth-of-cost``: the first n images of a long walk around the courtyard become metric cameras. All sizes
 show the same yard, so each image overlaps with ever more others.
-``pair-choice``: all pairs of each set are matched and verified; the overlap estimate then chooses from the
-same features as if the set were large.
 """
 
 from __future__ import annotations
@@ -23,18 +21,16 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.config import ImageOptions, PipelineConfig, preset
+from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import Image, RunResult
-from thesisrecon.runtime.executors import Workers
-from validation.metrics.record import Metric
+from thesisrecon.records import RunResult
 from validation.scenes.crops import Crop, make_crops, make_separate_crops, shared_area
 from validation.scenes.many_views import walk, write_views
 from validation.scenes.real import REAL_SCENES
 from validation.studies.measuring import call_apart, exponent
-from validation.studies.runner import Part, Rows, load_scene, scenes_here, text_table
+from validation.studies.runner import Part, load_scene, text_table
 
 # ---------------------------------------------------------------- growth of matching
 
@@ -283,56 +279,6 @@ def cost_table(costs: Sequence[Cost]) -> str:
     return "\n".join([text_table(["", *(f"{n:.0f}" for n in sizes), "power of N"], lines), *failures])
 
 
-# ---------------------------------------------------------------- choice of pairs
-
-MIN_RECALL = 0.97
-ESTIMATE = "overlap estimate"
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Pairs of one set: possible, tried by the estimate, and accepted if all are tried.
-
-    ``missed`` holds the verified matches of each accepted pair that the estimate did not try.
-    """
-
-    scene: str
-    possible: int
-    tried: int
-    accepted: int
-    missed: tuple[int, ...]
-
-    @property
-    def recall(self) -> float:
-        """Tried share of the accepted pairs."""
-        return 1.0 - len(self.missed) / max(self.accepted, 1)
-
-
-def choose(scene: str, everything: RunResult, threads: int, estimate: OverlapEstimate) -> Choice:
-    """Compare the estimate with a run that tried all pairs."""
-    choice = estimate.select(
-        [image.name for image in everything.images],
-        everything.features,
-        map_all=Workers(threads).map_all,
-        rng=np.random.default_rng(0),
-    )
-    tried = {(int(i), int(j)) for i, j in choice.pairs}
-    accepted = [pair for pair in everything.pairs if pair.accepted]
-    missed = tuple(sorted(pair.inliers for pair in accepted if (pair.i, pair.j) not in tried))
-    return Choice(scene, len(everything.pairs), len(tried), len(accepted), missed)
-
-
-def to_metrics(choice: Choice) -> list[Metric]:
-    """Return the rows of the table."""
-    lost, rows = ", ".join(map(str, choice.missed)), Rows(choice.scene, ESTIMATE)
-    rows.add("pairs tried", 100.0 * choice.tried / choice.possible, "%")
-    rows.add("pairs accepted of all", 100.0 * choice.accepted / choice.possible, "%")
-    note = f"missed pairs have {lost} verified matches" if lost else ""
-    name = "accepted pairs that were tried"
-    rows.add(name, 100.0 * choice.recall, "%", at_least=100.0 * MIN_RECALL, note=note)
-    return rows
-
-
 # ---------------------------------------------------------------- the studies
 
 
@@ -344,15 +290,7 @@ def growth_study(
     same_scenes: bool = False,
     seed: int = 0,
 ) -> Iterator[Part]:
-    """Measure how time and memory of matching grow with the number of images.
-
-    Parameters
-    ----------
-    all_pairs_up_to : int
-        Largest set of which all pairs are tried.
-    same_scenes : bool
-        Cut all sets from the same scenes, so that overlapping pairs grow with the square of the size.
-    """
+    """Measure how time and memory of matching grow with the number of images."""
 
     def measure(method: str, count: int) -> Growth:
         given = (method, count, long_side, threads, seed, not same_scenes)
@@ -386,31 +324,3 @@ def growth_of_cost_study(
         yield f"{count} images: {sum(costs[-1].cpu_s.values()):.0f} processor s"
     yield f"long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
     yield cost_table(costs)
-
-
-def pair_choice_study(
-    out: Path,
-    crops: Sequence[int] = (1, 2),
-    count: int = 30,
-    long_side: int = 480,
-    max_size: int = 1600,
-    threads: int = 2,
-) -> Iterator[Part]:
-    """Measure which accepted pairs the overlap estimate tries and misses.
-
-    Parameters
-    ----------
-    crops : sequence of int
-        Seeds of the sets of crops.
-    count : int
-        Crops of each set.
-    """
-    scenes = scenes_here(["courtyard", *REAL_SCENES])
-    sets: list[tuple[str, Sequence[Path] | Sequence[Image]]] = [(s.name, s.image_paths) for s in scenes]
-    for seed in crops:
-        images = [crop.image for crop in draw_crops(count, long_side, seed)]
-        sets.append((f"{count} crops, seed {seed}", images))
-    config = replace(preset("default"), pairs=AllPairs(), images=ImageOptions(max_size))
-    for name, chosen in sets:
-        run = reconstruct(list(chosen), out / name, config=config, until="matches", threads=threads)
-        yield to_metrics(choose(name, run, threads, OverlapEstimate(all_up_to=0)))

@@ -126,13 +126,7 @@ HEAD += ["off by more than 3 %", "and by more than the interval"]
 
 
 def harsh_study(trials: int = 20, workers: int = 1, kinds: Sequence[str] | None = None) -> Iterator[Part]:
-    """Look for trusted answers with a wrong focal length outside its interval, on harsh synthetic sets.
-
-    Parameters
-    ----------
-    kinds : sequence of str
-        Words; kinds of sets that contain one of them are taken.
-    """
+    """Look for trusted answers with a wrong focal length outside its interval, on harsh synthetic sets."""
     chosen = [k for k in KINDS if kinds is None or any(word in k for word in kinds)]
     with ProcessPoolExecutor(workers) as pool:
         yield from _report((k, list(pool.map(partial(run_trial, k), range(trials)))) for k in chosen)

@@ -285,13 +285,7 @@ def main_job_study(
     threads: int = 2,
     readme: Path | None = None,
 ) -> Iterator[Part]:
-    """Run both presets and COLMAP on the same images and compare them with the truth.
-
-    Parameters
-    ----------
-    readme : Path
-        Markdown file whose table of measurements is replaced.
-    """
+    """Run both presets and COLMAP on the same images and compare them with the truth."""
     found = scenes_here(scenes)
     if not found:
         return

@@ -27,7 +27,7 @@ from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.projective.factorization import Factorization, depths_from_fundamentals, factorize
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
-from thesisrecon.runtime.run import stream
+from thesisrecon.runtime._run import stream
 from validation.metrics.record import Metric
 from validation.scenes.cloud import make_cloud
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks

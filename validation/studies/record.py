@@ -123,7 +123,7 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
     from thesisrecon.errors import StageFailure
     from thesisrecon.intrinsics import prior_for
     from thesisrecon.records import Tracks
-    from thesisrecon.runtime.run import stream
+    from thesisrecon.runtime._run import stream
     from validation.scenes.dinosaur import load_dinosaur, pairs_from_tracks
 
     if name == "cube":
@@ -228,19 +228,7 @@ def record_study(
     presets: Sequence[str] = PRESETS,
     compare_with: Sequence[Path] = (),
 ) -> Iterator[Part]:
-    """Record every number of some runs in a file, or compare two such files.
-
-    Parameters
-    ----------
-    write_to : Path
-        File of the record; earlier runs in it are kept.
-    sets : sequence of str
-        Names of recorded sets.
-    presets : sequence of str
-        Presets of the runs.
-    compare_with : sequence of Path
-        Two files: before and after.
-    """
+    """Record every number of some runs in a file, or compare two such files."""
     if write_to is not None:
         yield from write(write_to, out, pick(sets, (*TRACKS, *IMAGE_SETS)), presets)
     elif len(compare_with) == 2:

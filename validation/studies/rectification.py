@@ -1,8 +1,4 @@
-"""Rectification of real pairs beside OpenCV.
-
-Every accepted pair of fountain-P11 and Herz-Jesus-P8 (reconstructed once in OUT) with every method, and pairs
-of kusvod2, some with the epipoles in the image, with the best method.
-"""
+"""Rectification of every accepted pair of real images (reconstructed once in OUT) beside OpenCV."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
 
 import thesisrecon
 from thesisrecon.arrays import F64
@@ -33,7 +28,6 @@ from thesisrecon.stereo.rectification import RectificationQuality, jacobians, me
 from thesisrecon.stereo.resampling import Rectification
 from validation.metrics.record import Metric
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
-from validation.scenes.real import data_root
 from validation.studies.measuring import timed
 from validation.studies.runner import Part, Rows, scenes_here
 
@@ -42,7 +36,6 @@ BEST_F, BEST = "best from F", "best from cameras"
 OPENCV_F, OPENCV = "OpenCV uncalibrated", "OpenCV stereoRectify"
 DY_PX, ORTHOGONALITY_DEG, ASPECT, KEPT = 0.3, 5.0, 0.1, 0.8
 GRID = 48
-Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -243,77 +236,10 @@ def _merged(merge: Callable[[F64], float], values: list[float]) -> float | None:
     return float(merge(finite)) if len(finite) else None
 
 
-def check_hand_made(names: Sequence[str]) -> list[Metric]:
-    """Match and rectify pairs of kusvod2 with the best method from F."""
-    root, rows = data_root(), Rows("kusvod2", "RMS |dy|")
-    for name in names:
-        folder = root / "kusvod2" / name if root else None
-        if folder is None or not folder.is_dir():
-            continue
-        sizes = [_size(folder / f"{side}.jpg") for side in "AB"]
-        found = thesisrecon.match_pair(str(folder / "A.jpg"), str(folder / "B.jpg"))
-        try:
-            pair = pair_of_fundamental(found.F, found.xy1, found.xy2, sizes[0], sizes[1])
-            chosen = rectify(pair)
-        except StageFailure as reason:
-            rows.add(name, {"RMS |dy|": None}, "px", note=str(reason))
-            continue
-        q = measure_quality(chosen, pair)
-        kept = [_kept(chosen, side, size) for side, size in enumerate(sizes)]
-        values = {"matches": float(len(found.xy1)), "RMS |dy|": _dy_and_range(chosen, pair)[0]}
-        values |= {"distortion": q.distortion, "kept of A": kept[0], "kept of B": kept[1]}
-        values |= {"pixels over the image's": q.size_ratio}
-        rows.add(name, values, note="planar" if isinstance(chosen, PlanarRectification) else "polar")
-    return rows
-
-
-def _kept(rectified: Rectification, side: int, size: Size) -> float:
-    """Share of an image inside the frame."""
-    x, y = ((np.arange(GRID) + 0.5) / GRID * length - 0.5 for length in size)
-    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return float(np.isfinite(rectified.rectified_from_original(side, grid)).all(axis=1).mean())
-
-
-def _size(path: Path) -> Size:
-    with Image.open(path) as image:
-        return image.size
-
-
-def draw_pair(rectified: Rectification, images: Sequence[np.ndarray], to: Path) -> None:
-    """Draw both sides beside each other with red lines."""
-    sides = [rectified.warp(image.astype(np.float32), side) for side, image in enumerate(images)]
-    shown = np.hstack([np.where(np.isnan(s), 40.0, np.clip(s, 0.0, 255.0)).astype(np.uint8) for s in sides])
-    picture = Image.fromarray(shown)
-    pen = ImageDraw.Draw(picture)
-    for y in np.linspace(0, picture.height - 1, 24).astype(int):
-        pen.line([(0, y), (picture.width, y)], fill=(255, 0, 0))
-    picture.save(to)
-
-
-HAND_MADE = ("booksh", "corr", "kampa", "rotunda", "valbonne")
-
-
-def rectification_study(
-    out: Path, scenes: Sequence[str] = SCENES, hand_made: Sequence[str] = HAND_MADE, pictures: bool = False
-) -> Iterator[Part]:
-    """Compare rectification of real pairs with OpenCV.
-
-    Parameters
-    ----------
-    hand_made : sequence of str
-        Pairs of kusvod2, some with the epipoles in the image.
-    pictures : bool
-        Draw some pairs with horizontal lines into OUT.
-    """
-    yield check_hand_made(hand_made)
+def rectification_study(out: Path, scenes: Sequence[str] = SCENES) -> Iterator[Part]:
+    """Compare rectification of real pairs with OpenCV."""
     for scene in scenes_here(scenes):
         run = thesisrecon.reconstruct(list(scene.image_paths), out / scene.name, until="metric")
         assert run.metric is not None
         sizes = np.array([image.size for image in run.images], dtype=np.float64)
-        pairs = pairs_of(run.pairs, run.metric.reconstruction, sizes)
-        yield check_scene(scene.name, pairs)
-        for pair in pairs if pictures else ():
-            i, j = map(int, pair.name.split("-"))
-            if j - i in (1, 3):
-                images = [run.images[k].rgb for k in (i, j)]
-                draw_pair(rectify(pair.loose), images, out / f"{scene.name}-{pair.name}.png")
+        yield check_scene(scene.name, pairs_of(run.pairs, run.metric.reconstruction, sizes))

@@ -31,7 +31,7 @@ from typing import Any, Literal
 
 from thesisrecon.cli.main import run_command
 from thesisrecon.errors import REMEDIES
-from thesisrecon.runtime.signals import CODES
+from thesisrecon.runtime._signals import CODES
 from validation.scenes.real import ROOT
 from validation.studies.runner import Part, Rows, text_table
 
@@ -483,15 +483,7 @@ def _count(scene: str, name: str, wrong: int, total: int) -> Rows:
 def kill_anywhere_study(
     kills: int = 20, writes: int = 5, max_size: int = 640, until: str = "model", threads: int = 2
 ) -> Iterator[Part]:
-    """Kill runs anywhere, resume them and compare all bytes with an undisturbed run.
-
-    Parameters
-    ----------
-    kills : int
-        Runs killed (SIGKILL) at moments spread over their time.
-    writes : int
-        Runs killed in the middle of a write.
-    """
+    """Kill runs anywhere, resume them and compare all bytes with an undisturbed run."""
     options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
     with TemporaryDirectory() as place:
         rows = _printed(kill_runs(Runs(Path(place), options), kills, writes))
@@ -510,23 +502,7 @@ def stop_anywhere_study(
     set_: Sequence[str] = (),
     cold: bool = False,
 ) -> Iterator[Part]:
-    """Interrupt runs anywhere; each must end in 2 s with one sentence and resume to the same bytes.
-
-    Parameters
-    ----------
-    signal_ : str
-        Signal that the process group gets.
-    moments : int
-        Moments spread over the time of a run.
-    images : Path
-        Folder of images.
-    executor : str
-        Executor of the runs.
-    set_ : sequence of str
-        Settings STAGE.FIELD=VALUE of the runs.
-    cold : bool
-        Begin each run without compiled kernels.
-    """
+    """Interrupt runs anywhere; each must end in 2 s with one sentence and resume to the same bytes."""
     asked = signal.Signals[f"SIG{signal_}"]
     options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
     options += ["--executor", executor, *(word for value in set_ for word in ("--set", value))]
@@ -539,17 +515,7 @@ def stop_anywhere_study(
 def full_disk_study(
     every: int = 1, disks: int = 10, views: int = 3, max_size: int = 320, until: str = "model"
 ) -> Iterator[Part]:
-    """Fill the disk or make it read-only at every file; each run must say so and resume.
-
-    Parameters
-    ----------
-    every : int
-        Take every n-th file only.
-    disks : int
-        Number of small and of read-only file systems.
-    views : int
-        Number of images.
-    """
+    """Fill the disk or make it read-only at every file; each run must say so and resume."""
     with TemporaryDirectory() as place:
         runs = SmallRuns(Path(place), views, max_size, until)
         rows = _printed(refuse_runs(runs, every, disks))

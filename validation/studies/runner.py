@@ -1,10 +1,9 @@
 """Run the studies: ``python -m validation study NAME [--option ...]``, ``python -m validation study --list``.
 
 A study is a generator function ``NAME_study`` in a module of this folder. Its keyword parameters with their
-defaults and annotations are the options of the command; :data:`HELP` or the Parameters section of its
-docstring explain them. It yields parts: a list of :class:`Metric` rows (printed as one table under the scene
-of the first row) or a string (printed as it is). The exit code is 1 if a bound is missed, 2 if an option or
-the data are missing.
+defaults and annotations are the options of the command, which :data:`HELP` explains. It yields parts: a list
+of :class:`Metric` rows (one table under the scene of the first row) or a string (printed as it is).
+The exit code is 1 if a bound is missed, 2 if an option or the data are missing.
 
 A parameter ``out : Path`` is a folder that keeps what the study makes; without ``--out`` it is temporary.
 """
@@ -32,7 +31,7 @@ from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_s
 
 MODULES = {
     "benchmark-table": "timing",
-    "calibration-coverage": "calibration_parts",
+    "calibration-coverage": "coverage",
     "calibration-real": "calibration_real",
     "critical-motions": "critical_motions",
     "dinosaur": "projective",
@@ -51,8 +50,6 @@ MODULES = {
     "kill-anywhere": "robustness",
     "main-job": "main_job",
     "package": "package.steps",
-    "pair-choice": "growth",
-    "parallel": "timing",
     "perturbation": "perturbation",
     "record": "record",
     "rectification": "rectification",
@@ -68,28 +65,65 @@ MODULES = {
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 """Folder that keeps SIFT matches of image pairs between studies."""
 HELP = {
+    "all_pairs_up_to": "largest set of which all pairs are tried",
+    "append": "file to which every trial is appended as a line of JSON",
+    "benchmark": "JSON file of pytest-benchmark",
     "cache": "folder that keeps SIFT matches",
     "cameras": "shared: one camera for all images; per-image: one for each",
+    "cold": "begin each run without compiled kernels",
+    "compare_with": "two records: before and after",
+    "corpus": "folder of inputs that are continued",
+    "disks": "number of small and of read-only file systems",
+    "every": "take every n-th one only",
+    "executor": "executor of the runs",
+    "first": "number of the first draw",
+    "gaps": "gaps of the pairs (i, i + gap)",
+    "grid": "run every noise at every number of cameras",
+    "images": "folder of images",
+    "kills": "runs killed (SIGKILL) at moments spread over their time",
+    "kinds": "words; kinds of sets that contain one of them are taken",
     "long_side": "long side of the images in px",
     "max_size": "long side of the images in px",
+    "memory": "limit of the process in MB",
     "methods": "names of methods (default: all)",
+    "modes": "one camera or focal length for all images, or one for each",
+    "moments": "moments spread over the time of a run",
+    "motions": "names of motions (default: all)",
+    "mutual": "keep only mutual best matches in kusvod2",
     "noise": "standard deviations of image coordinates in px",
+    "pairs": "names of pairs of kusvod2 (default: all)",
     "parts": "parts of the study (default: all)",
+    "plain": "do not use atheris even if it is installed",
     "points": "numbers of points or matches",
+    "presets": "presets of the runs",
+    "pytest": "arguments of pytest in place of the quick suite",
+    "python": "interpreter of the new environments",
+    "ratios": "JSON file for the ratios",
+    "read": "files of earlier trials; with --trials 0 they are only reported",
+    "readme": "Markdown file whose table of measurements is replaced",
     "repeats": "repetitions; the least or the median counts",
-    "results": "JSON file whose rows are kept, and replaced by those of this run",
+    "same_scenes": "cut all sets from the same scenes: overlapping pairs grow with the square of the size",
     "scenes": "names of image sets (default: all on this machine)",
+    "seconds": "duration",
     "seed": "random seed",
     "seeds": "random seeds, or their number",
+    "set_": "settings STAGE.FIELD=VALUE of the runs",
+    "sets": "names of the recorded sets",
+    "signal_": "signal that the process group gets",
     "sizes": "numbers of images",
+    "steps": "build install imports typed quiet demo lowest newest",
     "threads": "threads of a run",
     "trials": "random trials of each setting",
     "until": "last stage of the runs",
-    "views": "view numbers, or fewest and most views",
+    "verbose": "report every pair of the scenes with cameras",
+    "views": "numbers of views, or fewest and most",
     "workers": "processes that share the trials",
+    "write_to": "file of the record; earlier runs in it are kept",
+    "writes": "runs killed in the middle of a write",
     "wrong": "shares of wrong matches",
+    "zoom": "whether focal lengths differ",
 }
-"""Help of the options that mean the same in all studies."""
+"""Help of the options of all studies."""
 SHIFTED = "Cones9"
 """Nine views of the Middlebury Cones, by a camera that moves without rotation."""
 Part = Sequence[Metric] | str
@@ -167,12 +201,12 @@ def study_parser(name: str, function: StudyFunction) -> argparse.ArgumentParser:
     )
     parser.add_argument("-o", "--out", type=Path, help="folder for the tables and for what the study makes")
     parser.add_argument("--json", type=Path, help="file for the metric rows")
-    hints, help_of = typing.get_type_hints(function), HELP | _parameter_help(function)
+    hints = typing.get_type_hints(function)
     for parameter in inspect.signature(function).parameters.values():
         if parameter.name != "out":
             flag = f"--{parameter.name.replace('_', '-').strip('-')}"
             given = _argument(hints[parameter.name], parameter.default)
-            parser.add_argument(flag, dest=parameter.name, help=help_of.get(parameter.name), **given)
+            parser.add_argument(flag, dest=parameter.name, help=HELP.get(parameter.name), **given)
     return parser
 
 
@@ -195,18 +229,6 @@ def _argument(hint: Any, default: Any) -> dict[str, Any]:
 
 def _summary(function: StudyFunction) -> str:
     return (inspect.getdoc(function) or "").partition("\n")[0]
-
-
-def _parameter_help(function: StudyFunction) -> dict[str, str]:
-    """Read the descriptions in the Parameters section of a numpydoc docstring."""
-    lines = (inspect.getdoc(function) or "").partition("Parameters\n----------\n")[2].splitlines()
-    found: dict[str, str] = {}
-    for line in lines:
-        if line and not line.startswith(" "):
-            name = line.partition(" :")[0]
-        elif line.strip():
-            found[name] = f"{found.get(name, '')} {line.strip()}".strip().replace("%", "%%")
-    return found
 
 
 @contextmanager

@@ -399,23 +399,7 @@ def selfcalibration_study(
     read: Sequence[Path] = (),
     append: Path | None = None,
 ) -> Iterator[Part]:
-    """Compare all self-calibration methods on the thesis' cube and on a point cloud.
-
-    Parameters
-    ----------
-    modes : sequence of str
-        One focal length for all images, or one for each.
-    views : sequence of int
-        Numbers of cameras.
-    grid : bool
-        Run every noise at every number of cameras.
-    first : int
-        Number of the first draw.
-    read : sequence of Path
-        Files of earlier trials; with --trials 0 they are only reported.
-    append : Path
-        File to which every trial is appended as a line of JSON.
-    """
+    """Compare all self-calibration methods on the thesis' cube and on a point cloud."""
     names = tuple(pick(methods, [*VARIANTS, WITH_BUNDLE, BOUND]))
     places = cells(scenes, modes, noise, views, grid=grid)
     jobs = [(cell, names, first + k, 1) for k in range(trials) for cell in places]

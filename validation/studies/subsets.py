@@ -25,7 +25,7 @@ from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline._cameras import ATTEMPTS
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult, Tracks, TwoView
-from thesisrecon.runtime.run import stream
+from thesisrecon.runtime._run import stream
 from validation.scenes.real import REAL_SCENES, Scene
 from validation.studies.runner import SHIFTED, Part, Rows, scenes_here, text_table
 
@@ -243,13 +243,7 @@ def subsets_study(
     views: Sequence[int] = (MIN_VIEWS, MAX_VIEWS),
     threads: int = 2,
 ) -> Iterator[Part]:
-    """Reconstruct random subsets of images and of tracks.
-
-    Parameters
-    ----------
-    modes : sequence of str
-        One camera for all images, or one for each.
-    """
+    """Reconstruct random subsets of images and of tracks."""
     rows, judged = [], Rows("subsets", "share")
     for scene in scenes_here(scenes):
         matched = match_scene(scene, out, threads=threads)

@@ -147,17 +147,7 @@ STEPS: dict[str, Callable[[Checks], list[str]]] = {
 def package_study(
     out: Path, steps: Sequence[str] = ("build",), python: str = sys.executable, pytest: Sequence[str] = ()
 ) -> Iterator[Part]:
-    """Build the package, install it into empty environments and use it from empty folders.
-
-    Parameters
-    ----------
-    steps : sequence of str
-        build install imports typed quiet demo lowest newest.
-    python : str
-        Interpreter of the new environments.
-    pytest : sequence of str
-        Arguments of pytest in place of the quick suite.
-    """
+    """Build the package, install it into empty environments and use it from empty folders."""
     checks, rows = Checks(out, python, list(pytest)), Rows("package", "ours")
     for step in pick(steps, STEPS):
         found = STEPS[step](checks)

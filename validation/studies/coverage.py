@@ -1,0 +1,125 @@
+"""Coverage of the 95 % intervals of self-calibration on synthetic scenes.
+
+General scenes of random cameras with noisy tracks, from the projective maximum-likelihood reconstruction
+through self-calibration to the metric stage. The intervals of focal length and principal point should contain
+the truth in 95 of 100 cases.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.intrinsics import prior_for
+from thesisrecon.records import MetricResult
+from thesisrecon.runtime._run import stream
+from validation.metrics.intervals import (
+    LEVEL,
+    IntervalScores,
+    holding_std,
+    interval_scores,
+    join_scores,
+)
+from validation.metrics.record import Metric
+from validation.scenes.critical import Motion, make_sequence, projective_estimate
+from validation.studies.main_job import OURS
+from validation.studies.runner import Part, Rows
+
+Cameras = Literal["shared", "per-image"]
+MODES: tuple[Cameras, ...] = ("shared", "per-image")
+SUCCESS_PCT = 3.0
+MIN_HOLDING = 0.92
+WIDE_REL = 0.02
+"""Relative standard deviation from which on a focal length counts as marked uncertain."""
+
+
+def add_intervals(rows: Rows, scores: IntervalScores, least: float | None) -> None:
+    """Add coverage and width of the 95 % intervals of focal length and principal point."""
+    for label, columns in COLUMNS.items():
+        row = f"95 % intervals of the {label} that hold the truth"
+        rows.add(row, scores.holding(columns), at_least=least)
+        rows.add(f"largest error, {label}", scores.worst(columns), "stated standard deviations")
+    width = float(100.0 * np.nanmedian(scores.std_rel))
+    rows.add("stated standard deviation of the focal, median", width, "%")
+
+
+def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
+    """Keep one view if all views share a camera."""
+    if cameras == "per-image":
+        return scores
+    first = int(np.flatnonzero(np.isfinite(scores.std_rel))[0])
+    return IntervalScores(scores.z[first : first + 1], scores.std_rel[first : first + 1])
+
+
+def named(result: MetricResult, view: int) -> bool:
+    """Return whether the result marks the focal length of a view as uncertain.
+
+    The view is not registered, a sentence names it, its value is shrunk, or its standard deviation is
+    large.
+    """
+    if not result.reconstruction.registered[view]:
+        return True
+    sentence = re.compile(rf"#{view}\b")
+    if any(sentence.search(said) for said in (*result.warnings, *result.failed_checks)):
+        return True
+    interval = result.intrinsics[view]["focal_px"]
+    return interval.source.startswith("shrunk") or interval.std / interval.value >= WIDE_REL
+
+
+COVERAGE = 0.92, 0.98
+ZOOM = 0.3
+COLUMNS = {"focal": (0,), "principal point": (1, 2)}
+
+
+def run_trial(cameras: Cameras, number: int) -> tuple[IntervalScores, MetricResult] | None:
+    """Solve one synthetic scene; None if calibration fails.
+
+    With one camera per image the focal lengths vary by factors of up to e^0.3.
+    """
+    rng = np.random.default_rng([number, 5])
+    scene = make_sequence(Motion.GENERAL, rng, zoom=0.0 if cameras == "shared" else ZOOM)
+    projective = projective_estimate(scene, rng)
+    config = PipelineConfig()
+    prior = prior_for(projective, replace(config.intrinsics, cameras=cameras))
+    try:
+        calibration = config.selfcalibration.calibrate(
+            projective, prior=prior, rng=stream(number, "selfcalibration")
+        )
+        result = config.metric.refine(projective, calibration, prior=prior, rng=stream(number, "metric"))
+    except StageFailure:
+        return None
+    return one_camera(interval_scores(result, scene.K), cameras), result
+
+
+def check_coverage(cameras: Cameras, numbers: Iterable[int]) -> list[Metric]:
+    """Measure one mode over these trials; results that are not trusted do not count."""
+    found = [run_trial(cameras, number) for number in numbers]
+    trusted = [part for part in found if part is not None and part[1].trusted]
+    rows = Rows(f"synthetic, {cameras}", OURS)
+    rows.add(f"calibrated of {len(found)}", float(sum(part is not None for part in found)))
+    rows.add(f"trusted of {len(found)}", float(len(trusted)))
+    if not trusted:
+        return rows
+    scores = [part[0] for part in trusted]
+    joined = join_scores(scores)
+    for label, columns in COLUMNS.items():
+        z, share = joined.z[:, columns], joined.holding(columns)
+        name = f"95 % intervals of the {label} that hold the truth"
+        rows.add(name, share, at_least=COVERAGE[0])
+        rows.add(f"{name} (no wider than needed)", share, at_most=COVERAGE[1])
+        rows.add(f"{name}, 95 % uncertainty of this share", LEVEL * holding_std(scores, columns))
+        rows.add(f"error, {label}, rms in stated standard deviations", float(np.sqrt(np.nanmean(z**2))))
+    rows.add("stated standard deviation of the focal, median, %", float(100 * np.nanmedian(joined.std_rel)))
+    return rows
+
+
+def calibration_coverage_study(trials: int = 200) -> Iterator[Part]:
+    """Count 95 % intervals that contain the truth, on synthetic scenes that match the model."""
+    for cameras in MODES:
+        yield check_coverage(cameras, range(trials))
