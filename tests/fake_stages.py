@@ -29,8 +29,8 @@ from thesisrecon.records import (
     TwoView,
     Upgrade,
 )
+from thesisrecon.stereo._neighbours import SparsePoints
 from thesisrecon.stereo.depth import MultiViewScene
-from thesisrecon.stereo.neighbours import SparsePoints
 
 CALLS = []
 WIDTH, HEIGHT, POINTS = 96, 80, 30

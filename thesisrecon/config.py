@@ -1,7 +1,7 @@
 """The configuration: one field per stage, each holding the object that does its work.
 
 Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis). Its text form, TOML and
-``--set``, is read and written by :mod:`thesisrecon.settings`.
+``--set``, is read and written by :mod:`thesisrecon._settings`.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations
 from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
+from thesisrecon.stereo._depth_fusion import SequenceLinking
 from thesisrecon.stereo.correspondence import PairMatching, RectifiedPair
 from thesisrecon.stereo.depth import MultiViewScene, MultiViewStereo
-from thesisrecon.stereo.depth_fusion import SequenceLinking
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets
@@ -92,16 +92,14 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
 }
 
 
+# The stages. `rng` is the source of randomness, which deterministic methods ignore; views are numbered as images.
+
+
 class Detector(Protocol):
     """Detect the features of one image (4.2.1)."""
 
     def detect(self, image: Image) -> Features:
         """Detect the corners and, for some detectors, the seeds of an image.
-
-        Parameters
-        ----------
-        image : Image
-            The image.
 
         Returns
         -------
@@ -114,12 +112,7 @@ class PairSelector(Protocol):
     """Select the pairs of images to match; ``check`` refuses invalid settings before anything is computed."""
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Check the settings against the image names.
-
-        Parameters
-        ----------
-        names, left_out : collection of str
-            Names of the images, and of images that were not used.
+        """Check the settings against the names of the images and of images that were not used.
 
         Raises
         ------
@@ -130,23 +123,7 @@ class PairSelector(Protocol):
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
     ) -> PairChoice:
-        """Select pairs of images.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Names of the images.
-        features : sequence of Features
-            Features of the images, with seeds if overlap is estimated.
-        map_all : callable
-            Parallel map.
-        rng : numpy.random.Generator
-            Source of the vocabulary sample.
-
-        Returns
-        -------
-        PairChoice
-            The pairs.
+        """Select pairs of images by their names and features; ``map_all`` is a parallel map.
 
         Raises
         ------
@@ -156,17 +133,10 @@ class PairSelector(Protocol):
 
 
 class Matcher(Protocol):
-    """Match the features of two images (4.2.2); ``prepare`` does the work that depends on one image."""
+    """Match the features of two images (4.2.2)."""
 
     def prepare(self, image: Image, features: Features) -> Any:
-        """Prepare an image for matching.
-
-        Parameters
-        ----------
-        image : Image
-            The image.
-        features : Features
-            Its features.
+        """Do the work that depends on one image.
 
         Returns
         -------
@@ -194,17 +164,12 @@ class Matcher(Protocol):
         estimate_fundamental : callable
             Robust estimator of F, for guided matching.
         rng : numpy.random.Generator
-            Source of randomness; not used by deterministic methods.
+            Source of randomness.
 
         Returns
         -------
         Matches
-            Matches, possibly none.
-
-        Raises
-        ------
-        UsageError
-            If the features have no seeds but need them.
+            Matches, possibly none; ``UsageError`` if the features have no seeds but need them.
         """
 
 
@@ -212,14 +177,7 @@ class FundamentalEstimator(Protocol):
     """Estimate F from matches with outliers (chapter 5)."""
 
     def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
-        """Estimate F of matches with outliers.
-
-        Parameters
-        ----------
-        xy1, xy2 : array_like (N, 2)
-            Matched points, N >= 8, px.
-        rng : numpy.random.Generator
-            Source of the samples.
+        """Estimate F of matched points ``xy1``, ``xy2`` (N, 2), px, with outliers.
 
         Returns
         -------
@@ -239,16 +197,7 @@ class Verifier(Protocol):
     """Decide whether a pair and its F are accepted, and which matches are inliers."""
 
     def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
-        """Verify the matches of a pair.
-
-        Parameters
-        ----------
-        matches : Matches
-            All matches of the pair.
-        fit : FundamentalFit
-            Robust estimate of F from these matches.
-        rng : numpy.random.Generator
-            Source of the samples.
+        """Verify all matches of a pair by the F estimated from them.
 
         Returns
         -------
@@ -261,16 +210,7 @@ class TrackBuilder(Protocol):
     """Join pairwise matches to tracks."""
 
     def build(self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
-        """Build tracks from the matches of accepted pairs.
-
-        Parameters
-        ----------
-        prepared : sequence
-            The prepared images.
-        pairs : sequence of TwoView
-            The verified pairs.
-        rng : numpy.random.Generator
-            Source of randomness; not used by deterministic methods.
+        """Build tracks from the accepted pairs of the prepared images.
 
         Returns
         -------
@@ -295,10 +235,8 @@ class ProjectiveReconstructor(Protocol):
 
         Parameters
         ----------
-        tracks : Tracks
-            All tracks; a selection is used.
-        pairs : sequence of TwoView
-            Verified pairs.
+        tracks, pairs : Tracks, sequence of TwoView
+            All tracks, of which a selection is used, and the verified pairs.
         sizes : ndarray (V, 2) of int
             Width and height of each image.
         rng : numpy.random.Generator
@@ -324,16 +262,7 @@ class SelfCalibrator(Protocol):
     def calibrate(
         self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
     ) -> SelfCalibration:
-        """Upgrade a projective reconstruction to a metric one.
-
-        Parameters
-        ----------
-        reconstruction : Reconstruction
-            Projective reconstruction of at least three cameras.
-        prior : IntrinsicsPrior
-            Prior of the intrinsics of every view.
-        rng : numpy.random.Generator
-            Source of randomness; not used by deterministic methods.
+        """Upgrade a projective reconstruction of at least three cameras by the prior of every view.
 
         Returns
         -------
@@ -352,10 +281,8 @@ def with_images(method: SelfCalibrator, images: Sequence[Image]) -> SelfCalibrat
 
     Parameters
     ----------
-    method : SelfCalibrator
-        Any method.
-    images : sequence of Image
-        One per view.
+    method, images : SelfCalibrator, sequence of Image
+        Any method, and one image per view.
 
     Returns
     -------
@@ -377,18 +304,7 @@ class MetricRefiner(Protocol):
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
     ) -> MetricResult:
-        """Refine a projective reconstruction to the final metric model.
-
-        Parameters
-        ----------
-        reconstruction : Reconstruction
-            Projective reconstruction.
-        calibration : SelfCalibration
-            Its self-calibration; all candidates are tried.
-        prior : IntrinsicsPrior
-            Prior of the views.
-        rng : numpy.random.Generator
-            Source of randomness.
+        """Refine a projective reconstruction to the metric model; all candidate calibrations are tried.
 
         Returns
         -------
@@ -403,7 +319,10 @@ class MetricRefiner(Protocol):
 
 
 class DepthEstimator(Protocol):
-    """Estimate depth maps one view at a time (2.5)."""
+    """Estimate depth maps one view at a time (2.5).
+
+    ``scene`` has all views, or those of ``required_views``.
+    """
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap:
         """Compute the disparities of a rectified pair.
@@ -425,18 +344,9 @@ class DepthEstimator(Protocol):
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
     ) -> RectifiedPair:
-        """Rectify two images by their F and match both directions.
+        """Rectify two images by their F and at least 8 inliers, and match both directions.
 
-        Parameters
-        ----------
-        image1, image2 : Image
-            The images.
-        F : ndarray (3, 3)
-            Fundamental matrix, x2' F x1 = 0.
-        xy1, xy2 : ndarray (N >= 8, 2)
-            Inlier matches in pixels.
-        planar : bool
-            Rectify by homographies only.
+        ``planar`` allows homographies only.
 
         Returns
         -------
@@ -446,14 +356,7 @@ class DepthEstimator(Protocol):
         ...
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
-        """Undistort the views and select their neighbours.
-
-        Parameters
-        ----------
-        images : sequence of Image
-            The V images.
-        reconstruction : Reconstruction
-            Metric reconstruction of these images.
+        """Undistort the images of a metric reconstruction and select the neighbours of each.
 
         Returns
         -------
@@ -465,13 +368,6 @@ class DepthEstimator(Protocol):
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
         """Return the views that the depth map of a view and its confirmation need.
 
-        Parameters
-        ----------
-        scene : MultiViewScene
-            All views.
-        view : int
-            Number of the view.
-
         Returns
         -------
         frozenset of int
@@ -482,13 +378,6 @@ class DepthEstimator(Protocol):
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
         """Compute the depth map of one view from its neighbours.
 
-        Parameters
-        ----------
-        scene : MultiViewScene
-            All views, or those of ``required_views``.
-        view : int
-            Number of the view.
-
         Returns
         -------
         DepthMap
@@ -498,16 +387,7 @@ class DepthEstimator(Protocol):
         ...
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
-        """Complete a depth map, and keep the depths that the maps of other views confirm.
-
-        Parameters
-        ----------
-        scene : MultiViewScene
-            All views, or those of ``required_views``.
-        depth_maps : mapping of int to DepthMap
-            Results of ``depth_map``.
-        view : int
-            Number of the view.
+        """Complete a result of ``depth_map``, and keep the depths that the maps of other views confirm.
 
         Returns
         -------
@@ -518,26 +398,12 @@ class DepthEstimator(Protocol):
 
 
 class ModelBuilder(Protocol):
-    """Fuse depth maps to a textured surface (2.6)."""
+    """Fuse depth maps to a textured surface (2.6); the result does not depend on ``threads``."""
 
     def build(
         self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
     ) -> TexturedMesh:
         """Build the textured surface of a scene.
-
-        Parameters
-        ----------
-        depth_maps : sequence of DepthMap
-            Depths of the views.
-        views : sequence of PinholeView
-            Undistorted images with their cameras.
-        threads : int
-            Number of threads; the result does not depend on it.
-
-        Returns
-        -------
-        TexturedMesh
-            The model.
 
         Raises
         ------
@@ -553,22 +419,12 @@ class ModelBuilder(Protocol):
         without: int | None = None,
         threads: int = 1,
     ) -> TexturedMesh:
-        """Texture a surface.
-
-        Parameters
-        ----------
-        surface : TexturedMesh
-            Surface without colours.
-        views, threads
-            As in :meth:`build`.
-        without : int, optional
-            Number of a view that is not used, for comparison of its image with a rendering of the model. Its
-            depths remain part of the surface.
+        """Texture a surface by all views, except view ``without`` if its image is compared with the model.
 
         Returns
         -------
         TexturedMesh
-            The textured surface.
+            The textured surface; the depths of that view remain part of it.
         """
 
 

@@ -11,8 +11,8 @@ from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.records import Image
+from thesisrecon.stereo._depth_fusion import SequenceLinking
 from thesisrecon.stereo.depth import MultiViewStereo
-from thesisrecon.stereo.depth_fusion import SequenceLinking
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
 
 STEREO = MultiViewStereo()

@@ -10,13 +10,13 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import DepthMap, DisparityMap
+from thesisrecon.stereo._depth_fusion import _concatenated, _inverse_depth_of
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
+from thesisrecon.stereo._neighbours import pinhole_view, select_neighbours, shared_projections, sparse_points
+from thesisrecon.stereo._planar import common_orientation
+from thesisrecon.stereo._polar import polar
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
 from thesisrecon.stereo.depth import _region_sizes, _transfer, complete_depths, confirm_depths
-from thesisrecon.stereo.depth_fusion import _concatenated, _inverse_depth_of
-from thesisrecon.stereo.neighbours import pinhole_view, select_neighbours, shared_projections, sparse_points
-from thesisrecon.stereo.planar import common_orientation
-from thesisrecon.stereo.polar import polar
 
 
 @pytest.fixture(scope="module")

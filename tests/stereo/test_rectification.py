@@ -11,14 +11,15 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.stereo import rectification
 from thesisrecon.stereo._epipolar_pair import MAX_GROWTH, MAX_SHRINK, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo.planar import (
+from thesisrecon.stereo._planar import (
     PlanarRectification,
     common_orientation,
     hartley,
     loop_zhang,
     minimum_distortion,
 )
-from thesisrecon.stereo.polar import PolarRectification, polar
+from thesisrecon.stereo._polar import PolarRectification, polar
+from thesisrecon.stereo._resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
 from thesisrecon.stereo.rectification import (
     disparity_range,
     jacobians,
@@ -27,7 +28,6 @@ from thesisrecon.stereo.rectification import (
     rectify_cameras,
     rectify_pair,
 )
-from thesisrecon.stereo.resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
 
 PLANAR_METHODS = (hartley, loop_zhang, minimum_distortion, common_orientation)
 CASES = [(method, motion) for method in PLANAR_METHODS for motion in PLANAR]

@@ -8,7 +8,7 @@ from tests.synthetic import texture
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
-from thesisrecon.stereo.planar import minimum_distortion
+from thesisrecon.stereo._planar import minimum_distortion
 from thesisrecon.views.interpolation import InterpolatedPair
 from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
 

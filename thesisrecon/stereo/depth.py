@@ -13,17 +13,17 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
+from thesisrecon.stereo._depth_fusion import InverseDepth, RobustFusion, SequenceLinking, pixel_transfer
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
-from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
-from thesisrecon.stereo.depth_fusion import InverseDepth, RobustFusion, SequenceLinking, pixel_transfer
-from thesisrecon.stereo.neighbours import (
+from thesisrecon.stereo._neighbours import (
     SparsePoints,
     pinhole_view,
     select_neighbours,
     shared_projections,
     sparse_points,
 )
-from thesisrecon.stereo.plane_refinement import ALIKE, refine_depths, search_planes
+from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
+from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 
 SURE = 3.0
 """Standard deviations by which an inverse depth must exceed 0, that of infinity."""

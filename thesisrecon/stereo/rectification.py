@@ -19,9 +19,9 @@ from thesisrecon.stereo._epipolar_pair import (
     pair_of_fundamental,
     singular_values,
 )
-from thesisrecon.stereo.planar import common_orientation, hartley, loop_zhang, minimum_distortion
-from thesisrecon.stereo.polar import PolarRectification, polar
-from thesisrecon.stereo.resampling import Rectification
+from thesisrecon.stereo._planar import common_orientation, hartley, loop_zhang, minimum_distortion
+from thesisrecon.stereo._polar import PolarRectification, polar
+from thesisrecon.stereo._resampling import Rectification
 
 STEP_PX = 0.01
 """Half step of numerical derivatives."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import decompose_camera
-from thesisrecon.stereo.planar import PlanarRectification
+from thesisrecon.stereo._planar import PlanarRectification
 from validation.references.libraries import cv2
 
 Size = tuple[int, int]

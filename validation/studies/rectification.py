@@ -16,16 +16,16 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.records import Reconstruction, TwoView
 from thesisrecon.stereo._epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo.planar import (
+from thesisrecon.stereo._planar import (
     PlanarRectification,
     common_orientation,
     hartley,
     loop_zhang,
     minimum_distortion,
 )
-from thesisrecon.stereo.polar import polar
+from thesisrecon.stereo._polar import polar
+from thesisrecon.stereo._resampling import Rectification
 from thesisrecon.stereo.rectification import RectificationQuality, jacobians, measure_quality, rectify
-from thesisrecon.stereo.resampling import Rectification
 from validation.metrics.record import Metric
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
 from validation.studies.measuring import timed

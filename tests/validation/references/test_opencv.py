@@ -6,7 +6,7 @@ import pytest
 from tests.validation.references.conftest import Looked, skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import Image
-from thesisrecon.stereo.planar import PlanarRectification
+from thesisrecon.stereo._planar import PlanarRectification
 from validation.references.corners import harris_corners, sift_corners
 from validation.references.pictures import shrink, warp_affine, warp_perspective
 from validation.references.rectification import opencv_calibrated

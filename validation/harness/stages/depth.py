@@ -15,8 +15,8 @@ from thesisrecon.config import preset
 from thesisrecon.io._files import write_text
 from thesisrecon.io.images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
+from thesisrecon.stereo._neighbours import pinhole_view
 from thesisrecon.stereo.depth import MultiViewStereo
-from thesisrecon.stereo.neighbours import pinhole_view
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.scenes import load_images
 from validation.harness.stages._shared import OURS, each, row

@@ -9,6 +9,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, U8
 from thesisrecon.records import PinholeView
+from thesisrecon.stereo._depth_fusion import InverseDepth, pixel_transfer
 from thesisrecon.stereo._depth_kernels import surface_continuation
 from thesisrecon.stereo._plane_kernels import (
     UNKNOWN,
@@ -20,7 +21,6 @@ from thesisrecon.stereo._plane_kernels import (
     rate_planes,
     sweep_planes,
 )
-from thesisrecon.stereo.depth_fusion import InverseDepth, pixel_transfer
 
 ALIKE = 0.03
 """Largest relative difference of inverse depths on one surface."""

@@ -22,7 +22,7 @@ from thesisrecon.stereo._epipolar_pair import (
     disparity_gradients,
     frame_size,
 )
-from thesisrecon.stereo.resampling import Rectification
+from thesisrecon.stereo._resampling import Rectification
 
 ANGLES = 4096
 """Number of half-planes at which the row spacing is computed."""

@@ -28,7 +28,7 @@ from thesisrecon.stereo._epipolar_pair import (
     plane_from_angle,
     singular_values,
 )
-from thesisrecon.stereo.resampling import Rectification
+from thesisrecon.stereo._resampling import Rectification
 
 SEARCH = 96
 """Lines at infinity that are tried before the best is refined."""

@@ -11,7 +11,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, distort, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Image, PinholeView, Reconstruction
-from thesisrecon.stereo.resampling import warp_image
+from thesisrecon.stereo._resampling import warp_image
 
 BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
 """Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones."""
