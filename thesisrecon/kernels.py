@@ -26,6 +26,8 @@ from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
+from thesisrecon.arrays import F64, I64
+
 CACHE_VARIABLE = "THESISRECON_KERNEL_CACHE"
 """Environment variable: the folder of the compiled kernels."""
 
@@ -38,7 +40,7 @@ _pickled: Callable[[Any], bytes] = dumps
 
 # Level 2 compiles a third faster than numba's default of 3, and the kernels are as fast.
 if "NUMBA_OPT" not in os.environ:
-    numba.config.OPT = type(numba.config.OPT)(2)
+    vars(numba.config)["OPT"] = type(vars(numba.config)["OPT"])(2)
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
@@ -247,3 +249,36 @@ def _write(path: Path, content: bytes) -> None:
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
         file.write(hashlib.sha256(content).digest() + content)
     Path(file.name).replace(path)
+
+
+# Arrays of kernels. numba compiles NumPy's own functions anew for each kernel and shape, with their messages.
+
+
+@kernel
+def empty_vector(n: int) -> F64:
+    """Float64 array (n,), not initialised."""
+    return np.empty(n)
+
+
+@kernel
+def empty_matrix(m: int, n: int) -> F64:
+    """Float64 array (m, n), not initialised."""
+    return np.empty((m, n))
+
+
+@kernel
+def zero_vector(n: int) -> F64:
+    """Float64 array (n,) of zeros."""
+    return np.zeros(n)
+
+
+@kernel
+def zero_matrix(m: int, n: int) -> F64:
+    """Float64 array (m, n) of zeros."""
+    return np.zeros((m, n))
+
+
+@kernel
+def empty_integers(n: int) -> I64:
+    """Int64 array (n,), not initialised."""
+    return np.empty(n, np.int64)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty_matrix, empty_vector, kernel, zero_matrix
 
 # H is singular at a match if det J J' is below the first times its squared trace; it then has the second
 # squared distance.
@@ -51,7 +51,7 @@ def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) 
 @kernel(error_model="numpy")
 def _plane_distances(h: F64, points: F64) -> F64:
     """Squared distances (N,) of all points from a homography."""
-    squared = np.empty(len(points))
+    squared = empty_vector(len(points))
     for k in range(len(points)):
         squared[k] = _squared_plane_distance(h, points[k, 0], points[k, 1], points[k, 2], points[k, 3])
     return squared
@@ -63,12 +63,12 @@ def induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area:
 
     Each match gives v . x1 = b with b = (x2 x A x1) . (x2 x e2) / |x2 x e2|^2. False if nearly collinear.
     """
-    A = np.empty(9)
+    A = empty_vector(9)
     for j in range(3):
         A[j] = e2[1] * f[6 + j] - e2[2] * f[3 + j]
         A[3 + j] = e2[2] * f[j] - e2[0] * f[6 + j]
         A[6 + j] = e2[0] * f[3 + j] - e2[1] * f[j]
-    M, b = np.empty((3, 2)), np.empty(3)
+    M, b = empty_matrix(3, 2), empty_vector(3)
     for k in range(3):
         x1, y1, x2, y2 = points[triple[k]]
         M[k, 0], M[k, 1] = x1, y1
@@ -100,7 +100,7 @@ def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
     """
     G[:] = 0.0
     total, wide = 0.0, gate * gate
-    row = np.zeros((2, 9))
+    row = zero_matrix(2, 9)
     for k in range(len(points)):
         x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
         share = _squared_plane_distance(h, x1, y1, x2, y2) / wide
@@ -135,7 +135,7 @@ def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
 @kernel(error_model="numpy")
 def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
     """Fit ``h`` in place to the points within a gate by reweighted least squares; returns G."""
-    G = np.empty((9, 9))
+    G = empty_matrix(9, 9)
     for _ in range(iterations):
         h /= np.sqrt(np.sum(h * h)) + 1e-300
         _plane_normal_equations(h, points, gate, G)
@@ -153,7 +153,7 @@ def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
 @kernel(error_model="numpy")
 def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> None:
     """Write the plane ``h`` of triples (S, 3) with the smallest sum of truncated squared distances."""
-    best, trial = float(len(points)), np.empty(9)
+    best, trial = float(len(points)), empty_vector(9)
     h[:] = 0.0
     wide = 1.0 / (gate * gate)
     for t in range(len(triples)):
@@ -238,7 +238,7 @@ def plane_covariance(h: F64, points: F64, sigma: float) -> F64:
 @kernel(error_model="numpy")
 def _parallax_lines(h: F64, points: F64) -> F64:
     """Lines (N, 3) x2 x H x1 in image 2 through a match and its position on the plane."""
-    lines = np.empty((len(points), 3))
+    lines = empty_matrix(len(points), 3)
     for k in range(len(points)):
         x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
         p0 = h[0] * x1 + h[1] * y1 + h[2]
@@ -282,7 +282,7 @@ def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: f
     """
     columns = np.ascontiguousarray(points.T)
     lines = _parallax_lines(h, points)
-    F, agree, e2 = np.empty((len(pairs), 9)), np.empty((len(pairs), len(points))), np.empty(3)
+    F, agree, e2 = empty_matrix(len(pairs), 9), empty_matrix(len(pairs), len(points)), empty_vector(3)
     for s in range(len(pairs)):
         a, b = lines[pairs[s, 0]], lines[pairs[s, 1]]
         e2[0], e2[1], e2[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty_matrix, empty_vector, kernel
 from thesisrecon.numerics.levenberg_marquardt import solve_damped
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
@@ -28,7 +28,7 @@ def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delt
     Row 9 is the signed residual, row 10 the weight rho'(r) / r, 0 beyond the gate. No branches and contiguous
     rows, so that the loop vectorises.
     """
-    X = np.empty((4, BLOCK))
+    X = empty_matrix(4, BLOCK)
     for k in range(len(points)):
         for c in range(4):
             X[c, k] = points[k, c]
@@ -119,7 +119,7 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
     G[:] = 0.0
     h[:] = 0.0
     cost = 0.0
-    D, wd = np.empty((11, BLOCK)), np.empty(BLOCK)
+    D, wd = empty_matrix(11, BLOCK), empty_vector(BLOCK)
     for start in range(0, len(points), BLOCK):
         m = min(BLOCK, len(points) - start)
         block = points[start : start + m]
@@ -148,7 +148,7 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
 @kernel
 def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64, F64]:
     """Signed residuals (N,) of a criterion and their derivatives (N, 9) by F."""
-    r, J, D = np.empty(len(points)), np.empty((len(points), 9)), np.empty((11, BLOCK))
+    r, J, D = empty_vector(len(points)), empty_matrix(len(points), 9), empty_matrix(11, BLOCK)
     for start in range(0, len(points), BLOCK):
         block = points[start : start + BLOCK]
         if criterion == REPROJECTION:
@@ -223,10 +223,10 @@ def refine(
     The cost is never above that of the nearest rank-2 matrix of the start. Residuals beyond ``gate`` have no
     weight; ``delta`` is the width of Huber's loss.
     """
-    U, V, Un, Vn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    U, V, Un, Vn = empty_matrix(3, 3), empty_matrix(3, 3), empty_matrix(3, 3), empty_matrix(3, 3)
     phi = orthonormal_from_fundamental(f, U, V)
-    G, h, Gn, hn = np.empty((9, 9)), np.empty(9), np.empty((9, 9)), np.empty(9)
-    B, step, trial = np.empty((9, 7)), np.empty(7), np.empty(9)
+    G, h, Gn, hn = empty_matrix(9, 9), empty_vector(9), empty_matrix(9, 9), empty_vector(9)
+    B, step, trial = empty_matrix(9, 7), empty_vector(7), empty_vector(9)
     fundamental_from_orthonormal(U, V, phi, f)
     cost = normal_equations(f, points, criterion, gate, delta, G, h)
     exact = 1e-26 * len(points)

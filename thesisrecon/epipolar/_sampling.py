@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._refinement import SAMPSON, refine
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty_integers, empty_matrix, empty_vector, kernel
 from thesisrecon.numerics.ransac import draw_sample, required_samples
 
 LANES = 32
@@ -226,7 +226,7 @@ def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> floa
 @kernel(error_model="numpy")
 def sampson_distances(f: F64, points: F64) -> F64:
     """Sampson distances (N,) >= 0 of all points."""
-    r = np.empty(len(points))
+    r = empty_vector(len(points))
     for k in range(len(points)):
         r[k] = np.sqrt(_squared_sampson(f, points[k, 0], points[k, 1], points[k, 2], points[k, 3]))
     return r
@@ -294,7 +294,7 @@ def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
 @kernel
 def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
     """Write the samples of the rows of ``uniforms`` (B <= LANES, 7) as columns of ``X`` (28, LANES)."""
-    sample = np.empty(7, np.int64)
+    sample = empty_integers(7)
     for lane in range(len(uniforms)):
         draw_sample(uniforms[lane], len(points), sample)
         for m in range(7):
@@ -325,8 +325,8 @@ def search_fundamental(
     """
     columns = np.ascontiguousarray(points.T)
     done, least, confidence = stop
-    X, Y = np.ones((28, LANES)), np.empty((ROWS, LANES))
-    solutions, work = np.empty((3, 9)), np.empty(9)
+    X, Y = np.ones((28, LANES)), empty_matrix(ROWS, LANES)
+    solutions, work = empty_matrix(3, 9), empty_vector(9)
     for start in range(0, len(uniforms), LANES):
         if done >= least and done >= required_samples(state[1], 7, confidence, LARGEST):
             break

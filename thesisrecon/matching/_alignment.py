@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty_matrix, empty_vector, kernel, zero_matrix, zero_vector
 from thesisrecon.matching._prepared import (
     FAST,
     SAMPLES,
@@ -115,7 +115,7 @@ def _read_template(
     """
     xy, size = place
     template, gradient = out
-    step = np.zeros((2, 2))
+    step = zero_matrix(2, 2)
     step[0, 0] = step[1, 1] = size
     if not sample_window(pixels, level, to_level, xy, step, WIDE, border):
         return False
@@ -164,7 +164,7 @@ def _project_out_gain_and_bias(gradient: F32, template: F32, norm: float) -> Non
 def _normal_matrix(gradient: F32) -> F64:
     """Inner products of the derivatives."""
     unknowns = len(gradient)
-    normal = np.zeros((unknowns, unknowns))
+    normal = zero_matrix(unknowns, unknowns)
     for g in range(unknowns):
         for h in range(g, unknowns):
             normal[g, h] = normal[h, g] = dot(gradient[g], gradient[h])
@@ -189,7 +189,7 @@ def _iterate(
     xy, a = found
     iterations, affine_std, reach, size = limits
     x, y = xy[0], xy[1]
-    moved = np.zeros(len(gradient))
+    moved = zero_vector(len(gradient))
     value = 0.0
     for turn in range(iterations + 1):
         if not sample_window(pixels, level, to_level, xy, a * size, SIDE, window):
@@ -217,7 +217,7 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
     moved, affine_std = prior
     unknowns = len(gradient)
     damped = normal.copy()
-    right = np.empty(unknowns)
+    right = empty_vector(unknowns)
     # Residual variance of a normalised sample against the prior of the affine coefficients.
     ridge = max(1.0 - value * value, 1e-4) / SAMPLES / max(HALF * HALF * affine_std * affine_std, 1e-12)
     for g in range(unknowns):
@@ -225,7 +225,7 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
         if g >= 2:
             damped[g, g] += ridge
             right[g] -= ridge * moved[g]
-    delta = np.empty(unknowns)
+    delta = empty_vector(unknowns)
     delta[:] = np.linalg.solve(damped, right)
     for g in range(2, unknowns):
         moved[g] += delta[g]
@@ -236,7 +236,7 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
 def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
     """Compose the map x2(x) = xy + a x with the inverse of the step of the template, in place."""
     if len(delta) == 6:
-        d = np.empty((2, 2))
+        d = empty_matrix(2, 2)
         d[0, 0], d[0, 1] = 1.0 + delta[2] / HALF, delta[3] / HALF
         d[1, 0], d[1, 1] = delta[4] / HALF, 1.0 + delta[5] / HALF
         a[:] = a @ np.linalg.inv(d)

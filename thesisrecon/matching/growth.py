@@ -10,7 +10,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty_integers, empty_matrix, empty_vector, kernel, zero_matrix
 from thesisrecon.matching._alignment import align_matches, strongest_distinct
 from thesisrecon.matching._prepared import (
     SAMPLES,
@@ -48,15 +48,15 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
     """
     count, k = neighbours.shape
     affine = np.empty((count, 2, 2))
-    position = np.empty((count, 2))
-    spread = np.empty(count)
-    offset = np.empty((k, 2))
-    rest = np.empty((k, 2))
-    distance2 = np.empty(k)
-    residual2 = np.empty(k)
+    position = empty_matrix(count, 2)
+    spread = empty_vector(count)
+    offset = empty_matrix(k, 2)
+    rest = empty_matrix(k, 2)
+    distance2 = empty_vector(k)
+    residual2 = empty_vector(k)
     for n in range(count):
         mean2 = 0.0
-        a0 = np.zeros((2, 2))
+        a0 = zero_matrix(2, 2)
         for m in range(k):
             i = neighbours[n, m]
             dx, dy = xy1[i, 0] - xy[n, 0], xy1[i, 1] - xy[n, 1]
@@ -71,7 +71,7 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
             rest[m, 0] = xy2[i, 0] - (a0[0, 0] * dx + a0[0, 1] * dy)
             rest[m, 1] = xy2[i, 1] - (a0[1, 0] * dx + a0[1, 1] * dy)
         scale2 = np.inf
-        a, z = a0, np.zeros((3, 2))
+        a, z = a0, zero_matrix(3, 2)
         for _ in range(ROUNDS):
             z = _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2))
             a = a0 + z[:2].T
@@ -92,8 +92,8 @@ def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: t
     """Correction (3, 2) of the prior map, transposed, above the translation, by weighted least squares."""
     distance2, mean2 = near
     residual2, scale2 = misfit
-    s = np.zeros((3, 3))
-    r = np.zeros((3, 2))
+    s = zero_matrix(3, 3)
+    r = zero_matrix(3, 2)
     total = 0.0
     for m in range(len(offset)):
         w = 1.0 / (distance2[m] + mean2)
@@ -115,7 +115,7 @@ def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: t
     s[0, 0] += ridge
     s[1, 1] += ridge
     s[1, 0], s[2, 0], s[2, 1] = s[0, 1], s[0, 2], s[1, 2]
-    correction = np.empty((3, 2))
+    correction = empty_matrix(3, 2)
     correction[:] = np.linalg.solve(s, r)
     return correction
 
@@ -145,7 +145,7 @@ def _match_guided(
     index = np.full(count, -1, np.int64)
     score = np.zeros(count, np.float32)
     second_best = np.full(count, -1.0, np.float32)
-    near, seen = np.empty(len(xy2), np.int64), np.empty(len(xy2), np.float32)
+    near, seen = empty_integers(len(xy2)), np.empty(len(xy2), np.float32)
     window = np.empty((2, SAMPLES), np.float32)
     ready = np.zeros(2, np.bool_)
     sizes = np.array([1.0, 2.0]) * float(np.min(scale2))
@@ -229,7 +229,7 @@ def _warp_windows(
     a, determinant = local
     window, ready = out
     m = np.sqrt(determinant)
-    inverse = np.empty((2, 2))
+    inverse = empty_matrix(2, 2)
     inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
     inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
     for t in range(len(sizes)):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty_integers, empty_matrix, kernel
 from thesisrecon.matching._alignment import align_corners
 from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.numerics.observations import morton_pair_order
@@ -58,7 +58,7 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
         last[a] = last[b]
         size[a] += size[b]
     first = np.full(count, -1, np.int64)
-    root = np.empty(count, np.int64)
+    root = empty_integers(count)
     for n in range(count):
         a = n
         while parent[a] != a:
@@ -86,19 +86,19 @@ def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle:
         start[edges[e, 1] + 1] += 1
     start = np.cumsum(start)
     fill = start[:-1].copy()
-    incident = np.empty(2 * len(edges), np.int64)
+    incident = empty_integers(2 * len(edges))
     for e in range(len(edges)):
         for side in range(2):
             incident[fill[edges[e, side]]] = e
             fill[edges[e, side]] += 1
     reached = np.zeros(count, np.bool_)
-    queue = np.empty(count, np.int64)
+    queue = empty_integers(count)
     head, tail = 0, 0
     for t in range(len(middle)):
         queue[tail] = middle[t]
         reached[middle[t]] = True
         tail += 1
-    inverse = np.empty((2, 2))
+    inverse = empty_matrix(2, 2)
     while head < tail:
         k = queue[head]
         head += 1
