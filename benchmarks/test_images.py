@@ -13,7 +13,7 @@ from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.matching._seeds import _scan_correlations as scan_correlations
-from thesisrecon.pipeline.image_pair import detect_features, match_views
+from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo._planar import PlanarRectification, hartley
@@ -52,7 +52,7 @@ def test_corners(bench: Bench, method: str, photographs: tuple[Image, ...]) -> N
 @pytest.mark.parametrize("method", ["ours", "SIFT"])
 def test_matches_of_a_pair(bench: Bench, method: str, photographs: tuple[Image, ...]) -> None:
     config = preset("default") if method == "ours" else sift_front_end(preset("default"))
-    one, two = (config.matching.prepare(image, detect_features(config, image)) for image in photographs)
+    one, two = (config.matching.prepare(image, config.features.detect(image)) for image in photographs)
     bench("matches and F of a pair, features known", method, lambda: match_views(config, one, two, (0, 1), 0))
 
 

@@ -6,6 +6,15 @@ import tomllib
 import numpy as np
 import pytest
 
+from thesisrecon._settings import (
+    _parse,
+    _toml_lines,
+    config_from_tables,
+    config_from_toml,
+    tables_from_config,
+    tables_from_settings,
+    toml_from_config,
+)
 from thesisrecon.config import KINDS, PRESETS, preset
 from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import (
@@ -18,15 +27,6 @@ from thesisrecon.intrinsics import (
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.stratified import Stratified
-from thesisrecon.settings import (
-    config_from_tables,
-    config_from_toml,
-    parse_word,
-    tables_from_config,
-    tables_from_settings,
-    toml_from_config,
-    toml_from_tables,
-)
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets
 
@@ -166,7 +166,7 @@ def test_another_kind_on_the_command_line_drops_the_settings_of_the_kind_in_the_
     [("true", True), ("3", 3), ("-2.5e3", -2500.0), ("[1, 2.5]", [1, 2.5]), ("word", "word"), ("'3'", "3")],
 )
 def test_words_of_the_command_line(text, value):
-    parsed = parse_word(text)
+    parsed = _parse(text)
     assert parsed == value
     assert type(parsed) is type(value)
 
@@ -179,7 +179,7 @@ def test_toml_keeps_awkward_text():
             "b": {"c": 1e-300},
         }
     }
-    assert tomllib.loads(toml_from_tables(tables)) == tables
+    assert tomllib.loads("\n".join(_toml_lines(tables, ()))) == tables
 
 
 def test_surface_and_fusion_are_chosen_by_their_words():

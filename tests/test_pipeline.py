@@ -22,8 +22,8 @@ from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Image
-from thesisrecon.runtime.executors import Workers
-from thesisrecon.runtime.run import stream
+from thesisrecon.runtime._executors import Workers
+from thesisrecon.runtime._run import stream
 from thesisrecon.views.render import render
 
 

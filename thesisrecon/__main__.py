@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thesisrecon.runtime.signals import install_signal_handlers
+from thesisrecon.runtime._signals import install_signal_handlers
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ from thesisrecon.records import (
     Tracks,
     TwoView,
 )
-from thesisrecon.runtime.run import stream
+from thesisrecon.runtime._run import stream
 from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
 from thesisrecon.view_interpolation import interpolate_view
 from thesisrecon.view_synthesis import synthesize_view

@@ -92,7 +92,7 @@ KINDS: Mapping[str, Mapping[str, type[Any]]] = {
 }
 
 
-# The stages. `rng` is the source of randomness, which deterministic methods ignore; views are numbered as images.
+# `rng` is the source of randomness, which deterministic methods ignore; views are numbered like images.
 
 
 class Detector(Protocol):
@@ -445,10 +445,6 @@ class ImageOptions:
             raise ValueError(f"max_size_px must be at least 64; got {self.max_size_px}")
 
 
-def _precise_ransac() -> LocallyOptimisedRansac:
-    return LocallyOptimisedRansac(inlier_sigmas=PRECISE_SIGMAS)
-
-
 @dataclass(frozen=True)
 class PipelineConfig:
     """Settings of the whole pipeline; the defaults are the preset ``default``.
@@ -474,7 +470,9 @@ class PipelineConfig:
     features: Detector = field(default_factory=MultiScaleCorners)
     pairs: PairSelector = field(default_factory=OverlapEstimate)
     matching: Matcher = field(default_factory=SeedsAndGrowth)
-    epipolar: FundamentalEstimator = field(default_factory=_precise_ransac)
+    epipolar: FundamentalEstimator = field(
+        default_factory=lambda: LocallyOptimisedRansac(inlier_sigmas=PRECISE_SIGMAS)
+    )
     verification: Verifier = field(default_factory=PairVerification)
     tracks: TrackBuilder = field(default_factory=AlignedTracks)
     projective: ProjectiveReconstructor = field(default_factory=IncrementalProjective)

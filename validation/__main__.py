@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from thesisrecon.runtime.signals import install_signal_handlers, with_resume_advice
+from thesisrecon.runtime._signals import install_signal_handlers, with_resume_advice
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.runtime.signals import with_resume_advice
+from thesisrecon.runtime._signals import with_resume_advice
 from validation.ablation import command as ablation
 from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates

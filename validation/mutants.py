@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon.errors import counted
-from thesisrecon.runtime.signals import install_signal_handlers
+from thesisrecon.runtime._signals import install_signal_handlers
 from validation.harness.planting import CopiedTree, imports_of
 from validation.harness.process import own_cores, run_process
 from validation.scenes.real import ROOT

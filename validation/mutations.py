@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from thesisrecon.errors import counted
-from thesisrecon.runtime.signals import install_signal_handlers
+from thesisrecon.runtime._signals import install_signal_handlers
 from validation.harness.gates import Gate, read_gates
 from validation.harness.planting import CopiedTree
 from validation.harness.process import last_words, own_cores, run_process

@@ -12,24 +12,24 @@ import PIL.Image
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from thesisrecon.io.colmap_model import read_colmap_model, write_colmap_model
 
 from tests.hostile.files import glb, require_sentence, triangle
 from tests.io.test_colmap import _SMALL, _plain_names
 from tests.io.test_images import picture
 from tests.io.test_meshes import roof
 from tests.runtime.test_run_folder import some_metric
+from thesisrecon._settings import config_from_tables, config_from_toml, toml_from_config
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._exports import read_cameras
 from thesisrecon.io._files import read_json, read_pairs, read_text
 from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_model import read_colmap_model, write_colmap_model
 from thesisrecon.io.images import read_images
 from thesisrecon.io.meshes import read_mesh, write_mesh
 from thesisrecon.runtime._record_files import ChangedRecord, bytes_from_record, read_record
 from thesisrecon.runtime._run_folder import StageFolder
-from thesisrecon.settings import config_from_tables, config_from_toml, toml_from_config
 
 few = settings(
     derandomize=True,

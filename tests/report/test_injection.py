@@ -11,7 +11,7 @@ import pytest
 
 from tests.report.synthetic import Witness
 from thesisrecon.cli.main import run_command
-from thesisrecon.report.page import strip_page
+from thesisrecon.report._page import strip_page
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 MARK = "header-of-a-photograph"

@@ -23,7 +23,7 @@ from thesisrecon.report._data import (
     used_observations,
 )
 from thesisrecon.report._figures import _BINS, _common_limit_px, _histogram_shares
-from thesisrecon.report.page import render_report, strip_page
+from thesisrecon.report._page import render_report, strip_page
 
 EVIL = [
     "<img src=x onerror=alert(1)>.jpg",

@@ -24,8 +24,8 @@ from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report import _viewer
 from thesisrecon.report._figures import upright_rotation
+from thesisrecon.report._page import render_report
 from thesisrecon.report._viewer import LEVELS, viewer_data
-from thesisrecon.report.page import render_report
 
 
 def unpacked(text, kind, columns):

@@ -25,8 +25,8 @@ from thesisrecon.pipeline import _state as preparing
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime import _dask_cluster as cluster
-from thesisrecon.runtime import executors as workers
-from thesisrecon.runtime.executors import Workers
+from thesisrecon.runtime import _executors as workers
+from thesisrecon.runtime._executors import Workers
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 NO_RESULT = ("seconds", "elapsed_seconds", "peak_memory_mb", "threads", "executor", "resumed")
@@ -260,7 +260,7 @@ def test_workers_may_become_fewer_in_the_middle():
     there, done = iter([4]), list[int]()
     with futures.ThreadPoolExecutor(1) as pool:
         remote = workers._Remote(pool, lambda: next(there, 1))
-        workers._run_all(remote, (abs, False), [(n,) for n in range(20)], lambda n, _: done.append(n))
+        workers._run_all(remote, abs, False, [(n,) for n in range(20)], lambda n, _: done.append(n))
     assert sorted(done) == list(range(20))
 
 

@@ -12,8 +12,8 @@ import pytest
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.runtime.executors import ProcessPool
-from thesisrecon.runtime.signals import CODES, with_resume_advice
+from thesisrecon.runtime._executors import ProcessPool
+from thesisrecon.runtime._signals import CODES, with_resume_advice
 from validation.studies.robustness import Stop, different, outputs, stop_table, stopped
 
 ROOT = Path(__file__).parents[2]
@@ -24,8 +24,8 @@ PROGRAM = """
 import hashlib, sys, time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from thesisrecon.runtime.signals import with_resume_advice, install_signal_handlers
-from thesisrecon.runtime.executors import ProcessPool
+from thesisrecon.runtime._signals import with_resume_advice, install_signal_handlers
+from thesisrecon.runtime._executors import ProcessPool
 if __name__ == "__main__":
     install_signal_handlers("toy")
     with with_resume_advice("it goes on\\nlater"):

@@ -18,8 +18,8 @@ import typer
 
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
 from thesisrecon.io._files import printable, shorten_middle, shortened
-from thesisrecon.runtime.executors import available_threads
-from thesisrecon.runtime.signals import CODES, REASONS, with_resume_advice
+from thesisrecon.runtime._executors import available_threads
+from thesisrecon.runtime._signals import CODES, REASONS, with_resume_advice
 
 DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"

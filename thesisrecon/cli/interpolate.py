@@ -19,7 +19,7 @@ from thesisrecon.cli.common import (
 )
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import printable
-from thesisrecon.runtime.executors import available_threads
+from thesisrecon.runtime._executors import available_threads
 
 
 def interpolate(

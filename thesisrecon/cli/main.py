@@ -16,7 +16,7 @@ from thesisrecon.cli.inspect import inspect
 from thesisrecon.cli.interpolate import interpolate
 from thesisrecon.cli.reconstruct import demo, reconstruct
 from thesisrecon.cli.render import render
-from thesisrecon.runtime.signals import set_error_stream
+from thesisrecon.runtime._signals import set_error_stream
 
 app = typer.Typer(
     name="thesisrecon",

@@ -133,9 +133,9 @@ def _config(
     preset: str | None, file: Path | None, options: Mapping[str, Mapping[str, Any]], settings: list[str]
 ) -> PipelineConfig:
     """Apply the preset (of the command, else of the file), the file, the options and --set, in this order."""
+    from thesisrecon._settings import config_from_toml, tables_from_settings
     from thesisrecon.config import preset as preset_of
     from thesisrecon.io._files import read_text
-    from thesisrecon.settings import config_from_toml, tables_from_settings
 
     text, base = "" if file is None else read_text(file), preset_of(preset or "default")
     changes = (options, tables_from_settings(settings))

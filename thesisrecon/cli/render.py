@@ -10,7 +10,7 @@ import typer
 
 from thesisrecon.cli.common import Frames, Threads, cap_threads, interruptible, parse_folder, progress_bars
 from thesisrecon.errors import UsageError
-from thesisrecon.runtime.executors import available_threads
+from thesisrecon.runtime._executors import available_threads
 
 _MAX_SIDE_PX = 8192
 

@@ -18,8 +18,8 @@ from thesisrecon.io._files import is_partial, printable, read_json, write_json, 
 from thesisrecon.io.images import read_image
 from thesisrecon.io.meshes import read_mesh
 from thesisrecon.records import TexturedMesh
-from thesisrecon.report.page import strip_page
-from thesisrecon.runtime.executors import Workers
+from thesisrecon.report._page import strip_page
+from thesisrecon.runtime._executors import Workers
 from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.render import Light, Shading, render
 

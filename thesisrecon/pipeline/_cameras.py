@@ -12,7 +12,7 @@ from thesisrecon.config import with_images
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline._state import PipelineState, name_images
 from thesisrecon.records import MetricResult, Reconstruction, RunResult, SelfCalibration
-from thesisrecon.runtime.run import stream
+from thesisrecon.runtime._run import stream
 
 ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""

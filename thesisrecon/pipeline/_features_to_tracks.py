@@ -12,10 +12,9 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs
-from thesisrecon.pipeline.image_pair import detect_features, match_views
+from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Features, Image, PairChoice, TwoView
-from thesisrecon.runtime._run_state import Batch
-from thesisrecon.runtime.run import stream
+from thesisrecon.runtime._run import Batch, stream
 
 MIN_CORNERS = 16
 
@@ -28,9 +27,11 @@ def find_features(state: PipelineState) -> None:
     variant = run.variant_key("features")
     digests = enumerate(image.digest for image in state.inputs.decoded)
     keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
-    features = run.map_cached(
-        "features", keys, _detect_all, lambda missing: (([i], (state.config, [images[i]])) for i in missing)
-    )
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        return (([i], (state.config, images[i])) for i in missing)
+
+    features = run.map_cached("features", keys, _detect, batches)
     state.result = replace(state.result, features=tuple(features))
     found = [len(f.xy) for f in features]
     few = [(image, n) for image, n in zip(images, found, strict=True) if n < MIN_CORNERS]
@@ -39,8 +40,8 @@ def find_features(state: PipelineState) -> None:
     run.finish("features", counts=counts, warnings=poor)
 
 
-def _detect_all(config: PipelineConfig, images: Sequence[Image]) -> list[Features]:
-    return [detect_features(config, image) for image in images]
+def _detect(config: PipelineConfig, image: Image) -> list[Features]:
+    return [config.features.detect(image)]
 
 
 # ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
@@ -58,8 +59,9 @@ def select_pairs(state: PipelineState) -> None:
     )
     state.result = replace(state.result, pair_choice=choice)
     possible = len(images) * (len(images) - 1) // 2
-    counts = {"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
-    run.finish("pairs", counts=counts)
+    run.finish(
+        "pairs", counts={"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
+    )
     run.progress("pairs", 1, 1)
 
 
@@ -125,17 +127,9 @@ def build_tracks(state: PipelineState) -> None:
         advice = "add images with more overlap, all of one textured scene"
         raise StageFailure("no two images could be matched", evidence, advice)
     key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
-    tracks = run.cached(
-        "tracks",
-        "tracks",
-        key,
-        lambda: state.config.tracks.build(_prepared(state), result.pairs, stream(run.seed, "tracks")),
-    )
+    build, rng = state.config.tracks.build, stream(run.seed, "tracks")
+    tracks = run.cached("tracks", "tracks", key, lambda: build(_prepared(state), result.pairs, rng))
     state.result = replace(result, tracks=tracks)
     seen = np.bincount(tracks.point_index, minlength=tracks.n_points)
-    counts = {
-        "points": tracks.n_points,
-        "observations": len(tracks.xy),
-        "seen_3_times": int((seen >= 3).sum()),
-    }
-    run.finish("tracks", counts=counts)
+    counts = {"points": tracks.n_points, "observations": len(tracks.xy)}
+    run.finish("tracks", counts=counts | {"seen_3_times": int((seen >= 3).sum())})

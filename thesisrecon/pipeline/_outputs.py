@@ -11,23 +11,21 @@ from typing import Any, get_args
 import numpy as np
 
 from thesisrecon import __version__
+from thesisrecon._settings import toml_from_config
 from thesisrecon.arrays import F32, U8
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import read_json, write_json, write_text
-from thesisrecon.io.colmap import colmap_from_reconstruction, skewed_views
-from thesisrecon.io.colmap_model import write_colmap_model
+from thesisrecon.io.colmap import write_colmap_model
 from thesisrecon.io.meshes import write_mesh
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.records import Reconstruction, RunResult, TexturedMesh
 from thesisrecon.report._data import ReportData
+from thesisrecon.report._page import render_report
 from thesisrecon.report._summary import point_colors, summarize
-from thesisrecon.report.page import render_report
+from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
-from thesisrecon.runtime._run_state import Run
-from thesisrecon.runtime.run import Until
 from thesisrecon.selfcalibration.stratified import affine_camera_centres, upgrade_to_affine
-from thesisrecon.settings import toml_from_config
 from thesisrecon.surface.simplification import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
@@ -178,20 +176,21 @@ def _write_model(
 ) -> list[str]:
     """Write ``sparse/0``, ``points.ply`` and ``cameras.json`` in original pixels; return warnings."""
     warnings: list[str] = []
-    skewed = skewed_views(reconstruction)
-    if len(skewed):
+    skewed = write_colmap_model(
+        directory.path / "sparse" / "0",
+        reconstruction,
+        [image.name for image in result.images],
+        colors=colors,
+        groups=result.groups,
+        scales=np.array([1 / image.scale for image in result.images]),
+        original_sizes=np.array([image.original_size for image in result.images]),
+    )
+    if skewed:
         directory.remove(COLMAP_FILES)
         warnings.append(
-            f"sparse/0 is not written: COLMAP has no camera model with skew, but {len(skewed)} of "
+            f"sparse/0 is not written: COLMAP has no camera model with skew, but {skewed} of "
             f"{counted(int(reconstruction.registered.sum()), 'camera')} have skew; see cameras.json"
         )
-    else:
-        names, scales, sizes = zip(
-            *((i.name, 1 / i.scale, i.original_size) for i in result.images), strict=True
-        )
-        frame = {"groups": result.groups, "scales": np.array(scales), "original_sizes": np.array(sizes)}
-        model = colmap_from_reconstruction(reconstruction, names, colors=colors, **frame)
-        write_colmap_model(directory.path / "sparse" / "0", model)
     X = reconstruction.X[reconstruction.valid]
     write_point_cloud(directory.path / "points.ply", X[:, :3] / X[:, 3:], colors[reconstruction.valid])
     write_json(directory.path / "cameras.json", cameras_table(reconstruction, result.images))

@@ -17,7 +17,7 @@ from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io.images import ImageSet
 from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Features, Image, RunResult
-from thesisrecon.runtime._run_state import Run
+from thesisrecon.runtime._run import Run
 
 CACHE_BYTES = 2**30
 """Prepared views take several times the memory of their image and are quickly prepared again."""

@@ -10,8 +10,8 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.io.images import read_image
-from thesisrecon.records import Features, Image, TwoView
-from thesisrecon.runtime.run import stream
+from thesisrecon.records import Image, TwoView
+from thesisrecon.runtime._run import stream
 
 ImageInput = str | Path | np.ndarray | Image
 """A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
@@ -55,26 +55,11 @@ def match_pair(
     config = config or PipelineConfig()
     size = config.images.max_size_px
     images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
-    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+    views = [config.matching.prepare(image, config.features.detect(image)) for image in images]
     pair = match_views(config, views[0], views[1], (0, 1), seed)
     if not pair.accepted:
         raise StageFailure("the two images do not match", pair.reason)
     return pair
-
-
-def detect_features(config: PipelineConfig, image: Image) -> Features:
-    """Detect the corners and patches of one image (4.2.1).
-
-    Parameters
-    ----------
-    config, image : PipelineConfig, Image
-        Settings and image.
-
-    Returns
-    -------
-    Features
-    """
-    return config.features.detect(image)
 
 
 def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:

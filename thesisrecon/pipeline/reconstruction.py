@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Unpack
 
+from thesisrecon._settings import tables_from_config
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
@@ -15,9 +16,7 @@ from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
 from thesisrecon.pipeline._state import PipelineState, name_images
 from thesisrecon.pipeline._surface import build_model, estimate_depth_maps
 from thesisrecon.records import RunResult
-from thesisrecon.runtime._run_state import Run, start_run
-from thesisrecon.runtime.run import Progress, RunOptions
-from thesisrecon.settings import tables_from_config
+from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
 
 STEPS = {
     "features": (find_features,),
@@ -56,8 +55,11 @@ def reconstruct(
     progress : callable, optional
         Called with (stage, done, total).
     **options
-        ``until``, ``threads``, ``executor``, ``overwrite``, ``shared``: see
-        :class:`~thesisrecon.runtime.run.RunOptions`.
+        ``until``: last stage, "features", "matches", "projective", "metric", "dense" or "model" (by default
+        "model", where a surface that fails is only a warning); ``threads``: number of workers;
+        ``executor``: "local" (threads), "processes", "dask://HOST:PORT" (needs the extra ``distributed``) or
+        a :class:`concurrent.futures.Executor`; ``overwrite``: replace another run in the output folder;
+        ``shared``: folder in which runs share cached results of stages.
 
     Returns
     -------

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from thesisrecon._settings import config_from_tables, dataclass_from_table
 from thesisrecon.config import KINDS, PipelineConfig, preset
 from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.settings import config_from_tables, dataclass_from_table
 from validation.ablation.own import is_own, load_own
 from validation.ablation.tasks.function import FunctionTask
 

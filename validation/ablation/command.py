@@ -9,7 +9,7 @@ from pathlib import Path
 from signal import SIGINT
 
 from thesisrecon.errors import UsageError, counted
-from thesisrecon.runtime.signals import CODES, with_resume_advice
+from thesisrecon.runtime._signals import CODES, with_resume_advice
 from validation.ablation.analysis import analyse
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import Plan, plan_study
@@ -32,9 +32,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     command.add_argument(
         "-o", "--out", type=Path, required=True, help="output folder; a rerun continues from its rows"
     )
-    command.add_argument(
-        "--executor", default="processes", help="local, processes (default) or dask://HOST:PORT"
-    )
+    command.add_argument("--executor", default="processes", help="local or processes (default)")
     command.add_argument(
         "--threads", type=int, help="number of parallel rows (default: number of processors)"
     )

@@ -13,12 +13,14 @@ import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon.io._files import write_text
-from thesisrecon.report.page import plotly_script, render_page
+from thesisrecon.report._page import plotly_script, render_page
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan
+from validation.ablation.run import Row
 from validation.ablation.study import Measure
 from validation.ablation.tables import comparison_text, mean_text, number, write_tables
 from validation.harness.page import HERE as HARNESS
+from validation.harness.plots import scatter
 
 HERE = Path(__file__).parent
 PAGE = "index.html"
@@ -67,15 +69,14 @@ def _page(analysis: Analysis, tables: Sequence[str]) -> str:
 def _facts(analysis: Analysis) -> list[tuple[str, str]]:
     plan = analysis.plan
     scenes = list(dict.fromkeys(r.scene for r in plan.rows))
-    cost = sum(r.cost_s for r in analysis.rows)
     return [
         ("Variants", str(len(plan.variants))),
-        ("Conditions", str(len(plan.conditions)) if plan.conditions[0].name else "1"),
+        ("Conditions", str(len(plan.conditions))),
         ("Scenes", ", ".join(scenes) if len(scenes) <= 4 else str(len(scenes))),
         ("Seeds", str(len(plan.seeds))),
         ("Rows", f"{len(analysis.rows)} of {len(plan.rows)}"),
         ("Failed", str(sum(bool(r.failure) for r in analysis.rows))),
-        ("Processor time", f"{cost:.0f} s"),
+        ("Processor time", f"{sum(r.cost_s for r in analysis.rows):.0f} s"),
     ]
 
 
@@ -98,16 +99,15 @@ def _findings(analysis: Analysis) -> list[str]:
     return found
 
 
-def _who(found: Comparison) -> str:
+def _who(found: Any) -> str:
     return f"{found.variant} ({found.condition})" if found.condition else found.variant
 
 
-def _failures(failed: Sequence[Any]) -> list[dict[str, Any]]:
+def _failures(failed: Sequence[Row]) -> list[dict[str, Any]]:
     """Failed rows, those of one reason together."""
     groups: dict[tuple[str, str], list[str]] = {}
     for row in failed:
-        who = f"{row.variant} ({row.condition})" if row.condition else row.variant
-        groups.setdefault((who, row.failure), []).append(f"{row.scene}, seed {row.seed}")
+        groups.setdefault((_who(row), row.failure), []).append(f"{row.scene}, seed {row.seed}")
     return [
         {"who": who, "why": why, "where": "; ".join(where) if len(where) <= 4 else f"{len(where)} rows"}
         for (who, why), where in groups.items()
@@ -128,7 +128,6 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
         _forest(measure, comparisons, plan.baseline, slug),
         _cost(measure, cells, slug),
     ]
-    drawn = {c.interval.unit for c in comparisons if c.interval.pairs}
     return {
         "id": slug,
         "measure": measure,
@@ -136,7 +135,7 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
         "conditions": [c.name for c in plan.conditions],
         "baseline": plan.baseline,
         "steps": bool(steps),
-        "about": _about(drawn),
+        "about": _about({c.interval.unit for c in comparisons if c.interval.pairs}),
         "plots": [p for p in plots if p is not None],
     }
 
@@ -157,28 +156,20 @@ def _table(
     against = {(c.variant, c.condition): c for c in comparisons}
     step = {(c.variant, c.condition): c for c in steps}
     found = []
-    for variant in plan.variants:
-        columns = []
-        for condition in plan.conditions:
-            place = (variant.name, condition.name)
-            columns.append(
-                {
-                    "mean": mean_text(at[place]),
-                    "rank": number(at[place].rank),
-                    "against": _comparison_cells(against.get(place)),
-                    "step": _comparison_cells(step.get(place)),
-                    "on_front": at[place].on_front,
-                }
-            )
-        cost = float(np.mean([at[variant.name, c.name].cost_s for c in plan.conditions]))
-        found.append(
+    for name in (v.name for v in plan.variants):
+        places = [(name, condition.name) for condition in plan.conditions]
+        columns = [
             {
-                "name": variant.name,
-                "columns": columns,
-                "cost": number(cost),
-                "base": variant.name == plan.baseline,
+                "mean": mean_text(at[place]),
+                "rank": number(at[place].rank),
+                "against": _comparison_cells(against.get(place)),
+                "step": _comparison_cells(step.get(place)),
+                "on_front": at[place].on_front,
             }
-        )
+            for place in places
+        ]
+        cost = number(float(np.mean([at[place].cost_s for place in places])))
+        found.append({"name": name, "columns": columns, "cost": cost, "base": name == plan.baseline})
     return found
 
 
@@ -197,38 +188,25 @@ def _comparison_cells(found: Comparison | None) -> dict[str, str]:
 def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] | None:
     """The means over a condition that is a number, a line for each variant, where there is but one such."""
     axes = list(dict.fromkeys(a for c in plan.conditions for a in c.levels))
-    if len(axes) != 1:
-        return None
     values = [next(iter(c.changes.values()), None) for c in plan.conditions]
-    numeric = len(values) > 1 and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-    if not numeric:
+    numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    if len(axes) != 1 or len(values) < 2 or not numeric:
         return None
     at = {(c.variant, c.condition): c for c in cells}
     traces = []
     for k, variant in enumerate(plan.variants):
         y = [_finite(at[variant.name, c.name].mean) for c in plan.conditions]
-        traces.append(_line(variant.name, values, y, k))
-    positive = all(v is None or v > 0 for t in traces for v in t["y"])
+        line = {"color": COLOURS[k % len(COLOURS)], "dash": ("solid", "dash", "dot")[k // len(COLOURS) % 3]}
+        traces.append(scatter(variant.name, values, y, "lines+markers", line=line))
+    log = measure.ratio and all(v is None or v > 0 for t in traces for v in t["y"])
     layout = {
         "xaxis": {"title": {"text": axes[0].rpartition(".")[2]}},
-        "yaxis": _axis(measure) | ({"type": "log"} if measure.ratio and positive else {}),
+        "yaxis": _axis(measure, log=log),
         "margin": _MARGIN,
         "legend": {"orientation": "h", "y": -0.25},
         "height": 420,
     }
-    return _plot(f"plot-{slug}-over", f"{measure.name} over {axes[0]}", {"data": traces, "layout": layout})
-
-
-def _line(name: str, x: Sequence[Any], y: Sequence[float | None], k: int) -> dict[str, Any]:
-    colour = COLOURS[k % len(COLOURS)]
-    return {
-        "type": "scatter",
-        "mode": "lines+markers",
-        "name": name,
-        "x": list(x),
-        "y": list(y),
-        "line": {"color": colour, "dash": ("solid", "dash", "dot")[k // len(COLOURS) % 3]},
-    }
+    return _plot(f"plot-{slug}-over", f"{measure.name} over {axes[0]}", traces, layout)
 
 
 def _forest(
@@ -241,22 +219,16 @@ def _forest(
     ratio = all(c.ratio for c in shown)
     shown = [c for c in shown if c.ratio == ratio]
     values = [as_reported(c) for c in shown]
-    colours = [{"better": GOOD, "worse": BAD}.get(c.verdict, NONE) for c in shown]
-    trace = {
-        "type": "scatter",
-        "mode": "markers",
-        "x": [_finite(mean) for mean, _, _ in values],
-        "y": [_who(c) for c in shown],
-        "error_x": {
-            "type": "data",
-            "symmetric": False,
-            "array": [_finite(high - mean) for mean, _, high in values],
-            "arrayminus": [_finite(mean - low) for mean, low, _ in values],
-            "color": "#55636f",
-        },
-        "marker": {"color": colours, "size": 9},
-        "showlegend": False,
+    errors = {
+        "type": "data",
+        "symmetric": False,
+        "array": [_finite(high - mean) for mean, _, high in values],
+        "arrayminus": [_finite(mean - low) for mean, low, _ in values],
+        "color": "#55636f",
     }
+    marker = {"color": [{"better": GOOD, "worse": BAD}.get(c.verdict, NONE) for c in shown], "size": 9}
+    means, names = [_finite(mean) for mean, _, _ in values], [_who(c) for c in shown]
+    trace = scatter("", means, names, error_x=errors, marker=marker, showlegend=False)
     stroke = {"color": "#1b2733", "width": 1}
     line = {"type": "line", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "line": stroke}
     what = f"times {baseline}" if ratio else f"difference from {baseline}"
@@ -268,62 +240,41 @@ def _forest(
         "margin": _MARGIN,
         "height": 140 + 28 * len(shown),
     }
-    title = f"{measure.name} against {baseline}"
-    return _plot(f"plot-{slug}-forest", title, {"data": [trace], "layout": layout})
+    return _plot(f"plot-{slug}-forest", f"{measure.name} against {baseline}", [trace], layout)
 
 
 def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] | None:
     """Plot accuracy over processor time with the Pareto front."""
-    names = list(dict.fromkeys(c.variant for c in cells))
-    conditions = list(dict.fromkeys(c.condition for c in cells))
-    if len(names) < 2 or len(conditions) > 1:
+    if len({c.variant for c in cells}) < 2 or len({c.condition for c in cells}) > 1:
         return None
     known = [c for c in cells if math.isfinite(c.mean) and math.isfinite(c.cost_s)]
     front = sorted((c for c in known if c.on_front), key=lambda c: c.cost_s)
-    line = {
-        "type": "scatter",
-        "mode": "lines",
-        "x": [c.cost_s for c in front],
-        "y": [c.mean for c in front],
-        "line": {"color": "#9fabb5", "dash": "dot"},
-        "hoverinfo": "skip",
-        "showlegend": False,
-    }
-    points = [
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "name": cell.variant,
-            "x": [cell.cost_s],
-            "y": [cell.mean],
-            "marker": {
-                "size": 11,
-                "color": COLOURS[k % len(COLOURS)],
-                "symbol": SYMBOLS[k // len(COLOURS) % len(SYMBOLS)] + ("" if cell.on_front else "-open"),
-            },
-        }
-        for k, cell in enumerate(known)
-    ]
-    log = measure.ratio and all(c.mean > 0 for c in known)
+    dots, hidden = {"color": "#9fabb5", "dash": "dot"}, {"hoverinfo": "skip", "showlegend": False}
+    traces = [scatter("", [c.cost_s for c in front], [c.mean for c in front], "lines", line=dots, **hidden)]
+    for k, c in enumerate(known):
+        symbol = SYMBOLS[k // len(COLOURS) % len(SYMBOLS)] + ("" if c.on_front else "-open")
+        marker = {"size": 11, "color": COLOURS[k % len(COLOURS)], "symbol": symbol}
+        traces.append(scatter(c.variant, [c.cost_s], [c.mean], marker=marker))
     layout = {
         "xaxis": {"title": {"text": "processor time of a row (s)"}, "rangemode": "tozero"},
-        "yaxis": _axis(measure) | ({"type": "log"} if log else {}),
+        "yaxis": _axis(measure, log=measure.ratio and all(c.mean > 0 for c in known)),
         "margin": _MARGIN,
         "legend": {"orientation": "h", "y": -0.2},
         "height": 420 + 10 * len(known),
     }
     words = "Filled: Pareto-optimal (no variant is both better and cheaper)."
-    figure = {"data": [line, *points], "layout": layout}
-    return _plot(f"plot-{slug}-cost", f"{measure.name} against cost", figure, words)
+    return _plot(f"plot-{slug}-cost", f"{measure.name} against cost", traces, layout, words)
 
 
-def _axis(measure: Measure) -> dict[str, Any]:
+def _axis(measure: Measure, *, log: bool) -> dict[str, Any]:
     unit = f" ({measure.unit})" if measure.unit else ""
-    return {"title": {"text": f"{measure.name}{unit}"}}
+    return {"title": {"text": f"{measure.name}{unit}"}} | ({"type": "log"} if log else {})
 
 
-def _plot(place: str, title: str, figure: Mapping[str, Any], words: str = "") -> dict[str, Any]:
-    return {"id": place, "title": title, "figure": figure, "words": words}
+def _plot(
+    place: str, title: str, traces: Sequence[Any], layout: Mapping[str, Any], words: str = ""
+) -> dict[str, Any]:
+    return {"id": place, "title": title, "figure": {"data": [*traces], "layout": layout}, "words": words}
 
 
 def _finite(value: float) -> float | None:

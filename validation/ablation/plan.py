@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import thesisrecon
+from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
+from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import code_key, key_of
-from thesisrecon.runtime.executors import package_key
-from thesisrecon.settings import table_from_dataclass, tables_from_config
 from validation.ablation.changes import STAGES, TASK, Setting, apply_changes, level_name
 from validation.ablation.own import PREFIX
 from validation.ablation.study import Axis, Changes, Measure, Mode, Study

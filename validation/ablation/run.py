@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
-from thesisrecon.errors import WorkersLost
+from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.io._files import write_json
-from thesisrecon.runtime.executors import CHECK_S
-from thesisrecon.settings import table_from_dataclass, tables_from_config
 from validation.ablation.plan import Plan, PlannedRow, plan_study
-from validation.ablation.row import Job, carry_out, pack
 from validation.ablation.store import STEPS, WORK, Outcome, Store, finite
 from validation.ablation.study import Study
 from validation.ablation.tasks import FunctionTask
-from validation.ablation.workers import Crew, crew_of
+from validation.ablation.workers import Crew, Job, carry_out, crew_of, pack
 
-ProgressCallback = Callable[["State"], None]
-"""Called with the state whenever a row or a step has ended."""
 LOST = "the worker process of this row was killed or ran out of memory"
 
 
@@ -53,11 +47,7 @@ class Rows(Sequence[Row]):
     plan: Plan
     rows: tuple[Row, ...]
 
-    @overload
-    def __getitem__(self, index: int) -> Row: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Row]: ...
-    def __getitem__(self, index: int | slice) -> Row | Sequence[Row]:
+    def __getitem__(self, index: Any) -> Any:
         return self.rows[index]
 
     def __len__(self) -> int:
@@ -66,39 +56,26 @@ class Rows(Sequence[Row]):
 
 @dataclass
 class State:
-    """Progress of a study: all rows, rows of earlier runs and of this run, failures; seconds by variant;
-    seconds since the start; number of parallel rows."""
+    """Number of all rows, of those that ended (in earlier runs too) and that failed, and of shared steps."""
 
     total: int
-    kept: int = 0
-    done: int = 0
+    done: int
     failed: int = 0
     steps: int = 0
     steps_done: int = 0
-    width: int = 1
-    started: float = field(default_factory=time.perf_counter)
-    spent: dict[str, list[float]] = field(default_factory=dict)
-    waiting: Counter[str] = field(default_factory=Counter)
 
-    @property
-    def left_s(self) -> float | None:
-        """Estimate the remaining seconds from the mean of each variant, else of all rows; None
-        before the first row."""
-        every = [s for spent in self.spent.values() for s in spent]
-        if not every:
-            return None
-        usual = sum(every) / len(every)
-        mean = {v: sum(s) / len(s) for v, s in self.spent.items()}
-        return sum(n * mean.get(v, usual) for v, n in self.waiting.items()) / self.width
+
+ProgressCallback = Callable[[State], None]
+"""Called with the state whenever a row or a step has ended."""
 
 
 def ablate(
     study: Study,
     out: str | Path,
     *,
-    executor: str | Executor = "processes",
+    executor: str = "processes",
     threads: int | None = None,
-    on_progress: ProgressCallback | None = None,
+    on_progress: ProgressCallback = lambda _: None,
 ) -> Rows:
     """Compute the rows of a study that are not in ``out`` yet, and return all of them.
 
@@ -107,29 +84,25 @@ def ablate(
     study : the study to run.
     out : the folder of the study. It may be used again, after a kill or for a study that has grown: rows that
         are there under the same setting, scene, seed and versions are not computed again.
-    executor : "local" (this process), "processes", "dask://HOST:PORT", or any
-        :class:`concurrent.futures.Executor`.
-    threads : rows at a time; all processors where None.
+    executor : "local" (this process) or "processes".
+    threads : processes; as many as processors where None.
     on_progress : called with the state after each row.
 
     Raises
     ------
-    UsageError : an invalid study (see :func:`plan_study`), a folder that cannot be written, a scheduler
-        that does not answer. Errors of a row are stored in the row.
+    UsageError : an invalid study (see :func:`plan_study`) or a folder that cannot be written. Errors of a row
+        are stored in the row.
     """
     plan, store = plan_study(study), Store(Path(out).resolve())
     store.prepare()
     write_json(store.path / "study.json", _study_record(plan))
     todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
-    state = State(len({row.key for row in plan.rows}), waiting=Counter(r.variant for r in todo.values()))
-    state.kept = state.total - len(todo)
+    total = len({row.key for row in plan.rows})
     lost: dict[str, Outcome] = {}
     if todo:
         with crew_of(executor, threads) as crew:
-            state.width = min(crew.width, len(todo))
-            lost = _Session(plan, store, crew, state, on_progress or (lambda _: None)).run(
-                list(todo.values())
-            )
+            session = _Session(plan, store, crew, State(total, total - len(todo)), on_progress)
+            lost = session.run(list(todo.values()))
     shutil.rmtree(store.path / WORK, ignore_errors=True)
     return _rows(plan, store, lost)
 
@@ -141,28 +114,17 @@ def read_rows(study: Study, out: str | Path) -> Rows:
 
 def _rows(plan: Plan, store: Store, lost: Mapping[str, Outcome]) -> Rows:
     rows = []
-    for planned in plan.rows:
-        outcome = store.load(planned.key) or lost.get(planned.key)
+    for p in plan.rows:
+        outcome = store.load(p.key) or lost.get(p.key)
         if outcome is None:
             continue
         shared = [s for s in (store.load(key, STEPS) for key in outcome.steps) if s is not None]
         cost = outcome.cpu_s + sum(s.cpu_s for s in shared)
         metrics, failure = dict(outcome.metrics), outcome.failure
         if not failure:
-            metrics, failure = finite(metrics, plan.wanted(planned))
-        rows.append(
-            Row(
-                planned.key,
-                planned.variant,
-                planned.condition,
-                planned.scene,
-                planned.seed,
-                metrics,
-                failure,
-                outcome.seconds,
-                cost,
-            )
-        )
+            metrics, failure = finite(metrics, plan.wanted(p))
+        place = (p.key, p.variant, p.condition, p.scene, p.seed)
+        rows.append(Row(*place, metrics, failure, outcome.seconds, cost))
     return Rows(plan, tuple(rows))
 
 
@@ -226,7 +188,7 @@ class _Session:
     lost: dict[str, Outcome] = field(default_factory=dict)
 
     def run(self, rows: Sequence[PlannedRow]) -> dict[str, Outcome]:
-        """Carry out all rows; the outcomes of those that were lost, which are not kept."""
+        """Carry out all rows; the outcomes of those that were lost, which are not stored."""
         parts = parts_of(rows)
         ended = {p.key for p in parts if p.step and self.store.load(p.key, STEPS) is not None}
         waiting = [p for p in parts if p.name not in ended]
@@ -238,77 +200,40 @@ class _Session:
             for part in self._ready(waiting, ended, len(running)):
                 waiting.remove(part)
                 running[self._submit(part, packed[part.row.key])] = part
-                if len(running) >= self.crew.most:
-                    break
-            done, _ = wait(running, CHECK_S, return_when=FIRST_COMPLETED)
-            if not done and self.crew.cluster is not None:
-                self.crew.cluster.check()
-            outcomes = [(running.pop(f), self._outcome(f)) for f in done if not f.cancelled()]
-            if self.crew.renew is not None and any(outcome.lost for _, outcome in outcomes):
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            outcomes = [(running.pop(future), _outcome(future)) for future in done]
+            if any(outcome.lost for _, outcome in outcomes):
                 # No row of a broken pool ends.
                 outcomes += [(part, Outcome(failure=LOST, lost=True)) for part in running.values()]
                 running.clear()
                 self.crew.executor = self.crew.renew()
             for part, outcome in outcomes:
-                if outcome.lost and self._again(part):
+                self.tries[part.name] += outcome.lost
+                if outcome.lost and self.tries[part.name] < 2:
                     waiting.insert(0, part)
                 else:
                     ended.add(part.name)
                     self._keep(part, outcome)
-            if any(future.cancelled() for future in done):
-                # Rows are never cancelled here, so the cluster was lost.
-                raise self._gone()
         return self.lost
 
-    def _ready(self, waiting: Sequence[_Part], ended: set[str], running: int) -> Iterator[_Part]:
+    def _ready(self, waiting: Sequence[_Part], ended: set[str], running: int) -> list[_Part]:
         """The parts that can begin, in order. One that was in a process that died runs alone, so that it is
         known which of them kills processes."""
         ready = [p for p in waiting if set(p.after) <= ended]
         suspects = [p for p in ready if self.tries[p.name]]
         if suspects:
-            return iter(suspects[:1] if not running else [])
-        return iter(ready[: max(0, self.crew.most - running)])
+            return suspects[:1] if not running else []
+        return ready[: max(0, self.crew.most - running)]
 
     def _submit(self, part: _Part, packed: tuple[bytes, Any]) -> Future[Outcome]:
         row = part.row
-        job = Job(
-            part.name,
-            *packed,
-            row.scene,
-            row.seed,
-            self.store.path,
-            part.step,
-            self.crew.by_thread,
-        )
+        job = Job(part.name, *packed, row.scene, row.seed, self.store.path, part.step)
         try:
             return self.crew.executor.submit(carry_out, job)
         except BrokenProcessPool as error:
             future: Future[Outcome] = Future()
             future.set_exception(error)
             return future
-
-    def _outcome(self, future: Future[Outcome]) -> Outcome:
-        try:
-            return future.result()
-        except BrokenProcessPool:
-            return Outcome(failure=LOST, lost=True)
-        except CancelledError:
-            raise self._gone() from None
-        except Exception as error:
-            # Foreign executors report a lost worker in their own way.
-            if type(error).__name__ == "KilledWorker":
-                return Outcome(failure=LOST, lost=True)
-            raise
-
-    def _gone(self) -> WorkersLost:
-        cluster = self.crew.cluster
-        lost = WorkersLost("the workers are gone") if cluster is None else cluster.lost()
-        return WorkersLost(f"{lost}; the rows that ended are kept, and the same command continues from there")
-
-    def _again(self, part: _Part) -> bool:
-        """Return whether a part whose process died is tried once more."""
-        self.tries[part.name] += 1
-        return self.crew.renew is not None and self.tries[part.name] < 2
 
     def _keep(self, part: _Part, outcome: Outcome) -> None:
         row, state = part.row, self.state
@@ -323,20 +248,21 @@ class _Session:
             else:
                 self.store.save(row.key, outcome, _row_record(self.plan, row))
             state.done += 1
-            failed = outcome.failure or finite(outcome.metrics, self.plan.wanted(row))[1]
-            state.failed += bool(failed)
-            state.waiting[row.variant] -= 1
-            state.spent.setdefault(row.variant, []).append(outcome.seconds)
+            state.failed += bool(outcome.failure or finite(outcome.metrics, self.plan.wanted(row))[1])
         self.on_progress(state)
+
+
+def _outcome(future: Future[Outcome]) -> Outcome:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return Outcome(failure=LOST, lost=True)
 
 
 def _row_record(plan: Plan, row: PlannedRow) -> dict[str, Any]:
     task = row.setting.task
     return {
-        "variant": row.variant,
-        "condition": row.condition,
-        "scene": row.scene,
-        "seed": row.seed,
+        **{name: getattr(row, name) for name in ("variant", "condition", "scene", "seed")},
         "config": tables_from_config(row.setting.config),
         "task": {} if isinstance(task, FunctionTask) else table_from_dataclass(task),
         "versions": dict(plan.versions),
@@ -345,10 +271,9 @@ def _row_record(plan: Plan, row: PlannedRow) -> dict[str, Any]:
 
 def _study_record(plan: Plan) -> dict[str, Any]:
     """The study in plain words, beside its rows."""
-    study = plan.study
     return {
-        "title": study.title,
-        "mode": study.mode,
+        "title": plan.study.title,
+        "mode": plan.study.mode,
         "baseline": plan.baseline,
         "variants": {v.name: dict(v.levels) for v in plan.variants},
         "conditions": {c.name: dict(c.levels) for c in plan.conditions},

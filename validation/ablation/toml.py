@@ -7,17 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.config import PipelineConfig, preset
+from thesisrecon._settings import config_from_tables, dataclass_from_table
+from thesisrecon.config import preset
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.io._files import read_bytes
-from thesisrecon.settings import config_from_tables, dataclass_from_table
 from validation.ablation.own import is_own, load_own
 from validation.ablation.study import Measure, Study
 from validation.ablation.tasks import TASKS
 
 _TEXTS = ("title", "words", "mode", "baseline", "start")
-_TABLES = ("axes", "conditions")
-_KEYS = (*_TEXTS, *_TABLES, "task", "preset", "config", "scenes", "seeds", "metrics")
+_TABLES = ("axes", "conditions", "config")
+_KEYS = (*_TEXTS, *_TABLES, "task", "preset", "scenes", "seeds", "metrics")
 
 
 def read_study(path: str | Path) -> Study:
@@ -41,33 +41,24 @@ def read_study(path: str | Path) -> Study:
 
 def study_from_table(table: Mapping[str, Any], folder: Path = Path()) -> Study:
     """Return the study of a table; its files are relative to ``folder``."""
-    for key in table:
+    for key, value in table.items():
         if key not in _KEYS:
             raise UsageError(unknown_word("key of a study", key, _KEYS))
-    for key in _TEXTS:
-        if key in table and not isinstance(table[key], str):
-            raise UsageError(f"{key} takes text; got {table[key]!r}")
-    for key in _TABLES:
-        if not isinstance(table.get(key, {}), Mapping):
-            raise UsageError(f"{key} takes a table, path or name -> levels; got {table[key]!r}")
+        if key in _TEXTS and not isinstance(value, str):
+            raise UsageError(f"{key} takes text; got {value!r}")
+        if key in _TABLES and not isinstance(value, Mapping):
+            raise UsageError(f"{key} takes a table; got {value!r}")
     for key in ("scenes", "axes"):
         if key not in table:
             raise UsageError(f"a study needs {key}")
-    plain = {key: table[key] for key in (*_TEXTS, *_TABLES, "scenes", "seeds") if key in table}
+    plain = {key: table[key] for key in (*_TEXTS, "axes", "conditions", "scenes", "seeds") if key in table}
     return Study(
         **plain,
         metrics=_metrics(table.get("metrics", [])),
         task=_task(table.get("task", "reconstruction"), folder),
-        config=_config(table),
+        config=config_from_tables(table.get("config", {}), preset(table.get("preset", "default"))),
         folder=folder,
     )
-
-
-def _config(table: Mapping[str, Any]) -> PipelineConfig:
-    base, changes = preset(table.get("preset", "default")), table.get("config", {})
-    if not isinstance(changes, Mapping):
-        raise UsageError(f"config takes a table of stages; got {changes!r}")
-    return config_from_tables(changes, base)
 
 
 def _task(value: Any, folder: Path) -> Any:
@@ -92,12 +83,9 @@ def _metrics(names: Any) -> list[str | Measure]:
     """Return names of measures, or measures described by tables."""
     if not isinstance(names, list):
         raise UsageError(f"metrics take a list; got {names!r}")
-    return [_metric(item) for item in names]
-
-
-def _metric(item: Any) -> str | Measure:
-    if isinstance(item, str):
-        return item
-    if not isinstance(item, Mapping) or "name" not in item:
-        raise UsageError(f"a metric is a name or a table with one; got {item!r}")
-    return dataclass_from_table(Measure, item, "metrics")
+    for item in names:
+        if not isinstance(item, str) and (not isinstance(item, Mapping) or "name" not in item):
+            raise UsageError(f"a metric is a name or a table with one; got {item!r}")
+    return [
+        item if isinstance(item, str) else dataclass_from_table(Measure, item, "metrics") for item in names
+    ]

@@ -1,38 +1,129 @@
-"""Executors of rows: this process, local processes, a Dask cluster or a given executor."""
+"""Compute rows in this process or in processes of their own."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+import pickle
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.runtime._dask_cluster import Cluster, connect_dask, is_dask_address
-from thesisrecon.runtime.executors import NAMES, ProcessPool, available_threads
+from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError, unknown_word
+from thesisrecon.runtime._executors import ProcessPool, available_threads
+from validation.ablation.changes import Setting
+from validation.ablation.own import Source, sources_of
+from validation.ablation.store import SHARED, WORK, Outcome
+from validation.ablation.study import Place
 
+EXECUTORS = ("local", "processes")
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-MANY = 64
-"""Queued rows of a given executor with an unknown number of workers."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Input of a worker: ``setting`` as bytes, since user classes are known only after their source
+    is installed. ``step`` is the shared step to be prepared, empty for the row itself."""
+
+    key: str
+    setting: bytes
+    sources: tuple[Source, ...]
+    scene: str
+    seed: int
+    out: Path
+    step: str = ""
+
+
+def pack(setting: Setting) -> tuple[bytes, tuple[Source, ...]]:
+    """Serialise a setting; :class:`UsageError` if impossible."""
+    try:
+        content: bytes = _pickler().dumps(setting)
+    except Exception as error:
+        raise UsageError(f"this variant cannot be sent to a worker: {error}") from None
+    return content, sources_of(_modules(setting))
+
+
+def _pickler() -> Any:
+    """Prefer cloudpickle (installed with Dask), which also sends classes of a script."""
+    try:
+        import cloudpickle
+    except ImportError:
+        return pickle
+    return cloudpickle
+
+
+def _modules(value: Any) -> set[str]:
+    """The modules of every object of a setting."""
+    found, waiting = set(), [value]
+    while waiting:
+        item = waiting.pop()
+        found.add(getattr(item, "__module__", type(item).__module__))
+        if hasattr(item, "__dataclass_fields__"):
+            waiting += [getattr(item, name) for name in item.__dataclass_fields__]
+        elif isinstance(item, tuple):
+            waiting += item
+    return found
+
+
+def carry_out(job: Job) -> Outcome:
+    """Compute the row or the requested step. Errors are recorded, not raised, except for a full disk
+    (:class:`OutputError`), because the row itself has not failed."""
+    for source in job.sources:
+        source.install()
+    setting: Setting = pickle.loads(job.setting)
+    own = job.out / WORK / job.key
+    shutil.rmtree(own, ignore_errors=True)
+    place = Place(own, job.out / SHARED)
+    start, cpu = time.perf_counter(), time.process_time()
+    metrics: Mapping[str, float] = {}
+    failure = ""
+    try:
+        own.mkdir(parents=True, exist_ok=True)
+        if job.step:
+            setting.task.prepare(setting.config, job.scene, job.seed, place, step=job.step)
+        else:
+            metrics = _plain(setting.task.run(setting.config, job.scene, job.seed, place))
+    except OutputError:
+        raise
+    except (StageFailure, UsageError) as error:
+        failure = str(error)
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in WRITE_ERRNOS:
+            raise OutputError(error.filename or own, error) from None
+        failure = f"{type(error).__name__}: {error}{_where(error)}"
+    seconds, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+    shutil.rmtree(own, ignore_errors=True)
+    return Outcome(metrics, failure, seconds, cpu_s)
+
+
+def _plain(metrics: Any) -> dict[str, float]:
+    if not isinstance(metrics, Mapping):
+        raise TypeError(f"a task returns a table of numbers; got {type(metrics).__name__}")
+    return {str(name): float(value) for name, value in metrics.items()}
+
+
+def _where(error: BaseException) -> str:
+    """Return file and line of an error, for the author of the variant."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None:
+        return ""
+    return f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})"
 
 
 @dataclass
 class Crew:
-    """An executor and its number of parallel rows; ``renew`` replaces a pool whose processes died, None for a
-    given executor. ``by_thread``: rows share a process."""
+    """An executor, the most rows to hand to it (one extra for each process, so that none waits), and how to
+    replace it when a process died."""
 
     executor: Executor
-    width: int
-    by_thread: bool
-    renew: Callable[[], Executor] | None = None
-    cluster: Cluster | None = None
-
-    @property
-    def most(self) -> int:
-        """Number of submitted rows: one extra for each worker, so that none waits."""
-        return 1 if isinstance(self.executor, _Here) else 2 * self.width
+    most: int
+    renew: Callable[[], Executor]
 
 
 class _Here(Executor):
@@ -48,29 +139,20 @@ class _Here(Executor):
 
 
 @contextmanager
-def crew_of(executor: str | Executor, threads: int | None) -> Iterator[Crew]:
-    """Yield the crew for an executor or its name: "local", "processes" or "dask://HOST:PORT".
-
-    A given executor is left open. Raises :class:`UsageError` for an unknown name, fewer than one thread, and
-    a scheduler that does not answer.
-    """
+def crew_of(executor: str, threads: int | None) -> Iterator[Crew]:
+    """Yield the crew of "local" or "processes"; :class:`UsageError` for another name or no thread."""
     if threads is not None and threads < 1:
         raise UsageError(f"threads must be at least 1; got {threads}")
-    if isinstance(executor, Executor):
-        workers: int = getattr(executor, "_max_workers", MANY)
-        yield Crew(executor, threads or workers, not isinstance(executor, ProcessPoolExecutor))
-        return
-    count = threads or available_threads()
+    if executor not in EXECUTORS:
+        raise UsageError(unknown_word("executor", executor, EXECUTORS))
     if executor == "local":
-        crew = Crew(ThreadPoolExecutor(count) if count > 1 else _Here(), count, count > 1)
-    elif executor == "processes":
-        crew = Crew(_processes(count), count, False, lambda: _processes(count))
-    elif is_dask_address(executor):
-        with connect_dask(executor) as cluster:
-            yield Crew(cluster.executor, cluster.parallel(), True, cluster=cluster)
+        yield Crew(_Here(), 1, _Here)
         return
-    else:
-        raise UsageError(unknown_word("executor", executor, NAMES))
+    for name in ONE_THREAD:
+        # One process per core: NumPy's own threads would compete for them.
+        os.environ.setdefault(name, "1")
+    count = threads or available_threads()
+    crew = Crew(ProcessPool(count), 2 * count, lambda: ProcessPool(count))
     try:
         yield crew
     except BaseException:
@@ -79,10 +161,3 @@ def crew_of(executor: str | Executor, threads: int | None) -> Iterator[Crew]:
         raise
     finally:
         crew.executor.shutdown(wait=True, cancel_futures=True)
-
-
-def _processes(count: int) -> ProcessPool:
-    for name in ONE_THREAD:
-        # One process per core: NumPy's own threads would compete for them.
-        os.environ.setdefault(name, "1")
-    return ProcessPool(count)

@@ -14,7 +14,7 @@ import PIL.Image
 from thesisrecon import __version__
 from thesisrecon.errors import counted
 from thesisrecon.io._files import write_text
-from thesisrecon.report.page import plotly_script, render_page
+from thesisrecon.report._page import plotly_script, render_page
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, key_of, slug
 from validation.harness.results import Change, Results, Row
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from thesisrecon.runtime.signals import kill_on_exit
+from thesisrecon.runtime._signals import kill_on_exit
 from validation.scenes.real import ROOT
 
 POLL_S = 0.02

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import RUN_FILE
-from thesisrecon.runtime.run import FOLDERS
 from validation.harness.records import Outcome, ReportOptions, Stage, Task
 from validation.harness.worker import OUTCOMES
 

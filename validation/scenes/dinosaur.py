@@ -12,7 +12,7 @@ from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.verification import PairVerification, homography_inlier_ratio
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Tracks, TwoView
-from thesisrecon.runtime.run import stream
+from thesisrecon.runtime._run import stream
 from validation.scenes.real import data_root
 
 SIZE = (720, 576)

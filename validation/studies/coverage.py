@@ -19,13 +19,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.records import MetricResult
 from thesisrecon.runtime._run import stream
-from validation.metrics.intervals import (
-    LEVEL,
-    IntervalScores,
-    holding_std,
-    interval_scores,
-    join_scores,
-)
+from validation.metrics.intervals import LEVEL, IntervalScores, holding_std, interval_scores, join_scores
 from validation.metrics.record import Metric
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 from validation.studies.main_job import OURS
@@ -40,7 +34,6 @@ WIDE_REL = 0.02
 
 
 def add_intervals(rows: Rows, scores: IntervalScores, least: float | None) -> None:
-    """Add coverage and width of the 95 % intervals of focal length and principal point."""
     for label, columns in COLUMNS.items():
         row = f"95 % intervals of the {label} that hold the truth"
         rows.add(row, scores.holding(columns), at_least=least)
@@ -50,7 +43,6 @@ def add_intervals(rows: Rows, scores: IntervalScores, least: float | None) -> No
 
 
 def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
-    """Keep one view if all views share a camera."""
     if cameras == "per-image":
         return scores
     first = int(np.flatnonzero(np.isfinite(scores.std_rel))[0])

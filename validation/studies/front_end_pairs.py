@@ -19,7 +19,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.io.images import read_images
-from thesisrecon.pipeline.image_pair import detect_features, match_views
+from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image, TwoView
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
@@ -56,17 +56,14 @@ class Related:
 
     @property
     def right(self) -> bool:
-        """Whether F is right."""
         return self.error_px < RIGHT_PX
 
     @property
     def verified(self) -> int:
-        """Inliers of a right F."""
         return self.view.inliers if self.right else 0
 
     @property
     def falsely_accepted(self) -> bool:
-        """Whether the pair is accepted with a wrong F."""
         return self.view.accepted and not self.right
 
     @property
@@ -96,12 +93,11 @@ class PreparedViews:
 
     def __getitem__(self, i: int) -> Any:
         if i not in self._views:
-            features = detect_features(self.config, self.images[i])
+            features = self.config.features.detect(self.images[i])
             self._views[i] = self.config.matching.prepare(self.images[i], features)
         return self._views[i]
 
     def relate(self, i: int, j: int, seed: int = 0) -> TwoView:
-        """Match, estimate F and verify one pair."""
         return match_views(self.config, self[i], self[j], (i, j), seed)
 
 

@@ -63,14 +63,12 @@ class Start:
     X: F64
 
     def rms_px(self, xy: F64) -> float:
-        """Return the RMS distance of the projections."""
         xh = np.einsum("vab,nb->vna", self.P, self.X)
         distance = np.linalg.norm(xh[..., :2] / xh[..., 2:] - xy, axis=2)
         return float(np.sqrt(np.mean(np.minimum(np.nan_to_num(distance, nan=np.inf), OUTLIER_PX) ** 2)))
 
 
 def complete_rig(rng: np.random.Generator) -> Rig:
-    """Draw six views of a cloud that all see every point."""
     rig = make_cloud(VIEWS, rng, points=POINTS)
     return replace(rig, seen=np.ones_like(rig.seen))
 
@@ -155,7 +153,6 @@ def complete_tracks(tracks: Tracks) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def tracks_of(xy: F64) -> Tracks:
-    """Return the table (V, N, 2) as tracks."""
     views, points = xy.shape[:2]
     view, point = np.tile(np.arange(views), points), np.repeat(np.arange(points), views)
     return Tracks(view, point, xy[view, point], views, points)
@@ -203,7 +200,6 @@ def check_images(scene: Scene, out: Path) -> list[Metric]:
 
 
 def residual_rms_px(model: Reconstruction) -> float:
-    """Return the RMS distance of the inlier observations."""
     t, k = model.tracks, model.inlier
     xh = np.einsum("kab,kb->ka", model.P[t.view_index[k]], model.X[t.point_index[k]])
     return float(np.sqrt(np.mean(np.sum((xh[:, :2] / xh[:, 2:] - t.xy[k]) ** 2, axis=1))))
@@ -241,7 +237,6 @@ class Comparison:
         return np.fmin(self.ours.px, self.published.px) < WRONG_PX
 
     def rms_px(self, residuals: Residuals, *, all_observations: bool = False) -> float:
-        """Return the RMS over the right observations, or over all with distances capped at ``WRONG_PX``."""
         d = np.minimum(residuals.px, WRONG_PX) if all_observations else residuals.px[self.right]
         return float(np.sqrt(np.mean(d**2)))
 
@@ -261,7 +256,6 @@ def judge_cameras(P: F64, registered: B8, tracks: Tracks) -> tuple[F64, Residual
 
 
 def judge_adjusted(P: F64, registered: B8, tracks: Tracks) -> tuple[Residuals, Residuals]:
-    """Return residuals of cameras as given and after bundle adjustment."""
     X, before = judge_cameras(P, registered, tracks)
     k = np.isfinite(before.px)
     result = refine_projective_bundle(
@@ -272,7 +266,6 @@ def judge_adjusted(P: F64, registered: B8, tracks: Tracks) -> tuple[Residuals, R
 
 
 def compare(dinosaur: Dinosaur, *, seed: int = 0) -> Comparison:
-    """Reconstruct, and measure our and the published cameras alike."""
     tracks = dinosaur.tracks
     pairs = pairs_from_tracks(tracks, seed=seed)
     start = time.perf_counter()

@@ -34,7 +34,6 @@ VOLATILE = ("seconds", "memory", "version", "out", "path", "time", "threads")
 
 
 def digest(array: Any) -> str:
-    """Digest dtype, shape and bytes of an array."""
     values = np.ascontiguousarray(array)
     head = f"{values.dtype.str} {values.shape} ".encode()
     return hashlib.sha256(head + values.tobytes()).hexdigest()[:16]
@@ -59,14 +58,12 @@ def numbers_of(value: Any, place: str = "") -> dict[str, float]:
 
 
 def combined(digests: list[str] | str) -> str:
-    """Return the number of digests and a digest of them, in their order."""
     if isinstance(digests, str):
         return digests
     return f"{len(digests)}:{hashlib.sha256(' '.join(digests).encode()).hexdigest()[:16]}"
 
 
 def arrays_of(record: Any) -> list[str]:
-    """Return digests of all arrays in nested records."""
     if isinstance(record, np.ndarray):
         return [digest(record)]
     if is_dataclass(record) and not isinstance(record, type):
@@ -91,13 +88,11 @@ def stage_digests(out: Path) -> dict[str, str]:
 
 
 def file_digests(out: Path) -> dict[str, str]:
-    """Return digests of the output files of a run."""
     names = ["points.ply", "model.glb", "affine.ply", *(f"sparse/0/{p.name}" for p in out.glob("sparse/0/*"))]
     return {n: hashlib.sha256((out / n).read_bytes()).hexdigest()[:16] for n in names if (out / n).exists()}
 
 
 def record_images(name: str, preset: str, folder: Path) -> dict[str, Any]:
-    """Run the command on one image set and digest its outputs."""
     from thesisrecon.cli.main import run_command
 
     images, until = IMAGE_SETS[name]

@@ -101,11 +101,9 @@ class Runs:
         self.environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
     def arguments(self, out: Path) -> list[str]:
-        """Return the command line after the program."""
         return ["reconstruct", str(self.images), "-o", str(out), *self.options]
 
     def whole(self, out: Path) -> float:
-        """Run to the end and return the seconds."""
         start = time.perf_counter()
         program = [sys.executable, "-m", "thesisrecon", *self.arguments(out)]
         subprocess.run(program, env=self.environment, check=True, stdout=subprocess.DEVNULL)
@@ -130,14 +128,12 @@ class Runs:
         return out, ended.returncode == -signal.SIGKILL
 
     def resumed(self, when: str, out: Path, died: bool, wanted: dict[str, bytes]) -> Kill:
-        """Resume a killed run and compare its outputs."""
         kept = sum(1 for _ in out.glob("0*/*.npz"))
         self.whole(out)
         return Kill(when, died, kept, different(outputs(out), wanted))
 
 
 def kill_runs(runs: Runs, kills: int, writes: int) -> Iterator[Kill]:
-    """Compare two undisturbed runs, then kill and resume others."""
     runs.whole(runs.place / "first")
     seconds = runs.whole(runs.place / "whole")
     wanted = outputs(runs.place / "whole")
@@ -159,7 +155,6 @@ def kill_runs(runs: Runs, kills: int, writes: int) -> Iterator[Kill]:
 
 
 def kill_table(rows: Sequence[Kill]) -> str:
-    """Return every kill as a row."""
     cells = []
     for row in rows:
         late = "" if row.died or not row.kept else " (had ended)"
@@ -192,7 +187,6 @@ class Stop:
     different: tuple[str, ...] = ()
 
     def wrong(self, asked: signal.Signals) -> str:
-        """Return the faults in a few words; empty if there is none or if the run had ended before."""
         if self.code == 0:
             return f"differs: {', '.join(self.different)}" if self.different else ""
         found = {
@@ -250,7 +244,6 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 
 def _of_session(leader: int) -> list[int]:
-    """Return the living processes of a session."""
     found = []
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -267,7 +260,6 @@ def _is_past(moment: float) -> bool:
 
 
 def stop_runs(runs: Runs, moments: int, asked: signal.Signals, *, cold: bool) -> Iterator[Stop]:
-    """Interrupt runs at moments spread over their time, and resume them."""
     runs.whole(runs.place / "first")
     if cold:
         runs.environment["NUMBA_CACHE_DIR"] = str(runs.place / "kernels")
@@ -288,7 +280,6 @@ def stop_runs(runs: Runs, moments: int, asked: signal.Signals, *, cold: bool) ->
 
 
 def stop_table(rows: Sequence[Stop], asked: signal.Signals) -> str:
-    """Return every interrupted run as a row."""
     cells = []
     for row in rows:
         wrong = row.wrong(asked) or ("nothing" if row.code else "nothing (had ended)")
@@ -320,7 +311,6 @@ class Refusal:
 
     @property
     def wrong(self) -> str:
-        """Faults in a few words; empty if there is none."""
         found = {
             f"exit code {self.code}": self.code != REFUSED,
             "not one sentence": self.said.count("\n") != 1 or "Traceback" in self.said,
@@ -366,14 +356,12 @@ class SmallRuns:
         self.options = ["--max-size", str(size_px), "--until", until, "--threads", "1", *SMALL_MODEL]
 
     def run(self, out: Path) -> tuple[int, str]:
-        """Run; return the exit code and the error stream."""
         said = io.StringIO()
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
             code = run_command(["reconstruct", str(self.images), "-o", str(out), *self.options])
         return code, said.getvalue()
 
     def whole(self, out: Path) -> dict[str, bytes]:
-        """Return the outputs of an undisturbed run; ``RuntimeError`` if it fails."""
         code, said = self.run(out)
         if code:
             raise RuntimeError(f"a run with room ended with {code}: {said}")
@@ -457,7 +445,6 @@ def refuse_runs(runs: SmallRuns, every: int, disks: int) -> Iterator[Refusal]:
 
 
 def refusal_table(rows: Sequence[Refusal]) -> str:
-    """Return every run as a row."""
     cells = ([r.when, r.code, r.said.strip(), r.wrong or "nothing"] for r in rows)
     return text_table(["the run could not write", "exit code", "message", "wrong"], cells)
 
@@ -466,7 +453,6 @@ def refusal_table(rows: Sequence[Refusal]) -> str:
 
 
 def _printed(rows: Iterable[Any]) -> list[Any]:
-    """Collect the rows and print each on the error stream."""
     found = []
     for row in rows:
         found.append(row)

@@ -83,7 +83,6 @@ class Trial:
 
     @property
     def right(self) -> bool:
-        """Whether there is an answer with a median focal error of at most 3 %."""
         return self.median_pct <= SUCCESS_PCT
 
     @property
@@ -224,7 +223,6 @@ def run_trial(
 
 
 def table_row(name: str, mode: str, trials: Sequence[Trial]) -> list[object]:
-    """Return one row of the table."""
     errors = [trial.median_pct for trial in trials if np.isfinite(trial.median_pct)]
     worst = [t.worst_pct for t in trials if not t.failed_checks and np.isfinite(t.worst_pct)]
     counts = [sum(t.outcome == kind for t in trials) for kind in OUTCOMES]

@@ -21,7 +21,7 @@ import sys
 from pathlib import Path
 from tests.validation.harness.test_harness import toy_options
 from tests.validation.harness.test_stops import hanging_stages
-from thesisrecon.runtime.signals import with_resume_advice, install_signal_handlers
+from thesisrecon.runtime._signals import with_resume_advice, install_signal_handlers
 from validation.harness.schedule import run_tasks
 install_signal_handlers("toy")
 with with_resume_advice("begin again"):

@@ -15,7 +15,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.io.images import read_images
-from thesisrecon.pipeline.image_pair import detect_features, match_views
+from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
@@ -64,7 +64,7 @@ class PairsOfPhotographs:
         name, _, first = scene.rpartition("/")
         i = int(first)
         images, truth = _photographs(name, i, self.gap)
-        views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+        views = [config.matching.prepare(image, config.features.detect(image)) for image in images]
         return numbers_of_pair(config, views, (i, i + self.gap), seed, truth)
 
 

@@ -11,12 +11,12 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 
 import thesisrecon
+from thesisrecon._settings import tables_from_config
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.records import RunResult
+from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import code_key, key_of
-from thesisrecon.runtime.run import Until
-from thesisrecon.settings import tables_from_config
 from validation.ablation.study import Measure, Place
 from validation.harness.records import ReportOptions
 from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of

@@ -10,23 +10,22 @@ from typing import Any, Literal
 import numpy as np
 
 import thesisrecon
+from thesisrecon._settings import config_from_tables
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import read_json
-from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_model import read_colmap_model
 from thesisrecon.records import Reconstruction
+from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
-from thesisrecon.runtime.run import FOLDERS
-from thesisrecon.settings import config_from_tables
+from validation.harness.plots import OURS, Values, each, plot, row, scatter
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
 from validation.harness.scenes import has_images, load_images, truth_of
-from validation.harness.stages._shared import OURS, Values, each, plot, row, scatter
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
 from validation.references.colmap_mapping import Start, map_with_pycolmap
 from validation.references.colmap_matching import match_with_pycolmap
+from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import Scene
 
 THESIS, PER_IMAGE = "ours (thesis)", "ours (a camera each)"
@@ -103,9 +102,9 @@ def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | 
     names = [path.name for path in scene.image_paths]
     folder = outcome.place / "run" if method in SETTINGS else outcome.place
     try:
-        models = [read_colmap_model(path) for path in sorted((folder / "sparse").glob("*")) if path.is_dir()]
-        largest = max(models, key=lambda model: len(model.images), default=None)
-        return None if largest is None else reconstruction_from_colmap(largest, names=names)
+        folders = [path for path in sorted((folder / "sparse").glob("*")) if path.is_dir()]
+        models = [read_colmap_model(path, names) for path in folders]
+        return max(models, key=lambda model: model.registered.sum(), default=None)
     except (StageFailure, OSError):
         return None
 

@@ -1,25 +1,65 @@
-"""One run: its settings, workers and folder, and the clock, cache and reports of its stages."""
+"""One run: options, random streams, workers and folder, and the clock, cache and reports of its stages."""
 
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, TypedDict, get_args
 
+import numpy as np
+
+from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import OutputError, UsageError, WorkersLost, unknown_word
 from thesisrecon.records import StageReport
+from thesisrecon.runtime._executors import Workers, available_threads
 from thesisrecon.runtime._record_files import ChangedRecord
 from thesisrecon.runtime._run_folder import RunDirectory, code_key, key_of
-from thesisrecon.runtime.executors import Workers, available_threads
-from thesisrecon.runtime.run import FOLDERS, Progress, RunOptions, Until, checked_seed
-from thesisrecon.settings import table_from_dataclass, tables_from_config
 
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
 Batch = tuple[Sequence[int], tuple[Any, ...]]
 """Numbers of some items, and the arguments of the function that computes their records."""
+Until = Literal["features", "matches", "projective", "metric", "dense", "model"]
+
+FOLDERS: Mapping[str, str] = {
+    "features": "01-features",
+    "pairs": "02-pairs",
+    "matches": "02-matches",
+    "tracks": "03-tracks",
+    "projective": "04-projective",
+    "selfcalibration": "05-selfcalibration",
+    "metric": "06-metric",
+    "dense": "07-dense",
+    "model": "08-model",
+}
+
+
+class RunOptions(TypedDict, total=False):
+    """Options of :func:`thesisrecon.reconstruct` that change no result."""
+
+    until: Until | None
+    threads: int | None
+    executor: str | Executor
+    overwrite: bool
+    shared: str | Path | None
+
+
+def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
+    """The random generator of one task (view or pair numbers), which depends only on the arguments."""
+    entropy = [_checked_seed(seed), zlib.crc32(stage.encode()), *ids]
+    return np.random.default_rng(np.random.SeedSequence(entropy))
+
+
+def _checked_seed(seed: Any) -> int:
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+        raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
+    return int(seed)
 
 
 @dataclass
@@ -192,7 +232,7 @@ def start_run(
         raise UsageError(unknown_word("stage", str(until), get_args(Until)))
     if not str(out).strip():
         raise UsageError("the output folder has no name; write . for the current one")
-    seed = checked_seed(seed)
+    seed = _checked_seed(seed)
     workers = Workers(options.get("threads") or available_threads(), options.get("executor", "local"))
     shared = options.get("shared")
     directory = RunDirectory(Path(out), None if shared is None else Path(shared))

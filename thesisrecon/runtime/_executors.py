@@ -26,7 +26,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from thesisrecon.errors import UsageError, WorkersLost, unknown_word
 from thesisrecon.runtime._dask_cluster import Cluster, connect_dask, is_dask_address, tcp_address
-from thesisrecon.runtime.signals import CODES, starting_processes
+from thesisrecon.runtime._signals import CODES, starting_processes
 
 NAMES = ("local", "processes", "dask://HOST:PORT")
 AHEAD = 2
@@ -39,13 +39,7 @@ CHECK_S = 5.0
 
 @cache
 def package_key() -> str:
-    """Return a digest of the code of the package, to detect workers with another version.
-
-    Returns
-    -------
-    str
-        32 hexadecimal digits.
-    """
+    """Return a digest of the code of the package, to detect workers with another version."""
     package = Path(__file__).parent.parent
     content = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
@@ -61,33 +55,20 @@ Finished = Callable[[int, Any], None]
 
 
 def available_threads() -> int:
-    """Return the number of processors this process may use.
-
-    Returns
-    -------
-    int
-    """
+    """Return the number of processors this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 @dataclass
 class Workers:
-    """Workers for independent tasks.
+    """Workers for independent tasks; as a context manager it keeps them between calls of :meth:`run`.
 
-    As a context manager it keeps its processes or connection between calls of :meth:`run`.
-
-    Parameters
-    ----------
-    threads : int
-        Number of threads or processes. With a cluster or a custom executor: threads of this process for small
-        tasks; a custom executor gets twice as many tasks at a time.
-    executor : str or concurrent.futures.Executor
-        "local" (threads), "processes", "dask://HOST:PORT" or an executor, which is not shut down.
+    With a cluster or a custom executor ``threads`` counts the threads of this process for small tasks.
     """
 
     threads: int
-    executor: str | futures.Executor = "local"
+    executor: str | futures.Executor = "local"  #: one of ``NAMES``, or an executor, which is not shut down
     _remote: _Remote | None = field(default=None, repr=False)
     _open_stack: ExitStack | None = field(default=None, repr=False)
 
@@ -95,10 +76,8 @@ class Workers:
         if self.threads < 1:
             raise UsageError(f"threads must be at least 1; got {self.threads}")
         if not isinstance(self.executor, str | futures.Executor):
-            names = ", ".join(NAMES)
-            raise UsageError(
-                f"executor must be {names} or a concurrent.futures.Executor; got {self.executor!r}"
-            )
+            known = f"{', '.join(NAMES)} or a concurrent.futures.Executor"
+            raise UsageError(f"executor must be {known}; got {self.executor!r}")
         if is_dask_address(self.executor):
             tcp_address(str(self.executor))
         elif isinstance(self.executor, str) and self.executor not in NAMES:
@@ -127,30 +106,13 @@ class Workers:
             stack.__exit__(*error)  # type: ignore[arg-type]
 
     def parallel(self) -> int:
-        """Return the number of tasks processed at a time, at least 1.
-
-        Returns
-        -------
-        int
-        """
+        """Return the number of tasks processed at a time, at least 1."""
         return self.threads if self._remote is None else self._remote.parallel()
 
     def run(self, function: Callable[..., Any], tasks: Iterable[Task], finished: Finished) -> None:
-        """Call a function for all tasks; the first error cancels the rest and is raised.
+        """Call a function (importable by the workers) for all tasks, taken as workers become free.
 
-        Parameters
-        ----------
-        function : callable
-            Must be importable by the workers unless they share this process.
-        tasks : iterable of tuple
-            Arguments of the calls, consumed as workers become free.
-        finished : callable
-            Called with (number, result) in this thread when a task ends.
-
-        Raises
-        ------
-        WorkersLost
-            If the workers are gone.
+        ``finished`` is called with (number, result) in this thread. The first error cancels the rest.
         """
         if self.executor == "local" and self.threads == 1:
             for n, given in enumerate(tasks):
@@ -161,21 +123,10 @@ class Workers:
         else:
             if self._remote is None:
                 self._remote = self._open_stack.enter_context(self._opened())
-            _run_all(self._remote, (function, not self.in_process), tasks, finished)
+            _run_all(self._remote, function, not self.in_process, tasks, finished)
 
     def map_all(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """Map a function over items in threads, for short tasks such as reading files.
-
-        Parameters
-        ----------
-        function, items : callable, iterable
-            Function of one item, and the items.
-
-        Returns
-        -------
-        list
-            Results in order.
-        """
+        """Map a function over items in threads, for short tasks such as reading files."""
         with futures.ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(function, items))
 
@@ -209,22 +160,19 @@ class _Remote:
 
 
 def _run_all(
-    remote: _Remote, call: tuple[Callable[..., Any], bool], tasks: Iterable[Task], finished: Finished
+    remote: _Remote, function: Callable[..., Any], pickled: bool, tasks: Iterable[Task], finished: Finished
 ) -> None:
-    """Keep the executor busy until all tasks are done; ``call`` (function, whether to pickle its tasks)."""
-    function, pickled = call
+    """Keep the executor busy until all tasks are done."""
     waiting: dict[futures.Future[Any], int] = {}
     left = enumerate(tasks)
     try:
         while True:
             # After workers died, more tasks may be waiting than AHEAD allows.
             for n, given in islice(left, max(AHEAD * remote.parallel() - len(waiting), 0)):
-                task = (
-                    (_answer, package_key(), pickle.dumps((function, given), 5))
-                    if pickled
-                    else (function, *given)
-                )
-                waiting[remote.executor.submit(*task)] = n
+                call: Task = (function, *given)
+                if pickled:
+                    call = (_answer, package_key(), pickle.dumps((function, given), 5))
+                waiting[remote.executor.submit(*call)] = n
             if not waiting:
                 return
             done, _ = futures.wait(waiting, CHECK_S, return_when=futures.FIRST_COMPLETED)
@@ -263,13 +211,7 @@ def _answer(key: str, task: bytes) -> bytes:
 
 
 class ProcessPool(futures.ProcessPoolExecutor):
-    """Processes that ignore Ctrl-C and end with this process.
-
-    Parameters
-    ----------
-    count : int
-        Number of processes.
-    """
+    """Processes that ignore Ctrl-C and end with this process."""
 
     def __init__(self, count: int) -> None:
         # Forking a process that runs threads can deadlock.
@@ -280,17 +222,7 @@ class ProcessPool(futures.ProcessPoolExecutor):
         super().__init__(count, mp_context=context, initializer=_end_with_parent, initargs=(watched,))
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
-        """Submit a call with signals blocked while processes start.
-
-        Parameters
-        ----------
-        fn, *args, **kwargs
-            As for :class:`concurrent.futures.Executor`.
-
-        Returns
-        -------
-        concurrent.futures.Future
-        """
+        """Submit a call with signals blocked while processes start."""
         with starting_processes():
             return super().submit(fn, *args, **kwargs)
 

@@ -32,30 +32,10 @@ def config_from_toml(
     fixed_preset: bool = False,
     changes: Sequence[Mapping[str, Any]] = (),
 ) -> PipelineConfig:
-    """Read a configuration.
+    """Read a TOML configuration; a line ``preset = "thesis"`` selects the base, unless ``fixed_preset``.
 
-    All tables are merged before values are checked, so settings that need each other may come from different
-    tables.
-
-    Parameters
-    ----------
-    text : str
-        TOML. A line ``preset = "thesis"`` at its top selects the base, unless ``fixed_preset``.
-    base : PipelineConfig, optional
-        Base; None: the preset ``default``.
-    fixed_preset : bool
-        Ignore the preset of the text.
-    changes : sequence of mapping
-        Further tables, later ones override.
-
-    Returns
-    -------
-    PipelineConfig
-
-    Raises
-    ------
-    UsageError
-        For invalid TOML, unknown stages, kinds or settings, and values of the wrong type.
+    ``changes`` are further tables, later ones override. All are merged before values are checked, so settings
+    that need each other may come from different tables.
     """
     try:
         tables = tomllib.loads(text)
@@ -67,10 +47,9 @@ def config_from_toml(
     if name is not None and not fixed_preset:
         base = preset(name)
     base = base or PipelineConfig()
-    merged: dict[str, Any] = {}
-    for change in (tables, *changes):
-        merged = _merged_stages(merged, change, base)
-    return config_from_tables(merged, base)
+    for change in changes:
+        tables = _merged_stages(tables, change, base)
+    return config_from_tables(tables, base)
 
 
 def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
@@ -97,19 +76,7 @@ def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
 
 
 def config_from_tables(tables: Mapping[str, Any], base: PipelineConfig | None = None) -> PipelineConfig:
-    """Change a configuration by plain tables.
-
-    Parameters
-    ----------
-    tables : mapping
-        Stage -> field -> value; ``UsageError`` as :func:`config_from_toml`.
-    base : PipelineConfig, optional
-        Base; None: the preset ``default``.
-
-    Returns
-    -------
-    PipelineConfig
-    """
+    """Change a configuration by plain tables."""
     config = base or PipelineConfig()
     stages = [item.name for item in dataclasses.fields(config)]
     for stage, table in tables.items():
@@ -138,51 +105,23 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
 
 
 def tables_from_settings(settings: Sequence[str]) -> Table:
-    """Parse the values of ``--set``.
-
-    Parameters
-    ----------
-    settings : sequence of str
-        ``stage.field=value``, or ``stage.field.field=value`` for nested ones; later ones override.
-
-    Returns
-    -------
-    dict
-        Tables for :func:`config_from_tables`.
-
-    Raises
-    ------
-    UsageError
-        If a text has another form.
-    """
+    """Parse the texts of ``--set``, ``stage.field=value``; later ones override."""
     tables: Table = {}
     for setting in settings:
         place, equals, text = setting.partition("=")
         path = place.strip().split(".")
         if not equals or not 2 <= len(path) <= _MAX_DEPTH or not all(path):
-            raise UsageError(
-                "--set takes stage.field=value, for example features.kind=harris-corners; "
-                f"got {in_words(setting)}"
-            )
-        value = parse_word(text)
+            example = "for example features.kind=harris-corners"
+            raise UsageError(f"--set takes stage.field=value, {example}; got {in_words(setting)}")
+        value = _parse(text)
         for key in reversed(path):
             value = {key: value}
         tables = _merged(tables, value)
     return tables
 
 
-def parse_word(text: str) -> Any:
-    """Parse the value of ``--set``.
-
-    Parameters
-    ----------
-    text : str
-        true, false, a number, a flat list ``[a, b]``, else text.
-
-    Returns
-    -------
-    bool, int, float, list or str
-    """
+def _parse(text: str) -> Any:
+    """Parse the value of ``--set``: true, false, a number, a flat list ``[a, b]``, else text."""
     text = text.strip()
     if text.startswith("[") and text.endswith("]"):
         # No setting is a list of lists.
@@ -202,39 +141,14 @@ def _parse_plain(text: str) -> Any:
 
 
 def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
-    """Return the complete configuration as plain tables.
-
-    Parameters
-    ----------
-    config : PipelineConfig
-        The configuration.
-
-    Returns
-    -------
-    dict
-        Stage -> field -> value.
-    """
-    tables = {}
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        head = {_KIND: kind_of(item.name, value)} if item.name in KINDS else {}
-        tables[item.name] = head | table_from_dataclass(value)
-    return tables
+    """Return the complete configuration as plain tables."""
+    stages = {item.name: getattr(config, item.name) for item in dataclasses.fields(config)}
+    kinds = {stage: {_KIND: kind_of(stage, stages[stage])} for stage in KINDS}
+    return {stage: kinds.get(stage, {}) | table_from_dataclass(value) for stage, value in stages.items()}
 
 
 def table_from_dataclass(value: Any) -> Table:
-    """Convert a dataclass to a table of plain values.
-
-    Parameters
-    ----------
-    value : dataclass
-        A method or its settings.
-
-    Returns
-    -------
-    dict
-        Field -> number, text, list or table; a table of one of several dataclasses begins with ``kind``.
-    """
+    """Convert a dataclass to a table; one of several dataclasses gives a table that begins with ``kind``."""
     hints = typing.get_type_hints(type(value))
     table = {}
     for name in _settings_of(type(value)):
@@ -269,23 +183,7 @@ def _plain(value: Any) -> Any:
 
 
 def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, base: T | None = None) -> T:
-    """Build a dataclass from a table; unknown keys and values of wrong types are a ``UsageError``.
-
-    Parameters
-    ----------
-    kind : type
-        The dataclass.
-    table : mapping
-        Field -> plain value.
-    where : str
-        Dotted name of the table, for messages.
-    base : dataclass, optional
-        Supplies the other fields; None: the defaults.
-
-    Returns
-    -------
-    dataclass
-    """
+    """Build a dataclass from a table; ``where`` is its name in messages, ``base`` supplies other fields."""
     hints = typing.get_type_hints(kind)
     names = _settings_of(kind)
     changes = {}
@@ -329,8 +227,7 @@ def _coerce_optional(value: Any, arguments: tuple[Any, ...], where: str, current
         return None
     if several := _alternatives(arguments):
         return _coerce_alternative(value, several, where, current)
-    rest = [a for a in arguments if a is not type(None)]
-    return _coerce(value, rest[0], where, current)
+    return _coerce(value, next(a for a in arguments if a is not type(None)), where, current)
 
 
 def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str, current: Any) -> Any:
@@ -363,33 +260,8 @@ def _type_words(annotation: Any) -> str:
 
 
 def toml_from_config(config: PipelineConfig) -> str:
-    """Return the configuration as TOML, which :func:`config_from_toml` reads back.
-
-    Parameters
-    ----------
-    config : PipelineConfig
-        The configuration.
-
-    Returns
-    -------
-    str
-    """
-    return toml_from_tables(tables_from_config(config))
-
-
-def toml_from_tables(tables: Mapping[str, Any]) -> str:
-    """Write nested tables of plain values as TOML, which ``tomllib`` reads back.
-
-    Parameters
-    ----------
-    tables : mapping
-        Nested tables.
-
-    Returns
-    -------
-    str
-    """
-    return "\n".join(_toml_lines(tables, ())).strip() + "\n"
+    """Return the configuration as TOML, which :func:`config_from_toml` reads back."""
+    return "\n".join(_toml_lines(tables_from_config(config), ())).strip() + "\n"
 
 
 def _toml_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:

@@ -37,11 +37,6 @@ def install_signal_handlers(program: str, advice: str = "repeat the command to r
 
     Call it once, from the main thread of a program (not of a library). Signals that the process ignores
     (``nohup``, background jobs) stay ignored.
-
-    Parameters
-    ----------
-    program, advice : str
-        Name of the program in the message, and what to do unless :func:`with_resume_advice` says otherwise.
     """
     _advice.append(advice)
     pipe, written = os.pipe()
@@ -58,25 +53,13 @@ def install_signal_handlers(program: str, advice: str = "repeat the command to r
 
 
 def set_error_stream(descriptor: int) -> None:
-    """Set the file descriptor for messages.
-
-    Parameters
-    ----------
-    descriptor : int
-        Replaces standard error.
-    """
+    """Set the file descriptor for messages."""
     _stderr.append(descriptor)
 
 
 @contextmanager
 def with_resume_advice(advice: str) -> Iterator[None]:
-    """Set the advice printed if the program is ended in the block.
-
-    Parameters
-    ----------
-    advice : str
-        What to do; a ``KeyboardInterrupt`` also carries it.
-    """
+    """Set the advice printed if the program is ended in the block; a ``KeyboardInterrupt`` carries it too."""
     _advice.append(advice)
     try:
         yield
@@ -89,13 +72,7 @@ def with_resume_advice(advice: str) -> Iterator[None]:
 
 @contextmanager
 def kill_on_exit(kill: Callable[[], object]) -> Iterator[None]:
-    """Call a function if the program is ended in the block.
-
-    Parameters
-    ----------
-    kill : callable
-        Kills processes other than those of :mod:`multiprocessing`, which are killed anyway.
-    """
+    """Kill processes other than those of :mod:`multiprocessing` if the program is ended in the block."""
     _kills.append(kill)
     try:
         yield
@@ -145,10 +122,9 @@ def _say(sentence: str) -> None:
     with suppress(OSError, ValueError):
         # A progress bar hides the cursor and leaves it in the middle of a line.
         start = _SHOW_CURSOR if os.isatty(_stderr[-1]) else ""
+        line = f"{start}{' '.join(sentence.split())}\n"
         if select.select([], [_stderr[-1]], [], START_S)[1]:
-            os.write(
-                _stderr[-1], f"{start}{' '.join(sentence.split())}\n".encode("utf-8", "backslashreplace")
-            )
+            os.write(_stderr[-1], line.encode("utf-8", "backslashreplace"))
 
 
 def _kill_children() -> None:

@@ -73,24 +73,7 @@ def render_page(
     filters: Mapping[str, Callable[..., str]] | None = None,
     **content: Any,
 ) -> str:
-    """Render a page: text is escaped, names are defined, JSON has no NaN, and only these scripts run.
-
-    Parameters
-    ----------
-    template : str
-        Text of the Jinja template; ``style``, ``scripts`` and ``hashes`` are given.
-    scripts : sequence of str
-        Texts of all scripts of the page, which the content security policy lists by their hashes.
-    filters : mapping, optional
-        Name -> filter of the template.
-    **content
-        Variables of the template.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Render a page: text is escaped, names are defined, JSON has no NaN, and only these scripts run."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -106,27 +89,12 @@ def render_page(
 
 
 def page_resource(name: str) -> str:
-    """Read a style, script or template of this folder.
-
-    Parameters
-    ----------
-    name : str
-        File name.
-
-    Returns
-    -------
-    str
-    """
+    """Read a style, script or template of this folder."""
     return files("thesisrecon.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def plotly_script() -> str:
-    """Return plotly.js as text that can be embedded in a page.
-
-    Returns
-    -------
-    str
-    """
+    """Return plotly.js as text that can be embedded in a page."""
     from plotly.offline import get_plotlyjs
 
     return str(get_plotlyjs()).replace("</script", "<\\/script")
@@ -135,22 +103,7 @@ def plotly_script() -> str:
 def strip_page(
     title: str, frames: Sequence[tuple[str, NDArray[np.uint8]]], *, notes: Sequence[str] = ()
 ) -> str:
-    """Render the page of a view sequence.
-
-    Parameters
-    ----------
-    title : str
-        Heading.
-    frames : sequence of (str, ndarray (H, W, 3) uint8)
-        Captions and pixels.
-    notes : sequence of str
-        Sentences without full stops.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Render the page of a view sequence."""
     if not frames:
         raise ValueError("a strip page needs at least one frame")
     script = page_resource("strip.js")
@@ -166,18 +119,7 @@ def _embedded(rgb: NDArray[np.uint8]) -> str:
 
 
 def render_report(data: ReportData) -> str:
-    """Render the page of a run; the same data gives the same text.
-
-    Parameters
-    ----------
-    data : ReportData
-        The run.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Render the page of a run; the same data gives the same text."""
     best = data.best_reconstruction
     working = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
