@@ -8,13 +8,12 @@ pytest.importorskip("poselib")
 pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
-from validation.scenes.cube import make_cube
-from validation.studies import epipolar_cube, epipolar_methods
-from validation.studies.epipolar_cube import BOUND, cube_pairs, run_cube
+from validation.ablation.tasks.fundamental import measure_pair
+from validation.scenes.cube import cube_pairs, make_cube
+from validation.studies import epipolar_methods
 from validation.studies.epipolar_methods import (
     DEFAULT,
     GOLD,
-    GOLD_FROM_DEFAULT,
     METHODS,
     NORMALISED,
     OWN,
@@ -35,14 +34,6 @@ CRITERIA = ("gradient (5.4)", "epipolar distance (5.6)", "gold standard")
 def clean():
     """Every method at 1 px and 60 matches, 40 trials, by its label."""
     return {r.label: r for r in run_methods([Setting(1.0, 60)], METHODS, 40)}
-
-
-@pytest.fixture(scope="module")
-def cube():
-    """The methods of the cube study on 12 of its pairs."""
-    methods = [BY_NAME[name] for name in epipolar_cube.CUBE_METHODS]
-    rows = run_cube(cube_pairs(make_cube())[::12], methods, (0.0, 0.5, 2.0))
-    return {(r.method, r.sigma_px): r for r in rows}
 
 
 def test_the_gold_standard_is_at_the_bound_and_nothing_is_far_below_it(clean):
@@ -102,30 +93,11 @@ def test_pairs_of_the_cube_share_more_than_a_face():
         assert min(np.ptp(pair.X, axis=0)) > 0.5
 
 
-def test_perfect_projections_give_perfect_epipolar_lines(cube):
-    for name in epipolar_cube.CUBE_METHODS:
-        assert cube[name, 0.0].worst_px < 1e-8
-        assert cube[name, 0.0].failures == 0
-
-
-def test_the_cube_orders_the_methods(cube):
-    for sigma in (0.5, 2.0):
-        gold, linear, raw = (cube[m, sigma] for m in (GOLD_FROM_DEFAULT, NORMALISED, RAW))
-        assert gold.ratio < 1.25
-        assert gold.ratio < linear.ratio < raw.ratio
-        assert gold.epipole_deg < raw.epipole_deg
-        assert cube[BOUND, sigma].within == 1.0
-        assert 1.25 * cube[BOUND, sigma].distance_px > gold.distance_px
-        assert gold.residual_px == pytest.approx(1.4142 * sigma, rel=0.1)
-    assert cube["Algorithm 2, seven-point search alone", 2.0].ratio > 2.0
-
-
-def test_tables_of_the_cube(tmp_path, capsys):
-    some = ["--methods", NORMALISED, GOLD, "--every", "40", "--noise", "0", "1"]
-    assert run_study("epipolar-cube", [*some, "-o", str(tmp_path)]) == 0
-    text = (tmp_path / "epipolar-cube.md").read_text(encoding="utf-8")
-    assert text in capsys.readouterr().out
-    assert text.count(f"| {GOLD} |") == len(epipolar_cube.MEASURES)
+def test_perfect_projections_give_perfect_epipolar_lines():
+    for pair in cube_pairs(make_cube())[::40]:
+        for method in OWN:
+            F = method.fundamental(pair.xy1, pair.xy2, threshold_px=1.0, seed=0)
+            assert measure_pair(F, pair)[0] < 1e-8, method.name
 
 
 def test_the_command_states_if_the_bound_was_reached(capsys):
@@ -133,4 +105,3 @@ def test_the_command_states_if_the_bound_was_reached(capsys):
     assert run_study("epipolar-methods", [*base, "--methods", NORMALISED]) == 0
     run_study("epipolar-methods", [*base, "--methods", GOLD])
     assert capsys.readouterr().out.count("RMS (median)") == 2
-    assert set(epipolar_cube.CUBE_METHODS) <= {m.name for m in OWN}

@@ -4,12 +4,14 @@ projections."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from math import cos, pi, sin
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64
+from thesisrecon.geometry.camera_matrix import compose_camera
 from validation.scenes.pose import look_at
 
 SIZE = (800, 600)
@@ -87,3 +89,31 @@ def make_cube() -> CubeSequence:
     facing = C[:, face] > HALF_SIDE
     xy[~(inside & facing)] = np.nan
     return CubeSequence(K, R, C, X, face, xy)
+
+
+OFF_FACE = 20
+"""Minimum number of common points off the face that holds most of them."""
+
+
+@dataclass(frozen=True)
+class CubePair:
+    """Two cameras (3, 4) with calibration K, the common points X (N, 3) and their exact pixels."""
+
+    K: F64
+    P1: F64
+    P2: F64
+    X: F64
+    xy1: F64
+    xy2: F64
+
+
+def cube_pairs(cube: CubeSequence) -> list[CubePair]:
+    """Return the pairs whose common points do not lie on one face."""
+    P = [compose_camera(cube.K, R, -R @ C) for R, C in zip(cube.R, cube.C, strict=True)]
+    pairs = []
+    for i, j in combinations(range(len(P)), 2):
+        both = cube.visible[i] & cube.visible[j]
+        on_face = np.bincount(cube.face[both], minlength=3)
+        if on_face.sum() - on_face.max() >= OFF_FACE:
+            pairs.append(CubePair(cube.K, P[i], P[j], cube.X[both], cube.xy[i, both], cube.xy[j, both]))
+    return pairs

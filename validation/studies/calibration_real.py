@@ -41,7 +41,6 @@ from validation.studies.runner import Part, Rows, scenes_here
 
 
 def truth_of(scene: Scene) -> TrueCameras:
-    """Return the true cameras of a scene that has them."""
     assert scene.K is not None
     assert scene.R is not None
     assert scene.C is not None
@@ -102,14 +101,12 @@ class Bench:
         return run, models
 
     def colmap_true(self) -> Reconstruction | None:
-        """Run COLMAP with the true calibration."""
         assert self.scene.K is not None
         K = {path.name: K for path, K in zip(self.scene.image_paths, self.scene.K, strict=True)}
         return self.colmap("per-image", "true-K", Start(K=K))
 
 
 def model_of(run: RunResult | None) -> Reconstruction | None:
-    """Return the metric model of a run, or None."""
     return None if run is None or run.metric is None else run.metric.reconstruction
 
 
@@ -123,19 +120,16 @@ class CameraRows(Rows):
         self.errors = {m: None if r is None else measure_cameras(r, truth) for m, r in models.items()}
 
     def registered(self) -> None:
-        """Add the number of registered cameras."""
         values = {m: 0.0 if r is None else float(r.registered.sum()) for m, r in self.models.items()}
         self.add(f"cameras registered of {self.total}", values, at_least=float(self.total))
 
     def error(
         self, name: str, unit: str, read: Callable[[CameraErrors], float | None], bound: float | None = None
     ) -> None:
-        """Add one of the errors of the cameras."""
         values = {m: None if e is None else read(e) for m, e in self.errors.items()}
         self.add(name, values, unit, at_most=bound)
 
     def focals(self, median: float | None = None, worst: float | None = None) -> None:
-        """Add the median and the worst focal error of the views."""
         errors = {m: self._focals(r) for m, r in self.models.items()}
         for name, reduce, bound in (("median", np.median, median), ("worst", np.max, worst)):
             values = {m: reduced(reduce, e) for m, e in errors.items()}
@@ -152,16 +146,13 @@ class CameraRows(Rows):
         return np.full(self.total, np.inf) if errors is None else np.nan_to_num(errors, nan=np.inf)
 
     def poses(self, centre_mm: float | None = None, rotation_deg: float | None = None) -> None:
-        """Add errors of centres and rotations."""
         self.error("camera centres, mean", "mm", centre_mm_of, centre_mm)
         self.error("camera rotations, median", "deg", lambda e: e.rotation_error_deg, rotation_deg)
 
     def principal_point(self, bound: float | None = None) -> None:
-        """Add the error of the principal point."""
         self.error("principal point error", "px", lambda e: e.principal_point_error_px, bound)
 
     def intervals(self, run: RunResult | None, least: float | None = MIN_HOLDING) -> None:
-        """Add the coverage and the width of the 95 % intervals."""
         if run is None or run.metric is None:
             return
         add_intervals(self, interval_scores(run.metric, self.K), least)
@@ -169,7 +160,6 @@ class CameraRows(Rows):
 
 
 def reduced(reduce: Callable[[np.ndarray], float], values: np.ndarray | None) -> float | None:
-    """Reduce values to one number; None without values."""
     return None if values is None or not len(values) else float(reduce(values))
 
 
@@ -256,10 +246,7 @@ class Targets:
     rotation_deg: float | None = None
 
 
-TARGETS = {
-    "fountain-P11": Targets(0.15, 3.0, 3.3, 0.05),
-    "Herz-Jesus-P8": Targets(0.25, 3.0, 4.0, 0.03),
-}
+TARGETS = {"fountain-P11": Targets(0.15, 3.0, 3.3, 0.05), "Herz-Jesus-P8": Targets(0.25, 3.0, 4.0, 0.03)}
 PER_IMAGE_MEDIAN_PCT, PER_IMAGE_WORST_PCT = 0.2, 0.5
 ZOOM_MEDIAN_PCT, ZOOM_WORST_PCT = 0.5, 3.0
 
@@ -284,7 +271,6 @@ def check_cameras(bench: Bench) -> Iterator[list[Metric]]:
 
 
 def _variant(bench: Bench, name: str, change: Callable[[Scene, Path], Scene]) -> Bench:
-    """Return the bench of a changed scene in a folder of its own."""
     scene = change(bench.scene, bench.out / name / "images")
     return replace(bench, scene=scene, out=bench.out / name)
 

@@ -79,7 +79,6 @@ def run_trial(motion: Motion, seed: int, *, by_hand: bool, zoom: float) -> Trial
 
 
 def _neighbours(scene: SyntheticSequence, rng: np.random.Generator, *, most: int = 4) -> list[TwoView]:
-    """Estimate and verify the first pairs of neighbours."""
     t = scene.tracks
     table = np.full((t.n_views, t.n_points), -1)
     table[t.view_index, t.point_index] = np.arange(len(t.xy))
@@ -128,7 +127,6 @@ def check_motion(
 
 
 def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: str = "shared") -> IdentifiabilityReport:
-    """Return the report on projective cameras of the dinosaur."""
     options = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
     answer = HypothesesAndRefinement().calibrate(
         reconstruction, prior=prior_for(reconstruction, options), rng=np.random.default_rng(0)

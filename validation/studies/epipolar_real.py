@@ -39,7 +39,6 @@ STRONG, STRONGEST = ("USAC_ACCURATE", "USAC_MAGSAC", "COLMAP", "PoseLib"), ("Pos
 def run_pair(
     pair: RealPair, methods: Iterable[str], *, seeds: int, threshold_px: float
 ) -> dict[str, list[Estimate]]:
-    """Run every method on one pair, once for each seed."""
     return {
         method: [
             estimate_with(method, pair.xy1, pair.xy2, threshold_px=threshold_px, seed=seed)
@@ -57,7 +56,6 @@ def least(values: dict[str, float], references: tuple[str, ...]) -> float | None
 def errors_of(
     runs: dict[str, list[Estimate]], pair: RealPair, error: Callable[[F64 | None, F64], float]
 ) -> dict[str, F64]:
-    """Return errors (seeds,) of every method on the pair's true correspondences."""
     assert pair.truth is not None
     return {name: np.array([error(e.F, pair.truth) for e in found]) for name, found in runs.items()}
 

@@ -51,7 +51,6 @@ class JudgedPair:
     disagreement_px: Mapping[str, float]
 
     def contradicts(self, model: str) -> bool:
-        """Whether the pair contradicts the geometry of this model."""
         return self.disagreement_px[model] > CONTRADICTS_PX
 
 
@@ -82,7 +81,6 @@ def measure_kermit() -> KermitRun | None:
 
 
 def judge(view: TwoView, models: Mapping[str, Reconstruction]) -> JudgedPair:
-    """Compare the pair with the models."""
     return JudgedPair(view, {name: disagreement(view, model) for name, model in models.items()})
 
 
@@ -130,7 +128,6 @@ def check_kermit(run: KermitRun) -> list[Metric]:
 
 
 def _worst_agreeing(pairs: list[JudgedPair], model: str) -> float | None:
-    """Return the largest disagreement of a pair that counts as agreeing."""
     agreeing = [
         p.disagreement_px[model]
         for p in pairs

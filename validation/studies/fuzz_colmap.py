@@ -23,9 +23,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from thesisrecon.errors import StageFailure
-from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.colmap_model import (
     NO_POINT,
     PARAMETER_COUNTS,
@@ -37,6 +34,9 @@ from thesisrecon.io.colmap_model import (
     encode_model,
     inconsistency,
 )
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.io.colmap import reconstruction_from_colmap
 from validation.studies.runner import Part, Rows
 
 LENGTHS = struct.Struct("<HH")
@@ -93,7 +93,6 @@ def small_model(views: int, points: int, *, kind: str = "SIMPLE_RADIAL", name: s
 
 
 def input_of(model: ColmapModel) -> bytes:
-    """Return the three files of a model as one input."""
     files = encode_model(model)
     cameras, images, points = (files[name] for name in ("cameras", "images", "points3D"))
     return LENGTHS.pack(len(cameras), len(images)) + cameras + images + points

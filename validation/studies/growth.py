@@ -73,7 +73,6 @@ def draw_crops(count: int, long_side: int, seed: int, *, separate: bool = False)
 
 
 def configure(method: str) -> PipelineConfig:
-    """Return the default pipeline with this choice of pairs, for sets of any size."""
     pairs = AllPairs() if method == "all-pairs" else OverlapEstimate(all_up_to=0)
     return replace(preset("default"), pairs=pairs)
 
@@ -93,7 +92,6 @@ def measure_crops(
 
 
 def growth_of(method: str, crops: Sequence[Crop], result: RunResult, cpu_s: float) -> Growth:
-    """Return the record of a run up to its matches."""
     # Views are numbered without the crops that were left out.
     views = [crops[int(Path(image.name).stem)] for image in result.images]
     n = len(views)
@@ -116,7 +114,6 @@ def growth_of(method: str, crops: Sequence[Crop], result: RunResult, cpu_s: floa
 
 
 def recall_of(tried: Growth, everything: Growth) -> float:
-    """Return the tried share of the pairs that are accepted among all."""
     pairs = {(i, j) for i, j, _ in tried.pair_list}
     accepted = [(i, j) for i, j, good in everything.pair_list if good]
     return sum(pair in pairs for pair in accepted) / max(len(accepted), 1)
@@ -186,13 +183,11 @@ class Meter:
     since: float = field(default_factory=time.process_time)
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Take the progress report of a stage."""
         self.enter(stage)
         if done == total and stage in AFTER:
             self.enter(AFTER[stage])
 
     def enter(self, stage: str) -> None:
-        """Count what was used until now to the stage before."""
         now, peak = time.process_time(), _peak_mb()
         self.cpu_s[self.stage] = self.cpu_s.get(self.stage, 0.0) + now - self.since
         self.peak_mb[self.stage] = max(self.peak_mb.get(self.stage, 0.0), peak)
@@ -201,14 +196,12 @@ class Meter:
 
 
 def _peak_mb() -> float:
-    """Return the highest memory of this process since :func:`_reset_peak`."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
     return float(line.split()[1]) / 1024.0
 
 
 def _reset_peak() -> None:
-    """Start a new measurement of the highest memory (Linux)."""
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
@@ -250,7 +243,6 @@ def measure_cost(images: str, count: int, threads: int, long_side: int) -> dict[
 
 
 def counts_of(summary: Mapping[str, Any]) -> dict[str, int]:
-    """Return how much there was to do."""
     pairs = summary["pairs"]
     counts = {"pairs tried": pairs["matched"], "pairs accepted": pairs["accepted"]}
     counts |= {"verified matches": pairs["verified_matches"]}

@@ -53,7 +53,6 @@ class Trial:
 
 
 def run_trial(kind: str, number: int) -> Trial:
-    """Go from tracks to the self-check on one synthetic set."""
     rng = np.random.default_rng([number, list(KINDS).index(kind), 7])
     scene = KINDS[kind](rng)
     observed = scene.observe(rng)
@@ -67,7 +66,6 @@ def run_trial(kind: str, number: int) -> Trial:
 
 
 def judge(number: int, result: MetricResult | None, failures: Sequence[str], matched: Matched) -> Trial:
-    """Compare the result of a set with its true focal lengths."""
     if result is None:
         return Trial(number, "refused", 0, np.nan, np.nan, 0, tuple(failures[-1:]))
     error, stated = focal_errors(result, matched)
@@ -97,7 +95,6 @@ def focal_errors(result: MetricResult, matched: Matched) -> tuple[F64, F64]:
 
 
 def table_row(kind: str, trials: Sequence[Trial]) -> list[object]:
-    """Return one row of the table."""
     count = Counter(t.said for t in trials)
     trusted, doubted = ([t for t in trials if t.said == said] for said in ("trusted", "doubted"))
     median = f"{100.0 * float(np.median([t.worst for t in trusted])):.2f}" if trusted else "-"
@@ -107,7 +104,6 @@ def table_row(kind: str, trials: Sequence[Trial]) -> list[object]:
 
 
 def _report(found: Iterable[tuple[str, Sequence[Trial]]]) -> Iterator[Part]:
-    """Give the table of all kinds and the number of silent errors."""
     lines, silent, total = [], [], 0
     for kind, trials in found:
         lines.append(table_row(kind, trials))

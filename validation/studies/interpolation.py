@@ -26,9 +26,7 @@ from validation.scenes.between import (
 )
 from validation.scenes.nine_views import dissolved, read_rgb
 from validation.studies.runner import Part, Rows, load_scene
-from validation.studies.tensor_views import (
-    save_beside,
-)
+from validation.studies.tensor_views import save_beside
 
 
 def interpolation_study(out: Path) -> Iterator[Part]:

@@ -18,10 +18,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
-from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_model import read_colmap_model
 from thesisrecon.records import Reconstruction
 from validation.harness.process import Process, own_cores, run_process
 from validation.metrics.cameras import (
@@ -33,6 +32,7 @@ from validation.metrics.cameras import (
 )
 from validation.metrics.record import Metric, summary_table
 from validation.references.colmap_mapping import read_run
+from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import REAL_SCENES, Scene
 from validation.studies.runner import Part, Rows, scenes_here
 
@@ -110,7 +110,6 @@ def check_reconstruction(
 
 
 def centre_mm_of(errors: CameraErrors) -> float | None:
-    """Return the mean error of the camera centres in millimetres."""
     return None if errors.centre_error is None else 1000.0 * errors.centre_error
 
 
@@ -136,7 +135,6 @@ def _registered(scene: str, n_views: int, outcomes: Mapping[str, Outcome]) -> Me
 def _claims(
     outcomes: Mapping[str, Outcome], residuals: Mapping[str, Reprojection | None]
 ) -> dict[str, float | None]:
-    """Return how far the stated RMS is from the one of the saved model in percent."""
     differences: dict[str, float | None] = {}
     for name, outcome in outcomes.items():
         measured, claimed = residuals[name], outcome.claimed_rms_px
@@ -198,7 +196,7 @@ def _read_ours(scene: Scene, out: Path, process: Process) -> Outcome:
     names = [path.name for path in scene.image_paths]
     model, failure = None, ""
     try:
-        model = reconstruction_from_colmap(read_colmap_model(out / "sparse" / "0"), names=names)
+        model = read_colmap_model(out / "sparse" / "0", names)
     except StageFailure as missing:
         failure = str(summary.get("failure") or f"exit code {process.code}: {missing}")
     return Outcome(
@@ -267,7 +265,6 @@ def write_readme(readme: Path, rows: dict[str, list[Metric]], facts: dict[str, A
 
 
 def _notes(outcomes: dict[str, Outcome]) -> str:
-    """Return stage times, failures and unregistered images."""
     lines = []
     for method, run in outcomes.items():
         if run.seconds:

@@ -107,7 +107,6 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def _main() -> None:
-    """Answer one :func:`call_apart`."""
     module, _, function = sys.argv[1].partition(":")
     found = getattr(import_module(module), function)(*json.loads(sys.argv[2]))
     write_text(Path(sys.argv[3]), json.dumps(found))

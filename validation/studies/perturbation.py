@@ -45,7 +45,6 @@ class PerturbedDetector:
     repeat: int
 
     def detect(self, image: Image) -> Features:
-        """Detect the corners of one image."""
         found: Features = self.inner.detect(image)
         rng = np.random.default_rng([self.repeat, *image.name.encode()])
         seeds = found.seeds
@@ -62,11 +61,9 @@ class PerturbedMatcher:
     repeat: int
 
     def prepare(self, image: Image, features: Features) -> Any:
-        """Prepare one image without a change."""
         return self.inner.prepare(image, features)
 
     def match(self, view1: Any, view2: Any, *, pair: tuple[int, int], **given: Any) -> Matches:
-        """Match a pair."""
         found: Matches = self.inner.match(view1, view2, pair=pair, **given)
         rng = np.random.default_rng([self.repeat, *pair])
         return replace(found, xy1=perturbed(found.xy1, rng), xy2=perturbed(found.xy2, rng))
@@ -80,13 +77,11 @@ class PerturbedTracks:
     repeat: int
 
     def build(self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
-        """Build the tracks."""
         found: Tracks = self.inner.build(prepared, pairs, rng)
         return replace(found, xy=perturbed(found.xy, np.random.default_rng([self.repeat])))
 
 
 def disturbed(config: PipelineConfig, stage: str, repeat: int) -> PipelineConfig:
-    """Return the pipeline with the output of one stage perturbed."""
     if stage == "corners":
         return replace(config, features=PerturbedDetector(config.features, repeat))
     if stage == "matches":
@@ -111,7 +106,6 @@ class Moved:
 
 
 def compare(still: MetricResult, other: MetricResult) -> Moved:
-    """Compare two results on the same images."""
     both = still.reconstruction.registered & other.reconstruction.registered
     steps = [
         abs(other.intrinsics[view][name].value - interval.value) / interval.std
@@ -168,7 +162,6 @@ def measure(scene: Scene, out: Path, *, long_side: int, repeats: int, threads: i
 
 
 def rows(name: str, moved: Mapping[str, Sequence[Moved]]) -> list[Metric]:
-    """Return the largest movements; the columns name the perturbed stage."""
     table = Rows(name, STAGES[0])
 
     def add(label: str, unit: str, field: str, limit: float | None = None) -> None:

@@ -71,7 +71,6 @@ def undistorted(model: Reconstruction, view: int, xy: F64) -> F64:
 
 
 def pairs_of(pairs: Sequence[TwoView], model: Reconstruction, sizes: F64) -> list[RealPair]:
-    """Return every accepted pair of registered views."""
     found = []
     for p in pairs:
         if p.accepted and model.registered[p.i] and model.registered[p.j]:

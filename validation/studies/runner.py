@@ -36,7 +36,6 @@ MODULES = {
     "critical-motions": "critical_motions",
     "dinosaur": "projective",
     "epipolar": "epipolar_synthetic",
-    "epipolar-cube": "epipolar_cube",
     "epipolar-methods": "epipolar_methods",
     "epipolar-real": "epipolar_real",
     "factorization": "projective",
@@ -233,7 +232,6 @@ def _summary(function: StudyFunction) -> str:
 
 @contextmanager
 def output_folder(folder: Path | None) -> Iterator[Path]:
-    """Give the folder, made if it is absent, or a temporary one."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         yield folder.resolve()
@@ -243,12 +241,10 @@ def output_folder(folder: Path | None) -> Iterator[Path]:
 
 
 def part_text(part: Part) -> str:
-    """Return the Markdown of one part."""
     return part if isinstance(part, str) else f"## {part[0].scene}\n\n{markdown_table(list(part))}"
 
 
 def write_json(path: Path, metrics: Sequence[Metric]) -> None:
-    """Write rows with their verdicts."""
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = [{**asdict(metric), "verdict": metric.verdict} for metric in metrics]
     write_text(path, json.dumps(rows, indent=1) + "\n")

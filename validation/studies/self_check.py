@@ -88,7 +88,6 @@ def is_doubted(model: MetricEstimate, calibration: SelfCalibration, adjustment: 
 def judge(
     model: MetricEstimate, right: MetricEstimate, calibration: SelfCalibration, adjustment: BundleAdjustment
 ) -> Outcome | None:
-    """Return the outcome of a model; None if nothing is left."""
     settled = settle(model, adjustment)
     if settled is None:
         return None
@@ -98,7 +97,6 @@ def judge(
 def spoiled_outcomes(
     result: RunResult, prior: IntrinsicsPrior, seeds: int
 ) -> dict[str, list[Outcome | None]]:
-    """Return outcomes by kind of one scene."""
     assert result.metric is not None
     assert result.calibration is not None
     adjustment = BundleAdjustment(prior, 0.02, 0.02)

@@ -39,9 +39,9 @@ from thesisrecon.selfcalibration.stratified import Stratified
 from validation.metrics.focal_bound import focal_bound
 from validation.metrics.record import Metric
 from validation.scenes.cloud import make_cloud
+from validation.scenes.cube import OFF_FACE
 from validation.scenes.real import REAL_SCENES
 from validation.scenes.rigs import Rig, cube_rig, noisy_tracks, projective_from_truth, zoomed
-from validation.studies.epipolar_cube import OFF_FACE
 from validation.studies.runner import Part, Rows, pick, scenes_here, text_table
 
 WITH_BUNDLE = "the whole, with the metric stage"
@@ -123,9 +123,7 @@ def make_rig(cell: Cell, rng: np.random.Generator) -> Rig:
 def assumptions(rig: Rig, mode: str) -> IntrinsicsPrior:
     """Return the prior: square pixels, principal point near the middle, no distortion."""
     options = IntrinsicsOptions(
-        focal="constant" if mode == "constant" else "free",
-        principal_point_std_rel=PRINCIPAL_STD,
-        k1="known",
+        focal="constant" if mode == "constant" else "free", principal_point_std_rel=PRINCIPAL_STD, k1="known"
     )
     n = len(rig.K)
     return prior_from_options(options, [rig.size] * n, np.full(n, np.nan), np.ones(n))
@@ -147,13 +145,7 @@ def run_cell(cell: Cell, methods: Sequence[str], seeds: Iterable[int]) -> list[T
 
 def draw_cell(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
     """Return the true cameras and the projective reconstruction of noisy observations."""
-    place = (
-        seed,
-        SCENES.index(cell.scene),
-        MODES.index(cell.mode),
-        cell.views,
-        round(100 * cell.sigma_px),
-    )
+    place = (seed, SCENES.index(cell.scene), MODES.index(cell.mode), cell.views, round(100 * cell.sigma_px))
     rng = np.random.default_rng(place)
     rig = make_rig(cell, rng)
     return rig, projective_from_truth(rig, noisy_tracks(rig, cell.sigma_px, rng), rng)
@@ -234,7 +226,6 @@ def report(trials: Sequence[Trial]) -> str:
 
 
 def _table(title: str, trials: Sequence[Trial], places: Sequence[tuple[float, int]]) -> str:
-    """Return methods by places (noise, number of cameras)."""
     cells = [[t for t in trials if (t.sigma_px, t.views) == place] for place in places]
     rows = []
     for method in dict.fromkeys(t.method for t in trials):
@@ -250,7 +241,6 @@ def _table(title: str, trials: Sequence[Trial], places: Sequence[tuple[float, in
 
 
 def _draws(trials: Sequence[Trial]) -> str:
-    """Return the number of draws behind a column."""
     counts = Counter(t.method for t in trials).values() or [0]
     return f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 
@@ -277,7 +267,6 @@ def _entry(trials: Sequence[Trial]) -> str:
 
 
 def targets(trials: Sequence[Trial]) -> list[Metric]:
-    """Return the bounds of the whole at 1 px and 27 cameras."""
     metrics: list[Metric] = []
     for scene in SCENES:
         for mode in MODES:

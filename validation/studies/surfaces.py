@@ -23,7 +23,6 @@ NOISE = 5e-4
 
 
 def known_surfaces() -> dict[str, F64]:
-    """Return inverse depths (240, 320) by name."""
     y, x = np.indices((240, 320))
     u, v = x / 320.0 - 0.5, y / 240.0 - 0.5
 

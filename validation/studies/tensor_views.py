@@ -52,7 +52,6 @@ class Place:
     direction: str = "along"
 
     def of(self, pair: CalibratedPair) -> VirtualCamera:
-        """Return the camera for this pair."""
         camera = camera_at(pair, self.s, sizes=(SIZE, SIZE))
         if self.direction == "along":
             return camera
@@ -173,7 +172,6 @@ def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tup
 
 
 def save_beside(path: Path, pictures: list[U8]) -> None:
-    """Save images in a row at half their size."""
     PIL.Image.fromarray(np.concatenate(pictures, axis=1)[::2, ::2]).save(path)
 
 

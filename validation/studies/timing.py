@@ -21,7 +21,6 @@ def ratios_to_ours(groups: Mapping[str, Mapping[str, float]]) -> dict[str, dict[
 
 
 def ratio_table(groups: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a row for each group and method."""
     ratios, rows = ratios_to_ours(groups), []
     for group, times in groups.items():
         for name, seconds in times.items():

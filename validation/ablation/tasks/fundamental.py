@@ -13,9 +13,9 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
+from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
 from validation.ablation.study import Measure, Place
-from validation.scenes.cube import make_cube
-from validation.studies.epipolar_cube import CubePair, cube_pairs, measure_pair
+from validation.scenes.cube import CubePair, cube_pairs, make_cube
 from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHOLD_PX
 
 BY_METHOD = {m.name: m for m in METHODS}
@@ -77,8 +77,8 @@ class FundamentalOfCube:
         for pair in (_pairs()[k] for k in chosen):
             xy1, xy2 = self._matches(pair, rng)
             F = self._fundamental(config, xy1, xy2, threshold, seed)
-            found.append(measure_pair(F, pair, xy1, xy2))
-        distance, _, angle = np.array(found).T
+            found.append(measure_pair(F, pair))
+        distance, angle = np.array(found).T
         if np.isnan(distance).all():
             raise StageFailure("no pair has an F")
         bound = np.array([self._bound(_pairs()[k]) for k in chosen])
@@ -117,3 +117,23 @@ class FundamentalOfCube:
 @cache
 def _pairs() -> list[CubePair]:
     return cube_pairs(make_cube())
+
+
+def measure_pair(F: F64 | None, pair: CubePair) -> tuple[float, float]:
+    """Return the RMS distance (px) of the exact points to their epipolar lines and the larger epipole error
+    (degrees), NaN without F."""
+    if F is None:
+        return float("nan"), float("nan")
+    distance = float(np.sqrt(np.mean(symmetric_residuals(F, pair.xy1, pair.xy2) ** 2) / 2.0))
+    return distance, _epipole_error_deg(F, pair)
+
+
+def _epipole_error_deg(F: F64, pair: CubePair) -> float:
+    centres = [np.linalg.svd(P)[2][3] for P in (pair.P1, pair.P2)]
+    truths = (pair.P1 @ centres[1], pair.P2 @ centres[0])
+    angles = []
+    for found, true in zip(epipoles(F), truths, strict=True):
+        a, b = (np.linalg.solve(pair.K, e) for e in (found, true))
+        sine, cosine = np.linalg.norm(np.cross(a, b)), abs(float(a @ b))
+        angles.append(float(np.degrees(np.arctan2(sine, cosine))))
+    return max(angles)

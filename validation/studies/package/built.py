@@ -44,7 +44,6 @@ class Built:
 
 
 def build(out: Path) -> Built:
-    """Run ``python -m build`` in an empty environment."""
     interpreter = make_environment(out / "build-environment")
     install(interpreter, "build")
     for folder, flags in (("dist", []), ("direct", ["--wheel"])):
@@ -73,7 +72,6 @@ def wheel_faults(names: Iterable[str], size: int) -> list[str]:
 
 
 def content(wheel: Path) -> dict[str, str]:
-    """Return the digest of every file of a wheel."""
     with zipfile.ZipFile(wheel) as archive:
         return {name: hashlib.sha256(archive.read(name)).hexdigest() for name in archive.namelist()}
 

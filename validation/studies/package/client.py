@@ -11,14 +11,7 @@ import numpy as np
 import thesisrecon
 from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.records import (
-    DisparityMap,
-    RenderedView,
-    RunResult,
-    SelfCalibration,
-    TexturedMesh,
-    TwoView,
-)
+from thesisrecon.records import DisparityMap, RenderedView, RunResult, SelfCalibration, TexturedMesh, TwoView
 
 
 def points_of_two(first: Path, second: Path) -> F64:

@@ -21,7 +21,6 @@ BOUND = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)>=(?P<lowest>[0-9.]+)")
 
 
 def dependencies() -> list[str]:
-    """Return the lines ``NAME>=VERSION`` of pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return [str(line) for line in project["dependencies"]]
 
@@ -143,7 +142,6 @@ def run_part(place: Path, name: str, arguments: Sequence[str]) -> Part:
 
 
 def counted(lines: Sequence[str]) -> dict[str, int]:
-    """Count tests by outcome in the last line of pytest."""
     return {word: int(n) for n, word in COUNTED.findall(lines[-1] if lines else "")}
 
 

@@ -39,7 +39,6 @@ with contextlib.redirect_stdout(io.StringIO()):
 
 
 def statements() -> dict[str, str]:
-    """Return the timed statements by name."""
     doors = {f"thesisrecon.{door}": f"import thesisrecon; thesisrecon.{door}" for door in DOORS}
     commands = {f"thesisrecon {words}": COMMAND.format(words.split()) for words in COMMANDS}
     others = {name: f"import {name}" for name in ("numpy", "numba", "scipy.stats")}
@@ -134,7 +133,6 @@ class Watched:
     said: str
 
     def outside(self, *allowed: Path) -> list[Path]:
-        """Return files written outside these folders."""
         homes = [folder.resolve() for folder in allowed]
         return sorted(p for p in self.written if not any(p.resolve().is_relative_to(h) for h in homes))
 
@@ -171,7 +169,6 @@ def watch(program: str, arguments: Sequence[str], place: Path, **variables: str)
 
 
 def trespasses(run: Watched, *allowed: Path) -> list[str]:
-    """Return the faults of a run."""
     faults = [] if run.code == 0 else [f"the run ended with code {run.code}: {run.said.strip()}"]
     faults += [f"{path} was written" for path in run.outside(*allowed, Path(os.devnull))]
     faults += [f"{path} was left behind" for path in run.left]
