@@ -8,7 +8,7 @@ from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.geometry.camera_matrix import camera_centre, decompose_camera
 from thesisrecon.geometry.two_view import estimate_homography, homography_residuals
 from thesisrecon.views._warping import sample
-from thesisrecon.views.interpolation import InterpolatedPair
+from thesisrecon.views.interpolation import InterpolatedPair, original_from_rectified
 from validation.scenes.fixtures import Pose
 
 
@@ -21,21 +21,14 @@ def camera_between(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
     first, second = (H @ camera for H, camera in zip(pair.H, P, strict=True))
     # Equal up to the errors of F.
     scale = float(np.sum(first[1:] * second[1:]) / np.sum(second[1:] ** 2))
-    return np.asarray(pair.frame.original_from_rectified(s) @ ((1.0 - s) * first + s * scale * second))
+    P_s = (1.0 - s) * first + s * scale * second
+    return np.asarray(original_from_rectified(pair.H, pair.size, s) @ P_s)
 
 
 def pose_of(P: F64) -> Pose:
     """K, R, C of a camera."""
     K, R, t = decompose_camera(P)
     return Pose(K, R, -R.T @ t)
-
-
-def square_camera(pose: Pose) -> tuple[Pose, F64]:
-    """A camera of square pixels in the same place, which can be rendered, and what turns the one's pixels
-    into the other's (3, 3): an interpolated camera has some skew."""
-    focal = float(np.sqrt(pose.K[0, 0] * pose.K[1, 1]))
-    K = np.array([[focal, 0.0, pose.K[0, 2]], [0.0, focal, pose.K[1, 2]], [0.0, 0.0, 1.0]])
-    return Pose(K, pose.R, pose.C), np.asarray(K @ np.linalg.inv(pose.K))
 
 
 def camera_centre_of(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:

@@ -70,18 +70,6 @@ def rezoom_scene(scene: Scene, folder: Path, *, seed: int, how: Rezoom | None = 
     return _framed(scene, folder, lambda K, size: how.frame(K, size, rng), f"zoom-{seed}")
 
 
-def central_scene(scene: Scene, folder: Path, *, share: float = 0.5, zoom: float = 1.0) -> Scene:
-    """The scene seen through a longer lens: ``share`` of the width and height around the middle of every
-    image, enlarged ``zoom`` times."""
-
-    def frame(_: F64, size: tuple[int, int]) -> Frame:
-        width, height = (round(zoom * share * side) for side in size)
-        left, top = (0.5 * (zoom * side - part) for side, part in zip(size, (width, height), strict=True))
-        return Frame(zoom, left, top, (width, height))
-
-    return _framed(scene, folder, frame, f"centre-{zoom:g}")
-
-
 def windowed_scene(scene: Scene, folder: Path, boxes: dict[int, F64]) -> Scene:
     """The scene with only a part left of some images: ``boxes`` maps the number of an image to the
     part (left, top, right, bottom) as shares of width and height. The rest is grey, with a soft edge that

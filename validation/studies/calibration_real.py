@@ -20,7 +20,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Reconstruction, RunResult
-from validation.metrics.cameras import CameraErrors, TrueCameras, measure_cameras
+from validation.harness.scenes import truth_of
+from validation.metrics.cameras import CameraErrors, measure_cameras
 from validation.metrics.intervals import LEVEL, focal_errors_pct, interval_scores, join_scores
 from validation.metrics.record import Metric
 from validation.references.colmap_mapping import Start, map_with_pycolmap, read_run
@@ -40,13 +41,6 @@ from validation.studies.main_job import COLMAP, COLMAP_PP, OURS, centre_mm_of
 from validation.studies.runner import Part, Rows, scenes_here
 
 
-def truth_of(scene: Scene) -> TrueCameras:
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
-    return TrueCameras(scene.K, scene.R, scene.C)
-
-
 @dataclass(frozen=True)
 class Bench:
     """One scene and the folder that keeps its runs."""
@@ -63,14 +57,9 @@ class Bench:
         images = list(self.scene.image_paths)
         try:
             return reconstruct(
-                images,
-                self.out / "ours",
-                config=config,
-                seed=self.seed,
-                threads=self.threads,
-                until="metric",
-                overwrite=True,
-            )
+                images, self.out / "ours",
+                config=config, seed=self.seed, threads=self.threads, until="metric", overwrite=True,
+            )  # fmt: skip
         except StageFailure as failure:
             print(f"{self.scene.name}: {cameras}: {failure}", file=sys.stderr, flush=True)
             return None
@@ -116,6 +105,7 @@ class CameraRows(Rows):
     def __init__(self, title: str, scene: Scene, models: Mapping[str, Reconstruction | None]) -> None:
         super().__init__(title, OURS)
         truth = truth_of(scene)
+        assert truth is not None
         self.models, self.K, self.total = models, truth.K, len(truth.K)
         self.errors = {m: None if r is None else measure_cameras(r, truth) for m, r in models.items()}
 
@@ -126,8 +116,7 @@ class CameraRows(Rows):
     def error(
         self, name: str, unit: str, read: Callable[[CameraErrors], float | None], bound: float | None = None
     ) -> None:
-        values = {m: None if e is None else read(e) for m, e in self.errors.items()}
-        self.add(name, values, unit, at_most=bound)
+        self.each(name, self.errors, read, unit, at_most=bound)
 
     def focals(self, median: float | None = None, worst: float | None = None) -> None:
         errors = {m: self._focals(r) for m, r in self.models.items()}

@@ -12,17 +12,17 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.records import Reconstruction
 from validation.harness.process import Process, own_cores, run_process
+from validation.harness.scenes import truth_of
 from validation.metrics.cameras import (
     CameraErrors,
     Reprojection,
@@ -79,33 +79,22 @@ def check_reconstruction(
     residuals = {name: None if m is None else measure_reprojection(m) for name, m in models.items()}
     rows = Rows(scene, OURS)
 
-    def of_residuals(read: Callable[[Reprojection], float]) -> dict[str, float | None]:
-        return {name: None if residual is None else read(residual) for name, residual in residuals.items()}
-
-    def of_outcomes(read: Callable[[Outcome], float]) -> dict[str, float]:
-        return {name: read(outcome) for name, outcome in outcomes.items()}
-
     rows.append(_registered(scene, n_views, outcomes))
     if truth is not None:
         errors = {name: None if m is None else measure_cameras(m, truth) for name, m in models.items()}
-        quantities: tuple[tuple[str, str, Callable[[CameraErrors], float | None], float | None], ...] = (
-            ("focal error", "%", lambda e: e.focal_error_pct, focal),
-            ("principal point error", "px", lambda e: e.principal_point_error_px, None),
-            ("mean camera-centre error", "mm", centre_mm_of, centre),
-            ("median rotation error", "deg", lambda e: e.rotation_error_deg, None),
-        )
-        for label, unit, read, bound in quantities:
-            values = {name: None if e is None else read(e) for name, e in errors.items()}
-            rows.add(label, values, unit, at_most=bound)
-    rows.add("median reprojection", of_residuals(lambda r: r.median_px), "px", at_most=reprojection)
-    rows.add("mean reprojection", of_residuals(lambda r: r.mean_px), "px")
-    rows.add("points", {name: None if m is None else float(m.valid.sum()) for name, m in models.items()})
-    rows.add("observations", of_residuals(lambda r: float(r.observations)))
-    wall = of_outcomes(lambda o: o.wall_s)
-    rows.add("wall time", wall, "s", at_most=wall.get(COLMAP) if scene in TIMED_SCENES else None)
+        rows.each("focal error", errors, lambda e: e.focal_error_pct, "%", at_most=focal)
+        rows.each("principal point error", errors, lambda e: e.principal_point_error_px, "px")
+        rows.each("mean camera-centre error", errors, centre_mm_of, "mm", at_most=centre)
+        rows.each("median rotation error", errors, lambda e: e.rotation_error_deg, "deg")
+    rows.each("median reprojection", residuals, lambda r: r.median_px, "px", at_most=reprojection)
+    rows.each("mean reprojection", residuals, lambda r: r.mean_px, "px")
+    rows.each("points", models, lambda m: float(m.valid.sum()))
+    rows.each("observations", residuals, lambda r: float(r.observations))
+    colmap_s = outcomes[COLMAP].wall_s if COLMAP in outcomes and scene in TIMED_SCENES else None
+    rows.each("wall time", outcomes, lambda o: o.wall_s, "s", at_most=colmap_s)
     rows.add("rms it claims off by", _claims(outcomes, residuals), "%", at_most=CLAIM_TOLERANCE_PCT)
-    rows.add("processor time", of_outcomes(lambda o: o.cpu_s), "s")
-    rows.add("peak memory", of_outcomes(lambda o: o.peak_mb), "MB")
+    rows.each("processor time", outcomes, lambda o: o.cpu_s, "s")
+    rows.each("peak memory", outcomes, lambda o: o.peak_mb, "MB")
     return rows
 
 
@@ -238,10 +227,8 @@ def measure_scene(
             )
             if method not in outcomes or outcome.wall_s < outcomes[method].wall_s:
                 outcomes[method] = outcome
-    truth = None
-    if scene.K is not None and scene.R is not None and scene.C is not None:
-        truth = TrueCameras(scene.K, scene.R, scene.C)
-    return check_reconstruction(scene.name, len(scene.image_paths), truth, outcomes), outcomes
+    rows = check_reconstruction(scene.name, len(scene.image_paths), truth_of(scene), outcomes)
+    return rows, outcomes
 
 
 def warm_up(scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> float:

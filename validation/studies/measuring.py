@@ -26,34 +26,6 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float, float]:
     return answer, time.perf_counter() - wall, time.process_time() - cpu
 
 
-def least_seconds(
-    calls: Mapping[str, Callable[[], object]], repeats: int, *, warm: bool = True
-) -> dict[str, tuple[float, float]]:
-    """Time calls that take turns.
-
-    Parameters
-    ----------
-    calls : mapping
-        Name -> call.
-    repeats : int
-        Timed rounds; the fastest call counts.
-    warm : bool
-        Make one more round first, which compiles and is not counted.
-
-    Returns
-    -------
-    dict
-        Name -> least processor seconds, least wall seconds.
-    """
-    least = dict.fromkeys(calls, (np.inf, np.inf))
-    for repeat in range(repeats + warm):
-        for name, call in calls.items():
-            _, wall, cpu = timed(call)
-            if repeat >= warm:
-                least[name] = min(least[name][0], cpu), min(least[name][1], wall)
-    return least
-
-
 def call_apart(
     function: Callable[..., Any],
     *arguments: Any,
@@ -62,38 +34,15 @@ def call_apart(
 ) -> tuple[Any, Process]:
     """Call a module-level function in a new process on its own cores.
 
-    Parameters
-    ----------
-    function : callable
-        Function whose arguments and answer can be written as JSON.
-    cores : int
-        Number of processor cores of the process.
-    environment : mapping
-        Further environment variables.
-
-    Returns
-    -------
-    answer, Process
-        The answer as read from JSON, and what the process used.
-
-    Raises
-    ------
-    RuntimeError
-        The process failed; the message is the end of its output.
+    Arguments and answer are written as JSON. Return the answer and what the process used; ``RuntimeError``
+    with the end of its output if it fails.
     """
     with tempfile.TemporaryDirectory() as place:
         answer, log = Path(place) / "answer.json", Path(place) / "log"
         name = f"{function.__module__}:{function.__name__}"
-        command = [
-            sys.executable,
-            "-m",
-            "validation.studies.measuring",
-            name,
-            json.dumps(arguments, default=str),
-        ]
-        process = run_process(
-            [*command, str(answer)], log=log, cores=own_cores()[:cores], environment=environment
-        )
+        command = [sys.executable, "-m", "validation.studies.measuring", name]
+        command += [json.dumps(arguments, default=str), str(answer)]
+        process = run_process(command, log=log, cores=own_cores()[:cores], environment=environment)
         if process.code != 0:
             raise RuntimeError(log.read_text(encoding="utf-8")[-2000:])
         return json.loads(answer.read_text(encoding="utf-8")), process

@@ -41,7 +41,6 @@ MODULES = {
     "factorization": "projective",
     "front-end": "front_end",
     "full-disk": "robustness",
-    "fuzz-colmap": "fuzz_colmap",
     "growth": "growth",
     "growth-of-cost": "growth",
     "harsh": "harsh",
@@ -71,19 +70,16 @@ HELP = {
     "cameras": "shared: one camera for all images; per-image: one for each",
     "cold": "begin each run without compiled kernels",
     "compare_with": "two records: before and after",
-    "corpus": "folder of inputs that are continued",
     "disks": "number of small and of read-only file systems",
     "every": "take every n-th one only",
     "executor": "executor of the runs",
     "first": "number of the first draw",
     "gaps": "gaps of the pairs (i, i + gap)",
-    "grid": "run every noise at every number of cameras",
     "images": "folder of images",
     "kills": "runs killed (SIGKILL) at moments spread over their time",
     "kinds": "words; kinds of sets that contain one of them are taken",
     "long_side": "long side of the images in px",
     "max_size": "long side of the images in px",
-    "memory": "limit of the process in MB",
     "methods": "names of methods (default: all)",
     "modes": "one camera or focal length for all images, or one for each",
     "moments": "moments spread over the time of a run",
@@ -92,7 +88,6 @@ HELP = {
     "noise": "standard deviations of image coordinates in px",
     "pairs": "names of pairs of kusvod2 (default: all)",
     "parts": "parts of the study (default: all)",
-    "plain": "do not use atheris even if it is installed",
     "points": "numbers of points or matches",
     "presets": "presets of the runs",
     "pytest": "arguments of pytest in place of the quick suite",
@@ -127,6 +122,7 @@ SHIFTED = "Cones9"
 """Nine views of the Middlebury Cones, by a camera that moves without rotation."""
 Part = Sequence[Metric] | str
 StudyFunction = Callable[..., Iterable[Part]]
+T = typing.TypeVar("T")
 
 
 def run_studies(arguments: Sequence[str]) -> int:
@@ -146,13 +142,7 @@ def run_studies(arguments: Sequence[str]) -> int:
 
 
 def run_study(name: str, arguments: Sequence[str] = ()) -> int:
-    """Run one study with its options: print its parts, write them if asked, judge its bounds.
-
-    Returns
-    -------
-    int
-        0, 1 if a bound is missed, 2 if an option is wrong or there is no data.
-    """
+    """Run one study with its options: print its parts, write them if asked, return the exit code."""
     function = load_study(name)
     options = vars(study_parser(name, function).parse_args(list(arguments)))
     out, json_file, texts = options.pop("out"), options.pop("json"), list[str]()
@@ -254,15 +244,7 @@ def write_json(path: Path, metrics: Sequence[Metric]) -> None:
 
 
 class Rows(list[Metric]):
-    """Rows of one scene with one judged method.
-
-    Parameters
-    ----------
-    scene : str
-        Title of the table.
-    judged : str
-        Method whose numbers are held against the bounds.
-    """
+    """Rows of one scene; the numbers of one ``judged`` method are held against the bounds."""
 
     def __init__(self, scene: str, judged: str) -> None:
         super().__init__()
@@ -281,6 +263,19 @@ class Rows(list[Metric]):
         given = values if isinstance(values, typing.Mapping) else {self.judged: float(values)}
         bound = at_most if at_least is None else at_least
         self.append(Metric(self.scene, name, unit, given, self.judged, bound, at_least is None, note))
+
+    def each(
+        self,
+        name: str,
+        items: typing.Mapping[str, T | None],
+        read: Callable[[T], float | None],
+        unit: str = "",
+        at_most: float | None = None,
+        at_least: float | None = None,
+    ) -> None:
+        """Append a row with a number of each method's item; methods without an item have none."""
+        values = {method: None if item is None else read(item) for method, item in items.items()}
+        self.add(name, values, unit, at_most, at_least)
 
 
 def text_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:

@@ -190,39 +190,24 @@ def focals_of(method: str, projective: Reconstruction, prior: IntrinsicsPrior) -
 
 
 def cells(
-    scenes: Sequence[str],
-    modes: Sequence[str],
-    noises: Sequence[float],
-    views: Sequence[int],
-    *,
-    grid: bool = False,
+    scenes: Sequence[str], modes: Sequence[str], noises: Sequence[float], views: Sequence[int]
 ) -> list[Cell]:
-    """Return noises at the most cameras and numbers of cameras at 1 px, or the whole ``grid``."""
+    """Return all noises at the most cameras and all numbers of cameras at 1 px."""
     middle = min(noises, key=lambda s: abs(s - 1.0))
-    cross = [(s, max(views)) for s in noises] + [(middle, v) for v in views]
-    places = dict.fromkeys([(s, v) for s in noises for v in views] if grid else cross)
+    places = dict.fromkeys([(s, max(views)) for s in noises] + [(middle, v) for v in views])
     return [Cell(scene, mode, s, v) for scene in scenes for mode in modes for s, v in places]
 
 
 def report(trials: Sequence[Trial]) -> str:
-    """Return tables for each scene and mode.
-
-    One table has the cameras at 1 px and the noises at most cameras; every other noise with several numbers
-    of cameras gets its own table.
-    """
-    crosses, others = [], []
-    for scene in dict.fromkeys(t.scene for t in trials):
-        for mode in dict.fromkeys(t.mode for t in trials if t.scene == scene):
-            here = [t for t in trials if (t.scene, t.mode) == (scene, mode)]
-            places = {(t.sigma_px, t.views) for t in here}
-            noises, most = sorted({s for s, _ in places}), max(v for _, v in places)
-            cross = sorted(p for p in places if p[0] == 1.0) + [(s, most) for s in noises if s != 1.0]
-            crosses.append(_table(f"{scene}, {mode}", here, cross))
-            for sigma in noises:
-                row = sorted(p for p in places if p[0] == sigma)
-                if sigma != 1.0 and len(row) > 1:
-                    others.append(_table(f"{scene}, {mode}, {sigma:g} px", here, row))
-    return "\n\n".join([*crosses, *others])
+    """Return a table for each scene and mode: cameras at 1 px, other noises at the most cameras."""
+    tables = []
+    for scene, mode in dict.fromkeys((t.scene, t.mode) for t in trials):
+        here = [t for t in trials if (t.scene, t.mode) == (scene, mode)]
+        places = {(t.sigma_px, t.views) for t in here}
+        noises, most = sorted({s for s, _ in places}), max(v for _, v in places)
+        cross = sorted(p for p in places if p[0] == 1.0) + [(s, most) for s in noises if s != 1.0]
+        tables.append(_table(f"{scene}, {mode}", here, cross))
+    return "\n\n".join(tables)
 
 
 def _table(title: str, trials: Sequence[Trial], places: Sequence[tuple[float, int]]) -> str:
@@ -381,7 +366,6 @@ def selfcalibration_study(
     noise: Sequence[float] = NOISES_PX,
     views: Sequence[int] = VIEWS,
     methods: Sequence[str] | None = None,
-    grid: bool = False,
     trials: int = 10,
     first: int = 0,
     workers: int = 1,
@@ -390,7 +374,7 @@ def selfcalibration_study(
 ) -> Iterator[Part]:
     """Compare all self-calibration methods on the thesis' cube and on a point cloud."""
     names = tuple(pick(methods, [*VARIANTS, WITH_BUNDLE, BOUND]))
-    places = cells(scenes, modes, noise, views, grid=grid)
+    places = cells(scenes, modes, noise, views)
     jobs = [(cell, names, first + k, 1) for k in range(trials) for cell in places]
     done = read_trials(read)
     with ProcessPoolExecutor(workers) as pool:
