@@ -85,7 +85,7 @@ def test_rectifying_warp(bench: Bench, method: str, photographs: tuple[Image, ..
     rgb = photographs[0].rgb.astype(np.float32)
     size = (rgb.shape[1], rgb.shape[0])
     H = np.array([[1.02, 0.03, -8.0], [-0.02, 1.01, 5.0], [1e-5, 2e-5, 1.0]])
-    rectified = PlanarRectification(H, np.eye(3), size)
+    rectified = PlanarRectification(np.stack([H, np.eye(3)]), size)
     calls = {
         "ours": lambda: rectified.warp(rgb, 0),
         "OpenCV": lambda: warp_perspective(rgb, H, size),

@@ -16,6 +16,7 @@ from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io.images import read_image
 from thesisrecon.pipeline.image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
+from thesisrecon.stereo._planar import PlanarRectification
 from thesisrecon.stereo.semi_global import match_both_sides
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right
 
@@ -199,10 +200,8 @@ def prepare_pair(
         if "polar" not in failure.advice:
             raise
         raise StageFailure(failure.reason, failure.evidence, _SIDE_BY_SIDE) from None
-    H1, H2 = getattr(dense.frame, "H1", None), getattr(dense.frame, "H2", None)
-    assert H1 is not None
-    assert H2 is not None
-    return InterpolatedPair((first.rgb, second.rgb), np.stack([H1, H2]), dense.left, dense.right)
+    assert isinstance(dense.frame, PlanarRectification)
+    return InterpolatedPair((first.rgb, second.rgb), dense.frame.H, dense.left, dense.right)
 
 
 def require_comparable_images(images: Sequence[Image]) -> None:

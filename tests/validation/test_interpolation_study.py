@@ -6,10 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import texture
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo._planar import minimum_distortion
-from thesisrecon.views.interpolation import InterpolatedPair
+from thesisrecon.views.interpolation import InterpolatedPair, original_from_rectified
 from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
 
 SIZE = (160, 120)
@@ -28,15 +29,17 @@ def pair():
         np.zeros((SIZE[1], SIZE[0], 3), np.uint8),
         DisparityMap(np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32), 0.0),
     )
-    H = np.stack([frame.H1, frame.H2])
-    return InterpolatedPair((image, image), H, nothing, nothing), (first, second), centres
+    return InterpolatedPair((image, image), frame.H, nothing, nothing), (first, second), centres
 
 
 def test_points_are_seen_where_the_camera_between_sees_them(pair):
     X = np.random.default_rng(1).uniform([-2, -2, 4], [2, 2, 9], (100, 3))
     found, P, centres = pair
     for s in (0.0, 0.2, 0.5, 1.0):
-        expected = found.frame.points(project(P[0], X), project(P[1], X), s)
+        ends = (dehomogenize(homogenize(project(p, X)) @ H.T) for p, H in zip(P, found.H, strict=True))
+        between = sum(weight * x for weight, x in zip((1.0 - s, s), ends, strict=True))
+        G = original_from_rectified(found.H, SIZE, s)
+        expected = dehomogenize(homogenize(between) @ G.T)
         np.testing.assert_allclose(project(camera_between(found, P, s), X), expected, atol=1e-7)
         C = camera_centre_of(found, P, s)
         along = (C - centres[0]) @ (centres[1] - centres[0]) / np.sum((centres[1] - centres[0]) ** 2)

@@ -1,4 +1,4 @@
-"""Epipolar pencils of image pairs and extent of rectified frames, common to all rectification methods.
+"""Epipolar pencils of image pairs and extent of rectified frames.
 
 An epipolar plane has an angle phi; p = (cos phi, sin phi) is imaged as the line L p with a 3 x 2 matrix L per
 view. A pixel lies in a half-plane bounded by the baseline, so phi covers the full circle: half epipolar lines
@@ -16,7 +16,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
-from thesisrecon.geometry.homogeneous import homogenize, require_finite
+from thesisrecon.geometry.homogeneous import dehomogenize, require_finite, require_shapes
 from thesisrecon.geometry.homographies import infinite_homography
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import (
@@ -42,8 +42,6 @@ MAX_GROWTH = 6.0
 """Largest number of pixels of the frame relative to the larger image."""
 CROP_MARGIN = 1.0
 """Margin of the disparity range that limits the crop, as a share of the range of the matches."""
-MAX_MATCHES = 300
-"""Limit of the number of matches to which disparity gradients are fitted."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,16 @@ class EpipolarPencil:
     units: F64
     sizes: tuple[Size, Size]
     flipped: bool = False
+
+    @property
+    def normalization(self) -> F64:
+        """Homographies (2, 3, 3) from pixels to normalised coordinates."""
+        return scale_and_shift(1.0 / self.units, -self.centres / self.units[:, None])
+
+    @property
+    def fundamental(self) -> F64:
+        """F (3, 3) in normalised coordinates."""
+        return np.asarray(self.lines[1] @ _J.T @ self.lines[0].T)
 
     def normalized(self, side: int, xy: F64) -> F64:
         """Convert pixels (..., 2) to normalised coordinates."""
@@ -94,6 +102,20 @@ class EpipolarPencil:
         e = e / max(np.hypot(e[0], e[1]), abs(e[2]))
         return HalfLines(-offset[:, None] * n, np.stack([-n[:, 1], n[:, 0]], axis=1), offset, e)
 
+    def chords(self, side: int, phi: F64) -> tuple[HalfLines, F64, F64]:
+        """Half-lines of angles (N,), and where they enter and leave the image; entry > exit if they miss."""
+        lines, last = self.half_lines(side, phi), np.array(self.sizes[side]) - 1.0
+        low, high = self.normalized(side, np.zeros(2)), self.normalized(side, last)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, two = (low - lines.foot) / lines.direction, (high - lines.foot) / lines.direction
+        inside = (lines.foot >= low) & (lines.foot <= high)
+        parallel = lines.direction == 0.0
+        enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(one, two)).max(axis=1)
+        leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, two)).min(axis=1)
+        if lines.epipole[2] < 0.0:
+            return lines, enter, np.minimum(leave, lines.start)
+        return lines, np.maximum(enter, lines.start), leave
+
     def sweep_rate(self, side: int, phi: F64, z: F64) -> F64:
         """Motion (N,) of epipolar lines across their points z (N, 2) per radian, normalised."""
         p = plane_from_angle(phi)
@@ -120,8 +142,7 @@ class HalfLines:
         """(N,) distance of each foot from the circle about the epipole through the centre.
 
         D (1 - cos alpha) with the epipole's distance D and the angle alpha between foot and centre, without
-        cancellation for distant epipoles and 0 at infinity. It aligns columns of equal distance from the
-        epipole.
+        cancellation for distant epipoles. It aligns columns of equal distance from the epipole.
         """
         e = self.epipole
         D_w = float(np.hypot(e[0], e[1]))
@@ -147,22 +168,19 @@ class HalfLines:
         """Whether positions (N,) along the directions lie on the half-lines, not beyond the epipole."""
         return np.asarray(t < self.start if self.epipole[2] < 0.0 else t > self.start)
 
-    def chord(self, low: F64, high: F64) -> tuple[F64, F64]:
-        """Positions (N,) of entry into and exit from a box with corners (2,); entry >= exit if missed."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one, two = (low - self.foot) / self.direction, (high - self.foot) / self.direction
-        inside = (self.foot >= low) & (self.foot <= high)
-        parallel = self.direction == 0.0
-        enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(one, two)).max(axis=1)
-        leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, two)).min(axis=1)
-        if self.epipole[2] < 0.0:
-            return enter, np.minimum(leave, self.start)
-        return np.maximum(enter, self.start), leave
-
 
 def plane_from_angle(phi: F64) -> F64:
     """(cos phi, sin phi) of angles."""
     return np.stack([np.cos(phi), np.sin(phi)], axis=-1)
+
+
+def scale_and_shift(scale: F64 | float, shift: F64) -> F64:
+    """Homographies (2, 3, 3) x' = s x + t of scales (2,) and shifts (2, 2)."""
+    T = np.zeros((2, 3, 3))
+    T[:, 0, 0] = T[:, 1, 1] = scale
+    T[:, :2, 2] = shift
+    T[:, 2, 2] = 1.0
+    return T
 
 
 @dataclass(frozen=True)
@@ -197,18 +215,13 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
     if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
         raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
     if len(xy1) < MIN_MATCHES:
-        raise StageFailure(
-            "the pair has too few matches for rectification",
-            f"{counted(len(xy1), 'match')}, at least {MIN_MATCHES} are needed",
-            "match the images again, or rectify from cameras",
-        )
+        evidence = f"{counted(len(xy1), 'match')}, at least {MIN_MATCHES} are needed"
+        advice = "match the images again, or rectify from cameras"
+        raise StageFailure("the pair has too few matches for rectification", evidence, advice)
     pencil, ratio = _pencil_of_fundamental(F, (size1, size2))
     if not ratio > 1e-9:
-        raise StageFailure(
-            "the fundamental matrix has rank 1",
-            f"the ratio of its singular values is {ratio:.1g}",
-            "estimate it from more matches",
-        )
+        evidence = f"the ratio of its singular values is {ratio:.1g}"
+        raise StageFailure("the fundamental matrix has rank 1", evidence, "estimate it from more matches")
     require_parallax_of_matches(F, *matches, advice=", or rectify from cameras if the scene is a plane")
     return _complete(pencil, matches, None)
 
@@ -221,32 +234,23 @@ def pair_of_cameras(
     matches = _checked_call(none if xy1 is None else xy1, none if xy2 is None else xy2, size1, size2)
     P = np.stack([P1, P2])
     P = P * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
-    centres = _centres(P)
+    centres = dehomogenize(camera_centre(P))
     apart = float(np.linalg.norm(centres[1] - centres[0]))
     if not apart > 1e-12 * (1.0 + float(np.abs(centres).max())):
-        raise StageFailure(
-            "both cameras have one centre",
-            f"the distance of the centres is {apart:.1g}",
-            "take images from different positions, or choose other views",
-        )
+        evidence = f"the distance of the centres is {apart:.1g}"
+        advice = "take images from different positions, or choose other views"
+        raise StageFailure("both cameras have one centre", evidence, advice)
     F = fundamental_from_cameras(P[0], P[1])
     if len(matches[0]) >= MIN_MATCHES:
         require_parallax_of_matches(F, *matches, at_infinity=infinite_homography(P[0], P[1]))
     return _complete(_pencil_of_fundamental(F, (size1, size2))[0], matches, P)
 
 
-def _centres(P: F64) -> F64:
-    """Centres (2, 3) of two cameras."""
-    centres = np.stack([camera_centre(camera) for camera in P])
-    return np.asarray(centres[:, :3] / centres[:, 3:])
-
-
 def _checked_call(xy1: F64, xy2: F64, size1: Size, size2: Size) -> tuple[F64, F64]:
     if min(*size1, *size2) < 2:
         raise ValueError(f"an image must have at least 2 x 2 px; got {size1} and {size2}")
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
-        raise ValueError(f"matches are two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
+    require_shapes("rectification", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_finite("rectification, for its matches,", xy1, xy2)
     return xy1, xy2
 
@@ -255,10 +259,7 @@ def _pencil_of_fundamental(F: F64, sizes: tuple[Size, Size]) -> tuple[EpipolarPe
     """Unoriented pencil of F (3, 3), and the ratio of the singular values of the normalised F."""
     units = FOCAL_PER_SIDE * np.array([max(size) for size in sizes], dtype=np.float64)
     centres = (np.array(sizes, dtype=np.float64) - 1.0) / 2.0
-    T = [
-        np.array([[u, 0.0, c[0]], [0.0, u, c[1]], [0.0, 0.0, 1.0]])
-        for u, c in zip(units, centres, strict=True)
-    ]
+    T = scale_and_shift(units, centres)
     U, s, Vt = np.linalg.svd(T[1].T @ F @ T[0])
     ratio = float(s[1] / s[0]) if s[0] > 0.0 else 0.0
     # F z1 = U S V'z1, and V'z1 = J p with p the plane of z1.
@@ -279,20 +280,17 @@ def _complete(pencil: EpipolarPencil, matches: tuple[F64, F64], P: F64 | None) -
 def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:
     """Pencil with the sign of the second view that most matches support."""
     p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
-    with np.errstate(invalid="ignore"):
-        share = float(np.mean(np.sum(p1 * p2, axis=1) > 0.0))
+    share = float(np.mean(np.sum(p1 * p2, axis=1) > 0.0))
     if max(share, 1.0 - share) < MIN_SAME_HALF:
-        raise StageFailure(
-            "matches lie on opposite halves of their epipolar lines",
-            f"only {100.0 * max(share, 1.0 - share):.0f} % of {len(xy1)} lie on corresponding halves",
-            "the fundamental matrix or the matches are wrong; estimate them again",
-        )
+        evidence = f"only {100.0 * max(share, 1.0 - share):.0f} % of {len(xy1)} lie on corresponding halves"
+        advice = "the fundamental matrix or the matches are wrong; estimate them again"
+        raise StageFailure("matches lie on opposite halves of their epipolar lines", evidence, advice)
     return pencil if share >= 0.5 else replace(pencil, lines=pencil.lines * [[[1.0]], [[-1.0]]])
 
 
 def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[tuple[F64, F64], F64]:
     """Pixels of points at many depths in front of both cameras, and the cameras in normalised coordinates."""
-    (width, height), C = pencil.sizes[0], _centres(P)
+    (width, height), C = pencil.sizes[0], dehomogenize(camera_centre(P))
     x, y = np.meshgrid(np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7))
     grid = np.stack([x, y], axis=-1).reshape(-1, 2)
     rays = np.linalg.solve(P[0, :, :3], np.column_stack([grid, np.ones(len(grid))]).T).T
@@ -301,22 +299,14 @@ def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[tuple[F64, F64], F
     X = (C[0] + steps[:, None, None] * rays).reshape(-1, 3)
     X = X[np.column_stack([X, np.ones(len(X))]) @ P[1, 2] > 0.0]
     if len(X) == 0:
-        raise StageFailure(
-            "no point is in front of both cameras",
-            "their fields of view do not intersect",
-            "choose another pair",
-        )
-    z = []
-    for s, c, camera in zip(1.0 / pencil.units, pencil.centres, P, strict=True):
-        z.append(np.array([[s, 0.0, -s * c[0]], [0.0, s, -s * c[1]], [0.0, 0.0, 1.0]]) @ camera)
-    return (project(P[0], X), project(P[1], X)), np.stack(z)
+        evidence = "their fields of view do not intersect"
+        raise StageFailure("no point is in front of both cameras", evidence, "choose another pair")
+    return (project(P[0], X), project(P[1], X)), pencil.normalization @ P
 
 
 def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
     """Normalised cameras (2, 3, 4) of the pencil: the candidate with most points in front."""
-    z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
-    L1, L2 = pencil.lines
-    F = L2 @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ L1.T
+    z, F = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)]), pencil.fundamental
     best, most = np.empty((2, 3, 4)), -1
     for plane in quasi_euclidean_planes(F):
         for scale in (1.0, -1.0):
@@ -333,9 +323,8 @@ def _depth_increases_along_half_lines(pencil: EpipolarPencil, P: F64, xy1: F64, 
     """Whether points that recede along their rays of view 1 move along the half-lines of view 2."""
     z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
     X = triangulate(P, z, method="linear")
-    centre = camera_centre(P[0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        point, C = X[:, :3] / X[:, 3:], centre[:3] / centre[3]
+        point, C = dehomogenize(X), dehomogenize(camera_centre(P[0]))
         moved = project(P[1], C + 1.001 * (point - C)) - project(P[1], point)
         direction = pencil.half_lines(1, pencil.angles(1, xy2)).direction
         steps = np.sum(moved * direction, axis=1)
@@ -351,18 +340,15 @@ def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
     turn = 2.0 * np.pi * np.round((0.5 * (a + b) - 0.5 * (c + d)) / (2.0 * np.pi))
     low, high = max(a, c + turn), min(b, d + turn)
     if not high > low:
-        raise StageFailure(
-            "the images share no epipolar line",
-            "no half-plane through the baseline is visible in both",
-            "the fundamental matrix is wrong, or the views do not overlap; choose another pair",
-        )
+        evidence = "no half-plane through the baseline is visible in both"
+        advice = "the fundamental matrix is wrong, or the views do not overlap; choose another pair"
+        raise StageFailure("the images share no epipolar line", evidence, advice)
     return low, high
 
 
 def _arc(pencil: EpipolarPencil, side: int) -> tuple[float, float] | None:
     """Interval of phi that an image sees, None for the full circle (epipole inside)."""
-    width, height = pencil.sizes[side]
-    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+    corners = image_corners(pencil.sizes[side])
     e = pencil.epipole(side)
     if abs(e[2]) > 1e-12 * np.hypot(e[0], e[1]):
         inside = pencil.pixels(side, e[:2] / e[2])
@@ -385,12 +371,6 @@ def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
     return start, start + 2.0 * np.pi
 
 
-def chords(pencil: EpipolarPencil, side: int, phi: F64) -> tuple[HalfLines, F64, F64]:
-    """Half-lines of angles (N,), and where they enter and leave the image; entry > exit if they miss it."""
-    lines, last = pencil.half_lines(side, phi), np.array(pencil.sizes[side]) - 1.0
-    return lines, *lines.chord(pencil.normalized(side, np.zeros(2)), pencil.normalized(side, last))
-
-
 def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     """Samples of the part of an image within the arc: the corners of that polygon, then a grid."""
     width, height = pencil.sizes[side]
@@ -399,7 +379,7 @@ def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     middle, half = 0.5 * (arc[0] + arc[1]), 0.5 * (arc[1] - arc[0])
     # The tolerance keeps the corners that bound the arc despite rounding.
     inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half + 1e-9
-    rim, enter, leave = chords(pencil, side, np.array(arc))
+    rim, enter, leave = pencil.chords(side, np.array(arc))
     met = leave >= enter
     ends = [pencil.pixels(side, rim.foot + t[:, None] * rim.direction)[met] for t in (enter, leave)]
     corner = [0, SAMPLES - 1, -SAMPLES, -1]
@@ -407,22 +387,23 @@ def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     return np.concatenate([*ends, corners, grid[inside]])
 
 
+def image_corners(size: Size) -> F64:
+    """Corner pixels (4, 2) of an image."""
+    w, h = size
+    return np.array([[0.0, 0.0], [w - 1.0, 0.0], [w - 1.0, h - 1.0], [0.0, h - 1.0]])
+
+
 def frame_size(extent: F64, pair: EpipolarPair) -> tuple[int, int]:
     """(width, height) of a frame of some extent (2,), rounded up; ``StageFailure`` if too large or empty."""
     width, height = float(extent[0]), float(extent[1])
     most = MAX_GROWTH * max(w * h for w, h in pair.sizes)
     if not width * height <= most:
-        raise StageFailure(
-            "the rectified images are too distorted",
-            f"they need {width * height / 1e6:.3g} million pixels, the limit is {most / 1e6:.3g}",
-            "rectify in polar coordinates, or choose views with less forward motion",
-        )
+        evidence = f"they need {width * height / 1e6:.3g} million pixels, the limit is {most / 1e6:.3g}"
+        advice = "rectify in polar coordinates, or choose views with less forward motion"
+        raise StageFailure("the rectified images are too distorted", evidence, advice)
     if not min(width, height) >= 2.0:
-        raise StageFailure(
-            "the rectified images do not overlap",
-            f"their common frame is {width:.3g} x {height:.3g} px",
-            "choose views that overlap more",
-        )
+        evidence = f"their common frame is {width:.3g} x {height:.3g} px"
+        raise StageFailure("the rectified images do not overlap", evidence, "choose views that overlap more")
     return int(np.ceil(width)), int(np.ceil(height))
 
 
@@ -449,34 +430,3 @@ def disparity_bounds(disparities: F64, *, margin: float) -> tuple[float, float]:
     """
     low, high = np.quantile(disparities, [0.01, 0.99])
     return float(low - margin * (high - low)), float(high + margin * (high - low))
-
-
-def disparity_gradients(left: F64, right: F64) -> F64:
-    """Gradients (M, 2) of a quadratic polynomial fitted to the disparities of matches (N, 2), M <= 300.
-
-    They measure the relative stretch, shear and bending of both images without relief.
-    """
-    every = max(len(left) // MAX_MATCHES, 1)
-    left, right = left[::every], right[::every]
-    middle = 0.5 * (left + right)
-    middle = middle - middle.mean(axis=0)
-    unit = float(np.abs(middle).max(initial=1e-12))
-    x, y = (middle / unit).T
-    design = np.stack([x, y, x * x, x * y, y * y, np.ones_like(x)], axis=1)
-    # Minimum-norm solution for few or collinear matches.
-    c = np.linalg.lstsq(design, (left[:, 0] - right[:, 0]) / unit, rcond=1e-6)[0]
-    return np.stack([c[0] + 2.0 * c[2] * x + c[3] * y, c[1] + c[3] * x + 2.0 * c[4] * y], axis=1)
-
-
-def homography_jacobians(H: F64, xy: F64) -> F64:
-    """Derivatives (N, 2, 2) of a homography at positions (N, 2)."""
-    xh = homogenize(xy) @ H.T
-    moved = xh[:, :2] / xh[:, 2:]
-    return np.asarray((H[None, :2, :2] - moved[:, :, None] * H[2, :2]) / xh[:, 2, None, None])
-
-
-def singular_values(J: F64) -> F64:
-    """Singular values (N, 2) of 2 x 2 matrices, the larger first."""
-    a = 0.5 * np.hypot(J[:, 0, 0] + J[:, 1, 1], J[:, 1, 0] - J[:, 0, 1])
-    b = 0.5 * np.hypot(J[:, 0, 0] - J[:, 1, 1], J[:, 1, 0] + J[:, 0, 1])
-    return np.stack([a + b, np.abs(a - b)], axis=1)

@@ -7,26 +7,24 @@ parameters are phi, a unit of length and the first rows; the methods differ in t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.stereo._distortion import disparity_gradients, homography_jacobians, singular_values
 from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
     MIN_MATCHES,
     EpipolarPair,
     common_crop,
-    disparity_gradients,
     frame_size,
-    homography_jacobians,
     plane_from_angle,
-    singular_values,
+    scale_and_shift,
 )
 from thesisrecon.stereo._resampling import Rectification
 
@@ -38,29 +36,22 @@ MAX_LOG_SCALE, MAX_SHEAR = 0.05, 0.06
 
 @dataclass(frozen=True)
 class PlanarRectification(Rectification):
-    """Two homographies to a common rectified frame, which may be rotated against the images.
+    """Two homographies ``H`` (2, 3, 3) to a common rectified frame, which may be rotated against the images.
 
-    Parameters
-    ----------
-    H1, H2 : ndarray (3, 3)
-        Homographies from the images to the frame, scaled so that the third coordinate of visible points is
-        positive.
-    size : tuple of int
-        (width, height) of the frame.
+    They are scaled so that the third coordinate of visible points is positive.
     """
 
-    H1: F64
-    H2: F64
+    H: F64
     size: tuple[int, int]
 
     def _original(self, side: int, xy: F64) -> F64:
-        return _moved(np.asarray(np.linalg.inv((self.H1, self.H2)[side])), xy)
+        return _moved(np.asarray(np.linalg.inv(self.H[side])), xy)
 
     def _rectified(self, side: int, xy: F64) -> F64:
-        return _moved((self.H1, self.H2)[side], xy)
+        return _moved(self.H[side], xy)
 
     def _lookup(self, side: int, rows: range) -> F64:
-        G = np.linalg.inv((self.H1, self.H2)[side])
+        G = np.linalg.inv(self.H[side])
         x, y = np.arange(float(self.size[0])), np.arange(rows.start, rows.stop, dtype=np.float64)
         u, v, w = (np.add.outer(row[1] * y + row[2], row[0] * x) for row in G)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -82,26 +73,16 @@ def common_orientation(pair: EpipolarPair) -> PlanarRectification:
     the viewing direction of the first camera; here it is the mean of both. K is common except for the
     principal point, so a point at depth z in the new orientation has the disparity f B / z minus the
     difference of the origins.
-
-    Parameters
-    ----------
-    pair : EpipolarPair
-        The pair with metric cameras.
-
-    Returns
-    -------
-    PlanarRectification
     """
     if pair.cameras is None:
-        raise StageFailure("a common orientation needs metric cameras", "", "rectify from F")
+        raise StageFailure("a common orientation needs metric cameras", advice="rectify from F")
     P = pair.cameras
-    centres = np.stack([camera_centre(camera) for camera in P])
-    baseline = np.diff(centres[:, :3] / centres[:, 3:], axis=0)[0]
+    baseline = np.diff(dehomogenize(camera_centre(P)), axis=0)[0]
     x = baseline / np.linalg.norm(baseline)
     axis = principal_ray(P).sum(axis=0)
     z = axis - (axis @ x) * x
     if not np.linalg.norm(z) > 1e-6:
-        raise StageFailure("both cameras look along the baseline", "", "rectify in polar coordinates")
+        raise StageFailure("both cameras look along the baseline", advice="rectify in polar coordinates")
     z = z / np.linalg.norm(z)
     orientation = np.stack([x, np.cross(z, x), z])
     return _crop_and_scale(pair, np.asarray(orientation @ np.linalg.inv(P[:, :, :3])))
@@ -114,18 +95,9 @@ def hartley(pair: EpipolarPair) -> PlanarRectification:
     the epipole to infinity along x. The homography of the first is the compatible one with the least sum of
     squared x differences of the matches. In the pencil the line at infinity is perpendicular to the line
     through epipole and centre, and the least squares are linear in the first row.
-
-    Parameters
-    ----------
-    pair : EpipolarPair
-        The pair with at least 8 matches.
-
-    Returns
-    -------
-    PlanarRectification
     """
     if len(pair.matches[0]) < MIN_MATCHES:
-        raise StageFailure("Hartley's rectification needs matches", f"{len(pair.matches[0])} are given", "")
+        raise StageFailure("Hartley's rectification needs matches", f"{len(pair.matches[0])} are given")
     low, high = _admissible_lines(pair)
     middle = pair.pencil.centres[1][None]
     phi = float(pair.pencil.angles(1, middle, about=0.5 * (low + high))[0])
@@ -157,36 +129,18 @@ def loop_zhang(pair: EpipolarPair) -> PlanarRectification:
     w'p p'w (variance of w'x over its squared mean). Similarity and shear make the affine part a similarity.
     Departures: variances are taken over the common field of view, and the one-parameter minimum is searched
     globally instead of descending from an initial guess.
-
-    Parameters
-    ----------
-    pair : EpipolarPair
-        The prepared pair.
-
-    Returns
-    -------
-    PlanarRectification
     """
     rows = _pencil_rows(pair, _loop_zhang_line(pair))
     return _crop_and_scale(pair, _homographies_of_rows(pair, _affine_rows(pair, rows), rows))
 
 
 def minimum_distortion(pair: EpipolarPair) -> PlanarRectification:
-    """Rectify with the least distortion of :class:`thesisrecon.stereo.rectification.RectificationQuality`.
+    """Rectify with the least distortion of :class:`thesisrecon.stereo._distortion.RectificationQuality`.
 
     Least squares over the line at infinity and the scale and shear of both first rows (5 parameters), from
     the solution of :func:`loop_zhang`: the variance of the log singular values of both homographies,
     symmetric in enlargement and reduction, plus a quarter of the mean squared disparity gradient. Hartley
     makes the first image similar to the second, Loop and Zhang preserve each by itself; this is a compromise.
-
-    Parameters
-    ----------
-    pair : EpipolarPair
-        The prepared pair.
-
-    Returns
-    -------
-    PlanarRectification
     """
     low, high = _admissible_lines(pair)
     # Keep away from lines that touch the field of view, where derivatives are unbounded.
@@ -234,26 +188,19 @@ def _loop_zhang_line(pair: EpipolarPair) -> float:
         third = [z[s] @ w for s, w in enumerate(_pencil_rows(pair, phi)[:, 1])]
         return float(sum(np.var(t) / np.mean(t) ** 2 for t in third))
 
-    phi = _search(pair, variation)
-    _require_in_front(pair, _pencil_rows(pair, phi))
-    return phi
-
-
-def _search(pair: EpipolarPair, cost: Callable[[float], float]) -> float:
-    """phi of least ``cost`` within :func:`_admissible_lines`."""
     low, high = _admissible_lines(pair)
     # At the ends the line at infinity touches the field of view.
     tried = low + (high - low) * (np.arange(SEARCH) + 0.5) / SEARCH
     with np.errstate(all="ignore"):
-        costs = np.array([cost(phi) for phi in tried])
+        costs = np.array([variation(phi) for phi in tried])
     if not np.isfinite(costs).any():
-        raise StageFailure("no line can be sent to infinity", "", "rectify in polar coordinates")
-    k = int(np.nanargmin(costs))
-    step = (high - low) / SEARCH
-    found = scipy.optimize.minimize_scalar(
-        cost, bounds=(max(low, tried[k] - step), min(high, tried[k] + step)), method="bounded"
-    )
-    return float(found.x) if found.fun <= costs[k] else float(tried[k])
+        raise StageFailure("no line can be sent to infinity", advice="rectify in polar coordinates")
+    k, step = int(np.nanargmin(costs)), (high - low) / SEARCH
+    bounds = max(low, tried[k] - step), min(high, tried[k] + step)
+    found = scipy.optimize.minimize_scalar(variation, bounds=bounds, method="bounded")
+    phi = float(found.x) if found.fun <= costs[k] else float(tried[k])
+    _require_in_front(pair, _pencil_rows(pair, phi))
+    return phi
 
 
 def _pencil_rows(pair: EpipolarPair, phi: float, infinite: float | None = None) -> F64:
@@ -269,11 +216,8 @@ def _admissible_lines(pair: EpipolarPair) -> tuple[float, float]:
     """Interval of phi whose line at infinity misses the common field of view."""
     low, high = pair.arc
     if not high - low < np.pi - 1e-6:
-        raise StageFailure(
-            "the epipoles lie inside the images",
-            "every epipolar line crosses the common field of view",
-            "rectify in polar coordinates",
-        )
+        evidence = "every epipolar line crosses the common field of view"
+        raise StageFailure("the epipoles lie inside the images", evidence, "rectify in polar coordinates")
     return high - 0.5 * np.pi, low + 0.5 * np.pi
 
 
@@ -282,11 +226,9 @@ def _require_in_front(pair: EpipolarPair, rows: F64) -> None:
     for side, (xy, samples) in enumerate(zip(pair.matches, pair.regions, strict=True)):
         third = homogenize(pair.pencil.normalized(side, np.concatenate([samples, xy]))) @ rows[side, 1]
         if not third.min() > 1e-6 * third.max():
-            raise StageFailure(
-                "the line sent to infinity crosses the images",
-                "an epipole lies inside an image or at its border",
-                "rectify in polar coordinates",
-            )
+            reason = "the line sent to infinity crosses the images"
+            evidence = "an epipole lies inside an image or at its border"
+            raise StageFailure(reason, evidence, "rectify in polar coordinates")
 
 
 def _affine_rows(pair: EpipolarPair, rows: F64) -> F64:
@@ -303,13 +245,10 @@ def _affine_rows(pair: EpipolarPair, rows: F64) -> F64:
         middle = z - z.mean(axis=0)
         third = z @ w
         x_a = np.cross(v, w)
-        gradients = np.linalg.lstsq(
-            middle[:, :2], np.stack([z @ x_a, z @ v], axis=1) / third[:, None], rcond=None
-        )[0]
-        g_a, g_v = gradients.T
+        mapped = np.stack([z @ x_a, z @ v], axis=1) / third[:, None]
+        g_a, g_v = np.linalg.lstsq(middle[:, :2], mapped, rcond=None)[0].T
         # Preserve the orientation.
-        wanted = np.array([g_v[1], -g_v[0]])
-        alpha, beta = np.linalg.solve(np.stack([g_a, g_v], axis=1), wanted)
+        alpha, beta = np.linalg.solve(np.stack([g_a, g_v], axis=1), np.array([g_v[1], -g_v[0]]))
         first.append(alpha * x_a + beta * v)
     return np.stack(first)
 
@@ -319,44 +258,33 @@ def _homographies_of_rows(pair: EpipolarPair, first: F64, rows: F64) -> F64:
 
     They are rotated by 180 degrees if the pencil is flipped.
     """
-    p, T = pair.pencil, np.zeros((2, 3, 3))
-    T[:, 0, 0] = T[:, 1, 1] = 1.0 / p.units
-    T[:, :2, 2] = -p.centres / p.units[:, None]
-    T[:, 2, 2] = 1.0
-    H = np.concatenate([first[:, None], rows], axis=1) @ T
-    if p.flipped:
+    H = np.concatenate([first[:, None], rows], axis=1) @ pair.pencil.normalization
+    if pair.pencil.flipped:
         H[:, :2] *= -1.0
     return H
 
 
 def _crop_and_scale(pair: EpipolarPair, H: F64) -> PlanarRectification:
     """Scale homographies of pixels (2, 3, 3) and crop the frame to the common field of view."""
-    samples = [_mapped(H[side], pair.regions[side]) for side in (0, 1)]
-    low, high = common_crop(samples, [_mapped(H[side], pair.matches[side]) for side in (0, 1)])
-    kept = [np.all((xy >= low[side]) & (xy <= high[side]), axis=1) for side, xy in enumerate(samples)]
-    scale = _scale(pair, H, kept)
+    samples = [_mapped(H[side], xy) for side, xy in enumerate(pair.regions)]
+    low, high = common_crop(samples, [_mapped(H[side], xy) for side, xy in enumerate(pair.matches)])
+    values = []
+    for side, xy in enumerate(samples):
+        inside = np.all((xy >= low[side]) & (xy <= high[side]), axis=1)
+        values.append(singular_values(homography_jacobians(H[side], pair.regions[side][inside])))
+    found = np.concatenate(values)
+    if len(found) == 0:
+        raise StageFailure("the rectified images do not overlap", advice="choose views that overlap more")
+    area = float(np.exp(-0.5 * np.mean(np.log(found[:, 0] * found[:, 1]))))
+    scale = max(area, 1.0 / (MAX_SHRINK * float(found[:, 1].min())))
     size = frame_size(scale * (high - low).max(axis=0) + 1.0, pair)
     # Both origins have the same row; the narrower image leaves columns at the right empty.
-    T = np.zeros((2, 3, 3))
-    T[:, 0, 0] = T[:, 1, 1] = scale
-    T[:, :2, 2] = -scale * low
-    T[:, 2, 2] = 1.0
-    H = T @ H
-    return PlanarRectification(H[0], H[1], size)
+    return PlanarRectification(scale_and_shift(scale, -scale * low) @ H, size)
 
 
 def _mapped(H: F64, xy: F64) -> F64:
     xh = homogenize(xy) @ H.T
     if not (xh[:, 2] > 1e-9 * np.abs(xh[:, 2]).max(initial=0.0)).all() or np.linalg.det(H) <= 0.0:
-        raise StageFailure("the line sent to infinity crosses the images", "", "rectify in polar coordinates")
+        reason = "the line sent to infinity crosses the images"
+        raise StageFailure(reason, advice="rectify in polar coordinates")
     return np.asarray(xh[:, :2] / xh[:, 2:])
-
-
-def _scale(pair: EpipolarPair, H: F64, kept: list[B8]) -> float:
-    """Pixels of the frame per unit of H."""
-    values = [singular_values(homography_jacobians(H[s], pair.regions[s][kept[s]])) for s in (0, 1)]
-    found = np.concatenate(values)
-    if len(found) == 0:
-        raise StageFailure("the rectified images do not overlap", "", "choose views that overlap more")
-    area = float(np.exp(-0.5 * np.mean(np.log(found[:, 0] * found[:, 1]))))
-    return max(area, 1.0 / (MAX_SHRINK * float(found[:, 1].min())))

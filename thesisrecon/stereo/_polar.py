@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.stereo._distortion import disparity_gradients, matches_in_frame
 from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
     MIN_MATCHES,
     EpipolarPair,
     EpipolarPencil,
     HalfLines,
-    chords,
     common_crop,
-    disparity_gradients,
     frame_size,
+    image_corners,
 )
 from thesisrecon.stereo._resampling import Rectification
 
@@ -36,18 +36,7 @@ class PolarRectification(Rectification):
 
     Row r shows the half-plane ``angles[r]``, with linear interpolation between rows. The point s px farther
     from the epipole than the image centre (nearer if the pencil is flipped) has the column ``scales[side]`` s
-    + ``shears[side]`` r - ``origins[side]``.
-
-    Parameters
-    ----------
-    pencil : EpipolarPencil
-        Epipolar lines of the pair.
-    angles : ndarray (H,)
-        Angles of the rows.
-    scales, shears, origins : ndarray (2,)
-        Column coordinates of both images.
-    size : tuple of int
-        (width, height) of the frame.
+    + ``shears[side]`` r - ``origins[side]``; these arrays are (2,).
     """
 
     pencil: EpipolarPencil
@@ -113,20 +102,11 @@ def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
     be reduced by more than ``MAX_SHRINK`` (1: no pixel is lost, as in the paper). The row spacing is a
     function of the angle whose integral counts the rows, instead of walking from line to line.
 
-    Parameters
-    ----------
-    pair : EpipolarPair
-        The prepared pair.
-    aligned : bool
-        Reduce the disparity gradients of the matches by shear and scale along the rows.
-
-    Returns
-    -------
-    PolarRectification
+    ``aligned`` reduces the disparity gradients of the matches by shear and scale along the rows.
     """
     pencil, sign = pair.pencil, -1 if pair.pencil.flipped else 1
     phi = _half_planes(pair)
-    both = [chords(pencil, side, phi) for side in (0, 1)]
+    both = [pencil.chords(side, phi) for side in (0, 1)]
     angles = _rows_of(pencil, phi, both)[::sign]
     frame = PolarRectification(pencil, angles, np.ones(2), np.zeros(2), np.zeros(2), (1, len(angles)))
     frame = _align_disparities(frame, pair) if aligned else frame
@@ -136,13 +116,13 @@ def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
         rim = [(lines.foot + t[:, None] * lines.direction)[met] for t in (enter, leave)]
         xy = frame.rectified_from_original(side, pencil.pixels(side, np.concatenate(rim)), within=False)
         ends.append(xy[np.isfinite(xy).all(axis=1)])
-    low, high = common_crop(ends, _matches_in(frame, pair))
+    low, high = common_crop(ends, matches_in_frame(frame, pair.matches, within=False))
     extent = np.array([(high - low)[:, 0].max() + 1.0, len(angles)])
     return replace(frame, origins=low[:, 0].copy(), size=frame_size(extent, pair))
 
 
 def _align_disparities(frame: PolarRectification, pair: EpipolarPair) -> PolarRectification:
-    left, right = _matches_in(frame, pair)
+    left, right = matches_in_frame(frame, pair.matches, within=False)
     if len(left) < MIN_MATCHES:
         return frame
     # The disparity slope is the difference of the scales along x and of the shears along y.
@@ -153,20 +133,12 @@ def _align_disparities(frame: PolarRectification, pair: EpipolarPair) -> PolarRe
     return replace(frame, scales=scales, shears=np.array([shear, -shear]))
 
 
-def _matches_in(frame: PolarRectification, pair: EpipolarPair) -> tuple[F64, F64]:
-    left, right = (frame.rectified_from_original(s, xy, within=False) for s, xy in enumerate(pair.matches))
-    seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
-    return left[seen], right[seen]
-
-
 def _half_planes(pair: EpipolarPair) -> F64:
     """Angles over the arc, including those of the image corners, where the row spacing is extreme."""
     low, high = pair.arc
-    corners = [np.array([[0, 0], [w - 1.0, 0], [w - 1.0, h - 1.0], [0, h - 1.0]]) for w, h in pair.sizes]
-    peaks = [pair.pencil.angles(side, xy, about=0.5 * (low + high)) for side, xy in enumerate(corners)]
-    inside = np.concatenate(peaks)
-    inside = inside[(inside > low) & (inside < high)]
-    return np.unique(np.concatenate([np.linspace(low, high, ANGLES), inside]))
+    corners, about = [image_corners(size) for size in pair.sizes], 0.5 * (low + high)
+    peaks = np.concatenate([pair.pencil.angles(side, xy, about=about) for side, xy in enumerate(corners)])
+    return np.unique(np.concatenate([np.linspace(low, high, ANGLES), peaks[(peaks > low) & (peaks < high)]]))
 
 
 def _rows_of(pencil: EpipolarPencil, phi: F64, both: list[tuple[HalfLines, F64, F64]]) -> F64:

@@ -1,30 +1,26 @@
-"""Rectification of image pairs (thesis, section 2.5): methods, distortion measures, selection."""
+"""Rectification of image pairs by the method of least distortion (thesis, section 2.5)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
+from thesisrecon.stereo._distortion import RectificationQuality, matches_in_frame, measure_quality
 from thesisrecon.stereo._epipolar_pair import (
     EpipolarPair,
     Size,
     disparity_bounds,
-    disparity_gradients,
     pair_of_cameras,
     pair_of_fundamental,
-    singular_values,
 )
 from thesisrecon.stereo._planar import common_orientation, hartley, loop_zhang, minimum_distortion
 from thesisrecon.stereo._polar import PolarRectification, polar
 from thesisrecon.stereo._resampling import Rectification
 
-STEP_PX = 0.01
-"""Half step of numerical derivatives."""
 MAX_TURN_DEG, MAX_ASPECT = 5.0, 0.1
 """Limits of the midline angle's deviation from 90 degrees, and of the change of the aspect ratio."""
 BENDING = 0.03
@@ -37,129 +33,6 @@ PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)
 """Methods from F with homographies."""
 METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar, aligned=False))
 """All methods; the common orientation needs cameras."""
-
-
-@dataclass(frozen=True)
-class RectificationQuality:
-    """Distortion measures of a rectified pair; pairs of numbers refer to both images.
-
-    Parameters
-    ----------
-    orthogonality_deg : tuple of float
-        Angle of the mapped image midlines.
-    aspect : tuple of float
-        Ratio of their lengths relative to the original, NaN if not finite.
-    size_ratio : float
-        Pixels of the frame relative to the larger image.
-    min_scale, max_scale : float
-        Extreme local scales along any direction.
-    stretch : float
-        Typical local scale change: exp of the standard deviation of the log singular values; 1 for
-        similarities.
-    disparity_slope : float
-        RMS gradient of a quadratic polynomial fitted to the disparities: the difference between both images.
-    """
-
-    orthogonality_deg: tuple[float, float]
-    aspect: tuple[float, float]
-    size_ratio: float
-    min_scale: float
-    max_scale: float
-    stretch: float
-    disparity_slope: float
-
-    @property
-    def distortion(self) -> float:
-        """Root of the sum of squares of ``log stretch`` and half the ``disparity_slope``.
-
-        A slope s stretches windows of one image against the other by s, to first order s / 2 in each.
-        """
-        disparity_slope = self.disparity_slope if np.isfinite(self.disparity_slope) else 0.0
-        return float(np.hypot(np.log(self.stretch), 0.5 * disparity_slope))
-
-
-def measure_quality(rectification: Rectification, pair: EpipolarPair) -> RectificationQuality:
-    """Measure the distortion of a rectification over the common field of view of a pair.
-
-    Parameters
-    ----------
-    rectification : Rectification
-        The rectification; it may come from another estimate of the epipolar geometry.
-    pair : EpipolarPair
-        The pair, which determines the common field of view.
-
-    Returns
-    -------
-    RectificationQuality
-    """
-    values, midlines = [], []
-    for side in (0, 1):
-        samples = pair.regions[side]
-        inside = np.isfinite(rectification.rectified_from_original(side, samples)).all(axis=1)
-        J = jacobians(rectification, side, samples[inside])
-        values.append(singular_values(J[np.isfinite(J).all(axis=(1, 2))]))
-        midlines.append(_midlines(rectification, side, pair.sizes[side]))
-    found = np.concatenate(values)
-    found = found if len(found) else np.full((1, 2), np.nan)
-    width, height = rectification.size
-    return RectificationQuality(
-        orthogonality_deg=(midlines[0][0], midlines[1][0]),
-        aspect=(midlines[0][1], midlines[1][1]),
-        size_ratio=width * height / max(w * h for w, h in pair.sizes),
-        min_scale=float(found[:, 1].min()),
-        max_scale=float(found[:, 0].max()),
-        stretch=float(np.exp(np.std(np.log(np.maximum(found, 1e-12))))),
-        disparity_slope=_disparity_slope(rectification, pair),
-    )
-
-
-def jacobians(rectification: Rectification, side: int, xy: F64) -> F64:
-    """Compute numerical derivatives of the map from an image to the frame.
-
-    Parameters
-    ----------
-    rectification : Rectification
-        The maps.
-    side : {0, 1}
-        The image.
-    xy : ndarray (N, 2)
-        Pixels of the image.
-
-    Returns
-    -------
-    ndarray (N, 2, 2)
-        Jacobians, NaN at the first and last row of a polar frame.
-    """
-    columns = []
-    for axis in np.eye(2):
-        ahead = rectification.rectified_from_original(side, xy + STEP_PX * axis, within=False)
-        behind = rectification.rectified_from_original(side, xy - STEP_PX * axis, within=False)
-        step = ahead - behind
-        # A full circle of half-lines has a cut, across which neighbours are far apart.
-        step[np.abs(step[:, 1]) > 0.5 * rectification.size[1]] = np.nan
-        columns.append(step / (2.0 * STEP_PX))
-    return np.stack(columns, axis=-1)
-
-
-def _midlines(rectification: Rectification, side: int, size: Size) -> tuple[float, float]:
-    """Angle in degrees of the mapped midlines, and the ratio of their lengths relative to the original."""
-    w, h = size[0] - 1.0, size[1] - 1.0
-    ends = np.array([[0.0, h / 2.0], [w, h / 2.0], [w / 2.0, 0.0], [w / 2.0, h]])
-    a, b, c, d = rectification.rectified_from_original(side, ends, within=False)
-    across, down = b - a, d - c
-    lengths = float(np.hypot(*across)), float(np.hypot(*down))
-    with np.errstate(invalid="ignore"):
-        angle = float(np.degrees(np.arccos(np.clip(across @ down / (lengths[0] * lengths[1]), -1.0, 1.0))))
-    return angle, lengths[0] / lengths[1] * h / w
-
-
-def _disparity_slope(rectification: Rectification, pair: EpipolarPair) -> float:
-    """RMS disparity gradient of the matches inside the frame, NaN with fewer than 3."""
-    left, right = (rectification.rectified_from_original(s, xy) for s, xy in enumerate(pair.matches))
-    seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
-    if int(seen.sum()) < 3:
-        return float("nan")
-    return float(np.sqrt(np.mean(np.sum(disparity_gradients(left[seen], right[seen]) ** 2, axis=1))))
 
 
 def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:
@@ -177,7 +50,6 @@ def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectific
     Returns
     -------
     Rectification
-        The rectification of least distortion.
 
     Raises
     ------
@@ -185,7 +57,7 @@ def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectific
         If all methods fail (the failure of the last).
     """
     best: Rectification | None = None
-    least, failure = (True, np.inf), None
+    least, failure = (True, np.inf), StageFailure("no method of rectification is given")
     for method in methods:
         try:
             found = method(pair)
@@ -196,7 +68,6 @@ def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectific
         if best is None or cost < least:
             best, least = found, cost
     if best is None:
-        assert failure is not None
         raise failure
     return best
 
@@ -213,7 +84,7 @@ def _cost(found: Rectification, quality: RectificationQuality) -> tuple[bool, fl
 def rectify_pair(
     F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size, *, methods: Sequence[Method] = METHODS
 ) -> Rectification:
-    """Rectify two images with known fundamental matrix (thesis, section 2.5).
+    """Rectify two images with known fundamental matrix; "nearer" is judged with usual focal lengths.
 
     Parameters
     ----------
@@ -229,7 +100,6 @@ def rectify_pair(
     Returns
     -------
     Rectification
-        With unknown focal lengths, "nearer" is judged with usual ones.
 
     Raises
     ------
@@ -254,7 +124,7 @@ def rectify_cameras(
     size1, size2 : tuple of int
         (width, height) in pixels.
     xy1, xy2 : ndarray (N, 2), optional
-        Matches in pixels; they crop the frame to the common field of view, and :func:`hartley` needs them.
+        Matches in pixels, by which the frame is cropped to the common field of view.
 
     Returns
     -------
@@ -262,10 +132,8 @@ def rectify_cameras(
 
     Raises
     ------
-    ValueError
-        If an array has the wrong shape or an image is too small.
-    StageFailure
-        If the pair cannot be rectified.
+    ValueError, StageFailure
+        As in :func:`rectify_pair`.
     """
     return rectify(pair_of_cameras(P1, P2, size1, size2, xy1=xy1, xy2=xy2))
 
@@ -273,7 +141,7 @@ def rectify_cameras(
 def disparity_range(
     rectification: Rectification, xy1: F64, xy2: F64, *, margin: float = 0.15
 ) -> tuple[int, int]:
-    """Return the disparity range to search from matches.
+    """Return the first and last disparity to search from matches; ``StageFailure`` if none is in the frame.
 
     Parameters
     ----------
@@ -287,20 +155,11 @@ def disparity_range(
     Returns
     -------
     tuple of int
-        First and last disparity.
-
-    Raises
-    ------
-    StageFailure
-        If no match lies inside the frame.
     """
-    left = rectification.rectified_from_original(0, xy1)
-    right = rectification.rectified_from_original(1, xy2)
-    d = left[:, 0] - right[:, 0]
-    d = d[np.isfinite(d)]
-    if len(d) == 0:
+    left, right = matches_in_frame(rectification, (xy1, xy2))
+    if len(left) == 0:
         raise StageFailure(
             "the disparity range is unknown", "no match is inside the rectified frame", "specify a range"
         )
-    low, high = disparity_bounds(d, margin=margin)
+    low, high = disparity_bounds(left[:, 0] - right[:, 0], margin=margin)
     return int(np.floor(low)) - 2, int(np.ceil(high)) + 2

@@ -18,7 +18,7 @@ def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectifi
     done, H1, H2 = cv2.stereoRectifyUncalibrated(xy1.copy(), xy2.copy(), F, size)
     if not done:
         return None
-    return PlanarRectification(_positive(np.asarray(H1), size), _positive(np.asarray(H2), size), size)
+    return PlanarRectification(np.stack([_positive(np.asarray(H), size) for H in (H1, H2)]), size)
 
 
 def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
@@ -31,7 +31,7 @@ def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
     turn1, turn2, new1, new2 = (np.asarray(part, dtype=np.float64) for part in found[:4])
     H1 = new1[:, :3] @ turn1 @ np.linalg.inv(K1)
     H2 = new2[:, :3] @ turn2 @ np.linalg.inv(K2)
-    return PlanarRectification(_positive(H1, size), _positive(H2, size), size)
+    return PlanarRectification(np.stack([_positive(H, size) for H in (H1, H2)]), size)
 
 
 def _positive(H: F64, size: Size) -> F64:

@@ -15,6 +15,7 @@ from thesisrecon.geometry.camera_matrix import project, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.records import Reconstruction, TwoView
+from thesisrecon.stereo._distortion import RectificationQuality, jacobians, measure_quality
 from thesisrecon.stereo._epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo._planar import (
     PlanarRectification,
@@ -25,7 +26,7 @@ from thesisrecon.stereo._planar import (
 )
 from thesisrecon.stereo._polar import polar
 from thesisrecon.stereo._resampling import Rectification
-from thesisrecon.stereo.rectification import RectificationQuality, jacobians, measure_quality, rectify
+from thesisrecon.stereo.rectification import rectify
 from validation.metrics.record import Metric
 from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
 from validation.studies.measuring import timed
@@ -87,13 +88,8 @@ def pairs_of(pairs: Sequence[TwoView], model: Reconstruction, sizes: F64) -> lis
 
 
 def _opencv_f(pair: RealPair) -> PlanarRectification | None:
-    loose = pair.loose
-    # F in the pixels of the matches of this pair.
-    L1, L2 = loose.pencil.lines
-    T = [np.diag([1.0 / u, 1.0 / u, 1.0]) for u in loose.pencil.units]
-    for t, u, c in zip(T, loose.pencil.units, loose.pencil.centres, strict=True):
-        t[:2, 2] = -c / u
-    F = T[1].T @ L2 @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ L1.T @ T[0]
+    loose, T = pair.loose, pair.loose.pencil.normalization
+    F = T[1].T @ loose.pencil.fundamental @ T[0]
     return opencv_uncalibrated(F / np.linalg.norm(F), *loose.matches, loose.sizes[0])
 
 

@@ -47,7 +47,7 @@ def test_pictures_move_the_way_their_maps_say():
     moved = warp_affine(picture, A, (72, 64))
     assert np.unravel_index(moved[..., 0].argmax(), (64, 72)) == (AT[1] - 3, AT[0] + 5)
     H = np.vstack([A, [0.0, 0.0, 1.0]])
-    ours = PlanarRectification(H, np.eye(3), (72, 64)).warp(picture.astype(np.float32), 0)
+    ours = PlanarRectification(np.stack([H, np.eye(3)]), (72, 64)).warp(picture.astype(np.float32), 0)
     theirs = warp_perspective(picture.astype(np.float32), H, (72, 64))
     inner = np.s_[6:-6, 8:-8]
     np.testing.assert_allclose(ours[inner], theirs[inner], atol=1e-2)
