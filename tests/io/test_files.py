@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.io.test_colmap import export, scene
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
 from thesisrecon.io._exports import read_cameras
 from thesisrecon.io._files import (
@@ -25,7 +26,6 @@ from thesisrecon.io._files import (
     write_json,
     write_text,
 )
-from thesisrecon.io.colmap_model import ColmapModel, ColmapPoints, write_colmap_model
 from validation.studies.robustness import disk_ends, remount, small_disk
 
 
@@ -46,12 +46,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, number):
 
 
 def test_each_file_of_a_model_is_whole_or_absent(tmp_path):
-    none, no_ids = np.zeros((0, 3)), np.zeros(0, np.int64)
-    points = ColmapPoints(
-        no_ids, none, none.astype(np.uint8), none[:, 0], np.zeros(1, np.int64), no_ids, no_ids
-    )
     with disk_ends(3, errno.ENOSPC), pytest.raises(OutputError, match=r"frames\.bin cannot be written"):
-        write_colmap_model(tmp_path / "0", ColmapModel((), (), points))
+        export(tmp_path / "0", scene())
     assert sorted(entries(tmp_path / "0")) == ["cameras.bin", "rigs.bin"]
 
 

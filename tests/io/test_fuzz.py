@@ -12,20 +12,17 @@ import PIL.Image
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from thesisrecon.io.colmap_model import read_colmap_model, write_colmap_model
 
 from tests.hostile.files import glb, require_sentence, triangle
-from tests.io.test_colmap import _SMALL, _plain_names
 from tests.io.test_images import picture
 from tests.io.test_meshes import roof
 from tests.runtime.test_run_folder import some_metric
 from thesisrecon._settings import config_from_tables, config_from_toml, toml_from_config
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.errors import UsageError
 from thesisrecon.io._exports import read_cameras
 from thesisrecon.io._files import read_json, read_pairs, read_text
-from thesisrecon.io.colmap import reconstruction_from_colmap
 from thesisrecon.io.images import read_images
 from thesisrecon.io.meshes import read_mesh, write_mesh
 from thesisrecon.runtime._record_files import ChangedRecord, bytes_from_record, read_record
@@ -49,18 +46,6 @@ class Reader:
     make: Callable[[Path], Any]
     read: Callable[[Path], Any]
     raises: tuple[type[Exception], ...] = ()
-
-
-def colmap(name):
-    """One file of a COLMAP model."""
-
-    def make(folder):
-        write_colmap_model(folder, _plain_names(_SMALL), binary=name.endswith(".bin"))
-
-    def read(path):
-        reconstruction_from_colmap(read_colmap_model(path.parent))
-
-    return Reader(name, make, read, (StageFailure,))
 
 
 def saved(kind):
@@ -111,7 +96,6 @@ def as_written(path):
 
 
 READERS = [
-    *(colmap(f"{name}{suffix}") for name in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")),
     *(saved(kind) for kind in ("JPEG", "PNG", "TIFF", "GIF", "WEBP", "BMP", "PPM")),
     text_file("cameras.json", json.dumps(CAMERAS), read_cameras),
     text_file("config.toml", toml_from_config(PipelineConfig()), lambda p: config_from_toml(read_text(p))),

@@ -8,8 +8,7 @@ from PIL import Image
 pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.colmap import colmap_from_reconstruction
-from thesisrecon.io.colmap_model import write_colmap_model
+from thesisrecon.io.colmap import write_colmap_model
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
@@ -44,14 +43,15 @@ def _fake_scene(folder):
 
 
 def _save_run(out, scene):
-    model = colmap_from_reconstruction(
+    write_colmap_model(
+        out / "sparse" / "0",
         _reconstruction(_truth()),
         [path.name for path in scene.image_paths],
         colors=np.zeros((N, 3), np.uint8),
         groups=np.zeros(V, dtype=np.int64),
         scales=np.ones(V),
+        original_sizes=np.full((V, 2), 640),
     )
-    write_colmap_model(out / "sparse" / "0", model)
     (out / "summary.json").write_text(json.dumps({"reprojection_rms_px": 0.0, "seconds": {"features": 1.5}}))
     (out / "seconds.json").write_text(json.dumps({"extract": 3.0, "match": 1.0, "map": 2.0}))
 

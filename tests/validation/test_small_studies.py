@@ -1,4 +1,4 @@
-"""Studies of growth, pair choice, subsets, killed runs, fuzzing, cost and rounding: what they compute."""
+"""Studies of growth, pair choice, subsets, killed runs, cost and rounding: what they compute."""
 
 import json
 import signal
@@ -14,11 +14,10 @@ import pytest
 
 from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
-from thesisrecon.io.colmap_model import PARAMETER_COUNTS, inconsistency, read_colmap_model
 from thesisrecon.pipeline.reconstruction import reconstruct
 from validation.metrics.record import Metric
 from validation.scenes.many_views import walk
-from validation.studies import fuzz_colmap, growth, perturbation, timing
+from validation.studies import growth, perturbation, timing
 from validation.studies.growth import Cost, Growth, Meter, recall_of, table
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
@@ -132,35 +131,6 @@ def test_a_torn_write_leaves_no_half_file_under_its_name(tmp_path):
     whole = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name[0] != "."]
     torn = list((tmp_path / "out").rglob(".*.partial"))
     assert len(whole) == len(torn) == 1
-
-
-def test_good_inputs_are_models(tmp_path):
-    inputs = fuzz_colmap.valid_inputs()
-    assert len(inputs) == len(PARAMETER_COUNTS) + 6
-    assert max(map(len, inputs)) <= fuzz_colmap.MAX_INPUT
-    for data in inputs:
-        fuzz_colmap.read_input(data)
-        first, second = fuzz_colmap.LENGTHS.unpack_from(data)
-        rest = data[fuzz_colmap.LENGTHS.size :]
-        for name, part in (
-            ("cameras", rest[:first]),
-            ("images", rest[first : first + second]),
-            ("points3D", rest[first + second :]),
-        ):
-            (tmp_path / f"{name}.bin").write_bytes(part)
-        assert inconsistency(read_colmap_model(tmp_path)) == ""
-
-
-def test_nothing_is_found_and_a_fault_is(monkeypatch, capsys):
-    assert run_study("fuzz-colmap", ["--plain", "--seconds", "1"]) == 0
-    assert "nothing found" in capsys.readouterr().out
-
-    def careless(contents):
-        return contents[Path("cameras.bin")][100_000]
-
-    monkeypatch.setattr(fuzz_colmap, "decode_model", careless)
-    assert run_study("fuzz-colmap", ["--plain", "--seconds", "1"]) == 1
-    assert "IndexError" in capsys.readouterr().out
 
 
 def entry(group, method, seconds):

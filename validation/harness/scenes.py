@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_model import read_colmap_model
 from validation.harness.records import ReportOptions
 from validation.metrics.cameras import TrueCameras
+from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import (
     SUFFIXES,
     Scene,
@@ -76,7 +75,7 @@ def _own_scene(folder: Path, name: str) -> Scene:
     if scene.has_truth or not model.is_dir():
         return scene
     names = [path.name for path in scene.image_paths]
-    truth = reconstruction_from_colmap(read_colmap_model(model), names=names)
+    truth = read_colmap_model(model, names)
     assert truth.K is not None
     if not truth.registered.all():
         return scene

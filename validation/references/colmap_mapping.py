@@ -16,10 +16,9 @@ from typing import Literal
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
-from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_model import read_colmap_model
 from thesisrecon.records import Reconstruction
 from validation.references.colmap_matching import DEFAULT_FOCAL_REL, forget_focal_priors
+from validation.references.colmap_reading import read_colmap_model
 from validation.references.libraries import pycolmap
 
 
@@ -82,10 +81,10 @@ def read_run(images: Path, out: Path) -> ReferenceRun:
     folders = sorted(path for path in (out / "sparse").glob("*") if path.is_dir())
     if not folders:
         raise StageFailure("COLMAP made no model of these images")
-    largest = max((read_colmap_model(path) for path in folders), key=lambda model: len(model.images))
     names = tuple(sorted(path.name for path in images.iterdir() if path.is_file()))
+    models = [read_colmap_model(path, names) for path in folders]
     seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
-    return ReferenceRun(names, reconstruction_from_colmap(largest, names=names), seconds)
+    return ReferenceRun(names, max(models, key=lambda model: model.registered.sum()), seconds)
 
 
 def mapper_options(threads: int, refine_principal_point: bool = False) -> pycolmap.IncrementalPipelineOptions:

@@ -98,7 +98,6 @@ HELP = {
     "repeats": "repetitions; the least or the median counts",
     "same_scenes": "cut all sets from the same scenes: overlapping pairs grow with the square of the size",
     "scenes": "names of image sets (default: all on this machine)",
-    "seconds": "duration",
     "seed": "random seed",
     "seeds": "random seeds, or their number",
     "set_": "settings STAGE.FIELD=VALUE of the runs",

@@ -6,13 +6,12 @@ import pytest
 
 from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.io.colmap import reconstruction_from_colmap
-from thesisrecon.io.colmap_model import read_colmap_model
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from validation.references.colmap_mapping import give_calibration
 from validation.references.colmap_matching import match_with_pycolmap
 from validation.references.colmap_model import cameras_from_colmap, colmap_model
+from validation.references.colmap_reading import read_colmap_model
 from validation.references.libraries import pycolmap
 from validation.references.triangulation import colmap_points
 
@@ -68,7 +67,7 @@ def test_files_that_colmap_writes_mean_the_same_to_us(looked, tmp_path, text):
     cameras, seen = problem(looked)
     model = colmap_model(cameras, looked.X, seen, SIZE)
     (model.write_text if text else model.write_binary)(tmp_path)
-    read = reconstruction_from_colmap(read_colmap_model(tmp_path), names=["0.png", "1.png"])
+    read = read_colmap_model(tmp_path, ["0.png", "1.png"])
     assert read.K is not None
     assert read.distortion is not None
     np.testing.assert_allclose(read.K, looked.K, atol=1e-9)

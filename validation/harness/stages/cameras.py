@@ -17,8 +17,8 @@ from thesisrecon.io._files import read_json
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
-from validation.harness.plots import OURS, Values, each, plot, row, scatter
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
+from validation.harness.rows import OURS, Values, each, plot, row, scatter
 from validation.harness.scenes import has_images, load_images, truth_of
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
