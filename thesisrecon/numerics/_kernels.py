@@ -1,10 +1,11 @@
-"""Compiled robust losses (``code`` is a number of ``LOSS_CODES``), guards and solvers of 3 x 3 systems."""
+"""Huber's loss for kernels, guards, and solvers of small systems."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.kernels import kernel
@@ -13,42 +14,22 @@ TINY = 1e-12
 
 
 @kernel(inline="always")
-def loss_value(code: int, s: float, delta: float) -> float:
-    """Evaluate rho(s)."""
+def loss_value(s: float, delta: float) -> float:
+    """Evaluate Huber's rho(s); least squares if delta is infinite."""
     d2 = delta * delta
-    if code == 1:
-        return s if s <= d2 else 2.0 * delta * math.sqrt(s) - d2
-    if code == 2:
-        return 2.0 * d2 * (math.sqrt(1.0 + s / d2) - 1.0)
-    if code == 3:
-        return d2 * math.log1p(s / d2)
-    return s
+    return s if s <= d2 else 2.0 * delta * math.sqrt(s) - d2
 
 
 @kernel(inline="always")
-def loss_weight(code: int, s: float, delta: float) -> float:
+def loss_weight(s: float, delta: float) -> float:
     """Evaluate rho'(s)."""
-    d2 = delta * delta
-    if code == 1:
-        return 1.0 if s <= d2 else delta / math.sqrt(s)
-    if code == 2:
-        return 1.0 / math.sqrt(1.0 + s / d2)
-    if code == 3:
-        return 1.0 / (1.0 + s / d2)
-    return 1.0
+    return 1.0 if s <= delta * delta else delta / math.sqrt(s)
 
 
 @kernel(inline="always")
-def loss_curvature(code: int, s: float, delta: float) -> float:
+def loss_curvature(s: float, delta: float) -> float:
     """Evaluate 1 + 2 s rho'' / rho', the fraction of the curvature along a residual that its loss leaves."""
-    u = s / (delta * delta)
-    if code == 1:
-        return 1.0 if u <= 1.0 else 0.0
-    if code == 2:
-        return 1.0 / (1.0 + u)
-    if code == 3:
-        return (1.0 - u) / (1.0 + u)
-    return 1.0
+    return 1.0 if s / (delta * delta) <= 1.0 else 0.0
 
 
 @kernel(inline="always")
@@ -98,3 +79,19 @@ def multiply_transposed_3x3(L: F64, out: F64) -> None:
     for a in range(3):
         for b in range(3):
             out[a, b] = L[0, a] * L[0, b] + L[1, a] * L[1, b] + L[2, a] * L[2, b]
+
+
+def floored_diagonal(diagonal: F64) -> F64:
+    """Floor the diagonal (D,) of J'J away from 0, so that the damped matrix is positive."""
+    largest = float(diagonal.max(initial=0.0))
+    return np.maximum(diagonal, 1e-12 * largest if largest > 0.0 else 1.0)
+
+
+def solve_positive(A: F64, b: F64) -> F64 | None:
+    """Solve A x = b, b (D,) or (D, M), by Cholesky factorisation; None if A is not positive."""
+    if not (np.isfinite(A).all() and np.isfinite(b).all()):
+        return None
+    if len(b) == 0:
+        return np.zeros_like(b)
+    _, x, info = scipy.linalg.lapack.dposv(A, b, lower=1)
+    return None if info != 0 or not np.isfinite(x).all() else np.asarray(x).reshape(b.shape)

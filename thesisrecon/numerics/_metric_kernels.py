@@ -73,7 +73,7 @@ def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> 
         x0, x1, x2 = _in_camera(model.R[v], model.t[v], x)
         px, py = _image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
         e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
-        cost += loss_value(weighting.code, e0 * e0 + e1 * e1, weighting.delta)
+        cost += loss_value(e0 * e0 + e1 * e1, weighting.delta)
     return 0.5 * cost
 
 
@@ -117,11 +117,11 @@ def linearize_metric(
         px, py = _image_of(q, x0, x1, w)
         e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
         s = e0 * e0 + e1 * e1
-        cost += loss_value(weighting.code, s, weighting.delta)
-        root = np.sqrt(loss_weight(weighting.code, s, weighting.delta))
+        cost += loss_value(s, weighting.delta)
+        root = np.sqrt(loss_weight(s, weighting.delta))
         a, b = x0 / w, x1 / w
         _fill_columns(q, a, b, root / weighting.sigma, D)
-        kept = max(loss_curvature(weighting.code, s, weighting.delta), weighting.min_curvature)
+        kept = max(loss_curvature(s, weighting.delta), weighting.min_curvature)
         if kept < 1.0:
             # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
             kept = np.sqrt(kept)

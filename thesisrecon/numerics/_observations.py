@@ -64,13 +64,12 @@ class Jacobians(NamedTuple):
 
 
 class Weighting(NamedTuple):
-    """Weighting of residuals: in units of ``sigma``, under loss number ``code`` that turns at ``delta``.
+    """Weighting of residuals: in units of ``sigma``, under Huber's loss that turns at ``delta``.
 
     ``min_curvature`` is the least fraction of the curvature along a residual that is kept if its loss bends
     (Triggs et al., Bundle Adjustment, 1999, equation 11): 1 is plain reweighting.
     """
 
     sigma: float
-    code: int
     delta: float
     min_curvature: float = 1.0

@@ -97,8 +97,8 @@ def linearize_projective(state: UnitState, obs: Observations, weighting: Weighti
         a, b = u0 / w, u1 / w
         r0, r1 = a - obs.xy[k, 0], b - obs.xy[k, 1]
         s = r0 * r0 + r1 * r1
-        cost += loss_value(weighting.code, s, weighting.delta)
-        root = np.sqrt(loss_weight(weighting.code, s, weighting.delta))
+        cost += loss_value(s, weighting.delta)
+        root = np.sqrt(loss_weight(s, weighting.delta))
         J.residual[k, 0], J.residual[k, 1] = root * r0, root * r1
         f = root / w
         e0 = x[0] * v[0] + x[1] * v[1] + x[2] * v[2] + x[3] * v[3]
@@ -135,5 +135,5 @@ def projective_cost(state: UnitState, obs: Observations, weighting: Weighting) -
         u1 = p[4] * x[0] + p[5] * x[1] + p[6] * x[2] + p[7] * x[3]
         w = away_from_zero(p[8] * x[0] + p[9] * x[1] + p[10] * x[2] + p[11] * x[3])
         r0, r1 = u0 / w - obs.xy[k, 0], u1 / w - obs.xy[k, 1]
-        cost += loss_value(weighting.code, r0 * r0 + r1 * r1, weighting.delta)
+        cost += loss_value(r0 * r0 + r1 * r1, weighting.delta)
     return 0.5 * cost

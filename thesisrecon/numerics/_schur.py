@@ -22,6 +22,7 @@ from thesisrecon.numerics._elimination import (
     mark_pairs,
     substitute_points,
 )
+from thesisrecon.numerics._kernels import floored_diagonal
 from thesisrecon.numerics._observations import Jacobians, SortedObservations
 from thesisrecon.numerics._reduced_solvers import (
     BandedCholesky,
@@ -30,7 +31,6 @@ from thesisrecon.numerics._reduced_solvers import (
     add_diagonal,
     choose_solver,
 )
-from thesisrecon.numerics.levenberg_marquardt import floored_diagonal
 from thesisrecon.numerics.observations import Observations
 
 CHUNK = 16384

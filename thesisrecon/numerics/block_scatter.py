@@ -19,7 +19,6 @@ from thesisrecon.numerics._covariance import gauge_directions, invert_in_inner_g
 from thesisrecon.numerics._intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricModel, linearize_metric
 from thesisrecon.numerics._observations import Jacobians, Weighting
-from thesisrecon.numerics.losses import LOSS_CODES
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 
@@ -160,7 +159,7 @@ def _linearise(
 ) -> _Linearised:
     (values, place), (sigma, loss), width = columns, noise, cameras.intrinsics.shape[1]
     model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
-    weighting = Weighting(sigma, LOSS_CODES["huber"], loss / sigma)
+    weighting = Weighting(sigma, loss / sigma)
     weighted, none = Jacobians.empty(len(o.xy), POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
     linearize_metric(model, o, weighting, np.arange(width), none, weighted)
     first = POSE_DOF * (int(place.max()) + 1)

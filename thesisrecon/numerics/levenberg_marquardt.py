@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
-import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.kernels import kernel
-from thesisrecon.numerics.losses import LOSSES, loss_code
+from thesisrecon.numerics._kernels import floored_diagonal, solve_positive
 
 State = TypeVar("State")
 Step = TypeVar("Step")
@@ -20,80 +19,57 @@ StepOut = TypeVar("StepOut", covariant=True)
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
 
 
-class LinearSystem(Protocol[StepOut]):
-    """A problem linearised at one state of the given cost, 1/2 sum rho."""
+class _LinearSystem(Protocol[StepOut]):
+    """Normal equations at one state; ``solve`` returns the damped step and its predicted gain of cost.
+
+    None if the damped system is not positive.
+    """
 
     @property
     def cost(self) -> float: ...
 
-    def solve(self, damping: float) -> tuple[StepOut, float] | None:
-        """Return the damped step and its predicted gain of cost; None if the system is not positive."""
+    def solve(self, damping: float) -> tuple[StepOut, float] | None: ...
 
 
-class Problem(Protocol[State, Step]):
-    """A problem of the loop; states are never changed in place."""
+class _Problem(Protocol[State, Step]):
+    """``retract`` moves a state by a step; a ``cost`` that is not finite rejects a state."""
 
-    def linearize(self, state: State) -> LinearSystem[Step]:
-        """Return the normal equations at a state."""
+    def linearize(self, state: State) -> _LinearSystem[Step]: ...
 
-    def retract(self, state: State, step: Step) -> State:
-        """Return the state moved by a step."""
+    def retract(self, state: State, step: Step) -> State: ...
 
-    def cost(self, state: State) -> float:
-        """Return 1/2 sum rho; inf or NaN rejects the state."""
-
-
-@dataclass(frozen=True)
-class Solution(Generic[State]):
-    """End of the loop.
-
-    Parameters
-    ----------
-    state : State
-        Final state.
-    cost, initial_cost : float
-        1/2 sum rho at the end and the start, cost <= initial_cost.
-    iterations, converged : int, bool
-        Linear solves, and whether a tolerance or the numerical floor was reached.
-    """
-
-    state: State
-    cost: float
-    initial_cost: float
-    iterations: int
-    converged: bool
+    def cost(self, state: State) -> float: ...
 
 
 def run_levenberg_marquardt(
-    problem: Problem[State, Step],
+    problem: _Problem[State, Step],
     state: State,
     *,
     max_iterations: int,
     tolerance: float = 1e-7,
     initial_damping: float = 1e-4,
-) -> Solution[State]:
+) -> tuple[State, float, int]:
     """Minimise a problem by Levenberg-Marquardt; the cost never rises and singular systems raise nothing.
 
-    Converged if the predicted or the actual gain is below ``tolerance`` times the cost, or no damping gives a
-    better state. The damping multiplies the diagonal (Marquardt 1963), so that units do not matter and gauge
-    freedoms need no other treatment; it follows Nielsen (IMM-REP-1999-05).
+    The damping multiplies the diagonal (Marquardt 1963), so that units do not matter and gauge freedoms need
+    no other treatment; it follows Nielsen (IMM-REP-1999-05).
 
     Parameters
     ----------
-    problem, state : Problem, State
-        Problem to minimise and its initial state.
+    problem, state : object, State
+        Problem with the methods ``linearize``, ``retract`` and ``cost``, and its initial state.
     max_iterations : int
         Maximum number of linear solves.
     tolerance, initial_damping : float
-        Relative gain of cost at convergence, and first damping.
+        Relative gain of cost, predicted or actual, at convergence, and first damping.
 
     Returns
     -------
-    Solution
-        Final state and cost.
+    state, cost, iterations : State, float, int
+        Final state, its cost, and number of linear solves.
     """
     system = problem.linearize(state)
-    cost = initial_cost = system.cost
+    cost = system.cost
     damping, growth = initial_damping, 2.0
     for iteration in range(1, max_iterations + 1):
         solved = system.solve(damping)
@@ -101,7 +77,7 @@ def run_levenberg_marquardt(
         if solved is not None:
             promised = solved[1]
             if promised <= tolerance * 1e-3 * cost:
-                return Solution(state, cost, initial_cost, iteration, True)
+                return state, cost, iteration
             candidate = problem.retract(state, solved[0])
             gain = cost - problem.cost(candidate)
         if gain > 0.0 and np.isfinite(gain):
@@ -109,7 +85,7 @@ def run_levenberg_marquardt(
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / promised - 1.0) ** 3), _MIN_DAMPING)
             growth = 2.0
             if gain <= tolerance * previous:
-                return Solution(state, cost - gain, initial_cost, iteration, True)
+                return state, cost - gain, iteration
             cost -= gain
             if iteration < max_iterations:
                 system = problem.linearize(state)
@@ -117,8 +93,8 @@ def run_levenberg_marquardt(
         else:
             damping, growth = damping * growth, growth * 2.0
             if damping > _MAX_DAMPING:
-                return Solution(state, cost, initial_cost, iteration, True)
-    return Solution(state, cost, initial_cost, max_iterations, False)
+                return state, cost, iteration
+    return state, cost, max_iterations
 
 
 @dataclass(frozen=True)
@@ -148,51 +124,13 @@ class DenseSystem:
         Returns
         -------
         tuple or None
-            Step (D,) and predicted gain of cost; None if the damped system is not positive.
+            Step (D,) and its predicted gain; None if the damped system is not positive.
         """
         diagonal = damping * floored_diagonal(np.diag(self.hessian))
         step = solve_positive(self.hessian + np.diag(diagonal), -self.gradient)
         if step is None:
             return None
         return step, 0.5 * float(step @ (diagonal * step - self.gradient))
-
-
-def floored_diagonal(diagonal: F64) -> F64:
-    """Floor the diagonal of J'J away from 0, so that the damped matrix is positive.
-
-    Parameters
-    ----------
-    diagonal : ndarray (D,)
-        Diagonal of J'J.
-
-    Returns
-    -------
-    ndarray (D,)
-        Floored diagonal.
-    """
-    largest = float(diagonal.max(initial=0.0))
-    return np.maximum(diagonal, 1e-12 * largest if largest > 0.0 else 1.0)
-
-
-def solve_positive(A: F64, b: F64) -> F64 | None:
-    """Solve A x = b for a symmetric positive A.
-
-    Parameters
-    ----------
-    A, b : ndarray (D, D), (D,) or (D, M)
-        Matrix and right-hand side.
-
-    Returns
-    -------
-    ndarray or None
-        x, of the shape of ``b``; None if a pivot of the Cholesky factorisation is not positive.
-    """
-    if not (np.isfinite(A).all() and np.isfinite(b).all()):
-        return None
-    if len(b) == 0:
-        return np.zeros_like(b)
-    _, x, info = scipy.linalg.lapack.dposv(A, b, lower=1)
-    return None if info != 0 or not np.isfinite(x).all() else np.asarray(x).reshape(b.shape)
 
 
 @kernel
@@ -246,8 +184,8 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
 def invert_information(information: F64) -> F64:
     """Invert an information matrix, eigenvalues floored relative to the largest.
 
-    Directions that the data do not determine get a huge variance instead of a failure. The matrix is first
-    scaled to a unit diagonal, so that units do not decide which directions are undetermined.
+    Undetermined directions get a huge variance; the matrix is scaled to a unit diagonal, so that units do not
+    decide which these are.
 
     Parameters
     ----------
@@ -287,17 +225,20 @@ class ResidualMinimum:
     residual: F64
 
 
+def _squared(s: F64) -> tuple[F64, F64]:
+    return s, np.ones_like(s)
+
+
 @dataclass(frozen=True)
 class _VectorProblem:
     residual_fn: Callable[[F64], F64]
     jacobian: Callable[[F64], F64] | None
-    loss: str
-    loss_scale: float
+    loss: Callable[[F64], tuple[F64, F64]]
 
     def linearize(self, state: F64) -> DenseSystem:
         r = self.residual_fn(state)
         J = self.jacobian(state) if self.jacobian else _difference_jacobian(self.residual_fn, state, r)
-        rho, weight = LOSSES[self.loss](r**2, self.loss_scale)
+        rho, weight = self.loss(r**2)
         return DenseSystem(0.5 * float(rho.sum()), (J.T * weight) @ J, J.T @ (weight * r))
 
     def retract(self, state: F64, step: F64) -> F64:
@@ -305,9 +246,7 @@ class _VectorProblem:
 
     def cost(self, state: F64) -> float:
         r = self.residual_fn(state)
-        if not np.isfinite(r).all():
-            return np.inf
-        return 0.5 * float(LOSSES[self.loss](r**2, self.loss_scale)[0].sum())
+        return 0.5 * float(self.loss(r**2)[0].sum()) if np.isfinite(r).all() else np.inf
 
 
 def _difference_jacobian(residual_fn: Callable[[F64], F64], x: F64, residual: F64) -> F64:
@@ -327,8 +266,7 @@ def minimize_residuals(
     x0: F64,
     *,
     jacobian: Callable[[F64], F64] | None = None,
-    loss: str = "squared",
-    loss_scale: float = 1.0,
+    loss: Callable[[F64], tuple[F64, F64]] = _squared,
     max_iterations: int = 50,
     tolerance: float = 1e-10,
 ) -> ResidualMinimum:
@@ -336,14 +274,12 @@ def minimize_residuals(
 
     Parameters
     ----------
-    residual_fn : callable
-        (D,) -> (M,); states with residuals that are not finite are rejected.
-    x0 : ndarray (D,)
-        Start.
+    residual_fn, x0 : callable, ndarray (D,)
+        (D,) -> (M,), not finite where a state is rejected; and the start.
     jacobian : callable, optional
         (D,) -> (M, D); forward differences by default.
-    loss, loss_scale : str, float
-        Name in :data:`~thesisrecon.numerics.losses.LOSSES`, and turning point in units of the residuals.
+    loss : callable, optional
+        Robust loss of squared residuals and its derivative (:mod:`~thesisrecon.numerics.losses`).
     max_iterations, tolerance : int, float
         As in :func:`run_levenberg_marquardt`.
 
@@ -363,15 +299,13 @@ def minimize_residuals(
     >>> result.x.round(6).tolist()
     [1.0, 2.0]
     """
-    loss_code(loss, loss_scale)
     x0 = np.array(x0, dtype=np.float64)
     if x0.ndim != 1 or not np.isfinite(x0).all() or not np.isfinite(residual_fn(x0)).all():
         raise ValueError(f"minimize_residuals needs a finite vector and residuals; got shape {x0.shape}")
-    problem = _VectorProblem(residual_fn, jacobian, loss, loss_scale)
-    end = run_levenberg_marquardt(
+    problem = _VectorProblem(residual_fn, jacobian, loss)
+    x, cost, _ = run_levenberg_marquardt(
         problem, x0, max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3
     )
-    residual = residual_fn(end.state)
-    variance = 2.0 * end.cost / max(len(residual) - len(x0), 1)
-    covariance = variance * invert_information(problem.linearize(end.state).hessian)
-    return ResidualMinimum(end.state, end.cost, covariance, residual)
+    residual = residual_fn(x)
+    variance = 2.0 * cost / max(len(residual) - len(x0), 1)
+    return ResidualMinimum(x, cost, variance * invert_information(problem.linearize(x).hessian), residual)

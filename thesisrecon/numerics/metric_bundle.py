@@ -33,8 +33,7 @@ from thesisrecon.numerics._metric_kernels import (
 )
 from thesisrecon.numerics._observations import Jacobians, SortedObservations, Weighting, sort_observations
 from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
-from thesisrecon.numerics.levenberg_marquardt import Solution, run_levenberg_marquardt
-from thesisrecon.numerics.losses import LossName, loss_code
+from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 
@@ -49,10 +48,9 @@ class BundleOptions:
 
     Parameters
     ----------
-    sigma_px : float
-        Standard deviation of one image coordinate, the weight of the data against the priors.
-    loss, loss_px : str, float
-        Robust loss and its turning point (px).
+    sigma_px, loss_px : float
+        Standard deviation of one image coordinate, the weight of the data against the priors, and turning
+        point of Huber's loss; infinite for least squares.
     max_iterations : int
         Maximum number of linear solves.
     fixed_views : ndarray (V,) of bool, optional
@@ -62,7 +60,6 @@ class BundleOptions:
     """
 
     sigma_px: float = 1.0
-    loss: LossName = "huber"
     loss_px: float = 1.0
     max_iterations: int = 20
     fixed_views: B8 | None = field(default=None, compare=False)
@@ -70,9 +67,8 @@ class BundleOptions:
     noise_floor_px: float = 0.0
 
     def __post_init__(self) -> None:
-        loss_code(self.loss, self.loss_px)
-        if not self.sigma_px > 0.0:
-            raise ValueError(f"sigma_px must be positive; got {self.sigma_px}")
+        if not (self.sigma_px > 0.0 and self.loss_px > 0.0):
+            raise ValueError(f"sigma_px and loss_px must be positive; got {self.sigma_px}, {self.loss_px}")
 
 
 @dataclass(frozen=True)
@@ -85,10 +81,8 @@ class MetricBundleResult:
         Refined cameras and points.
     residual_px : ndarray (K, 2)
         Projection minus observation in the caller's order.
-    cost, initial_cost : float
+    cost : float
         1/2 sum rho in units of the given sigma, priors included.
-    iterations : int
-        Linear solves.
     intrinsics_covariance : ndarray (G, C, C)
         Zero for entries that do not move, and without ``covariance``.
     pose_covariance : ndarray (V, 6, 6), optional
@@ -102,8 +96,6 @@ class MetricBundleResult:
     X: F64
     residual_px: F64
     cost: float
-    initial_cost: float
-    iterations: int
     intrinsics_covariance: F64
     pose_covariance: F64 | None
     sigma_px: float
@@ -235,8 +227,8 @@ def refine_metric_bundle(
         np.ascontiguousarray(cameras.group, dtype=np.int64),
         np.ascontiguousarray(scale * (X - origin)),
     )
-    solution = _minimize(problem, _State(start, values), options)
-    end, moved = solution.state.model, problem.free_views
+    state, cost = _minimize(problem, _State(start, values), options.max_iterations)
+    end, moved = state.model, problem.free_views
     refined = replace(
         cameras,
         R=np.where(moved[:, None, None], end.R, cameras.R),
@@ -244,14 +236,14 @@ def refine_metric_bundle(
         intrinsics=end.intrinsics,
     )
     residual = project_metric(end, o.seen)
-    sigma = problem.sigma(solution.state, residual)
+    sigma = problem.sigma(state, residual)
     covariances: tuple[F64, F64 | None] = (np.zeros((*table.shape, table.shape[1])), None)
     if options.covariance:
         noise = max(sigma or options.sigma_px, options.noise_floor_px)
-        covariances = _covariances(problem, solution.state, noise, scale)
+        covariances = _covariances(problem, state, noise, scale)
     return MetricBundleResult(
-        refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), solution.cost,
-        solution.initial_cost, solution.iterations, *covariances, sigma,
+        refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), cost,
+        *covariances, sigma,
     )  # fmt: skip
 
 
@@ -273,19 +265,15 @@ def _check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
         raise ValueError(f"groups must lie in 0..{n_rows - 1}")
 
 
-def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Solution[_State]:
-    """Minimise, by reweighting first and nearly Newton's steps at the end if the loss bends."""
-    if options.loss == "squared":
-        return run_levenberg_marquardt(problem, state, max_iterations=options.max_iterations)
-    far = run_levenberg_marquardt(
-        problem, state, max_iterations=options.max_iterations, tolerance=_NEWTON_GAIN
+def _minimize(problem: _MetricProblem, state: _State, most: int) -> tuple[_State, float]:
+    """Return the minimum and its cost: by reweighting first, nearly Newton's steps where the loss bends."""
+    state, cost, iterations = run_levenberg_marquardt(
+        problem, state, max_iterations=most, tolerance=_NEWTON_GAIN
     )
-    left = options.max_iterations - far.iterations
-    if left < 1:
-        return far
-    near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
-    end = run_levenberg_marquardt(near, far.state, max_iterations=left)
-    return replace(end, initial_cost=far.initial_cost, iterations=far.iterations + end.iterations)
+    if iterations < most:
+        near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
+        state, cost, _ = run_levenberg_marquardt(near, state, max_iterations=most - iterations)
+    return state, cost
 
 
 def _metric_problem(
@@ -308,15 +296,13 @@ def _metric_problem(
     layout = build_layout(
         o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border
     )
-    code, delta = loss_code(options.loss, options.loss_px), options.loss_px / options.sigma_px
-    weighting = Weighting(options.sigma_px, code, delta)
+    weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
     return _MetricProblem(layout, columns, free_views, values, weighting, layout.jacobians()), start, table
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
     """Return covariances of intrinsics (G, C, C) and poses (V, 6, 6), t in the caller's unit."""
-    w = problem.weighting
-    problem = replace(problem, weighting=Weighting(sigma_px, w.code, w.delta))
+    problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
     reduced, _, _ = problem.linearize(state).reduce(1e-10)
     m, block = state.model, np.where(problem.free_views, problem.layout.index.block, -1)
     found = CovarianceInput(reduced, block, m.R, m.t, problem.fixed_frame)

@@ -32,7 +32,6 @@ from thesisrecon.numerics._projective_kernels import (
     tangent_step,
 )
 from thesisrecon.numerics.levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
-from thesisrecon.numerics.losses import loss_code
 from thesisrecon.numerics.observations import Observations
 
 # Iterations of minimize_reprojection; the median point takes three or four.
@@ -45,7 +44,6 @@ class _PointOptions(NamedTuple):
     ``keep_cheirality`` rejects steps that change the number of views a point lies behind.
     """
 
-    loss_code: int
     delta: float
     iterations: int
     tolerance: float
@@ -56,7 +54,6 @@ class _PointOptions(NamedTuple):
 @kernel
 def _point_cost(P: F64, x: F64, view_index: I64, xy: F64, options: _PointOptions) -> tuple[float, int]:
     """Return 1/2 sum rho of one point's observations and the number of cameras it lies behind."""
-    code, delta = options.loss_code, options.delta
     cost, behind = 0.0, 0
     for k in range(len(xy)):
         p = P[view_index[k]]
@@ -67,7 +64,7 @@ def _point_cost(P: F64, x: F64, view_index: I64, xy: F64, options: _PointOptions
         if u2 < 0.0:
             behind += 1
         r0, r1 = u0 / w - xy[k, 0], u1 / w - xy[k, 1]
-        cost += loss_value(code, r0 * r0 + r1 * r1, delta)
+        cost += loss_value(r0 * r0 + r1 * r1, options.delta)
     return 0.5 * cost, behind
 
 
@@ -84,7 +81,6 @@ def _linearize_point(
 ) -> None:
     """Fill J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space (Householder vector, factor)."""
     v, beta = tangent
-    code, delta = options.loss_code, options.delta
     H[:] = 0.0
     g[:] = 0.0
     J = np.empty((2, 4))
@@ -96,7 +92,7 @@ def _linearize_point(
         w = away_from_zero(p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3])
         a, b = u0 / w, u1 / w
         r[0], r[1] = a - xy[k, 0], b - xy[k, 1]
-        weight = loss_weight(code, r[0] * r[0] + r[1] * r[1], delta)
+        weight = loss_weight(r[0] * r[0] + r[1] * r[1], options.delta)
         d0 = d1 = 0.0
         for c in range(4):
             J[0, c] = (p[0, c] - a * p[2, c]) / w
@@ -237,7 +233,7 @@ def refine_points(
     P, X, o, used = _checked_points("refine_points", P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
-    options = _PointOptions(loss_code("huber", loss_px), loss_px, iterations, 1e-9, 1, True)
+    options = _PointOptions(loss_px, iterations, 1e-9, 1, True)
     return _refine_in_frame(P, X, o, used, whitening_transform(X[used]), options)
 
 
@@ -270,7 +266,7 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
     # Cameras with one centre leave a direction of space undetermined.
     if len(M) < 4 or not np.abs(np.diag(M)).min() > 1e-13 * np.abs(M).max():
         M = np.eye(4)
-    options = _PointOptions(loss_code("squared", 1.0), 1.0, _MAX_ITERATIONS, 1e-14, 2, False)
+    options = _PointOptions(np.inf, _MAX_ITERATIONS, 1e-14, 2, False)
     return _refine_in_frame(P, X, o, used, M, options)
 
 
@@ -372,9 +368,9 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     start = (T @ P @ np.linalg.inv(M)).reshape(1, 12)
     scale = float(T[0, 0])
-    weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px * scale)
+    weighting = Weighting(1.0, loss_px * scale)
     problem = _CameraProblem(points, _one_view_observations(xy * scale + T[:2, 2]), weighting)
-    end = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations).state
+    end, _, _ = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), M.T)
     raw = back @ end[0]
@@ -467,11 +463,11 @@ def refine_pose(
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
     scale = 1.0 / size if size > 0.0 else 1.0
-    weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px)
+    weighting = Weighting(1.0, loss_px)
     problem = _PoseProblem(_one_view_observations(xy), columns, weighting)
     moved, points = scale * (t + R @ origin), np.ascontiguousarray(scale * (X - origin))
     start = MetricModel(R[None], moved[None], q[None], np.zeros(1, dtype=np.int64), points)
-    end = run_levenberg_marquardt(problem, start, max_iterations=iterations).state
+    end, _, _ = run_levenberg_marquardt(problem, start, max_iterations=iterations)
     units = np.ones(6 + len(columns))
     units[3:6] = 1.0 / scale
     covariance = invert_information(problem.linearize(end).hessian) * units * units[:, None]

@@ -22,7 +22,6 @@ from thesisrecon.numerics._projective_kernels import (
 )
 from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
-from thesisrecon.numerics.losses import loss_code
 from thesisrecon.numerics.observations import Observations
 
 _VIEW_DOF = 11
@@ -38,7 +37,7 @@ class ProjectiveBundleResult:
         Cameras and points in the caller's frame, norms and signs.
     residual_px : ndarray (K, 2)
         Projection minus observation in the caller's order.
-    cost, initial_cost : float
+    cost : float
         1/2 sum rho, px^2.
     """
 
@@ -46,7 +45,6 @@ class ProjectiveBundleResult:
     X: F64
     residual_px: F64
     cost: float
-    initial_cost: float
 
 
 @dataclass(frozen=True)
@@ -133,19 +131,18 @@ def refine_projective_bundle(
     points, X_norms = _unit_rows(X @ M.T, seen_points, "point")
     problem = _projective_problem(o, T, free, loss_px)
     start = UnitState.at(conditioned, points)
-    end = run_levenberg_marquardt(problem, start, max_iterations=max_iterations)
+    end, cost, _ = run_levenberg_marquardt(problem, start, max_iterations=max_iterations)
 
     scale = T[0, 0]
-    P_back = np.linalg.inv(T) @ (end.state.P * P_norms[:, None]).reshape(-1, 3, 4) @ M
-    X_back = (end.state.X * X_norms[:, None]) @ np.linalg.inv(M).T
+    P_back = np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4) @ M
+    X_back = (end.X * X_norms[:, None]) @ np.linalg.inv(M).T
     conditioned_xy = problem.layout.observations.seen
-    residual = project_projective(end.state.P.reshape(-1, 3, 4), end.state.X, conditioned_xy)
+    residual = project_projective(end.P.reshape(-1, 3, 4), end.X, conditioned_xy)
     return ProjectiveBundleResult(
         np.where(free[:, None, None], _with_norms(P_back, P, axis=(1, 2)), P),
         np.where(seen_points[:, None], _with_norms(X_back, X, axis=1), X),
         o.unsort(residual) / scale,
-        end.cost / scale**2,
-        end.initial_cost / scale**2,
+        cost / scale**2,
     )
 
 
@@ -155,7 +152,7 @@ def _projective_problem(o: SortedObservations, T: F64, free: B8, loss_px: float)
     block = np.where(free, np.cumsum(free) - 1, -1)
     none = np.zeros((len(free), 0), dtype=np.int64)
     layout = build_layout(conditioned, block, width=_VIEW_DOF, common=none, border=0)
-    weighting = Weighting(1.0, loss_code("huber", loss_px), loss_px * float(T[0, 0]))
+    weighting = Weighting(1.0, loss_px * float(T[0, 0]))
     return _ProjectiveProblem(layout, weighting, layout.jacobians())
 
 

@@ -136,7 +136,7 @@ def _minimize_kruppa(
     found = minimize_residuals(
         lambda x: residuals(x[None])[0], start,
         jacobian=lambda x: central_differences(residuals, x, np.full(len(x), 1e-6)),
-        loss="soft_l1", loss_scale=loss_scale, max_iterations=80, tolerance=1e-14,
+        loss=lambda s: soft_l1(s, loss_scale), max_iterations=80, tolerance=1e-14,
     )  # fmt: skip
     return unknown.calibrations(found.x[None])[0], unknown.calibration_std(found.x, found.covariance)
 

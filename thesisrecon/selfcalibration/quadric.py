@@ -14,6 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
+from thesisrecon.numerics.losses import huber
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
     FOCAL_LIMITS,
@@ -235,8 +236,7 @@ def _minimize(
     found = minimize_residuals(
         lambda x: residuals(x[None])[0], theta,
         jacobian=lambda x: central_differences(residuals, x, 1e-6 * (1.0 + np.abs(x))),
-        loss="huber", loss_scale=loss_scale,
-        max_iterations=100, tolerance=1e-14,
+        loss=lambda s: huber(s, loss_scale), max_iterations=100, tolerance=1e-14,
     )  # fmt: skip
     data = found.residual[: 6 * len(frame.views)]
     # Five independent entries per camera except the reference, whose residuals vanish.

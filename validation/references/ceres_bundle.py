@@ -10,19 +10,10 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics.losses import LossName
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from validation.references.colmap_model import cameras_from_colmap, colmap_model
 from validation.references.libraries import pycolmap
-
-LOSSES: dict[LossName, str] = {
-    "squared": "TRIVIAL",
-    "soft_l1": "SOFT_L1",
-    "cauchy": "CAUCHY",
-    "huber": "HUBER",
-}
-
 
 SOLVERS = {
     "dense": "DENSE_SCHUR",
@@ -33,11 +24,11 @@ SOLVERS = {
 
 @dataclass(frozen=True)
 class CeresOptions:
-    """Options of Ceres: ``principal_point`` frees it; ``function_tolerance`` 0 is COLMAP's default, 1e-6
-    Ceres'; ``solver`` a name of :data:`SOLVERS`, or "" for COLMAP's choice."""
+    """Options of Ceres: Huber's loss turns at ``loss_px``; ``principal_point`` frees it;
+    ``function_tolerance`` 0 is COLMAP's default, 1e-6 Ceres'; ``solver`` a name of :data:`SOLVERS`, or "" for
+    COLMAP's choice."""
 
-    loss: LossName = "squared"
-    loss_px: float = 1.0
+    loss_px: float = np.inf
     principal_point: bool = False
     threads: int = 1
     function_tolerance: float = 1e-6
@@ -91,8 +82,9 @@ def bundle_adjuster(
     adjustment.refine_principal_point = options.principal_point
     adjustment.print_summary = False
     ceres = adjustment.ceres
-    ceres.loss_function_type = getattr(pycolmap.LossFunctionType, LOSSES[options.loss])
-    ceres.loss_function_scale = options.loss_px
+    if np.isfinite(options.loss_px):
+        ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
+        ceres.loss_function_scale = options.loss_px
     ceres.min_num_residuals_for_cpu_multi_threading = 0
     solver = ceres.solver_options
     solver.num_threads, solver.max_num_iterations = options.threads, options.max_iterations

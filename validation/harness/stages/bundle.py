@@ -14,8 +14,8 @@ from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import Reconstruction
 from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
+from validation.harness.rows import OURS, each, ratio, read_arrays, row
 from validation.harness.scenes import has_images, load_images
-from validation.harness.stages._shared import OURS, each, ratio, read_arrays, row
 from validation.harness.stages.cameras import our_model
 from validation.metrics.record import Metric
 from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
@@ -37,7 +37,7 @@ class BundleStage(Stage):
     title = "Bundle adjustment"
     definition = (
         "The final model of our run, every camera and point moved (focal length by 2 %), adjusted to "
-        "convergence by ours and by COLMAP's Ceres from the same start, soft L1 loss. Cost is computed here, "
+        "convergence by ours and by COLMAP's Ceres from the same start, Huber's loss. Cost is computed here, "
         "by one function, from the cameras and points that each leaves. Covariances, ours beside COLMAP's "
         "estimate_ba_covariance: of the saved model (and of a synthetic street), each at its own optimum, "
         "squared loss, focal length, principal point and k1 free, two views fixed."
@@ -74,7 +74,7 @@ class BundleStage(Stage):
         focals, seconds = each(found, lambda f: f["intrinsics"][0, 0]), each(found, lambda f: f["seconds"])
         above = None if over is None else over - 1.0
         metrics = [
-            row(scene, "cost", "px^2", costs, "1/2 sum of rho(r^2), soft L1 at 0.2 px"),
+            row(scene, "cost", "px^2", costs, "1/2 sum of rho(r^2), Huber at 0.2 px"),
             row(scene, "cost above Ceres", "", above, "ratio of costs minus 1"),
             row(scene, "focal length", "px", focals, "of the first camera"),
             row(scene, "time", "s", seconds, "processor time of the second run"),
@@ -114,9 +114,9 @@ def _adjust(
 ) -> tuple[MetricCameras, F64, float]:
     """Run twice and return the second run; the first compiles."""
     if method == CERES:
-        result = refine_with_ceres(cameras, X, seen, size, CeresOptions("soft_l1", LOSS_PX))
+        result = refine_with_ceres(cameras, X, seen, size, CeresOptions(LOSS_PX))
         return result.cameras, result.X, result.cpu_s
-    options = BundleOptions(loss="soft_l1", loss_px=LOSS_PX, max_iterations=200)
+    options = BundleOptions(loss_px=LOSS_PX, max_iterations=200)
     for _ in range(2):
         start = time.process_time()
         fit = refine_metric_bundle(cameras, X, seen, free=FOCAL_K1, options=options)
@@ -125,7 +125,7 @@ def _adjust(
 
 
 def _cost(kept: Mapping[str, F64], group: np.ndarray, seen: Observations) -> float:
-    """1/2 sum rho(|r|^2), rho(s) = 2 c^2 (sqrt(1 + s / c^2) - 1): no library involved."""
+    """1/2 sum rho(|r|^2), rho(s) = s or, beyond s = c^2, 2 c sqrt(s) - c^2: no library involved."""
     f, aspect, skew, cx, cy, k1 = kept["intrinsics"][group[seen.view_index]].T
     X = kept["X"][seen.point_index]
     x = np.einsum("nab,nb->na", kept["R"][seen.view_index], X) + kept["t"][seen.view_index]
@@ -133,8 +133,8 @@ def _cost(kept: Mapping[str, F64], group: np.ndarray, seen: Observations) -> flo
     d = 1.0 + k1 * (u * u + v * v)
     dx = f * d * u + skew * d * v + cx - seen.xy[:, 0]
     dy = f * aspect * d * v + cy - seen.xy[:, 1]
-    s = (dx * dx + dy * dy) / LOSS_PX**2
-    return float(LOSS_PX**2 * np.sum(np.sqrt(1.0 + s) - 1.0))
+    r = np.hypot(dx, dy)
+    return 0.5 * float(np.sum(np.where(r <= LOSS_PX, r**2, 2.0 * LOSS_PX * r - LOSS_PX**2)))
 
 
 def _covariances(
@@ -144,7 +144,7 @@ def _covariances(
     if method == CERES:
         return ceres_covariances(cameras, X, seen, size, (0, 1))
     fixed = np.arange(len(cameras.R)) < 2
-    options = BundleOptions(loss="squared", max_iterations=100, covariance=True, fixed_views=fixed)
+    options = BundleOptions(loss_px=np.inf, max_iterations=100, covariance=True, fixed_views=fixed)
     fit = refine_metric_bundle(cameras, X, seen, free=WITH_CENTRE, options=options)
     assert fit.pose_covariance is not None
     some = [0, 3, 4, 5]
