@@ -158,42 +158,25 @@ def as_reported(found: Comparison) -> tuple[float, float, float]:
 def _cells(table: _Table, measure: Measure) -> list[Cell]:
     found = []
     names = [v.name for v in table.plan.variants]
-    for condition in table.plan.conditions:
-        values = [table.values(measure, name, condition.name) for name in names]
-        blocks = np.array([v.ravel() for v in values]).T
+    for condition in (c.name for c in table.plan.conditions):
+        blocks = np.array([table.values(measure, name, condition).ravel() for name in names]).T
         sign = 1.0 if measure.better == "less" else -1.0
         some = blocks[np.isfinite(blocks).any(axis=1)]
         ranks = mean_ranks(sign * some) if len(some) else np.full(len(names), np.nan)
-        rows = [table.rows(name, condition.name) for name in names]
+        rows = [table.rows(name, condition) for name in names]
         # The first rows of a process compile or load kernels; exclude them from the cost.
         cost = np.array([float(np.median([r.cost_s for r in own])) if own else np.nan for own in rows])
         # A variant that fails on hard rows is ranked on easier rows than the others.
         whole = np.isfinite(some).all(axis=0)
-        loss = np.array([sign * _mean(b[np.isfinite(b)]) for b in blocks.T])
-        front = on_front(cost, np.where(whole, loss, np.nan))
+        known = [column[np.isfinite(column)] for column in blocks.T]
+        means = np.array([float(np.mean(values)) if len(values) else np.nan for values in known])
+        front = on_front(cost, np.where(whole, sign * means, np.nan))
         for k, name in enumerate(names):
-            known = blocks[:, k][np.isfinite(blocks[:, k])]
-            middle = float(np.median(known)) if len(known) else float("nan")
-            failed = len(rows[k]) - len(known)
-            found.append(
-                Cell(
-                    measure,
-                    name,
-                    condition.name,
-                    _mean(known),
-                    middle,
-                    len(known),
-                    failed,
-                    float(cost[k]),
-                    float(ranks[k]),
-                    bool(front[k]),
-                )
-            )
+            count = len(known[k])
+            middle = float(np.median(known[k])) if count else float("nan")
+            numbers = (float(means[k]), middle, count, len(rows[k]) - count, float(cost[k]), float(ranks[k]))
+            found.append(Cell(measure, name, condition, *numbers, bool(front[k])))
     return found
-
-
-def _mean(values: Sequence[float] | F64) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")
 
 
 def _warnings(rows: Rows) -> list[str]:

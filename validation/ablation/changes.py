@@ -12,7 +12,7 @@ from thesisrecon._settings import config_from_tables, dataclass_from_table
 from thesisrecon.config import KINDS, PipelineConfig, preset
 from thesisrecon.errors import UsageError, unknown_word
 from validation.ablation.own import is_own, load_own
-from validation.ablation.tasks.function import FunctionTask
+from validation.ablation.study import FunctionTask
 
 TASK = "task"
 STAGES = tuple(f.name for f in dataclasses.fields(PipelineConfig))

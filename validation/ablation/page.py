@@ -20,7 +20,7 @@ from validation.ablation.run import Row
 from validation.ablation.study import Measure
 from validation.ablation.tables import comparison_text, mean_text, number, write_tables
 from validation.harness.page import HERE as HARNESS
-from validation.harness.plots import scatter
+from validation.harness.rows import scatter
 
 HERE = Path(__file__).parent
 PAGE = "index.html"

@@ -22,8 +22,8 @@ from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import code_key, key_of
 from validation.ablation.changes import STAGES, TASK, Setting, apply_changes, level_name
 from validation.ablation.own import PREFIX
-from validation.ablation.study import Axis, Changes, Measure, Mode, Study
-from validation.ablation.tasks import FunctionTask, Reconstruction
+from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode, Study
+from validation.ablation.tasks import Reconstruction
 
 ROOT = Path(__file__).resolve().parents[1]
 _RUN_BY_ROWS = ("scenes", "metrics", "references", "checks", "ablation/tasks")

@@ -15,8 +15,7 @@ from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.io._files import write_json
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.store import STEPS, WORK, Outcome, Store, finite
-from validation.ablation.study import Study
-from validation.ablation.tasks import FunctionTask
+from validation.ablation.study import FunctionTask, Study
 from validation.ablation.workers import Crew, Job, carry_out, crew_of, pack
 
 LOST = "the worker process of this row was killed or ran out of memory"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
@@ -35,33 +35,27 @@ class Task(Protocol):
     """Work of a row: a frozen dataclass whose fields are the parameters ``task.…``.
 
     ``measures`` are its numbers. ``check`` raises ``UsageError`` for an unknown or missing scene;
-    ``scene_key`` identifies the content of a scene. ``run`` works with a random seed in an empty folder
-    ``place``, which is removed afterwards, and returns numbers by measure name. ``StageFailure`` means that
-    the data could not be processed.
+    ``scene_key`` identifies the content of a scene; ``unavailable`` names the measures that a scene cannot
+    have. ``run`` works with a random seed in an empty folder ``place``, which is removed afterwards, and
+    returns numbers by measure name. ``StageFailure`` means that the data could not be processed.
 
-    A task without some measures on some scenes also has ``unavailable(scene)``, which returns their names.
-    Tasks with shared first steps also have the methods of :class:`SharingTask`.
+    A task whose first steps may be shared by many rows also has ``steps(config, scene, seed)``, which names
+    the steps in order with a key each (equal keys mean equal results), and ``prepare(config, scene, seed,
+    place, *, step)``, which runs a row up to and including that step and stores the result in
+    ``place.shared``.
     """
 
     measures: ClassVar[Sequence[Measure]]
 
     def check(self, scene: str) -> None: ...
 
-    def scene_key(self, scene: str) -> str: ...
+    def scene_key(self, scene: str) -> str:
+        return scene
+
+    def unavailable(self, scene: str) -> Collection[str]:
+        return ()
 
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]: ...
-
-
-class SharingTask(Task, Protocol):
-    """A task of several steps whose first steps may be shared by many rows.
-
-    ``steps`` names the steps in order with a key each: equal keys mean equal results. ``prepare`` runs a row
-    up to and including that step and stores the result in ``place.shared`` for ``run``.
-    """
-
-    def steps(self, config: PipelineConfig, scene: str, seed: int) -> Sequence[tuple[str, str]]: ...
-
-    def prepare(self, config: PipelineConfig, scene: str, seed: int, place: Place, *, step: str) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -73,6 +67,20 @@ class Place:
 
 
 TaskFunction = Callable[[PipelineConfig, str, int], Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class FunctionTask(Task):
+    """A task of a plain ``function(config, scene, seed)`` that returns numbers by name and checks its
+    scenes."""
+
+    function: TaskFunction
+    measures: ClassVar[Sequence[Measure]] = ()
+
+    def check(self, scene: str) -> None: ...
+
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
+        return self.function(config, scene, seed)
 
 
 @dataclass(frozen=True)

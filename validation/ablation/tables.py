@@ -3,126 +3,85 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.io._files import write_atomically, write_text
+from thesisrecon.io._files import write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.study import Measure
 
 Record = Mapping[str, Any]
 
 
-def row_records(analysis: Analysis) -> list[Record]:
+def _row_records(analysis: Analysis) -> list[Record]:
     """One flat table: a row each, with a column for every axis, condition and measure."""
     plan = analysis.plan
-    levels = {v.name: v.levels for v in plan.variants}
-    conditions = {c.name: c.levels for c in plan.conditions}
-    axes = list(dict.fromkeys(a for v in (*levels.values(), *conditions.values()) for a in v))
+    levels = {v.name: v.levels for v in (*plan.variants, *plan.conditions)}
+    axes = list(dict.fromkeys(axis for level in levels.values() for axis in level))
     other_names = (name for row in analysis.rows for name in row.metrics)
     names = list(dict.fromkeys([*(m.name for m in plan.measures), *other_names]))
     found: list[Record] = []
     for row in analysis.rows:
-        entries = {**levels[row.variant], **conditions[row.condition]}
+        stored = vars(row)
+        entries = {**levels[row.variant], **levels[row.condition]}
         found.append(
-            {
-                "variant": row.variant,
-                "condition": row.condition,
-                "scene": row.scene,
-                "seed": row.seed,
-                **{f"axis:{a}": entries.get(a) for a in axes},
-                **{name: row.metrics.get(name) for name in names},
-                "failure": row.failure,
-                "seconds": row.seconds,
-                "cost_s": row.cost_s,
-                "key": row.key,
-            }
+            {name: stored[name] for name in ("variant", "condition", "scene", "seed")}
+            | {f"axis:{axis}": entries.get(axis) for axis in axes}
+            | {name: row.metrics.get(name) for name in names}
+            | {name: stored[name] for name in ("failure", "seconds", "cost_s", "key")}
         )
     return found
 
 
-def comparison_records(comparisons: Iterable[Comparison]) -> list[Record]:
-    """One row for each comparison."""
-    found: list[Record] = []
-    for c in comparisons:
-        mean, low, high = as_reported(c)
-        found.append(
-            {
-                "metric": c.measure.name,
-                "unit": c.measure.unit,
-                "variant": c.variant,
-                "against": c.against,
-                "condition": c.condition,
-                "of": "quotients" if c.ratio else "differences",
-                "mean": mean,
-                "low": low,
-                "high": high,
-                "p": c.interval.p,
-                "p_holm": c.p,
-                "effect_size": c.interval.effect,
-                "pairs": c.interval.pairs,
-                "drawn": c.interval.unit,
-                "verdict": c.verdict,
-            }
-        )
-    return found
+def _comparison_record(c: Comparison) -> Record:
+    mean, low, high = as_reported(c)
+    return {
+        "metric": c.measure.name,
+        "unit": c.measure.unit,
+        "variant": c.variant,
+        "against": c.against,
+        "condition": c.condition,
+        "of": "quotients" if c.ratio else "differences",
+        "mean": mean,
+        "low": low,
+        "high": high,
+        "p": c.interval.p,
+        "p_holm": c.p,
+        "effect_size": c.interval.effect,
+        "pairs": c.interval.pairs,
+        "drawn": c.interval.unit,
+        "verdict": c.verdict,
+    }
 
 
-def cell_records(cells: Iterable[Cell]) -> list[Record]:
-    """One row for each variant, condition and measure."""
-    return [
-        {"metric": c.measure.name, "unit": c.measure.unit}
-        | {k: v for k, v in vars(c).items() if k != "measure"}
-        for c in cells
-    ]
+def _cell_record(c: Cell) -> Record:
+    own = {name: value for name, value in vars(c).items() if name != "measure"}
+    return {"metric": c.measure.name, "unit": c.measure.unit, **own}
 
 
 def write_tables(analysis: Analysis, out: Path) -> list[Path]:
-    """``rows``, ``comparisons`` and ``means`` as CSV, and as Parquet where pyarrow is installed; the tables
-    for people as ``tables.md``."""
+    """Write ``rows``, ``comparisons`` and ``means`` as CSV, and the tables for people as ``tables.md``."""
     write_text(out / "tables.md", text_of(analysis) + "\n")
-    written = [out / "tables.md"]
-    for name, records in (
-        ("rows", row_records(analysis)),
-        ("comparisons", comparison_records((*analysis.comparisons, *analysis.steps))),
-        ("means", cell_records(analysis.cells)),
-    ):
-        written.append(_write_csv(out / f"{name}.csv", records))
-        if records and importlib.util.find_spec("pyarrow") is not None:
-            written.append(_write_parquet(out / f"{name}.parquet", records))
-    return written
+    comparisons = [_comparison_record(c) for c in (*analysis.comparisons, *analysis.steps)]
+    tables = {
+        "rows": _row_records(analysis),
+        "comparisons": comparisons,
+        "means": [_cell_record(c) for c in analysis.cells],
+    }
+    for name, records in tables.items():
+        sink = io.StringIO(newline="")
+        writer = csv.DictWriter(sink, list(records[0]) if records else [])
+        writer.writeheader()
+        writer.writerows({k: "" if _is_nan(v) else v for k, v in r.items()} for r in records)
+        write_text(out / f"{name}.csv", sink.getvalue())
+    return [out / "tables.md", *(out / f"{name}.csv" for name in tables)]
 
 
-def _write_csv(path: Path, records: Sequence[Record]) -> Path:
-    sink = io.StringIO(newline="")
-    writer = csv.DictWriter(sink, list(records[0]) if records else [])
-    writer.writeheader()
-    writer.writerows({k: _cell_text(v) for k, v in r.items()} for r in records)
-    write_text(path, sink.getvalue())
-    return path
-
-
-def _write_parquet(path: Path, records: Sequence[Record]) -> Path:
-    import pyarrow
-    import pyarrow.parquet
-
-    columns = {name: [_no_nan(r[name]) for r in records] for name in records[0]}
-    sink = io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table(columns), sink)
-    write_atomically(path, sink.getvalue())
-    return path
-
-
-def _cell_text(value: Any) -> Any:
-    return "" if _no_nan(value) is None else value
-
-
-def _no_nan(value: Any) -> Any:
-    return None if isinstance(value, float) and math.isnan(value) else value
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
 
 
 # ---------------------------------------------------------------- Markdown
@@ -131,52 +90,36 @@ def _no_nan(value: Any) -> Any:
 def text_of(analysis: Analysis) -> str:
     """Markdown: a table for each measure."""
     blocks = [f"warning: {w}" for w in analysis.warnings]
-    several = len(analysis.plan.conditions) > 1
-    table = over_conditions if several else one_condition
-    blocks += [table(analysis, measure) for measure in analysis.plan.measures]
-    return "\n\n".join(blocks)
+    return "\n\n".join([*blocks, *(_measure_text(analysis, measure) for measure in analysis.plan.measures)])
 
 
-def one_condition(analysis: Analysis, measure: Measure) -> str:
-    """A row for each variant: its mean, how it differs from the baseline, in a ladder from the step before,
-    and what it costs."""
-    plan = analysis.plan
-    cells = {c.variant: c for c in analysis.cells if c.measure == measure}
-    found = {c.variant: c for c in analysis.comparisons if c.measure == measure}
-    steps = {c.variant: c for c in analysis.steps if c.measure == measure}
-    head = [_title(measure), "mean", f"against {plan.baseline}"]
-    head += ["this step alone", "cost, s"] if steps else ["cost, s"]
-    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
-    for name in (v.name for v in plan.variants):
-        entries = [name, mean_text(cells[name]), comparison_text(found.get(name))]
-        entries += [comparison_text(steps.get(name))] if steps else []
-        lines.append(f"| {' | '.join([*entries, number(cells[name].cost_s)])} |")
-    return "\n".join(lines)
-
-
-def over_conditions(analysis: Analysis, measure: Measure) -> str:
-    """Means, a row for each variant and a column for each condition: bold if significantly better than the
-    baseline, italic if significantly worse."""
+def _measure_text(analysis: Analysis, measure: Measure) -> str:
+    """A row for each variant. Under one condition: its mean, its difference from the baseline and, in a
+    ladder, from the step before. Under several: the means, bold if significantly better, italic if worse."""
     plan = analysis.plan
     cells = {(c.variant, c.condition): c for c in analysis.cells if c.measure == measure}
-    found = {(c.variant, c.condition): c.verdict for c in analysis.comparisons if c.measure == measure}
-    marks = {"better": "**", "worse": "*"}
-    head = [_title(measure), *(c.name for c in plan.conditions), "cost, s"]
+    found = {(c.variant, c.condition): c for c in analysis.comparisons if c.measure == measure}
+    steps = {(c.variant, c.condition): c for c in analysis.steps if c.measure == measure}
+    several = len(plan.conditions) > 1
+    head = [f"{measure.name}, {measure.unit}" if measure.unit else measure.name]
+    head += [c.name for c in plan.conditions] if several else ["mean", f"against {plan.baseline}"]
+    head += ["this step alone"] if steps and not several else []
+    head.append("cost, s")
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     for name in (v.name for v in plan.variants):
-        entries, cost = [], 0.0
-        for condition in plan.conditions:
-            at = (name, condition.name)
-            mark = marks.get(found.get(at, ""), "")
-            entries.append(f"{mark}{mean_text(cells[at])}{mark}")
-            cost += cells[at].cost_s / len(plan.conditions)
-        base = " (the baseline)" if name == plan.baseline else ""
-        lines.append(f"| {' | '.join([f'{name}{base}', *entries, number(cost)])} |")
+        places = [(name, condition.name) for condition in plan.conditions]
+        if several:
+            entries = [f"{name}{' (the baseline)' * (name == plan.baseline)}"]
+            for at in places:
+                verdict = found[at].verdict if at in found else ""
+                mark = {"better": "**", "worse": "*"}.get(verdict, "")
+                entries.append(f"{mark}{mean_text(cells[at])}{mark}")
+        else:
+            entries = [name, mean_text(cells[places[0]]), comparison_text(found.get(places[0]))]
+            entries += [comparison_text(steps.get(places[0]))] if steps else []
+        cost = sum(cells[at].cost_s / len(places) for at in places)
+        lines.append(f"| {' | '.join([*entries, number(cost)])} |")
     return "\n".join(lines)
-
-
-def _title(measure: Measure) -> str:
-    return f"{measure.name}, {measure.unit}" if measure.unit else measure.name
 
 
 def mean_text(cell: Cell) -> str:

@@ -11,8 +11,6 @@ import pytest
 from tests.report.synthetic import Witness
 from tests.validation.ablation.toy import Darts, marks
 from validation.ablation import Measure, Study, ablate, analyse, write_analysis
-from validation.ablation.progress import duration, words_of
-from validation.ablation.run import State
 from validation.command import main
 from validation.scenes.real import ROOT
 from validation.studies.robustness import stopped
@@ -88,16 +86,6 @@ def test_failed_rows_and_wrong_options_have_their_exit_codes(tmp_path, capsys):
     assert "none.toml cannot be read" in capsys.readouterr().err
     assert main(["ablate", str(write_study(tmp_path, "nowhere")), *out]) == 2
     assert "there is no scene 'nowhere'" in capsys.readouterr().err
-
-
-def test_the_progress_text_reports_failures_and_time_left():
-    state = State(10, kept=2, width=1, steps=3)
-    assert words_of(state) == "0 of 3 shared steps"
-    state.steps_done, state.done, state.failed = 3, 4, 1
-    state.spent["a"] = [30.0]
-    state.waiting["a"] = 4
-    assert words_of(state) == "1 failed, about 2 min left"
-    assert [duration(s) for s in (5.0, 600.0, 9000.0)] == ["5 s", "10 min", "2.5 h"]
 
 
 @pytest.fixture(scope="module")

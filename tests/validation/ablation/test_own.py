@@ -13,8 +13,8 @@ from thesisrecon.records import FundamentalFit
 from validation.ablation import Study, ablate, analyse
 from validation.ablation.own import load_own
 from validation.ablation.plan import plan_study
-from validation.ablation.row import pack
 from validation.ablation.toml import read_study, study_from_table
+from validation.ablation.workers import pack
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "ablation.md"
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from validation.ablation.tasks.calibration import CalibrationOverNoise
-from validation.ablation.tasks.function import FunctionTask
 from validation.ablation.tasks.fundamental import FundamentalOfCube
 from validation.ablation.tasks.pairs import PairsOfPhotographs
 from validation.ablation.tasks.reconstruction import Reconstruction
 from validation.ablation.tasks.stereo import RectifiedPairs
 from validation.ablation.tasks.triangulation import TriangulationOverNoise
 
-__all__ = ["TASKS", "FunctionTask", "Reconstruction"]
+__all__ = ["TASKS", "Reconstruction"]
 
 # The word of a study file and the task it means.
 TASKS: dict[str, type] = {

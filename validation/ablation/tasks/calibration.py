@@ -12,7 +12,7 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.records import Reconstruction
-from validation.ablation.study import Measure, Place
+from validation.ablation.study import Measure, Place, Task
 from validation.scenes.rigs import Rig
 from validation.studies.selfcalibration import (
     MODES,
@@ -24,7 +24,7 @@ from validation.studies.selfcalibration import (
 
 
 @dataclass(frozen=True)
-class CalibrationOverNoise:
+class CalibrationOverNoise(Task):
     """``views`` cameras of the cube or of a cloud with Gaussian noise of ``noise_px``, handed to the
     self-calibration as the minimum of the projective bundle adjustment in a random frame.
 
@@ -52,16 +52,7 @@ class CalibrationOverNoise:
         if scene not in SCENES:
             raise UsageError(unknown_word("scene", scene, SCENES))
 
-    def scene_key(self, scene: str) -> str:
-        return scene
-
-    def run(
-        self,
-        config: PipelineConfig,
-        scene: str,
-        seed: int,
-        place: Place,
-    ) -> Mapping[str, float]:
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         rig, projective = _drawn(Cell(scene, self.mode, self.noise_px, self.views), seed)
         prior, rng = assumptions(rig, self.mode), np.random.default_rng(seed)
         calibration = config.selfcalibration.calibrate(projective, prior=prior, rng=rng)

@@ -14,7 +14,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
-from validation.ablation.study import Measure, Place
+from validation.ablation.study import Measure, Place, Task
 from validation.scenes.cube import CubePair, cube_pairs, make_cube
 from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHOLD_PX
 
@@ -23,7 +23,7 @@ OF_CONFIG = "epipolar of the configuration"
 
 
 @dataclass(frozen=True)
-class FundamentalOfCube:
+class FundamentalOfCube(Task):
     """``pairs`` pairs of the 27 cameras, drawn by the seed, with Gaussian noise of ``noise_px`` and a share
     ``outliers`` of matches thrown anywhere.
 
@@ -56,20 +56,11 @@ class FundamentalOfCube:
         if scene != "cube":
             raise UsageError(unknown_word("scene", scene, ["cube"]))
 
-    def scene_key(self, scene: str) -> str:
-        return scene
-
     def unavailable(self, scene: str) -> set[str]:
         """Without noise there is no bound."""
         return set() if self.noise_px > 0.0 else {"over_bound"}
 
-    def run(
-        self,
-        config: PipelineConfig,
-        scene: str,
-        seed: int,
-        place: Place,
-    ) -> Mapping[str, float]:
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         rng = np.random.default_rng((seed, round(1e3 * self.noise_px), round(1e3 * self.outliers)))
         chosen = rng.choice(len(_pairs()), self.pairs, replace=False)
         threshold = max(THRESHOLD_PX, MATCHED_SIGMAS * self.noise_px)

@@ -17,7 +17,7 @@ from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.io.images import read_images
 from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
-from validation.ablation.study import Measure, Place
+from validation.ablation.study import Measure, Place, Task
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs
@@ -27,7 +27,7 @@ CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 
 
 @dataclass(frozen=True)
-class PairsOfPhotographs:
+class PairsOfPhotographs(Task):
     """Images ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side 1536: corners,
     matches, F and verification of the configuration, judged by correspondences of the true cameras."""
 
@@ -51,16 +51,7 @@ class PairsOfPhotographs:
         if int(first) + self.gap >= len(found.image_paths):
             raise UsageError(f"{name} has {len(found.image_paths)} images: there is no pair {scene}")
 
-    def scene_key(self, scene: str) -> str:
-        return scene
-
-    def run(
-        self,
-        config: PipelineConfig,
-        scene: str,
-        seed: int,
-        place: Place,
-    ) -> Mapping[str, float]:
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         name, _, first = scene.rpartition("/")
         i = int(first)
         images, truth = _photographs(name, i, self.gap)

@@ -17,7 +17,7 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.records import RunResult
 from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import code_key, key_of
-from validation.ablation.study import Measure, Place
+from validation.ablation.study import Measure, Place, Task
 from validation.harness.records import ReportOptions
 from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
@@ -42,7 +42,7 @@ AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(Task):
     """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread.
 
     A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth

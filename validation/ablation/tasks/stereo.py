@@ -12,13 +12,13 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.stereo.depth import MultiViewStereo
-from validation.ablation.study import Measure, Place
+from validation.ablation.study import Measure, Place, Task
 from validation.metrics.depth import bad_pixels
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 
 @dataclass(frozen=True)
-class RectifiedPairs:
+class RectifiedPairs(Task):
     """``dense.pairs.matcher`` on a pair with dense truth, judged where both cameras see."""
 
     measures: ClassVar[Sequence[Measure]] = (
@@ -33,16 +33,7 @@ class RectifiedPairs:
         if load_stereo_pair(scene) is None:
             raise UsageError(f"the pair {scene} is not on this machine (THESISRECON_DATA; scikit-image)")
 
-    def scene_key(self, scene: str) -> str:
-        return scene
-
-    def run(
-        self,
-        config: PipelineConfig,
-        scene: str,
-        seed: int,
-        place: Place,
-    ) -> Mapping[str, float]:
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         pair = _pair(scene)
         if not isinstance(config.dense, MultiViewStereo):
             found = config.dense.match_rectified(

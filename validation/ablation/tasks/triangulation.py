@@ -16,7 +16,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
-from validation.ablation.study import Measure, Place
+from validation.ablation.study import Measure, Place, Task
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.triangulation import SCENES, draw_rig, squared_distances
 
@@ -33,7 +33,7 @@ METHODS: dict[str, Callable[[F64, F64], F64]] = {
 
 
 @dataclass(frozen=True)
-class TriangulationOverNoise:
+class TriangulationOverNoise(Task):
     """``points`` points of a rig drawn by the seed, seen with Gaussian noise of ``noise_px``, triangulated by
     ``method`` in a ``frame`` of space that is "metric", "affine" or "projective".
 
@@ -62,16 +62,7 @@ class TriangulationOverNoise:
         if scene not in SCENES:
             raise UsageError(unknown_word("scene", scene, SCENES))
 
-    def scene_key(self, scene: str) -> str:
-        return scene
-
-    def run(
-        self,
-        config: PipelineConfig,
-        scene: str,
-        seed: int,
-        place: Place,
-    ) -> Mapping[str, float]:
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         if SCENES[scene][1] > 2 and self.method == POLYNOMIAL:
             raise ValueError("the polynomial method is one of two views")
         rng = np.random.default_rng(seed)

@@ -13,7 +13,7 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.view_interpolation import prepare_rectified_pair
 from thesisrecon.views.trilinear import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
-from validation.harness.stages._shared import OURS, Values, row
+from validation.harness.rows import OURS, Values, row
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread

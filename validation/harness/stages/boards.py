@@ -11,7 +11,7 @@ import PIL.Image
 
 from thesisrecon.arrays import F64, U8
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
-from validation.harness.stages._shared import OURS, plot, read_arrays, row, scatter
+from validation.harness.rows import OURS, plot, read_arrays, row, scatter
 from validation.metrics.record import Metric
 from validation.references.chessboard import board_corners, calibrate_from_corners
 from validation.references.libraries import one_thread

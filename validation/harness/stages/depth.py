@@ -18,8 +18,8 @@ from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._neighbours import pinhole_view
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.rows import OURS, each, row
 from validation.harness.scenes import load_images
-from validation.harness.stages._shared import OURS, each, row
 from validation.harness.stages.cameras import our_model
 from validation.metrics.depth import (
     Judged,

@@ -13,7 +13,7 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
-from validation.harness.stages._shared import OURS, each, ratio, read_arrays, row
+from validation.harness.rows import OURS, each, ratio, read_arrays, row
 from validation.metrics.depth import bad_pixels
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal

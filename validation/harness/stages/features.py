@@ -16,8 +16,8 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io.images import read_images
 from thesisrecon.records import Image
 from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
+from validation.harness.rows import OURS, Values, each, read_arrays, row
 from validation.harness.scenes import has_images, load_images
-from validation.harness.stages._shared import OURS, Values, each, read_arrays, row
 from validation.harness.stages.fundamental import MATCHES
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric

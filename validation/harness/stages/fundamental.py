@@ -10,8 +10,8 @@ import numpy as np
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.two_view import epipoles
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
+from validation.harness.rows import OURS, each, plot, read_arrays, row, scatter
 from validation.harness.scenes import has_images, load_images
-from validation.harness.stages._shared import OURS, each, plot, read_arrays, row, scatter
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
 from validation.references.fundamental import estimate_with

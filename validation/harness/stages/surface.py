@@ -15,8 +15,8 @@ from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.rows import OURS, Values, each, ratio, read_arrays, row
 from validation.harness.scenes import load_images
-from validation.harness.stages._shared import OURS, Values, each, ratio, read_arrays, row
 from validation.harness.stages.depth import (
     COURTYARD,
     PRESETS,

@@ -15,7 +15,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
-from validation.harness.stages._shared import each, plot, read_arrays, row, scatter
+from validation.harness.rows import each, plot, read_arrays, row, scatter
 from validation.metrics.record import Metric
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.rigs import Rig

@@ -17,8 +17,8 @@ from thesisrecon.surface.texture_blending import prepare_views
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.harness.rows import OURS, each, row
 from validation.harness.scenes import load_images
-from validation.harness.stages._shared import OURS, each, row
 from validation.harness.stages.depth import COURTYARD, our_maps, read_maps, views_of
 from validation.metrics.depth import coloured
 from validation.metrics.record import Metric
