@@ -9,11 +9,7 @@ from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.views._warping import DIRECTIONS, distances_to_known
 from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, camera_at, seed_of_two
-from thesisrecon.views.trilinear_synthesis import (
-    _complete_correspondence,
-    _extrapolate_inverse_depth,
-    prepare_synthesis,
-)
+from thesisrecon.views.trilinear_synthesis import _extrapolate_inverse_depth, prepare_synthesis
 
 SIZE = (160, 120)
 
@@ -27,6 +23,7 @@ PAIR = CalibratedPair(
 
 
 STILL = np.eye(3), np.zeros(3)
+BLACK = np.zeros((2, *SIZE[::-1], 3))
 
 
 def _scene(R, t, K=K):
@@ -178,7 +175,8 @@ def test_hidden_pixels_are_found_out_and_take_the_background(reported):
         if reported == "the foreground":
             # As a matcher does that fattens what is in front.
             given[side][hidden[side] & inside] = places[side][60, 80]
-    complete, known = _complete_correspondence(PAIR, (given[0], given[1]), 1.5)
+    made = prepare_synthesis(PAIR, BLACK, (given[0], given[1]))
+    complete, known = made.places, [levels[..., 3] > 0.5 for levels in made.levels]
     for side in (0, 1):
         inside = np.all((places[side] > 0.0) & (places[side] < np.array(SIZE) - 1.0), axis=2)
         assert known[side][inside & ~hidden[side]].mean() > 0.97
@@ -192,7 +190,7 @@ def test_hidden_pixels_are_found_out_and_take_the_background(reported):
 def test_photographs_that_contradict_each_other_have_no_correspondence():
     places, _ = _true_places()
     with pytest.raises(StageFailure, match="no pixel of image 1 has a known correspondence"):
-        _complete_correspondence(PAIR, (places[0] + 50.0, places[1]), 1.5)
+        prepare_synthesis(PAIR, BLACK, (places[0] + 50.0, places[1]))
 
 
 def test_the_kernel_is_its_plain_twin():

@@ -48,10 +48,9 @@ def _basis(u: F64, derivative: int = 0) -> F64:
 
 
 def _energies() -> tuple[F64, F64]:
-    """Quadratic forms (16, 16) of the bending and the gradient energy of a unit cell.
+    """Integrals (16, 16) of f_xx^2 + 2 f_xy^2 + f_yy^2 and of the squared gradient over a unit cell.
 
-    They are the integrals of f_xx^2 + 2 f_xy^2 + f_yy^2 and of the squared gradient; node (i, j) has the
-    index 4 i + j.
+    Node (i, j) has the index 4 i + j.
     """
     nodes, weights = np.polynomial.legendre.leggauss(4)
     values = [_basis(0.5 * (nodes + 1.0), d) for d in (0, 1, 2)]
@@ -150,31 +149,30 @@ class BSplineSurface:
         Returns
         -------
         DepthMap
-            The same view, see :meth:`BSplineFit.sample`.
-        """
-        return self.fit(depth_map).sample()
-
-    def fit(self, depth_map: DepthMap) -> BSplineFit:
-        """Fit the surface to a depth map.
-
-        Parameters
-        ----------
-        depth_map : DepthMap
-            Depths of one view.
-
-        Returns
-        -------
-        BSplineFit
-            The surface, defined at the pixels of the map.
+            The same view with its standard deviations, because a fit cannot reveal errors that neighbours
+            share.
         """
         cell = self.knot_px
         domain = domain_of(depth_map, least=cell * cell, reach=float(cell))
         pieces = pieces_of(domain, cell)
-        if not pieces.count:
-            return BSplineFit(depth_map, pieces, cell, np.zeros(0))
-        value, std = _inverse(depth_map, domain.reliable)
-        coefficients = self._coefficients(_NormalEquations.of(pieces, cell), value, std, domain.reliable)
-        return BSplineFit(depth_map, pieces, cell, coefficients)
+        inverse_depth = np.full(depth_map.depth.shape, np.nan)
+        if pieces.count:
+            reliable = domain.reliable
+            depth = np.where(reliable, depth_map.depth, 1.0).astype(np.float64)
+            std = np.where(reliable, depth_map.std, 1.0).astype(np.float64)
+            value = np.where(reliable, 1.0 / depth, 0.0)
+            equations = _NormalEquations.of(pieces, cell)
+            c = self._coefficients(equations, value, std / depth**2, reliable)
+            inverse_depth = _sample(pieces, cell, c)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fitted = np.where(inverse_depth > 0.0, 1.0 / inverse_depth, np.nan).astype(np.float32)
+        known = np.isfinite(fitted)
+        return replace(
+            depth_map,
+            depth=fitted,
+            std=np.where(known, depth_map.std, np.float32(np.nan)),
+            views=np.where(known, depth_map.views, np.uint8(0)),
+        )
 
     def _coefficients(self, equations: _NormalEquations, value: F64, std: F64, reliable: B8) -> F64:
         unit = float(np.median(std[reliable]))
@@ -182,40 +180,31 @@ class BSplineSurface:
         cells = equations.pieces.cell
         weight, stiffness = np.where(reliable, 1.0, 0.0), np.full(len(cells), MIN_STIFFNESS)
         noise = np.zeros(0)
+        # The n residuals of a window have n - p degrees of freedom with standard deviation sqrt(2 p) of the
+        # fitted part: larger mean squares are incompatible with the softest spline.
+        n, p = (self.knot_px * WINDOW) ** 2, WINDOW**2
+        allowed = float(n / (n - p) * (1.0 + np.sqrt(2.0 * p) / n))
         for k in range(ROUNDS):
             c = equations.solve(*equations.sums(value, weight / std**2), stiffness)
             residual = np.where(reliable, equations.values(c) - value, 0.0) / std
             weight = np.where(reliable, _weights(residual, reliable, redescending=k >= HUBER_ROUNDS), 0.0)
             found = self._mean_square(equations.pieces.shape, residual, weight)
             if k < INITIAL_ROUNDS:
-                noise = self._allowed() * found
+                noise = allowed * found
             else:
                 step = FIRST_STEP ** (STEP_DECAY ** (k - INITIAL_ROUNDS))
                 stiffness *= np.where(found <= noise, step, 1.0 / step)[cells]
         return c * unit
 
-    def _allowed(self) -> float:
-        """Factor of the mean squared residual of the softest spline up to which others are compatible.
-
-        The n residuals of a window have n - p degrees of freedom with standard deviation sqrt(2 p) of the
-        fitted part.
-        """
-        n, p = (self.knot_px * WINDOW) ** 2, WINDOW**2
-        return float(n / (n - p) * (1.0 + np.sqrt(2.0 * p) / n))
-
     def _mean_square(self, cells: tuple[int, int], residual: F64, weight: F64) -> F64:
         """(rows x columns of cells,) weighted means of squared residuals in the window around each cell."""
         y, x = np.indices(residual.shape) // self.knot_px
-        number = (y * cells[1] + x).ravel()
-        sums = [
-            scipy.ndimage.uniform_filter(
-                np.bincount(number, part.ravel(), cells[0] * cells[1]).reshape(cells),
-                WINDOW,
-                mode="constant",
-            )
-            for part in (weight * residual**2, weight)
-        ]
-        return np.asarray(sums[0] / np.maximum(sums[1], 1e-12)).ravel()
+        number, count = (y * cells[1] + x).ravel(), cells[0] * cells[1]
+        totals = (
+            np.bincount(number, part.ravel(), count).reshape(cells) for part in (weight * residual**2, weight)
+        )
+        above, below = (scipy.ndimage.uniform_filter(total, WINDOW, mode="constant") for total in totals)
+        return np.asarray(above / np.maximum(below, 1e-12)).ravel()
 
 
 def _weights(residual: F64, reliable: B8, *, redescending: bool) -> F64:
@@ -227,96 +216,11 @@ def _weights(residual: F64, reliable: B8, *, redescending: bool) -> F64:
     return np.asarray(HUBER / np.maximum(r, HUBER))
 
 
-def _inverse(depth_map: DepthMap, reliable: B8) -> tuple[F64, F64]:
-    """Inverse depths and standard deviations (H, W), 0 and 1 where not reliable."""
-    depth = np.where(reliable, depth_map.depth, 1.0).astype(np.float64)
-    std = np.where(reliable, depth_map.std, 1.0).astype(np.float64)
-    return np.where(reliable, 1.0 / depth, 0.0), std / depth**2
-
-
-@dataclass(frozen=True)
-class BSplineFit:
-    """B-spline surface of a depth map.
-
-    Parameters
-    ----------
-    depth_map : DepthMap
-        The map it was fitted to.
-    pieces, coefficients : SplinePieces, ndarray (C,)
-        Pieces and the values of their coefficients.
-    cell : int
-        Pixels between knots.
-    """
-
-    depth_map: DepthMap
-    pieces: SplinePieces
-    cell: int
-    coefficients: F64
-
-    def evaluate(self, xy: F64) -> tuple[F64, F64]:
-        """Evaluate the spline piece of the nearest pixel.
-
-        Parameters
-        ----------
-        xy : ndarray (N, 2)
-            Pixels.
-
-        Returns
-        -------
-        inverse_depth, gradient : ndarray (N,), (N, 2)
-            NaN where there is no surface.
-        """
-        height, width = self.depth_map.depth.shape
-        pixel = np.rint(xy)
-        inside = np.all((pixel >= 0) & (pixel <= np.array([width, height]) - 1), axis=1)
-        pixel = np.where(inside[:, None], pixel, 0).astype(np.int64)
-        piece = np.where(inside, self.pieces.piece[pixel[:, 1], pixel[:, 0]], -1)
-        there = np.flatnonzero(piece >= 0)
-        value, gradient = np.full(len(xy), np.nan), np.full((len(xy), 2), np.nan)
-        c = self.coefficients[self.pieces.coefficient[piece[there]]].reshape(-1, 4, 4)
-        u, v = ((xy[there] + 0.5) / self.cell - pixel[there] // self.cell).T
-        value[there] = _tensor(c, _basis(v), _basis(u))
-        gradient[there, 0] = _tensor(c, _basis(v), _basis(u, 1)) / self.cell
-        gradient[there, 1] = _tensor(c, _basis(v, 1), _basis(u)) / self.cell
-        return value, gradient
-
-    def sample(self, scale: float = 1.0) -> DepthMap:
-        """Sample the surface as a depth map.
-
-        Parameters
-        ----------
-        scale : float
-            Size relative to the original depth map.
-
-        Returns
-        -------
-        DepthMap
-            Depths of the surface; standard deviations and view counts are those of the nearest original
-            pixel, because a fit cannot reveal errors that neighbours share.
-        """
-        depth_map = self.depth_map
-        shape = tuple(max(round(n * scale), 1) for n in depth_map.depth.shape)
-        places = [(np.arange(n) + 0.5) / scale - 0.5 for n in shape]
-        xy = np.stack(np.meshgrid(places[1], places[0]), axis=-1).reshape(-1, 2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            rho = self.evaluate(xy)[0].reshape(shape)
-            depth = np.where(rho > 0.0, 1.0 / rho, np.nan).astype(np.float32)
-        nearest = np.ix_(
-            *(
-                np.clip(np.rint(at), 0, n - 1).astype(np.int64)
-                for at, n in zip(places, depth_map.depth.shape, strict=True)
-            )
-        )
-        known = np.isfinite(depth)
-        zoom = np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
-        return replace(
-            depth_map,
-            P=zoom @ depth_map.P,
-            depth=depth,
-            std=np.where(known, depth_map.std[nearest], np.float32(np.nan)),
-            views=np.where(known, depth_map.views[nearest], np.uint8(0)),
-        )
-
-
-def _tensor(c: F64, along_y: F64, along_x: F64) -> F64:
-    return np.asarray(np.einsum("nij,ni,nj->n", c, along_y, along_x))
+def _sample(pieces: SplinePieces, cell: int, c: F64) -> F64:
+    """(H, W) values of the spline at the pixels, NaN where there is no surface."""
+    value = np.full(pieces.piece.shape, np.nan)
+    y, x = np.nonzero(pieces.piece >= 0)
+    nodes = c[pieces.coefficient[pieces.piece[y, x]]].reshape(-1, 4, 4)
+    u, v = (x + 0.5) / cell - x // cell, (y + 0.5) / cell - y // cell
+    value[y, x] = np.einsum("nij,ni,nj->n", nodes, _basis(v), _basis(u))
+    return value

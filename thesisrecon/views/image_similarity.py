@@ -20,7 +20,7 @@ FLOOR_LUMINANCE, FLOOR_CONTRAST = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 
 
 def covered_pixels(rendered: RenderedView) -> B8:
-    """Return the pixels whose eight neighbours are covered too; others have the colour of the background.
+    """Return the pixels (H, W) whose eight neighbours are covered too; others blend with the background.
 
     Parameters
     ----------
@@ -30,7 +30,6 @@ def covered_pixels(rendered: RenderedView) -> B8:
     Returns
     -------
     ndarray (H, W) of bool
-        Pixels to compare.
     """
     return np.asarray(scipy.ndimage.binary_erosion(rendered.valid, np.ones((3, 3))))
 
@@ -46,7 +45,6 @@ def match_exposure(real: U8, rendered: U8, compared: B8) -> U8:
     Returns
     -------
     ndarray (H, W, 3) of uint8
-        The rendered image with the exposure of the real one.
     """
     _check(real, rendered, compared)
     a, b = real[compared].astype(np.float64), rendered[compared].astype(np.float64)
@@ -65,7 +63,6 @@ def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
     Returns
     -------
     float
-        PSNR in dB.
     """
     _check(real, rendered, compared)
     apart = (real.astype(np.float64) - rendered)[compared]
@@ -74,23 +71,7 @@ def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
 
 
 def ssim(real: U8, rendered: U8, compared: B8) -> float:
-    """Return the mean structural similarity of two images; see :func:`ssim_map`.
-
-    Parameters
-    ----------
-    real, rendered, compared : ndarray
-        Images and the pixels to compare.
-
-    Returns
-    -------
-    float
-        Mean SSIM over the compared pixels.
-    """
-    return float(np.mean(ssim_map(real, rendered, compared)[compared]))
-
-
-def ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
-    """Return the structural similarity of two images at each pixel (Wang, Bovik, Sheikh and Simoncelli 2004).
+    """Return the mean structural similarity of two images (Wang, Bovik, Sheikh and Simoncelli 2004).
 
     Luma in Gaussian windows of 1.5 px with the constants 0.01 and 0.03. Windows use compared pixels only.
 
@@ -101,10 +82,13 @@ def ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
 
     Returns
     -------
-    ndarray (H, W)
-        SSIM of each pixel.
+    float
     """
     _check(real, rendered, compared)
+    return float(np.mean(_ssim_map(real, rendered, compared)[compared]))
+
+
+def _ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
     a, b = (np.where(compared, picture @ GREY, 0.0) for picture in (real, rendered))
     share = np.maximum(_windowed(compared.astype(np.float64)), 1e-6)
     mean_a, mean_b = _windowed(a) / share, _windowed(b) / share

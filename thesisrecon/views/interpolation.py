@@ -43,13 +43,12 @@ UNKNOWN_WEIGHT, MIN_KNOWN_WEIGHT, EDGE_FACTOR = 0.01, 0.2, 0.2
 """Blending weight of guessed pixels, minimum of known ones, and factor beside a depth discontinuity."""
 
 
-@dataclass(frozen=True)
-class IntermediateFrame:
-    """Image frames of the views between two images.
+def original_from_rectified(H: F64, size: tuple[int, int], s: float) -> F64:
+    """Return the homography from the rectified frame to the pixels of the view between two images at s.
 
-    In the rectified frame a point of the view at s is (1 - s) x_left + s x_right, its exact image in a camera
-    on the baseline. A homography leads out of that frame; it takes a quadrilateral to the image corners: that
-    of the first image for s = 0, that of the second for s = 1, and linear in between.
+    In the rectified frame a point of the view is (1 - s) x_left + s x_right, its exact image in a camera on
+    the baseline. The homography takes a quadrilateral to the image corners: that of the first image for
+    s = 0, that of the second for s = 1, and linear in between.
 
     Parameters
     ----------
@@ -57,60 +56,26 @@ class IntermediateFrame:
         Homographies from the images to the rectified frame.
     size : tuple of int
         Width and height of the images.
+    s : float
+        Position between the images, 0 to 1.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        The homography; its determinant is positive where those of H are.
     """
-
-    H: F64
-    size: tuple[int, int]
-
-    def original_from_rectified(self, s: float) -> F64:
-        """Return the homography from the rectified frame at s to the pixels of the view.
-
-        Parameters
-        ----------
-        s : float
-            Position between the images, 0 to 1.
-
-        Returns
-        -------
-        ndarray (3, 3)
-            The homography; its determinant is positive where those of H are.
-        """
-        corners = self._corners()
-        ends = [dehomogenize(homogenize(corners) @ H.T) for H in self.H]
-        return _homography((1.0 - s) * ends[0] + s * ends[1], corners)
-
-    def points(self, xy1: F64, xy2: F64, s: float) -> F64:
-        """Return the image points of the view at s.
-
-        Parameters
-        ----------
-        xy1, xy2 : ndarray (N, 2)
-            Corresponding pixels of the two images.
-        s : float
-            Position between the images, 0 to 1.
-
-        Returns
-        -------
-        ndarray (N, 2)
-            Pixels of the view.
-        """
-        left, right = (dehomogenize(homogenize(xy) @ H.T) for xy, H in zip((xy1, xy2), self.H, strict=True))
-        between = (1.0 - s) * left + s * right
-        return dehomogenize(homogenize(between) @ self.original_from_rectified(s).T)
-
-    def _corners(self) -> F64:
-        """Corners (4, 2) of the quadrilateral: the image corners, moved inwards where necessary."""
-        width, height = self.size
-        middle = 0.5 * np.array([width - 1.0, height - 1.0])
-        reach = np.maximum(middle, 0.5) * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-        third = self.H[:, 2]
-        min_depth = MIN_DEPTH * (third @ np.append(middle, 1.0))
-        if not (min_depth > 0.0).all():
-            raise ValueError("the image centre lies beyond the line at infinity of the rectification")
-        while not (homogenize(middle + reach) @ third.T >= min_depth).all():
-            reach *= SHRINK
-        corners: F64 = middle + reach
-        return corners
+    width, height = size
+    middle = 0.5 * np.array([width - 1.0, height - 1.0])
+    reach = np.maximum(middle, 0.5) * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    third = H[:, 2]
+    min_depth = MIN_DEPTH * (third @ np.append(middle, 1.0))
+    if not (min_depth > 0.0).all():
+        raise ValueError("the image centre lies beyond the line at infinity of the rectification")
+    while not (homogenize(middle + reach) @ third.T >= min_depth).all():
+        reach *= SHRINK
+    corners = middle + reach
+    left, right = (dehomogenize(homogenize(corners) @ side.T) for side in H)
+    return _homography((1.0 - s) * left + s * right, corners)
 
 
 def _homography(source: F64, target: F64) -> F64:
@@ -129,9 +94,8 @@ def _homography(source: F64, target: F64) -> F64:
 def detect_monotonicity_violations(disparity: F32) -> B8:
     """Find the pixels of a rectified image that violate the monotonicity constraint (figure 1.1).
 
-    If u1 is left of v1 then their correspondences must satisfy u2 left of v2; u is then left of v in every
-    view between. A thin object in front of a distant background violates it, together with the background
-    that it passes.
+    If u1 is left of v1 then u2 must be left of v2; u is then left of v in every view between. A thin object
+    in front of a distant background violates it, together with the background that it passes.
 
     Parameters
     ----------
@@ -165,9 +129,9 @@ class InterpolatedPair:
     """Two images and the views between them (thesis, section 1.2).
 
     Each pixel of either image moves along its row by a share of its disparity and out of the rectified frame
-    in one step, so that colours are sampled once. Nearer pixels occlude farther ones, which also handles
-    violations of monotonicity. A pixel seen in one image only is taken from it, with the disparity of the
-    adjacent background; a pixel seen in neither is filled from behind.
+    in one step. Nearer pixels occlude farther ones, which also handles violations of monotonicity. A pixel
+    seen in one image only is taken from it, with the disparity of the adjacent background; a pixel seen in
+    neither is filled from behind.
 
     Parameters
     ----------
@@ -189,20 +153,13 @@ class InterpolatedPair:
         if a != b or len(a) != 3 or a[2] != 3:
             raise ValueError(f"views lie between two images (h, w, 3) of one size; got {a} and {b}")
         if self.left.disparity.shape != self.right.disparity.shape:
-            raise ValueError(
-                "disparities of both sides must have one shape; got "
-                f"{self.left.disparity.shape} and {self.right.disparity.shape}"
-            )
+            shapes = f"{self.left.disparity.shape} and {self.right.disparity.shape}"
+            raise ValueError(f"disparities of both sides must have one shape; got {shapes}")
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the images and of the views."""
         return self.images[0].shape[1], self.images[0].shape[0]
-
-    @cached_property
-    def frame(self) -> IntermediateFrame:
-        """The frames of the views between."""
-        return IntermediateFrame(self.H, self.size)
 
     @cached_property
     def _sides(self) -> tuple[_Side, _Side]:
@@ -248,12 +205,6 @@ class InterpolatedPair:
         Returns
         -------
         ndarray (h, w, 3) of uint8
-            The view.
-
-        Raises
-        ------
-        ValueError
-            If s is outside 0 to 1.
         """
         if not 0.0 <= s <= 1.0:
             raise ValueError(f"s must be from 0 (first image) to 1 (second image); got {s}")
@@ -265,22 +216,15 @@ class InterpolatedPair:
 
     def _seen(self, s: float, turn: F64 | None = None, threads: int = 1) -> tuple[F32, F32]:
         """Colours (h, w, 3) and disparities (h, w), NaN where neither image shows the scene."""
-        (colors0, near0, source0), (colors1, near1, source1) = (
-            self._warped(side, s, turn, threads) for side in (0, 1)
-        )
+        warped = [self._warped(side, s, turn, threads) for side in (0, 1)]
         weights = self._sides[0].weight, self._sides[1].weight
-        out = np.empty_like(colors0), np.empty_like(near0)
+        limits = SAME_SURFACE_PX, 1.5 * UNKNOWN_WEIGHT, s
+        out = np.empty_like(warped[0][0]), np.empty_like(warped[0][1])
 
         def work(rows: tuple[int, int]) -> None:
             part = slice(*rows)
-            blend(
-                (colors0[part], colors1[part]),
-                (near0[part], near1[part]),
-                (source0[part], source1[part]),
-                weights,
-                (SAME_SURFACE_PX, 1.5 * UNKNOWN_WEIGHT, s),
-                (out[0][part], out[1][part]),
-            )
+            colors, near, sources = ((a[part], b[part]) for a, b in zip(*warped, strict=True))
+            blend(colors, near, sources, weights, limits, (out[0][part], out[1][part]))
 
         run_in_strips(work, self.size[1], threads)
         return out
@@ -289,17 +233,17 @@ class InterpolatedPair:
         """Image ``side`` in the view at s: colours with its exposure, disparities and source pixels."""
         this = self._sides[side]
         target = np.empty_like(this.places)
-        G = self.frame.original_from_rectified(s)
+        G = original_from_rectified(self.H, self.size, s)
         if turn is not None:
             # The sign that keeps the view centre in front of the camera.
             middle = np.array([0.5 * (self.size[0] - 1.0), 0.5 * (self.size[1] - 1.0), 1.0])
             G = np.ascontiguousarray(np.sign(turn[2] @ middle) * (turn @ G))
         share = s - side
-        run_in_strips(
-            lambda rows: intermediate_positions(this.places, this.disparity, share, G, rows, target),
-            self.size[1],
-            threads,
-        )
+
+        def move(rows: tuple[int, int]) -> None:
+            intermediate_positions(this.places, this.disparity, share, G, rows, target)
+
+        run_in_strips(move, self.size[1], threads)
         source, near = forward_map(
             target, this.disparity, size=self.size, step=ONE_SURFACE_PX, threads=threads
         )
@@ -316,12 +260,11 @@ def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
     disparity, sure = (np.empty(shape, dtype=np.float32) for _ in range(2))
     disparity_from_rectified(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
     levels, filtered = image.astype(np.float32), np.empty_like(disparity)
-    limits = (COLOUR, GUESS_WEIGHT)
-    run_in_strips(
-        lambda rows: filter_extrapolated_by_colour(levels, disparity, sure, rows, limits, filtered),
-        shape[0],
-        PREPARING,
-    )
+
+    def by_colour(rows: tuple[int, int]) -> None:
+        filter_extrapolated_by_colour(levels, disparity, sure, rows, (COLOUR, GUESS_WEIGHT), filtered)
+
+    run_in_strips(by_colour, shape[0], PREPARING)
     run_in_strips(
         lambda rows: filter_extrapolated_by_median(filtered, sure, rows, disparity), shape[0], PREPARING
     )

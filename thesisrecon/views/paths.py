@@ -18,8 +18,7 @@ MIN_ARC = np.radians(30.0)
 TILT_WEIGHT = 0.02
 """Squared ratio of typical roll to typical tilt of hand-held cameras (about 3 and 20 degrees)."""
 MIN_HORIZONTAL_DISTANCE = 0.1
-"""Minimum horizontal distance of an orbit relative to its distance: near the vertical axis "up" is
-undefined."""
+"""Minimum horizontal distance of an orbit relative to its distance: on the vertical axis up is undefined."""
 GROWTH = 1.1 ** np.arange(13)
 """Radius factors, tried in this order until the orbit keeps clear of the model and shows it."""
 CLEARANCE = 0.5
@@ -48,10 +47,9 @@ def orbit(
     """Place cameras on a circle about the centre of the scene, upright and looking at it.
 
     The centre is the geometric median of X; radius and height are medians over the cameras; the field of view
-    is that of the first camera. If the cameras surround the scene (no gap above 120 degrees) the path is a
-    full circle from the first camera; otherwise it swings over the arc that they cover (at least 30 degrees),
-    because the rest was not observed. The radius grows up to threefold until the circle keeps half the median
-    camera distance from X and every frame shows about as much of X as the cameras do.
+    is that of the first camera. If the cameras surround the scene the path is a full circle from the first
+    camera; otherwise it swings over the arc that they cover. The radius grows up to threefold until the
+    circle keeps clear of X and every frame shows about as much of X as the cameras do.
 
     Parameters
     ----------
@@ -67,17 +65,22 @@ def orbit(
     Returns
     -------
     list of Camera
-        The path.
     """
     _check(cameras, frames)
-    X = _sample(X)
+    X = np.asarray(X, dtype=np.float64).reshape(-1, 3)
+    X = X[np.isfinite(X).all(axis=1)]
+    if not len(X):
+        raise ValueError("an orbit needs at least one point of the scene; got none that is finite")
+    X = X[:: -(-len(X) // SAMPLE)]
     size = size or cameras[0].size
     middle, up = _geometric_median(X), estimate_up(cameras)
     offset = np.array([camera.centre for camera in cameras]) - middle
     radius, height = _typical(offset, up, float(np.median(np.linalg.norm(X - middle, axis=1))))
     K = _fit_to_size(cameras[0], size).K.copy()
     K[:2, 2] = 0.5 * (np.array(size) - 1.0)
-    right, ahead = _level_axes(up)
+    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    right /= np.linalg.norm(right)
+    ahead = np.cross(up, right)
     azimuth = _azimuths(np.arctan2(offset @ ahead, offset @ right), frames)
 
     def circle(factor: float) -> list[Camera]:
@@ -94,9 +97,8 @@ def interpolate_cameras(
 ) -> list[Camera]:
     """Interpolate a smooth camera path through the cameras, from the first to the last.
 
-    Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011), which has no loops, at constant
-    speed. Where the rotation per path length exceeds three times the mean, the rotation determines the time.
-    Rotations are interpolated as quaternions, K linearly, after all cameras are fitted to ``size``.
+    Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011) at constant speed, slower where the
+    rotation per path length is large; rotations are interpolated as quaternions, K linearly.
 
     Parameters
     ----------
@@ -110,7 +112,6 @@ def interpolate_cameras(
     Returns
     -------
     list of Camera
-        The path.
     """
     _check(cameras, frames)
     shown = [_fit_to_size(camera, size or cameras[0].size) for camera in cameras]
@@ -133,8 +134,7 @@ def estimate_up(cameras: Sequence[Camera]) -> F64:
     """Estimate the up direction of the scene.
 
     It is most nearly perpendicular to the image rows, and weakly to the optical axes: hand-held cameras are
-    tilted but hardly rolled. Its sign follows the image up directions or, if these cancel, the cameras that
-    look down.
+    tilted but hardly rolled. The image up directions, or else cameras that look down, give its sign.
 
     Parameters
     ----------
@@ -169,15 +169,13 @@ def sample_surface(mesh: TexturedMesh, count: int = SAMPLE) -> F64:
 
     Parameters
     ----------
-    mesh : TexturedMesh
-        The mesh.
-    count : int
-        Number of points.
+    mesh, count : TexturedMesh, int
+        Mesh and number of points.
 
     Returns
     -------
     ndarray (count, 3)
-        Points; empty if the mesh has no area.
+        Empty if the mesh has no area.
     """
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
@@ -200,14 +198,6 @@ def _check(cameras: Sequence[Camera], frames: int) -> None:
         raise ValueError(f"a path needs at least one frame; got {frames}")
 
 
-def _sample(X: F64) -> F64:
-    X = np.asarray(X, dtype=np.float64).reshape(-1, 3)
-    X = X[np.isfinite(X).all(axis=1)]
-    if not len(X):
-        raise ValueError("an orbit needs at least one point of the scene; got none that is finite")
-    return X[:: -(-len(X) // SAMPLE)]
-
-
 def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
     """Radius and height of the orbit from camera offsets (V, 3) and the ``spread`` of the scene."""
     height = float(np.median(offset @ up))
@@ -216,13 +206,6 @@ def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
     if not least > 0.0:
         raise ValueError("an orbit needs a distance; all points and cameras are in one place")
     return max(radius, least), height
-
-
-def _level_axes(up: F64) -> tuple[F64, F64]:
-    """Two unit vectors perpendicular to ``up``, which rotates the first into the second."""
-    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    right /= np.linalg.norm(right)
-    return right, np.cross(up, right)
 
 
 def _azimuths(of_cameras: F64, frames: int) -> F64:

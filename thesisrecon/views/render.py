@@ -121,18 +121,6 @@ def _vertex_normals(mesh: TexturedMesh) -> F64:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """A mesh as the kernels take it; unused arrays are None."""
-
-    faces: I64
-    points: F32 | None
-    normals: F32 | None
-    colors: F32 | None
-    uv: F32 | None
-    texture: U8 | None
-
-
 def render(
     mesh: TexturedMesh,
     camera: Camera,
@@ -162,7 +150,6 @@ def render(
     Returns
     -------
     RenderedView
-        Colour, depth and validity of each pixel.
 
     Examples
     --------
@@ -178,22 +165,23 @@ def render(
     centre = rasterize(mesh.vertices, mesh.faces, camera, threads=threads)
     valid = centre.face >= 0
     depth = np.where(valid, centre.depth, np.float32(np.nan)).astype(np.float32)
-    if samples == 1:
-        fine = centre
-    else:
+    fine = centre
+    if samples > 1:
         fine = rasterize(mesh.vertices, mesh.faces, camera.scaled(samples), threads=threads)
     rgb = np.empty((*valid.shape, 3), dtype=np.uint8)
     behind = np.asarray(background, dtype=np.float32)
-    surface = _prepared(mesh, lit=shading is not None)
+    values = mesh.colors if mesh.texture is None or mesh.uv is None else mesh.uv
+    source = None if values is None else np.ascontiguousarray(values, dtype=np.float32)
+    lit = [] if shading is None else [a.astype(np.float32) for a in (mesh.vertices, _vertex_normals(mesh))]
 
     def paint(rows: tuple[int, int]) -> None:
-        # A few rows at a time keep intermediate arrays in cache.
         for first in range(rows[0], rows[1], STRIP):
             last = min(first + STRIP, rows[1])
             part = fine[samples * first : samples * last]
-            color = _colors(surface, part)
+            color = _colors(mesh, source, part)
             if shading is not None:
-                _light(surface, part, color, camera.centre, shading)
+                points, normals = (part.interpolate(v, mesh.faces).reshape(-1, 3) for v in lit)
+                _shade(color.reshape(-1, 3), points, normals, camera.centre, shading)
             _average_blocks(color, part.face, samples, behind, rgb[first:last])
 
     run_in_strips(paint, len(rgb), threads)
@@ -209,36 +197,15 @@ def _check(mesh: TexturedMesh) -> None:
         raise ValueError(f"colors must be {mesh.vertices.shape}; got {mesh.colors.shape}")
 
 
-def _prepared(mesh: TexturedMesh, *, lit: bool) -> _Surface:
-    textured = mesh.texture is not None and mesh.uv is not None
-    return _Surface(
-        mesh.faces,
-        points=mesh.vertices.astype(np.float32) if lit else None,
-        normals=_vertex_normals(mesh).astype(np.float32) if lit else None,
-        colors=None if mesh.colors is None or textured else mesh.colors.astype(np.float32),
-        uv=None if mesh.uv is None or not textured else np.ascontiguousarray(mesh.uv, dtype=np.float32),
-        texture=mesh.texture if textured else None,
-    )
-
-
-def _colors(surface: _Surface, raster: Raster) -> F32:
-    """Unlit colours (H, W, 3), 0 to 255."""
-    if surface.texture is not None and surface.uv is not None:
-        color = np.zeros((*raster.face.shape, 3), dtype=np.float32)
-        sample_texture(surface.texture, raster.interpolate(surface.uv), raster.face, color)
-        return color
-    if surface.colors is not None:
-        return raster.interpolate(surface.colors, surface.faces)
-    return np.tile(np.asarray(BARE, dtype=np.float32), (*raster.face.shape, 1))
-
-
-def _light(surface: _Surface, raster: Raster, color: F32, eye: F64, shading: Shading) -> None:
-    """Shade the colours (H, W, 3) in place."""
-    assert surface.points is not None
-    assert surface.normals is not None
-    points = raster.interpolate(surface.points, surface.faces).reshape(-1, 3)
-    normals = raster.interpolate(surface.normals, surface.faces).reshape(-1, 3)
-    _shade(color.reshape(-1, 3), points, normals, eye, shading)
+def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
+    """Unlit colours (H, W, 3), 0 to 255; ``source``: texture coordinates, colours of the vertices or None."""
+    if source is None:
+        return np.tile(np.asarray(BARE, dtype=np.float32), (*raster.face.shape, 1))
+    if mesh.texture is None or mesh.uv is None:
+        return raster.interpolate(source, mesh.faces)
+    color = np.zeros((*raster.face.shape, 3), dtype=np.float32)
+    sample_texture(mesh.texture, raster.interpolate(source), raster.face, color)
+    return color
 
 
 def _shade(color: F32, points: F32, normals: F32, eye: F64, shading: Shading) -> None:

@@ -19,8 +19,13 @@ import scipy
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, rq
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, require_finite
-from thesisrecon.geometry.three_view import cameras_from_tensor, fundamentals_from_tensor
+from thesisrecon.geometry.homogeneous import (
+    cross_matrix,
+    dehomogenize,
+    homogenize,
+    require_finite,
+    unit_normals,
+)
 from thesisrecon.geometry.two_view import (
     enforce_rank_two,
     epipoles,
@@ -29,8 +34,7 @@ from thesisrecon.geometry.two_view import (
 )
 
 MAX_RESIDUAL = 0.005
-"""Median distance of matches from their epipolar lines, in units of the long side, above which F is
-rejected."""
+"""Median distance of matches from their epipolar lines, per long side, above which F is rejected."""
 OFF_ROTATION = 1e-4
 """Tolerance of R'R - I: a rotation written with four digits passes."""
 IN_FRONT = 0.75
@@ -104,7 +108,7 @@ class CalibratedPair:
 
 
 def default_intrinsics(size: tuple[int, int]) -> F64:
-    """Return typical intrinsics: the focal length is the long side, the principal point the image centre.
+    """Return K with the long side as focal length and the principal point at the image centre.
 
     Parameters
     ----------
@@ -114,7 +118,6 @@ def default_intrinsics(size: tuple[int, int]) -> F64:
     Returns
     -------
     ndarray (3, 3)
-        K.
     """
     f = float(max(size))
     return calibration_matrix(f, f, 0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0))
@@ -147,15 +150,21 @@ def pair_from_fundamental(
 
     Raises
     ------
-    ValueError
-        For non-finite values or invalid intrinsics.
     StageFailure
         For an F of other matches, no parallax, or points behind the cameras.
     """
     require_finite("pair_from_fundamental", F, xy1, xy2)
     _require_intrinsics(K1)
     _require_intrinsics(K2)
-    _require_matches_of(F, xy1, xy2)
+    distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
+    extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
+    if not np.median(distance) <= MAX_RESIDUAL * extent:
+        raise StageFailure(
+            "the fundamental matrix does not fit the matches",
+            f"their median distance from the epipolar lines is {np.median(distance):.3g} px",
+            "estimate it from these matches",
+        )
+    require_parallax_of_matches(F, xy1, xy2)
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
     candidates = (_decompose_small if small_rotation else _decompose)(E / np.linalg.norm(E))
@@ -175,8 +184,14 @@ def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
     F = enforce_rank_two(F)
     e2 = epipoles(F)[1]
     H = -cross_matrix(e2) @ F
-    m, v = _nearest_plane(H, e2, K2 @ R @ np.linalg.inv(K1), K1=K1, K2=K2)
-    left = m * (H + np.outer(e2, v)) @ K1
+    # Least squares for m and m v: K2^-1 m (H + e2 v') K1 is nearest to R.
+    back = np.linalg.inv(K2)
+    design = np.stack(
+        [(back @ M @ K1).ravel() for M in (H, *(np.outer(e2, axis) for axis in np.eye(3)))], axis=1
+    )
+    wanted = K2 @ R @ np.linalg.inv(K1)
+    m, *mv = np.linalg.lstsq(design, (back @ wanted @ K1).ravel(), rcond=None)[0]
+    left = m * (H + np.outer(e2, np.asarray(mv) / m)) @ K1
     if not np.linalg.det(left) > 0.0:
         raise StageFailure(
             "the fundamental matrix contradicts the intrinsics",
@@ -189,15 +204,6 @@ def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
     return CalibratedPair(np.asarray(K1, dtype=np.float64), own / own[2, 2], turn, baseline)
 
 
-def _nearest_plane(a: F64, a4: F64, wanted: F64, *, K1: F64, K2: F64) -> tuple[float, F64]:
-    """m and v for which m (a + a_4 v') is nearest to ``wanted``: least squares of K2^-1 (.) K1."""
-    back = np.linalg.inv(K2)
-    members = [a, *(np.outer(a4, axis) for axis in np.eye(3))]
-    design = np.stack([(back @ member @ K1).ravel() for member in members], axis=1)
-    m, *mv = np.linalg.lstsq(design, (back @ wanted @ K1).ravel(), rcond=None)[0]
-    return float(m), np.asarray(mv) / m
-
-
 def _ratio_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
     """Share of ray pairs (N, 3) that meet, at their closest points, in front of both cameras."""
     turned = rays1 @ R.T
@@ -205,19 +211,6 @@ def _ratio_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
     first = -np.sum(np.cross(t, rays2) * normal, axis=1)
     second = -np.sum(np.cross(t, turned) * normal, axis=1)
     return float(np.mean((first > 0.0) & (second > 0.0)))
-
-
-def _require_matches_of(F: F64, xy1: F64, xy2: F64) -> None:
-    """Reject matches that do not fit F, and matches without parallax."""
-    distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
-    extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
-    if not np.median(distance) <= MAX_RESIDUAL * extent:
-        raise StageFailure(
-            "the fundamental matrix does not fit the matches",
-            f"their median distance from the epipolar lines is {np.median(distance):.3g} px",
-            "estimate it from these matches",
-        )
-    require_parallax_of_matches(F, xy1, xy2)
 
 
 def _decompose(E: F64) -> list[tuple[F64, F64]]:
@@ -277,10 +270,7 @@ class VirtualCamera:
 
 
 def camera_at(
-    pair: CalibratedPair,
-    s: float,
-    *,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    pair: CalibratedPair, s: float, *, sizes: tuple[tuple[int, int], tuple[int, int]]
 ) -> VirtualCamera:
     """Place a virtual camera on the baseline: the rotation about its axis is a share of that of the pair.
 
@@ -298,7 +288,6 @@ def camera_at(
     Returns
     -------
     VirtualCamera
-        The camera.
     """
     turned = scipy.spatial.transform.Rotation.from_rotvec(
         s * scipy.spatial.transform.Rotation.from_matrix(pair.R).as_rotvec()
@@ -358,9 +347,7 @@ class VirtualTensor:
         VirtualTensor
             The tensor; in pixels the motion is K R K_3^-1 and K t.
         """
-        _require_motion(rotation, translation)
         K = self.K if K is None else K
-        _require_intrinsics(K)
         turn, shift = K @ rotation @ np.linalg.inv(self.K), K @ translation
         T = np.einsum("kl,ijl->ijk", turn, self.T) + np.einsum("k,ji->ijk", shift, self.P2[:, :3])
         return VirtualTensor(T, self.P2, K)
@@ -371,9 +358,8 @@ class VirtualTensor:
         Of all lines through x2 these carry the most information: an x2 off its epipolar line acts as its
         nearest point on the line.
         """
-        epipolar = np.cross(self.P2[:, 3], homogenize(xy1) @ self.P2[:, :3].T)
-        norm = np.linalg.norm(epipolar[..., :2], axis=-1, keepdims=True)
-        along = np.stack([epipolar[..., 1], -epipolar[..., 0]], axis=-1) / np.where(norm > 0.0, norm, 1.0)
+        epipolar = unit_normals(np.cross(self.P2[:, 3], homogenize(xy1) @ self.P2[:, :3].T))
+        along = np.stack([epipolar[..., 1], -epipolar[..., 0]], axis=-1)
         return np.concatenate([along, -np.sum(along * xy2, axis=-1, keepdims=True)], axis=-1)
 
     def transfer(self, xy1: F64, xy2: F64) -> tuple[F64, F64]:
@@ -398,9 +384,8 @@ class VirtualTensor:
         sweep = lines @ self.P2[:, 3]
         seen = -places[:, 2] * sweep > 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            inverse_depth = np.where(
-                seen, np.sum(lines * (x @ self.P2[:, :3].T), axis=1) / places[:, 2], np.nan
-            )
+            inverse_depth = np.sum(lines * (x @ self.P2[:, :3].T), axis=1) / places[:, 2]
+        inverse_depth[~seen] = np.nan
         return np.where(seen[:, None], dehomogenize(places), np.nan), inverse_depth
 
     def disparity_per_inverse_depth(self, xy1: F64, xy2: F64) -> F64:
@@ -440,52 +425,12 @@ def seed_of_two(pair: CalibratedPair, *, first: bool = False) -> VirtualTensor:
     Returns
     -------
     VirtualTensor
-        The tensor; it holds the same information as F.
     """
     P3, K = (np.eye(3, 4), pair.K1) if first else (pair.P2, pair.K2)
     return VirtualTensor(_tensor(pair.P2, P3), pair.P2, K)
 
 
-def seed_of_three(
-    T: F64, xy1: F64, xy2: F64, *, K: tuple[F64, F64, F64]
-) -> tuple[CalibratedPair, VirtualTensor]:
-    """Return the tensor <1, 2, 3> of three images in the frame of the first two cameras.
-
-    The plane at infinity is that of :func:`pair_from_fundamental`; the scale of the third camera makes its
-    left part a rotation.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Trifocal tensor in pixels.
-    xy1, xy2 : ndarray (N, 2)
-        Matches of the first two images in pixels.
-    K : tuple of ndarray (3, 3)
-        Intrinsics of the three images.
-
-    Returns
-    -------
-    CalibratedPair, VirtualTensor
-        The first two cameras, and the tensor in their frame.
-    """
-    require_finite("seed_of_three", T)
-    _require_intrinsics(K[2])
-    _, P2, P3 = cameras_from_tensor(T)
-    pair = pair_from_fundamental(fundamentals_from_tensor(T)[0], xy1, xy2, K1=K[0], K2=K[1])
-    # P2 of the pair is m (a + a_4 v', s a_4).
-    a, a4 = P2[:, :3], P2[:, 3]
-    m, v = _nearest_plane(a, a4, pair.P2[:, :3], K1=pair.K1, K2=pair.K2)
-    change = np.eye(4)
-    change[3, :3] = v
-    change[3, 3] = a4 @ pair.P2[:, 3] / (m * (a4 @ a4))
-    third = np.linalg.inv(K[2]) @ P3 @ change
-    left = third[:, :3] @ K[0]
-    third = K[2] @ third / np.cbrt(np.linalg.det(left))
-    return pair, VirtualTensor(_tensor(pair.P2, third), pair.P2, np.asarray(K[2], dtype=np.float64))
-
-
 def _tensor(P2: F64, P3: F64) -> F64:
     """a_i^j b_4^k - a_4^j b_i^k (3, 3, 3) with the scales of P2 and P3 (3, 4)."""
-    return np.asarray(
-        np.einsum("ji,k->ijk", P2[:, :3], P3[:, 3]) - np.einsum("j,ki->ijk", P2[:, 3], P3[:, :3])
-    )
+    first, second = np.einsum("ji,k->ijk", P2[:, :3], P3[:, 3]), np.einsum("j,ki->ijk", P2[:, 3], P3[:, :3])
+    return np.asarray(first - second)

@@ -107,30 +107,6 @@ def _occludes(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> b
     return bool(rho / w > other[int(row), int(column)] + step)
 
 
-def _complete_correspondence(
-    pair: CalibratedPair, places: tuple[F32, F32], agree_px: float
-) -> tuple[tuple[F32, F32], tuple[B8, B8]]:
-    """Correspondences of all pixels, and which of them are known instead of guessed."""
-    known = _agreeing(places[0], places[1], agree_px), _agreeing(places[1], places[0], agree_px)
-    for side in (0, 1):
-        if not known[side].any():
-            raise StageFailure(
-                "the images have no dense correspondence",
-                f"no pixel of image {side + 1} has a known correspondence",
-                "choose images that overlap more",
-            )
-    pairs = pair, pair.swapped
-    sure = [np.where(known[side][..., None], places[side], np.nan) for side in (0, 1)]
-    own = [seed_of_two(one, first=True) for one in pairs]
-    inverse_depth = [_transfer_image(own[side], sure[side])[1] for side in (0, 1)]
-    steps = [_surface_step(own[side], sure[side]) for side in (0, 1)]
-    complete = [
-        _completed(pairs[side], sure[side], (inverse_depth[side], inverse_depth[1 - side]), steps[1 - side])
-        for side in (0, 1)
-    ]
-    return (complete[0], complete[1]), known
-
-
 def _transfer_image(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
     """Pixels (H, W, 2) of image 1 in the third view, and their inverse depth."""
     xy, inverse_depth = np.empty(places.shape), np.empty(places.shape[:2], dtype=np.float32)
@@ -168,12 +144,9 @@ def _agreeing(places: F32, others: F32, agree_px: float) -> B8:
 
 def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32], step: float) -> F32:
     """``places`` (H, W, 2) with guesses for NaN, from the inverse depth of both images."""
-    own = inverse_depth[0]
-    distance = distances_to_known(own)
+    own, P2 = inverse_depth[0], np.ascontiguousarray(pair.P2)
     guessed = np.empty_like(own)
-    _extrapolate_inverse_depth(
-        inverse_depth, np.ascontiguousarray(pair.P2), DIRECTIONS, distance, step, guessed
-    )
+    _extrapolate_inverse_depth(inverse_depth, P2, DIRECTIONS, distances_to_known(own), step, guessed)
     y, x = np.nonzero(np.isnan(own))
     X = np.stack([x, y, np.ones_like(x), guessed[y, x]], axis=1).astype(np.float64)
     complete = places.copy()
@@ -209,10 +182,7 @@ class TensorSynthesis:
         return (w1, h1), (w2, h2)
 
     def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:
-        """Render the image of a virtual camera.
-
-        Pixels that both images show are blended by the position of the camera; what neither shows is filled
-        from behind.
+        """Render a virtual camera: both images blended by its position, holes filled from behind.
 
         Parameters
         ----------
@@ -224,7 +194,6 @@ class TensorSynthesis:
         Returns
         -------
         ndarray (H, W, 3) of uint8
-            The image.
 
         Raises
         ------
@@ -234,7 +203,11 @@ class TensorSynthesis:
         seed = seed_of_two(self.pair)
         moved = [s.moved(camera.rotation, camera.translation, K=camera.K) for s in (seed, seed.swapped)]
         step = _surface_step(moved[0], self.places[0])
-        layers = [self._layer(side, moved[side], camera.size, step, threads) for side in (0, 1)]
+        layers = []
+        for virtual, places, levels in zip(moved, self.places, self.levels, strict=True):
+            xy, near = _transfer_image(virtual, places, threads=threads)
+            source, front = forward_map(xy, near, size=camera.size, step=step, threads=threads)
+            layers.append((sample(levels, source, threads=threads), front))
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
         if not seen.mean() >= MIN_SEEN:
             raise StageFailure(
@@ -251,14 +224,6 @@ class TensorSynthesis:
         centre, baseline = camera_centre(virtual.P3), self.pair.centre2
         along = np.linalg.solve(self.pair.K1, centre[:3]) @ baseline / (centre[3] * baseline @ baseline)
         return np.float32(np.clip(along, 0.0, 1.0))
-
-    def _layer(
-        self, side: int, virtual: VirtualTensor, size: tuple[int, int], step: float, threads: int
-    ) -> tuple[F32, F32]:
-        """The camera's view of one image (H, W, 4) and its inverse depth (H, W), NaN if empty."""
-        xy, inverse_depth = _transfer_image(virtual, self.places[side], threads=threads)
-        source, front = forward_map(xy, inverse_depth, size=size, step=step, threads=threads)
-        return sample(self.levels[side], source, threads=threads), front
 
     def _mixed(self, layers: list[tuple[F32, F32]], share: np.float32, step: float) -> tuple[F32, F32]:
         """Blended colours and inverse depth of both layers, NaN where both are empty."""
@@ -302,7 +267,7 @@ def prepare_synthesis(
     gain: ArrayLike = (1.0, 1.0, 1.0),
     agree_px: float = AGREE_PX,
 ) -> TensorSynthesis:
-    """Prepare everything that does not depend on the virtual camera.
+    """Complete the correspondences of all pixels and prepare the images for any virtual camera.
 
     Parameters
     ----------
@@ -320,17 +285,30 @@ def prepare_synthesis(
     Returns
     -------
     TensorSynthesis
-        The prepared images.
 
     Raises
     ------
     StageFailure
         If no correspondence is known.
     """
-    rgb = [np.asarray(image, dtype=np.float32) for image in images]
-    complete, known = _complete_correspondence(pair, places, agree_px)
+    known = _agreeing(places[0], places[1], agree_px), _agreeing(places[1], places[0], agree_px)
+    for side in (0, 1):
+        if not known[side].any():
+            raise StageFailure(
+                "the images have no dense correspondence",
+                f"no pixel of image {side + 1} has a known correspondence",
+                "choose images that overlap more",
+            )
+    pairs = pair, pair.swapped
+    sure = [np.where(known[side][..., None], places[side], np.nan) for side in (0, 1)]
+    own = [seed_of_two(one, first=True) for one in pairs]
+    near = [_transfer_image(own[side], sure[side])[1] for side in (0, 1)]
+    steps = [_surface_step(own[side], sure[side]) for side in (0, 1)]
+    complete = [_completed(pairs[k], sure[k], (near[k], near[1 - k]), steps[1 - k]) for k in (0, 1)]
     levels = [
-        np.concatenate([image, sure[..., None].astype(np.float32)], axis=2)
-        for image, sure in zip(rgb, known, strict=True)
+        np.concatenate([np.asarray(image, dtype=np.float32), seen[..., None].astype(np.float32)], axis=2)
+        for image, seen in zip(images, known, strict=True)
     ]
-    return TensorSynthesis(pair, (levels[0], levels[1]), complete, np.asarray(gain, dtype=np.float32))
+    return TensorSynthesis(
+        pair, (levels[0], levels[1]), (complete[0], complete[1]), np.asarray(gain, dtype=np.float32)
+    )
