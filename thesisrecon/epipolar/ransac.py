@@ -97,25 +97,6 @@ def discard_outliers(
 
 
 @dataclass(frozen=True)
-class _SevenPointProblem:
-    """Seven-point sampling of matches (N, 4) for :class:`~thesisrecon.numerics.ransac.SampleConsensus`."""
-
-    points: F64
-    sample_size: int = 7
-    test: InlierTest = "sampson"
-
-    def solve(self, sample: I64) -> list[F64]:
-        solutions = np.empty((3, 9))
-        return list(solutions[: seven_point(self.points, sample, solutions)])
-
-    def residuals(self, model: F64) -> F64:
-        if self.test == "sampson":
-            return np.asarray(sampson_distances(model, self.points))
-        distances = INLIER_TESTS[self.test].distances
-        return distances(model.reshape(3, 3), self.points[:, :2], self.points[:, 2:])
-
-
-@dataclass(frozen=True)
 class ThesisRansac:
     """RANSAC as in section 5.4 of the thesis, with its errors corrected.
 
@@ -212,19 +193,29 @@ def _search_and_refine(
     frame = PairFrame.of(xy1, xy2)
     points = frame.points(xy1, xy2)
     search = replace(search, threshold=search.threshold * frame.scale)
-    found = search.search(_SevenPointProblem(points, test=test), len(points), rng)
+
+    def solve(sample: I64) -> list[F64]:
+        solutions = np.empty((3, 9))
+        return list(solutions[: seven_point(points, sample, solutions)])
+
+    def residuals(model: F64) -> F64:
+        if test == "sampson":
+            return np.asarray(sampson_distances(model, points))
+        return INLIER_TESTS[test].distances(model.reshape(3, 3), points[:, :2], points[:, 2:])
+
+    found = search.search(solve, residuals, 7, len(points), rng)
     needed = MINIMUM if limit_px else 1
-    if found is None or found.inliers.sum() < needed:
+    if found is None or found[1].sum() < needed:
         raise StageFailure(
             "no epipolar geometry explains the matches",
             f"none of {search.max_samples} samples has {needed} inliers among {len(xy1)} matches",
             "check that the images overlap and that the matches are correct",
         )
-    F = frame.matrix_in_pixels(found.model)
+    F = frame.matrix_in_pixels(found[0])
     sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or np.inf, test=test)
     for _ in range(rounds):
         F = refine_fundamental(F, xy1[inliers], xy2[inliers], criterion)
         sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or NEAR_SIGMAS * sigma, test=test)
     f = frame.matrix_in_frame(F)
     covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
-    return FundamentalFit(F, inliers, sigma, covariance, found.samples)
+    return FundamentalFit(F, inliers, sigma, covariance, found[2])

@@ -73,10 +73,8 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 
     Parameters
     ----------
-    residuals : ndarray (N,)
-        Residuals of mean 0, any sign, less than half of them wrong.
-    parameters : int
-        Degrees of freedom p fitted to them.
+    residuals, parameters : ndarray (N,), int
+        Residuals of mean 0, any sign, less than half of them wrong; and degrees of freedom p fitted to them.
 
     Returns
     -------
@@ -93,10 +91,8 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
     Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987; Torr and Murray, IJCV 24(3), 1997.
     """
     n = len(residuals)
-    if n <= parameters:
-        raise ValueError(f"noise_scale needs more than {parameters} residuals; got {n}")
-    if not np.isfinite(residuals).all():
-        raise ValueError("noise_scale needs finite residuals")
+    if n <= parameters or not np.isfinite(residuals).all():
+        raise ValueError(f"noise_scale needs more than {parameters} finite residuals; got {n}")
     return float(MAD_FACTOR * (1.0 + 5.0 / (n - parameters)) * np.median(np.abs(residuals)))
 
 
@@ -109,10 +105,8 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
 
     Parameters
     ----------
-    residuals, threshold : ndarray (N,), float
-        Residuals >= 0, and least width.
-    parameters : int
-        Degrees of freedom fitted to the residuals.
+    residuals, threshold, parameters : ndarray (N,), float, int
+        Residuals >= 0, least width, and degrees of freedom fitted to the residuals.
 
     Returns
     -------
@@ -136,10 +130,8 @@ def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) ->
 
     Parameters
     ----------
-    residuals, start : ndarray (N,), float
-        Residuals >= 0, and initial standard deviation.
-    parameters : int
-        Degrees of freedom fitted to the residuals.
+    residuals, start, parameters : ndarray (N,), float, int
+        Residuals >= 0, initial standard deviation, and degrees of freedom fitted to the residuals.
 
     Returns
     -------
@@ -200,10 +192,8 @@ class NoiseMixture:
         ----------
         residuals : ndarray (N,)
             Residuals >= 0 in ascending order, N > 0.
-        sigma, spread : float
-            Initial standard deviation of the noise, and a prior one of wrong residuals, > 0.
-        parameters : int
-            Degrees of freedom fitted to the residuals.
+        sigma, spread, parameters : float, float, int
+            Initial standard deviation of the noise, a prior one of wrong residuals, and degrees of freedom.
 
         Returns
         -------
@@ -241,15 +231,12 @@ def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> fl
     """Return the width of Huber's loss with the least expected variance, infinite for least squares.
 
     The asymptotic variance mean(psi^2) / mean(psi')^2 (Huber, 1964) is estimated from the residuals (Jaeckel,
-    1971). Least squares is abandoned only for a gain of more than twice the chance: few residuals look
-    heavy-tailed easily.
+    1971). Few residuals look heavy-tailed easily: Huber's loss must gain more than twice the chance.
 
     Parameters
     ----------
-    residuals, sigma : ndarray (N,), float
-        Residuals >= 0, and standard deviation of the noise.
-    parameters : int
-        Degrees of freedom fitted to the residuals.
+    residuals, sigma, parameters : ndarray (N,), float, int
+        Residuals >= 0, standard deviation of the noise, and degrees of freedom fitted to the residuals.
 
     Returns
     -------
@@ -275,10 +262,8 @@ def effective_noise(residuals: F64, width: float, *, parameters: int = 0) -> flo
 
     Parameters
     ----------
-    residuals, width : ndarray (N,), float
-        Residuals >= 0, N > 0, and width of Huber's loss.
-    parameters : int
-        Degrees of freedom p fitted to the residuals.
+    residuals, width, parameters : ndarray (N,), float, int
+        Residuals >= 0, N > 0, width of Huber's loss, and degrees of freedom p fitted to the residuals.
 
     Returns
     -------

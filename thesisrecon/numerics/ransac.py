@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -63,37 +64,6 @@ def required_samples(inlier_ratio: float, sample_size: int, confidence: float, l
 Model = TypeVar("Model")
 
 
-class SampledProblem(Protocol[Model]):
-    """Model estimation from minimal samples."""
-
-    @property
-    def sample_size(self) -> int:
-        """Data in a minimal sample."""
-
-    def solve(self, sample: I64) -> list[Model]:
-        """Return the models of the data with indices ``sample`` (sample_size,), possibly none."""
-
-    def residuals(self, model: Model) -> F64:
-        """Return the distance (N,) of every datum."""
-
-
-@dataclass(frozen=True)
-class Consensus(Generic[Model]):
-    """Best model of a search.
-
-    Parameters
-    ----------
-    model, inliers : Model, ndarray (N,) of bool
-        Model with the most data within the threshold, and these data.
-    samples : int
-        Samples drawn.
-    """
-
-    model: Model
-    inliers: B8
-    samples: int
-
-
 @dataclass(frozen=True)
 class SampleConsensus:
     """Algorithm 2: the model with the most data within a threshold.
@@ -104,10 +74,8 @@ class SampleConsensus:
 
     Parameters
     ----------
-    threshold : float
-        Largest residual of an inlier.
-    max_samples : int
-        Number of samples.
+    threshold, max_samples : float, int
+        Largest residual of an inlier, and number of samples.
     stop_inlier_ratio : float
         The search ends if a model has more inliers than this share of the data.
     least_median : bool
@@ -120,41 +88,40 @@ class SampleConsensus:
     least_median: bool = False
 
     def search(
-        self, problem: SampledProblem[Model], n: int, rng: np.random.Generator
-    ) -> Consensus[Model] | None:
-        """Search the best model.
+        self,
+        solve: Callable[[I64], list[Model]],
+        residuals: Callable[[Model], F64],
+        sample_size: int,
+        n: int,
+        rng: np.random.Generator,
+    ) -> tuple[Model, B8, int] | None:
+        """Search the best model of n data.
 
         Parameters
         ----------
-        problem, n : SampledProblem, int
-            Minimal solver and residuals, and number of data.
+        solve, residuals : callable
+            Models of the data with indices (sample_size,), possibly none; and the distances (n,) of a model.
+        sample_size, n : int
+            Data in a minimal sample, and all.
         rng : numpy.random.Generator
             Source of randomness.
 
         Returns
         -------
-        Consensus or None
-            Best model; None if no sample gave one.
-
-        Raises
-        ------
-        ValueError
-            If there are fewer data than in a sample.
+        tuple or None
+            Best model, its inliers (n,) and the number of samples drawn; None if no sample gave a model.
         """
-        if n < problem.sample_size:
-            raise ValueError(f"sampling needs at least {problem.sample_size} data; got {n}")
-        best: Consensus[Model] | None = None
-        best_rank = (-np.inf, 0.0)
-        sample = np.empty(problem.sample_size, dtype=np.int64)
-        for drawn in range(1, self.max_samples + 1):
-            draw_sample(rng.random(problem.sample_size), n, sample)
-            for model in problem.solve(sample):
-                rank, inliers = self._rank(problem.residuals(model))
+        best: tuple[Model, B8] | None = None
+        best_rank, drawn = (-np.inf, 0.0), 0
+        sample = np.empty(sample_size, dtype=np.int64)
+        while drawn < self.max_samples and best_rank[0] <= self.stop_inlier_ratio * n:
+            draw_sample(rng.random(sample_size), n, sample)
+            drawn += 1
+            for model in solve(sample):
+                rank, inliers = self._rank(residuals(model))
                 if rank > best_rank:
-                    best, best_rank = Consensus(model, inliers, drawn), rank
-            if best is not None and best_rank[0] > self.stop_inlier_ratio * n:
-                break
-        return None if best is None else Consensus(best.model, best.inliers, drawn)
+                    best, best_rank = (model, inliers), rank
+        return None if best is None else (*best, drawn)
 
     def _rank(self, residuals: F64) -> tuple[tuple[float, float], B8]:
         if self.least_median:
