@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import argparse
 import ast
+import itertools
 import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from thesisrecon.errors import counted
 from thesisrecon.runtime._signals import install_signal_handlers
-from validation.harness.planting import CopiedTree, imports_of
+from validation.harness.planting import CopiedTree
 from validation.harness.process import own_cores, run_process
 from validation.scenes.real import ROOT
 
@@ -31,35 +33,16 @@ LIMIT_S = 420.0
 """Time limit of a test run (s)."""
 COLD_S = 3600.0
 """Time limit without a fault, when all kernels are compiled (s)."""
-SIGNS: dict[type[ast.AST], tuple[str, str]] = {
-    ast.Add: ("+", "-"),
-    ast.Sub: ("-", "+"),
-    ast.Mult: ("*", "/"),
-    ast.Div: ("/", "*"),
-    ast.FloorDiv: ("//", "*"),
-    ast.Mod: ("%", "*"),
-    ast.Pow: ("**", "*"),
-    ast.BitAnd: ("&", "|"),
-    ast.BitOr: ("|", "&"),
-    ast.LShift: ("<<", ">>"),
-    ast.RShift: (">>", "<<"),
-    ast.Lt: ("<", ">="),
-    ast.LtE: ("<=", ">"),
-    ast.Gt: (">", "<="),
-    ast.GtE: (">=", "<"),
-    ast.Eq: ("==", "!="),
-    ast.NotEq: ("!=", "=="),
-    ast.Is: ("is", "is not"),
-    ast.In: ("in", "not in"),
-    ast.And: ("and", "or"),
-    ast.Or: ("or", "and"),
-}
-BORDERS: dict[type[ast.AST], tuple[str, str]] = {
-    ast.Lt: ("<", "<="),
-    ast.LtE: ("<=", "<"),
-    ast.Gt: (">", ">="),
-    ast.GtE: (">=", ">"),
-}
+OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult, ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+    ast.LShift: ast.RShift, ast.RShift: ast.LShift, ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE,
+    ast.GtE: ast.Lt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.In: ast.NotIn,
+    ast.And: ast.Or, ast.Or: ast.And,
+}  # fmt: skip
+BORDER: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
+}  # fmt: skip
 """Opposites of integer comparisons; equality of floats is too rare to test."""
 OPPOSITES = {
     a: b
@@ -73,18 +56,19 @@ OPPOSITES = {
 
 @dataclass(frozen=True)
 class Mutant:
-    """A fault: in ``file``, the characters from ``start`` to ``end`` become ``new``."""
+    """The fault ``number`` of ``file``: in ``line``, the code ``old`` becomes ``new``."""
 
     file: str
     line: int
     old: str
     new: str
-    start: int
-    end: int
+    number: int
 
     def apply(self, text: str) -> str:
-        """Return the text with the fault."""
-        return text[: self.start] + self.new + text[self.end :]
+        """Return the text with the fault, without comments."""
+        tree = ast.parse(text)
+        next(itertools.islice(_faults(tree), self.number, None))
+        return ast.unparse(tree)
 
 
 @dataclass(frozen=True)
@@ -100,127 +84,73 @@ def mutants_of(root: Path, package: str) -> list[Mutant]:
     """Return all faults of a package, file by file."""
     found = []
     for path in sorted((root / "thesisrecon" / package).rglob("*.py")):
-        text = path.read_text(encoding="utf-8")
-        finder = _Finder(path.relative_to(root).as_posix(), text)
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef):
-                for statement in node.body:
-                    finder.visit(statement)
-        found += sorted(set(finder.found), key=lambda m: (m.start, m.end, m.new))
+        file = path.relative_to(root).as_posix()
+        for number, (line, old, new) in enumerate(_faults(ast.parse(path.read_text(encoding="utf-8")))):
+            found.append(Mutant(file, line, old, new, number))
     return found
 
 
-class _Finder(ast.NodeVisitor):
-    """Faults of one file."""
+def _faults(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
+    """Yield line, old and new code of each fault; the tree has it until the next one is asked for."""
+    for function in [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]:
+        for parent in _inside(function):
+            for name, value in ast.iter_fields(parent):
+                if name == "annotation" or (parent is function and name != "body"):
+                    continue
+                for k, node in enumerate(value if isinstance(value, list) else [value]):
+                    for new in _changes(node):
+                        text = ast.unparse(node), ast.unparse(new)
+                        for put in (new, node):
+                            whole = [*value[:k], put, *value[k + 1 :]] if isinstance(value, list) else put
+                            setattr(parent, name, whole)
+                            if put is new:
+                                yield node.lineno, *text
 
-    def __init__(self, file: str, text: str) -> None:
-        self.file, self.text = file, text
-        self.found: list[Mutant] = []
-        starts = [0]
-        for line in text.splitlines(keepends=True):
-            starts.append(starts[-1] + len(line))
-        self._starts, self._lines = starts, text.splitlines()
 
-    def _place(self, line: int, column: int) -> int:
-        """Return the character offset of a byte position of a line."""
-        return self._starts[line - 1] + len(self._lines[line - 1].encode()[:column].decode())
+def _inside(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a function and the nodes in it, without nested functions, messages and assertions."""
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.FunctionDef | ast.Raise | ast.Assert | ast.arguments):
+            yield from _inside(child)
 
-    def _span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
-        assert node.end_lineno is not None
-        assert node.end_col_offset is not None
-        return self._place(node.lineno, node.col_offset), self._place(node.end_lineno, node.end_col_offset)
 
-    def _add(self, start: int, end: int, new: str) -> None:
-        line = self.text.count("\n", 0, start) + 1
-        self.found.append(Mutant(self.file, line, self.text[start:end], new, start, end))
+def _changes(node: Any) -> Iterator[ast.AST]:
+    """Yield what may stand in the place of a node."""
 
-    def _between(self, left: ast.expr, right: ast.expr, signs: tuple[str, str]) -> None:
-        """Add the operator between two operands, ignoring brackets and line ends."""
-        start, end = self._span(left)[1], self._span(right)[0]
-        at = self.text.find(signs[0], start, end)
-        if at >= 0 and "#" not in self.text[start:end]:
-            self._add(at, at + len(signs[0]), signs[1])
+    def changed(**fields: Any) -> ast.AST:
+        found: ast.AST = type(node)(**{**dict(ast.iter_fields(node)), **fields})
+        return found
 
-    def visit_BinOp(self, node: ast.BinOp) -> None:
-        if type(node.op) in SIGNS:
-            self._between(node.left, node.right, SIGNS[type(node.op)])
-        self.generic_visit(node)
-
-    def visit_BoolOp(self, node: ast.BoolOp) -> None:
-        for left, right in zip(node.values, node.values[1:], strict=False):
-            self._between(left, right, SIGNS[type(node.op)])
-        self.generic_visit(node)
-
-    def visit_Compare(self, node: ast.Compare) -> None:
-        operands = [node.left, *node.comparators]
-        for left, right, sign in zip(operands, operands[1:], node.ops, strict=False):
-            if type(sign) in SIGNS:
-                self._between(left, right, SIGNS[type(sign)])
-            if type(sign) in BORDERS and (_is_whole(left) or _is_whole(right)):
-                self._between(left, right, BORDERS[type(sign)])
-        self.generic_visit(node)
-
-    def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
-        if isinstance(node.op, ast.USub | ast.Not):
-            start = self._span(node)[0]
-            self._add(start, start + (1 if isinstance(node.op, ast.USub) else 4), "")
-        self.generic_visit(node)
-
-    def visit_Constant(self, node: ast.Constant) -> None:
-        start, end = self._span(node)
-        value = node.value
-        if isinstance(value, bool):
-            self._add(start, end, str(not value))
-        elif isinstance(value, int):
-            self._add(start, end, str(value + 1))
-        elif isinstance(value, float):
-            self._add(start, end, repr(2.0 * value if value else 1.0))
-
-    def visit_Name(self, node: ast.Name) -> None:
-        if node.id in OPPOSITES and isinstance(node.ctx, ast.Load):
-            start, end = self._span(node)
-            self._add(start, end, OPPOSITES[node.id])
-
-    def visit_Attribute(self, node: ast.Attribute) -> None:
-        if node.attr in OPPOSITES:
-            end = self._span(node)[1]
-            self._add(end - len(node.attr), end, OPPOSITES[node.attr])
-        self.generic_visit(node)
-
-    def _condition(self, node: ast.If | ast.While | ast.IfExp) -> None:
-        start, end = self._span(node.test)
-        self._add(start, end, f"(not ({self.text[start:end]}))")
-        self.generic_visit(node)
-
-    visit_If = visit_While = visit_IfExp = _condition
-
-    def visit_AugAssign(self, node: ast.AugAssign) -> None:
-        if type(node.op) in SIGNS:
-            self._between(node.target, node.value, SIGNS[type(node.op)])
-        self._leave_out(node)
-        self.generic_visit(node)
-
-    def visit_Assign(self, node: ast.Assign) -> None:
-        if isinstance(node.targets[0], ast.Subscript):
-            self._leave_out(node)
-        self.generic_visit(node)
-
-    def _leave_out(self, node: ast.stmt) -> None:
-        start, end = self._span(node)
-        self._add(start, end, "pass")
-
-    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-        if node.value is not None:
-            self.visit(node.value)
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        """Skip nested functions; they are visited separately."""
-
-    def visit_Raise(self, node: ast.Raise) -> None:
-        """Skip error messages."""
-
-    def visit_Assert(self, node: ast.Assert) -> None:
-        """Skip assertions for types."""
+    match node:
+        case ast.BinOp() | ast.BoolOp() | ast.AugAssign():
+            if type(node.op) in OPPOSITE:
+                yield changed(op=OPPOSITE[type(node.op)]())
+        case ast.Compare():
+            operands = [node.left, *node.comparators]
+            for k, op in enumerate(node.ops):
+                whole = _is_whole(operands[k]) or _is_whole(operands[k + 1])
+                for table in (OPPOSITE, BORDER) if whole else (OPPOSITE,):
+                    if type(op) in table:
+                        yield changed(ops=[*node.ops[:k], table[type(op)](), *node.ops[k + 1 :]])
+        case ast.UnaryOp(op=ast.USub() | ast.Not()):
+            yield node.operand
+        case ast.Constant(value=bool(value)):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int(value)):
+            yield ast.Constant(value + 1)
+        case ast.Constant(value=float(value)):
+            yield ast.Constant(2.0 * value if value else 1.0)
+        case ast.Name(id=name, ctx=ast.Load()) if name in OPPOSITES:
+            yield changed(id=OPPOSITES[name])
+        case ast.Attribute(attr=name) if name in OPPOSITES:
+            yield changed(attr=OPPOSITES[name])
+        case ast.If() | ast.While() | ast.IfExp():
+            yield changed(test=ast.UnaryOp(ast.Not(), node.test))
+    if isinstance(node, ast.AugAssign) or (
+        isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript)
+    ):
+        yield ast.Pass()
 
 
 def _is_whole(node: ast.expr) -> bool:
@@ -228,6 +158,17 @@ def _is_whole(node: ast.expr) -> bool:
     if isinstance(node, ast.Constant):
         return isinstance(node.value, int)
     return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len"
+
+
+def imports_of(path: Path) -> set[str]:
+    """Return the imports of a file: modules and names in them."""
+    found = set[str]()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
 
 
 def draw(root: Path, package: str, count: int, seed: int) -> list[Mutant]:
@@ -259,22 +200,15 @@ class Bench(CopiedTree):
         return [[str(t.relative_to(self.tree)) for t in chosen] for chosen in (own, others) if chosen]
 
     def run_tests(
-        self, files: Sequence[str], kernels: Path, name: str, *, limit_s: float = LIMIT_S
+        self, files: Sequence[str], name: str, *, limit_s: float = LIMIT_S
     ) -> tuple[int, float, str]:
         """Return the exit code of pytest (99 on time-out), seconds and the first failed test."""
         log = self.out / "logs" / f"{name}.log"
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no"]
         command += ["-m", "not slow and not browser and not real", *files]
-        environment = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(kernels)}
-        environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        process = run_process(
-            command,
-            log=log,
-            cores=own_cores(),
-            environment=environment,
-            limit_s=limit_s,
-            cwd=self.tree,
-        )
+        environment = self.environment | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        where: Any = {"cores": own_cores(), "environment": environment, "cwd": self.tree}
+        process = run_process(command, log=log, limit_s=limit_s, **where)
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         failed = [line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR")) and " " in line]
         return 99 if process.timed_out else process.code, process.wall_s, failed[0] if failed else ""
@@ -293,7 +227,7 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterato
     judges = {file: bench.judges(file) for file in dict.fromkeys(m.file for m in mutants)}
     if not warm:
         everything = sorted({test for lists in judges.values() for files in lists for test in files})
-        code, _, failed = bench.run_tests(everything, bench.kernels, "sound", limit_s=COLD_S)
+        code, _, failed = bench.run_tests(everything, "sound", limit_s=COLD_S)
         if code == 99:
             raise ValueError(f"the tests take more than {COLD_S / 60:.0f} min without any fault")
         if code != 0:
@@ -301,9 +235,9 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterato
     for number, mutant in enumerate(mutants):
         text = mutant.apply((bench.tree / mutant.file).read_text(encoding="utf-8"))
         by, seconds = "", 0.0
-        with bench.planted(mutant.file, text, number) as kernels:
+        with bench.planted(mutant.file, text):
             for files in judges[mutant.file]:
-                code, spent, failed = bench.run_tests(files, kernels, f"{number:03d}")
+                code, spent, failed = bench.run_tests(files, f"{number:03d}")
                 seconds += spent
                 if code not in (0, 5):
                     by = failed or ("time-out" if code == 99 else f"pytest ended with {code}")

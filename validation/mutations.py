@@ -113,7 +113,7 @@ def read_mutations(path: Path = MUTATIONS_FILE) -> list[Mutation]:
 class Bench(CopiedTree):
     """The copied tree and its checks."""
 
-    def check(self, name: str, wanted: Sequence[Mutation], kernels: Path, resume: str = "") -> Checked:
+    def check(self, name: str, wanted: Sequence[Mutation], resume: str = "") -> Checked:
         """Run ``python -m validation check`` in the tree for these faults.
 
         Raises ``ValueError`` if it ends without results.
@@ -128,7 +128,7 @@ class Bench(CopiedTree):
         command += ["--resume", str(self.out / resume)] if resume else []
         methods = _all(m.methods for m in wanted)
         command += ["--methods", *methods] if resume and methods else []
-        environment = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(kernels)}
+        environment = self.environment
         root = data_root()
         if root is not None:
             environment["THESISRECON_DATA"] = str(root.resolve())
@@ -184,16 +184,16 @@ def plant_all(bench: Bench, mutations: Sequence[Mutation], *, sound: bool = Fals
     possible = [m for m in mutations if set(m.scenes) <= set(here)]
     bench.set_up()
     if not sound:
-        broken = bench.check("sound", possible, bench.kernels).broken(gates)
+        broken = bench.check("sound", possible).broken(gates)
         if broken:
             raise ValueError(f"the tree breaks gates without any fault: {', '.join(broken)}")
-    for number, mutation in enumerate(mutations):
+    for mutation in mutations:
         if mutation not in possible:
             absent = f"{mutation.scenes[0]} is not on this machine"
             yield Fate(mutation.name, mutation.file, (), 0.0, skipped=absent)
             continue
-        with bench.planted(mutation.file, mutation.apply(bench.tree), number) as kernels:
-            found = bench.check(slug(mutation.name), [mutation], kernels, resume="sound")
+        with bench.planted(mutation.file, mutation.apply(bench.tree)):
+            found = bench.check(slug(mutation.name), [mutation], resume="sound")
         yield Fate(mutation.name, mutation.file, found.broken(gates), found.seconds, found.ended)
 
 
