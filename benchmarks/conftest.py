@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
-from thesisrecon.io.images import read_images
+from thesisrecon.io._images import read_images
 from thesisrecon.records import Image
 from validation.references.libraries import NoReference, one_thread
 from validation.scenes.real import load_fixture_scene

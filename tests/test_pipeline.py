@@ -257,7 +257,7 @@ def test_the_folder_is_judged_before_any_photograph_is_read(tmp_path, monkeypatc
     def read_nothing(*_, **__):
         raise AssertionError("photographs were read")
 
-    monkeypatch.setattr("thesisrecon.io.images.read_images", read_nothing)
+    monkeypatch.setattr("thesisrecon.io._images.read_images", read_nothing)
     with pytest.raises(UsageError, match="seed was 0 and is now 1"):
         run(tmp_path / "out", seed=1)
     with pytest.raises(UsageError, match="cannot be written"):

@@ -13,7 +13,7 @@ from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
-from thesisrecon.io.images import read_image
+from thesisrecon.io._images import read_image
 from thesisrecon.pipeline.image_pair import ImageInput, match_pair
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import (
@@ -68,7 +68,8 @@ def match_rectified(
     Parameters
     ----------
     left, right : path or ndarray (H, W) or (H, W, 3)
-        Files (read at full size), or grey levels 0 to 255 with NaN for missing pixels; of one size.
+        Files (read at full size; ``UsageError`` or ``StageFailure`` if one cannot be read), or grey levels 0
+        to 255 with NaN for missing pixels; of one size.
     max_disparity_px : float
         Largest disparity; x_right = x_left - d with d from 0 to this.
     config : PipelineConfig, optional
@@ -78,11 +79,6 @@ def match_rectified(
     -------
     DisparityMap
         Disparity and confidence of each pixel of the left image, NaN where unknown.
-
-    Raises
-    ------
-    UsageError, StageFailure
-        If a file does not exist, or cannot be read.
 
     Examples
     --------

@@ -13,7 +13,7 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
-from thesisrecon.io.images import read_image
+from thesisrecon.io._images import read_image
 from thesisrecon.pipeline.image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo._planar import PlanarRectification
@@ -59,10 +59,8 @@ def interpolate_view(
 
     Raises
     ------
-    ValueError
-        If ``s`` is outside [0, 1], or images or disparities differ in shape.
-    UsageError, StageFailure
-        If a file does not exist or cannot be read.
+    ValueError, UsageError, StageFailure
+        If ``s`` is outside [0, 1], shapes differ, or a file does not exist or cannot be read.
 
     Notes
     -----
@@ -106,16 +104,16 @@ def prepare_rectified_pair(
     if shapes[0] != shapes[1]:
         raise ValueError(f"rectified images must have one size; got {shapes[0]} and {shapes[1]}")
     if disparity is None:
-        maps = _matched_both_ways(*images, config or PipelineConfig())
+        config = config or PipelineConfig()
+        most = _largest_disparity(*images, config)
+        maps = match_both_sides(partial(config.dense.match_rectified, max_disparity_px=most), *images)
     elif isinstance(disparity, tuple):
         maps = _as_map(disparity[0]), _as_map(disparity[1])
     else:
         maps = _as_map(disparity), disparity_of_right(_as_map(disparity))
-    for found in maps:
-        if found.disparity.shape != shapes[0]:
-            raise ValueError(
-                f"disparities must have the shape of the images {shapes[0]}; got {found.disparity.shape}"
-            )
+    for shape in (found.disparity.shape for found in maps):
+        if shape != shapes[0]:
+            raise ValueError(f"disparities must have the shape of the images {shapes[0]}; got {shape}")
     return InterpolatedPair(images, np.stack([np.eye(3)] * 2), *maps)
 
 
@@ -135,11 +133,6 @@ def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
     if disparity.ndim != 2:
         raise ValueError(f"disparities must be (H, W), or a tuple of two such maps; got {disparity.shape}")
     return DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.0)
-
-
-def _matched_both_ways(left: U8, right: U8, config: PipelineConfig) -> tuple[DisparityMap, DisparityMap]:
-    most = _largest_disparity(left, right, config)
-    return match_both_sides(partial(config.dense.match_rectified, max_disparity_px=most), left, right)
 
 
 def _largest_disparity(left: U8, right: U8, config: PipelineConfig) -> float:
@@ -172,10 +165,8 @@ def prepare_pair(
     ----------
     first, second : Image
         Images of one size.
-    config : PipelineConfig, optional
-        The default configuration if None.
-    seed : int
-        Random seed.
+    config, seed : PipelineConfig, int
+        Configuration (None: the default) and random seed.
 
     Returns
     -------
@@ -184,11 +175,10 @@ def prepare_pair(
 
     Raises
     ------
-    UsageError
-        If the images are the same or differ in size.
-    StageFailure
-        If the images do not match, show no parallax, or the camera moved forwards: epipolar lines then cannot
-        become rows, and every view in between is one of the images, scaled.
+    UsageError, StageFailure
+        If the images are the same or differ in size; if they do not match, show no parallax, or the camera
+        moved forwards: epipolar lines then cannot become rows, and every view in between is one of the
+        images, scaled.
     """
     config = config or PipelineConfig()
     require_comparable_images((first, second))

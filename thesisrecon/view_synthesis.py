@@ -12,7 +12,7 @@ from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.intrinsics import prior_from_options
-from thesisrecon.io.images import read_image
+from thesisrecon.io._images import read_image
 from thesisrecon.pipeline.image_pair import match_pair
 from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
@@ -22,22 +22,12 @@ from thesisrecon.views.trilinear_synthesis import TensorSynthesis, prepare_synth
 
 @dataclass(frozen=True)
 class MatchedImages:
-    """Two images with their sparse and dense correspondences.
+    """Two images with their sparse and dense correspondences."""
 
-    Parameters
-    ----------
-    images : tuple of Image
-        At working size.
-    pair, dense : TwoView, RectifiedPair
-        Verified matches and F; dense correspondences.
-    exif_focal_px : ndarray (2,)
-        Focal lengths of the originals from EXIF, NaN = unknown.
-    """
-
-    images: tuple[Image, Image]
-    pair: TwoView
+    images: tuple[Image, Image]  #: at working size
+    pair: TwoView  #: verified matches and F
     dense: RectifiedPair
-    exif_focal_px: F64
+    exif_focal_px: F64  #: (2,) of the originals, NaN = unknown
 
 
 def match_images(
@@ -49,10 +39,8 @@ def match_images(
     ----------
     image1, image2 : str, Path, ndarray (H, W, 3) uint8 or Image
         The images.
-    config : PipelineConfig, optional
-        The default configuration if None.
-    seed : int
-        Random seed.
+    config, seed : PipelineConfig, int
+        Configuration (None: the default) and random seed.
 
     Returns
     -------
@@ -80,14 +68,12 @@ def prepare_trilinear_views(
 
     Parameters
     ----------
-    found : MatchedImages
-        Result of :func:`match_images`.
+    found, config : MatchedImages, PipelineConfig
+        Result of :func:`match_images`, and the configuration (None: the default).
     K : array_like (3, 3) or (2, 3, 3), optional
         Intrinsics of both images, in pixels of the given images. If None, the prior of ``config.intrinsics``;
         without a focal length there, a typical one: the views are then correct up to a projective
         transformation of space.
-    config : PipelineConfig, optional
-        The default configuration if None.
 
     Returns
     -------
@@ -128,10 +114,8 @@ def synthesize_view(
         units of the distance between the two cameras. R = I and t = 0 reproduce the second image.
     K : array_like (3, 3) or (2, 3, 3), optional
         Intrinsics, as in :func:`prepare_trilinear_views`.
-    config : PipelineConfig, optional
-        The default configuration if None.
-    seed : int
-        Random seed of the matching.
+    config, seed : PipelineConfig, int
+        Configuration (None: the default) and random seed of the matching.
 
     Returns
     -------
@@ -163,9 +147,8 @@ def synthesize_view(
     rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
     _given_intrinsics(K)
     VirtualCamera(rotation, translation, np.eye(3), (1, 1))
-    views = prepare_trilinear_views(
-        match_images(image1, image2, config=config, seed=seed), K=K, config=config
-    )
+    found = match_images(image1, image2, config=config, seed=seed)
+    views = prepare_trilinear_views(found, K=K, config=config)
     return views.render(VirtualCamera(rotation, translation, views.pair.K2, views.sizes[1]))
 
 

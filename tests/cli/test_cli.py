@@ -17,7 +17,7 @@ from thesisrecon.cli import common
 from thesisrecon.cli import reconstruct as cli
 from thesisrecon.cli.inspect import _duration, _intrinsic_lines
 from thesisrecon.cli.main import run_command
-from thesisrecon.io import images as demo
+from thesisrecon.io import demo
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
 
 ROOT = Path(__file__).parents[2]

@@ -23,10 +23,9 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.io._exports import read_cameras
 from thesisrecon.io._files import read_json, read_pairs, read_text
-from thesisrecon.io.images import read_images
-from thesisrecon.io.meshes import read_mesh, write_mesh
-from thesisrecon.runtime._record_files import ChangedRecord, bytes_from_record, read_record
-from thesisrecon.runtime._run_folder import StageFolder
+from thesisrecon.io._images import read_images
+from thesisrecon.io._meshes import read_mesh, write_mesh
+from thesisrecon.runtime._run_folder import ChangedRecord, StageFolder, bytes_from_record, read_record
 
 few = settings(
     derandomize=True,
@@ -217,7 +216,7 @@ def test_tables_of_other_types_raise_only_documented_errors(reader, content, tmp
 @given(data=st.data())
 def test_settings_of_other_types_are_refused_in_a_sentence(data):
     whole = {"features": {"kind": "harris-corners"}, "intrinsics": {"focal_px": 9.0, "focal_std_rel": 0.1}}
-    whole |= {"dense": {"linker": {"kind": "sequence-linking"}}, "images": {"max_size_px": 640}}
+    whole |= {"dense": {"pairs": {"matcher": {"kind": "maximum-likelihood-scanline"}}}, "images": {"max_size_px": 640}}
     try:
         reported = data.draw(mistyped(whole).filter(lambda tables: isinstance(tables, dict)))
         toml_from_config(config_from_tables(reported))

@@ -10,6 +10,7 @@ import pytest
 
 from thesisrecon.errors import UsageError
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
+from thesisrecon.io._images import MAX_DECODED_BYTES, list_images, read_images, scene_name
 from thesisrecon.io._pixels import (
     EXIF_TRANSFORMS,
     STORED,
@@ -18,7 +19,6 @@ from thesisrecon.io._pixels import (
     decoding_bytes,
     resized_to,
 )
-from thesisrecon.io.images import MAX_DECODED_BYTES, list_images, read_images, scene_name
 
 
 def picture(seed=0, size=(96, 80)):
@@ -301,7 +301,7 @@ def test_an_image_whose_decoder_needs_too_much_memory_is_rejected_first(tmp_path
     for name in ("a.webp", "b.png", "c.jpg"):
         options = {"progressive": True} if name == "c.jpg" else {}
         coloured(90, 80).save(tmp_path / name, **options)
-    monkeypatch.setattr("thesisrecon.io.images.MAX_DECODED_BYTES", 5 * 90 * 80)
+    monkeypatch.setattr("thesisrecon.io._images.MAX_DECODED_BYTES", 5 * 90 * 80)
     read = read_images(tmp_path, max_size_px=1600)
     assert [image.name for image in read.images] == ["b.png"]
     assert "decoding a WEBP of this size takes" in read.refused["a.webp"]

@@ -6,7 +6,7 @@ import trimesh
 
 from thesisrecon.errors import UsageError
 from thesisrecon.io._exports import write_point_cloud
-from thesisrecon.io.meshes import _split_seams, read_mesh, write_mesh
+from thesisrecon.io._meshes import _split_seams, read_mesh, write_mesh
 from thesisrecon.records import TexturedMesh
 
 

@@ -5,10 +5,10 @@ from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.matching._seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.matching._seeds import corners_of_seeds, match_seeds, neighbour_support
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.strength import StrengthOfMatch
-from thesisrecon.records import Image
+from thesisrecon.records import Image, Matches
 
 VARIANTS = [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())]
 SWITCHED = [
@@ -102,7 +102,7 @@ def test_corners_without_seeds_are_refused():
 def test_seeds_find_a_photograph_that_was_turned(quarter_turns):
     gray = texture(300, 420, 4)
     seeds = [MultiScaleCorners().detect(photograph(g)).seeds for g in (gray, np.rot90(gray, quarter_turns))]
-    found = match_seeds(seeds[0], seeds[1], rotated=True, ratio=0.8)
+    found = match_seeds(*seeds, (0, 1), rotated=True, ratio=0.8)
     x, y = found.xy1.T
     w, h = 420, 300
     truth = {1: (y, w - 1 - x), 2: (w - 1 - x, h - 1 - y), 3: (h - 1 - y, x)}[quarter_turns]
@@ -181,13 +181,10 @@ def test_corners_of_seeds_are_one_to_one_and_follow_the_map():
     order = rng.permutation(60)
     xy2 = (xy1 @ turn.T)[order]
     seeds = xy1[:30] + rng.uniform(-1, 1, (30, 2))
-    known = SeedMatches(
-        np.vstack([seeds, seeds[:5], [[-50.0, -50.0]]]),
-        np.vstack([seeds, seeds[:5], [[-50.0, -50.0]]]) @ turn.T,
-        np.tile(turn, (36, 1, 1)),
-        np.linspace(1, 0.5, 36).astype(np.float32),
-    )
-    one, two, found = corners_of_seeds(xy1, xy2, known)
+    seeds, rows = np.vstack([seeds, seeds[:5], [[-50.0, -50.0]]]), np.arange(36)
+    score, maps = np.linspace(1, 0.5, 36).astype(np.float32), np.tile(turn, (36, 1, 1))
+    found = corners_of_seeds(xy1, xy2, Matches(0, 1, rows, rows, seeds, seeds @ turn.T, score, maps))
+    one, two = found.index1, found.index2
     assert set(one.tolist()) <= set(range(60))
     assert len(one) >= 29
     assert (order[two] == one).all()

@@ -14,7 +14,7 @@ from tests.selfcalibration.stratified_scenes import (
 )
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.images import read_images
+from thesisrecon.io._images import read_images
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration._frame import projective_scene
 from thesisrecon.selfcalibration._line_segments import LineSegments, _fit_segments

@@ -2,26 +2,139 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.arrays import F64
+import numpy as np
+
+from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.cli._view_sequences import interpolated_sequence, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import OutputError, UsageError, counted
 from thesisrecon.io._exports import animation_suffix, frame_name, read_cameras, write_animation, write_frame
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
-from thesisrecon.io.images import read_image
-from thesisrecon.io.meshes import read_mesh
-from thesisrecon.records import TexturedMesh
+from thesisrecon.io._images import read_image
+from thesisrecon.io._meshes import read_mesh
+from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
+from thesisrecon.view_interpolation import prepare_pair, require_comparable_images
+from thesisrecon.view_synthesis import match_images, prepare_trilinear_views
+from thesisrecon.views.interpolation import InterpolatedPair, detect_monotonicity_violations
 from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.render import Light, Shading, render
+from thesisrecon.views.trilinear import camera_at
+
+_MIDWAY = 0.5
+_BEYOND = 0.5
+"""Baselines by which a sequence of the tensor extends beyond either camera."""
+
+
+@dataclass(frozen=True)
+class ViewSequence:
+    """Views that are computed on demand, with numbers for ``frames.json``.
+
+    ``draw`` takes the number of a view and of threads; ``notes`` are sentences about the whole sequence.
+    """
+
+    captions: tuple[str, ...]
+    draw: Callable[[int, int], U8]
+    notes: tuple[str, ...]
+    metadata: dict[str, Any]
+    frame_metadata: tuple[dict[str, Any], ...]
+
+
+def interpolated_sequence(
+    images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int
+) -> ViewSequence:
+    """Interpolate from the first image to the second and, of three, across their triangle (section 1.2).
+
+    With three images the path leads half way to the second image and from there to the third: the view half
+    way is matched with the third image, so its pixels are resampled twice.
+    """
+    require_comparable_images(images)
+    path = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([_MIDWAY])
+    pair = prepare_pair(images[0], images[1], config=config, seed=seed)
+    weights: list[tuple[float, ...]]
+    if len(images) == 2:
+        weights = [(1.0 - float(s), float(s)) for s in path]
+        legs, stops = [pair], [(0, float(s)) for s in path]
+    else:
+        middle = Image("the interpolated view", pair.view(_MIDWAY), images[0].original_size)
+        legs = [pair, prepare_pair(middle, images[2], config=config, seed=seed)]
+        stops = [(0, float(u)) if u <= _MIDWAY else (1, float(2.0 * u - 1.0)) for u in path]
+        weights = [
+            (1 - s, s, 0.0) if leg == 0 else (_MIDWAY * (1 - s), _MIDWAY * (1 - s), s) for leg, s in stops
+        ]
+
+    def draw(k: int, threads: int) -> U8:
+        leg, s = stops[k]
+        return legs[leg].view(s, threads=threads)
+
+    names = [image.name for image in images]
+    violations = [_violating(leg) for leg in legs]
+    metadata = {"images": names, "violating_monotonicity": violations, "known": [leg.known for leg in legs]}
+    captions = tuple(
+        ", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights
+    )
+    notes = tuple(
+        f"{100.0 * leg.known:.0f} % of the pixels have a correspondence; {100.0 * share:.1f} % of these "
+        "violate monotonicity, where near surfaces occlude far ones"
+        for share, leg in zip(violations, legs, strict=True)
+    )
+    return ViewSequence(captions, draw, notes, metadata, tuple({"weights": list(w)} for w in weights))
+
+
+def _violating(pair: InterpolatedPair) -> float:
+    """Share of the known pixels of the first image that violate monotonicity."""
+    disparity = pair.left.disparity
+    known = max(int(np.isfinite(disparity).sum()), 1)
+    return float(detect_monotonicity_violations(disparity).sum() / known)
+
+
+def trilinear_sequence(
+    images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int
+) -> ViewSequence:
+    """Compute views on the line through both cameras, from half a baseline before to half beyond."""
+    if len(images) != 2:
+        raise UsageError(f"the trilinear tensor takes 2 images; got {len(images)}")
+    first, second = images
+    if np.array_equal(first.rgb, second.rgb):
+        raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
+    matched = match_images(first, second, config=config, seed=seed)
+    views = prepare_trilinear_views(matched, config=config)
+    pair, sizes = views.pair, (first.size, second.size)
+    positions = np.linspace(-_BEYOND, 1.0 + _BEYOND, frames).tolist() if frames > 1 else [_MIDWAY]
+    path = [camera_at(pair, s, sizes=sizes) for s in positions]
+    metadata = {
+        "images": [first.name, second.name],
+        "K": [pair.K1, pair.K2],
+        "second_from_first": {"R": pair.R, "t": pair.t},
+    }
+    frame_metadata = tuple(
+        {"baselines": s, "R": camera.rotation, "t": camera.translation, "K": camera.K}
+        for s, camera in zip(positions, path, strict=True)
+    )
+    captions = tuple(_caption(s, first.name, second.name) for s in positions)
+    note = (
+        f"the focal lengths are assumed to be {pair.K1[0, 0]:.0f} and {pair.K2[0, 0]:.0f} px; lengths are in "
+        "units of the distance between the two cameras"
+    )
+    return ViewSequence(
+        captions, lambda k, threads: views.render(path[k], threads=threads), (note,), metadata, frame_metadata
+    )
+
+
+def _caption(s: float, first: str, second: str) -> str:
+    if s < 0.0:
+        return f"{-s:.2f} baselines before {first}"
+    if s > 1.0:
+        return f"{s - 1.0:.2f} baselines beyond {second}"
+    return f"{100.0 * s:.0f} % of the way from {first} to {second}"
+
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
 PATHS = ("orbit", "interpolate")
@@ -36,138 +149,128 @@ _NO_MODEL = "No surface model was built"
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class RenderOptions:
-    """Options of ``render``; ``size`` None is that of the first image, of at most 1000 px."""
-
-    path: str = "orbit"
-    frames: int = 90
-    size: tuple[int, int] | None = None
-    light: str = "none"
-    background: tuple[int, int, int] = (0, 0, 0)
-
-
-@dataclass(frozen=True)
-class InterpolateOptions:
-    """Options of ``interpolate``."""
-
-    images: tuple[Path, ...]
-    method: str = "interpolation"
-    frames: int = 21
-    seed: int = 0
-    max_size_px: int | None = None
-
-    def __post_init__(self) -> None:
-        if len(self.images) not in (2, 3):
-            raise UsageError(f"interpolate takes 2 or 3 images; got {len(self.images)}")
-        for path in self.images:
-            if path.is_dir():
-                raise UsageError(f"{path} is a folder; interpolate takes image files")
-        for first, second in combinations(self.images, 2):
-            if first.is_file() and second.is_file() and first.samefile(second):
-                raise UsageError(f"{first} is given twice; give different images")
-
-
-@dataclass(frozen=True)
-class ViewFiles:
-    """Files that a command wrote, and the (width, height) of a frame."""
-
-    folder: Path
-    frames: tuple[Path, ...]
-    animation: Path
-    size: tuple[int, int]
-
-    def __str__(self) -> str:
-        width, height = self.size
-        files = f"{counted(len(self.frames), 'frame')} of {width} x {height} px and {self.animation.name}"
-        return f"{files} written to {printable(str(self.folder))}"
-
-
 def render_run(
-    out: Path, folder: Path, options: RenderOptions, *, threads: int = 1, progress: Progress | None = None
-) -> ViewFiles:
-    """Render the model of a run; write frames, an animation and ``frames.json``.
+    out: Path,
+    folder: Path,
+    *,
+    path: str = "orbit",
+    frames: int = 90,
+    size: tuple[int, int] | None = None,
+    light: str = "none",
+    background: tuple[int, int, int] = (0, 0, 0),
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> str:
+    """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence on them.
 
     Frames of an earlier call that this one does not replace are removed. The files do not depend on
-    ``threads``.
+    ``threads``. ``size`` None is that of the first image, at most 1000 px.
     """
     mesh, cameras = _read_run(out)
     _claim(folder)
-    path = _camera_path(mesh, list(cameras.values()), options)
+    size = size or cameras[0].scaled(min(1.0, _DEFAULT_SIDE_PX / max(cameras[0].size))).size
+    views = _camera_path(mesh, cameras, path, frames, size)
     # Written first: it marks the folder as one of these commands.
-    write_json(folder / FRAMES, _description(path, options))
-    _remove_old(folder, len(path))
-    files = [folder / frame_name(k + 1) for k in range(len(path))]
-    shading = _shading(mesh, list(cameras.values()), options.light)
+    given = {"path": path, "light": light, "background": background, "width": size[0], "height": size[1]}
+    write_json(folder / FRAMES, {**given, "frames": [_camera_entry(k, view) for k, view in enumerate(views)]})
+    _remove_old(folder, len(views))
+    shading = _shading(mesh, cameras, light)
     report, done = progress or (lambda *_: None), 0
 
     def draw(k: int) -> None:
-        view = render(mesh, path[k], shading=shading(path[k]), background=options.background)
+        view = render(mesh, views[k], shading=shading(views[k]), background=background)
         write_frame(folder, k + 1, view.color)
 
     def finished(_: int, __: Any) -> None:
         nonlocal done
         done += 1
         # The last step is the animation.
-        report("views", done, len(path) + 1)
+        report("views", done, len(views) + 1)
 
-    Workers(threads).run(draw, [(k,) for k in range(len(path))], finished)
-    animation = write_animation(folder / f"{options.path}{animation_suffix()}", files)
-    finished(len(path), animation)
-    return ViewFiles(folder, tuple(files), animation, path[0].size)
+    Workers(threads).run(draw, [(k,) for k in range(len(views))], finished)
+    animation = _animate(folder, path, len(views))
+    finished(len(views), animation)
+    return _written(folder, len(views), size, animation)
 
 
 def interpolate_images(
-    folder: Path, options: InterpolateOptions, *, threads: int = 1, progress: Progress | None = None
-) -> ViewFiles:
+    folder: Path,
+    paths: Sequence[Path],
+    *,
+    method: str = "interpolation",
+    frames: int = 21,
+    seed: int = 0,
+    max_size_px: int | None = None,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> str:
     """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``.
 
-    Nothing is written before the images have been matched. The files do not depend on ``threads``.
+    Returns a sentence about the files, which do not depend on ``threads``. Nothing is written before the
+    images have been matched.
     """
+    _check_images(paths)
     _claim(folder)
     config = PipelineConfig()
-    if options.max_size_px is not None:
-        config = replace(config, images=ImageOptions(options.max_size_px))
-    images = [read_image(path, max_size_px=config.images.max_size_px).images[0] for path in options.images]
-    report, count = progress or (lambda *_: None), options.frames
+    if max_size_px is not None:
+        config = replace(config, images=ImageOptions(max_size_px))
+    images = [read_image(path, max_size_px=config.images.max_size_px).images[0] for path in paths]
+    report = progress or (lambda *_: None)
     report("correspondence", 0, 1)
-    sequence = METHODS[options.method](images, count, config=config, seed=options.seed)
+    sequence = METHODS[method](images, frames, config=config, seed=seed)
     report("correspondence", 1, 1)
     listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(sequence.frame_metadata)]
-    write_json(folder / FRAMES, {"method": options.method, **sequence.metadata, "frames": listed})
-    _remove_old(folder, count)
-    frames = []
-    for k in range(count):
+    write_json(folder / FRAMES, {"method": method, **sequence.metadata, "frames": listed})
+    _remove_old(folder, frames)
+    drawn = []
+    for k, caption in enumerate(sequence.captions):
         rgb = sequence.draw(k, threads)
         write_frame(folder, k + 1, rgb)
-        frames.append((sequence.captions[k], rgb))
-        report("views", k + 1, count + 2)
-    files = [folder / frame_name(k + 1) for k in range(count)]
-    target = folder / f"{options.method}{animation_suffix()}"
-    animation = write_animation(target, files, milliseconds=_FRAME_MS)
-    report("views", count + 1, count + 2)
+        drawn.append((caption, rgb))
+        report("views", k + 1, frames + 2)
+    animation = _animate(folder, method, frames, milliseconds=_FRAME_MS)
+    report("views", frames + 1, frames + 2)
     title = "Between " + " and ".join(image.name for image in images)
-    write_text(folder / STRIP, strip_page(title, frames, notes=sequence.notes))
-    report("views", count + 2, count + 2)
-    height, width = frames[0][1].shape[:2]
-    return ViewFiles(folder, tuple(files), animation, (width, height))
+    write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
+    report("views", frames + 2, frames + 2)
+    return _written(folder, frames, rgb.shape[1::-1], animation)
 
 
-def _read_run(out: Path) -> tuple[TexturedMesh, dict[str, Camera]]:
+def _check_images(paths: Sequence[Path]) -> None:
+    if len(paths) not in (2, 3):
+        raise UsageError(f"interpolate takes 2 or 3 images; got {len(paths)}")
+    for path in paths:
+        if path.is_dir():
+            raise UsageError(f"{path} is a folder; interpolate takes image files")
+    for first, second in combinations(paths, 2):
+        if first.is_file() and second.is_file() and first.samefile(second):
+            raise UsageError(f"{first} is given twice; give different images")
+
+
+def _animate(folder: Path, name: str, frames: int, **options: int) -> Path:
+    files = [folder / frame_name(k + 1) for k in range(frames)]
+    return write_animation(folder / f"{name}{animation_suffix()}", files, **options)
+
+
+def _written(folder: Path, frames: int, size: Sequence[int], animation: Path) -> str:
+    files = f"{counted(frames, 'frame')} of {size[0]} x {size[1]} px and {animation.name}"
+    return f"{files} written to {printable(str(folder))}"
+
+
+def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:
     """Read the model and the cameras of a finished run."""
     if not out.is_dir() or not any((out / name).is_file() for name in (MODEL, CAMERAS, "run.json")):
         raise UsageError(f"{out} holds no run; create one with thesisrecon reconstruct IMAGES -o {out}")
     if not (out / MODEL).is_file():
         raise UsageError(_missing_model(out))
-    return read_mesh(out / MODEL), read_cameras(out / CAMERAS)
+    return read_mesh(out / MODEL), list(read_cameras(out / CAMERAS).values())
 
 
 def _missing_model(out: Path) -> str:
     """Why a run has no model: its surface stage failed, or it has not been run."""
     summary = read_json(out / "summary.json")
     warnings = summary.get("warnings", []) if isinstance(summary, dict) else []
-    reason = next((str(w) for w in warnings if str(w).startswith(_NO_MODEL)), None)
-    if reason is not None:
+    if reason := next((str(w) for w in warnings if str(w).startswith(_NO_MODEL)), None):
         return f"the run in {out} has cameras but no model: {reason}"
     command = f"thesisrecon reconstruct IMAGES -o {out}, without --until"
     return f"the run in {out} has no model yet ({MODEL}); continue it with {command}"
@@ -181,8 +284,7 @@ def _claim(folder: Path) -> None:
         names = [path.name for path in folder.iterdir()] if folder.exists() else []
     except OSError as error:
         raise UsageError(f"the folder {folder} cannot be used: {error.strerror}") from None
-    foreign = sorted(name for name in names if not is_partial(name))
-    if foreign:
+    if foreign := sorted(name for name in names if not is_partial(name)):
         strange = f"contains {foreign[0]!r}, which this command did not create"
         raise UsageError(f"the folder {folder} {strange}; choose an empty or a new folder")
 
@@ -199,13 +301,13 @@ def _remove_old(folder: Path, frames: int) -> None:
         raise OutputError(f"the folder {folder}", error) from None
 
 
-def _camera_path(mesh: TexturedMesh, cameras: list[Camera], options: RenderOptions) -> list[Camera]:
-    first = cameras[0]
-    size = options.size or first.scaled(min(1.0, _DEFAULT_SIDE_PX / max(first.size))).size
-    if options.path == "interpolate":
-        return interpolate_cameras(cameras, options.frames, size=size)
+def _camera_path(
+    mesh: TexturedMesh, cameras: list[Camera], path: str, frames: int, size: tuple[int, int]
+) -> list[Camera]:
+    if path == "interpolate":
+        return interpolate_cameras(cameras, frames, size=size)
     points = sample_surface(mesh)
-    return orbit(cameras, points if len(points) else mesh.vertices, options.frames, size=size)
+    return orbit(cameras, points if len(points) else mesh.vertices, frames, size=size)
 
 
 def _shading(mesh: TexturedMesh, cameras: list[Camera], light: str) -> Callable[[Camera], Shading | None]:
@@ -218,9 +320,8 @@ def _shading(mesh: TexturedMesh, cameras: list[Camera], light: str) -> Callable[
         towards = estimate_up(cameras) - 0.5 * cameras[0].R[0] - cameras[0].R[2]
         sun = Shading(ambient=0.4, lights=(Light(direction=_triple(towards), color=(0.9,) * 3),))
         return lambda _: sun
-    return lambda camera: Shading(
-        ambient=0.3, lights=(Light(position=_triple(camera.centre), color=(0.8,) * 3),)
-    )
+    grey = (0.8, 0.8, 0.8)
+    return lambda eye: Shading(ambient=0.3, lights=(Light(position=_triple(eye.centre), color=grey),))
 
 
 def _triple(vector: F64) -> tuple[float, float, float]:
@@ -228,11 +329,6 @@ def _triple(vector: F64) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _description(path: list[Camera], options: RenderOptions) -> dict[str, Any]:
-    """Content of ``frames.json``: the options, and the camera of each frame as in ``cameras.json``."""
-    frames = [
-        {"name": frame_name(k + 1), "K": camera.K, "R": camera.R, "t": camera.t, "centre": camera.centre}
-        for k, camera in enumerate(path)
-    ]
-    given = {"path": options.path, "light": options.light, "background": list(options.background)}
-    return {**given, "width": path[0].size[0], "height": path[0].size[1], "frames": frames}
+def _camera_entry(k: int, camera: Camera) -> dict[str, Any]:
+    """A frame in ``frames.json``, with its camera as in ``cameras.json``."""
+    return {"name": frame_name(k + 1), "K": camera.K, "R": camera.R, "t": camera.t, "centre": camera.centre}

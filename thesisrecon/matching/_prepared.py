@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.geometry.raster import halve, resample
 from thesisrecon.kernels import kernel, zero_matrix
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
@@ -196,7 +196,7 @@ def one_to_one(index: I64, score: F32) -> I64:
     return np.sort(rows[np.unique(index[rows], return_index=True)[1]])
 
 
-def select_matches(matches: Matches, rows: I64) -> Matches:
+def select_matches(matches: Matches, rows: I64 | B8) -> Matches:
     m = matches
     return Matches(
         m.i, m.j, m.index1[rows], m.index2[rows], m.xy1[rows], m.xy2[rows], m.score[rows], m.affine[rows]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.kernels import kernel
-from thesisrecon.records import Seeds
+from thesisrecon.matching._prepared import empty_matches
+from thesisrecon.records import Matches, Seeds
 
 BLOCK = 256
 NEIGHBOURS, TOLERANCE = 10, 0.3
@@ -76,32 +76,17 @@ def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32,
     return np.where(mutual, index, -1), value, np.where(mutual, second_best, np.float32(-1.0))
 
 
-@dataclass(frozen=True)
-class SeedMatches:
-    """Positions (M, 2) px, initial local affine maps (M, 2, 2) from image 1 to 2, and correlations (M,)."""
-
-    xy1: F64
-    xy2: F64
-    affine: F64
-    score: F32
-
-    def __len__(self) -> int:
-        return len(self.xy1)
-
-    def at(self, chosen: B8 | I64) -> SeedMatches:
-        return SeedMatches(self.xy1[chosen], self.xy2[chosen], self.affine[chosen], self.score[chosen])
-
-
-def match_seeds(seeds1: Seeds, seeds2: Seeds, *, rotated: bool, ratio: float) -> SeedMatches:
-    """Match seeds that are mutually nearest and pass the ratio test.
+def match_seeds(
+    seeds1: Seeds, seeds2: Seeds, pair: tuple[int, int], *, rotated: bool, ratio: float
+) -> Matches:
+    """Match seeds that are mutually nearest and pass the ratio test; their maps are similarities.
 
     The distance of unit patches is sqrt(2 - 2 correlation). Other seeds count as elsewhere beyond a quarter
     of the patch (8 pixels of its level). ``rotated``: use the patches rotated to their dominant gradient.
     """
     use1, use2 = (np.flatnonzero((s.angle != 0.0) == rotated) for s in (seeds1, seeds2))
     if not (len(use1) and len(use2)):
-        none = np.empty((0, 2))
-        return SeedMatches(none, none, np.empty((0, 2, 2)), np.empty(0, np.float32))
+        return empty_matches(pair)
     xy2, apart2 = seeds2.xy[use2].astype(np.float32), (8.0 * seeds2.scale[use2]) ** 2
     patches1, patches2 = seeds1.patches[use1], np.ascontiguousarray(seeds2.patches[use2].T)
     # A block of rows stays in the cache between the product and the scans.
@@ -112,7 +97,7 @@ def match_seeds(seeds1: Seeds, seeds2: Seeds, *, rotated: bool, ratio: float) ->
     one, two = use1[rows], use2[index[rows]]
     turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
     grow = (seeds2.scale[two] / seeds1.scale[one]).astype(np.float64)
-    return SeedMatches(seeds1.xy[one], seeds2.xy[two], _similarity(grow, turn), value[rows])
+    return Matches(*pair, one, two, seeds1.xy[one], seeds2.xy[two], value[rows], _similarity(grow, turn))
 
 
 def _similarity(scale: F64, angle: F64) -> F64:
@@ -122,7 +107,7 @@ def _similarity(scale: F64, angle: F64) -> F64:
     return maps
 
 
-def _common_similarity(matches: SeedMatches) -> F64:
+def _common_similarity(matches: Matches) -> F64:
     """Scaled rotation (2, 2) of most matches: medians of log scale and of the angle around its mode."""
     a = matches.affine
     scale = np.exp(np.median(np.log(np.hypot(a[:, 0, 0], a[:, 1, 0]))))
@@ -137,18 +122,19 @@ def _common_similarity(matches: SeedMatches) -> F64:
     return common
 
 
-def neighbour_support(matches: SeedMatches) -> F64:
+def neighbour_support(matches: Matches) -> F64:
     """Strength (M,) of each match: the number of neighbours that move alike ((4.1) with c = 1).
 
     Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (TOLERANCE |u_m - u_k|))^2), with d the displacement
     after removing the common rotation and scale; both images serve as the first in turn.
     """
-    if len(matches) < 2:
-        return np.zeros(len(matches))
+    count = len(matches.xy1)
+    support = np.zeros(count)
+    if count < 2:
+        return support
     a = _common_similarity(matches)
     u, v = matches.xy1 @ a.T, matches.xy2
-    k = min(NEIGHBOURS + 1, len(matches))
-    support = np.zeros(len(matches))
+    k = min(NEIGHBOURS + 1, count)
     for here, there in ((u, v), (v, u)):
         near = scipy.spatial.cKDTree(here).query(here, k)[1][:, 1:]
         apart = np.linalg.norm(here[near] - here[:, None], axis=2)
@@ -157,8 +143,8 @@ def neighbour_support(matches: SeedMatches) -> F64:
     return 0.5 * support
 
 
-def corners_of_seeds(xy1: F64, xy2: F64, known: SeedMatches) -> tuple[I64, I64, SeedMatches]:
-    """Pairs of corners at the positions of seed matches: indices (M,), (M,) and the matches.
+def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
+    """Matches of the corners ``xy1``, ``xy2`` (N, 2) at the positions of seed matches.
 
     The corner nearest to a seed in image 1 and the corner nearest to its prediction by the local affine map
     in image 2; one-to-one, best correlations first.
@@ -172,4 +158,6 @@ def corners_of_seeds(xy1: F64, xy2: F64, known: SeedMatches) -> tuple[I64, I64, 
         order = order[np.sort(np.unique(corner[order], return_index=True)[1])]
     order = order[np.argsort(one[order], kind="stable")]
     one, two = one[order].astype(np.int64), two[order].astype(np.int64)
-    return one, two, SeedMatches(xy1[one], xy2[two], known.affine[order], known.score[order])
+    return Matches(
+        known.i, known.j, one, two, xy1[one], xy2[two], known.score[order], known.affine[order]
+    )

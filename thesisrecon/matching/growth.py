@@ -27,7 +27,7 @@ from thesisrecon.matching._prepared import (
     sample_window,
     select_matches,
 )
-from thesisrecon.matching._seeds import SeedMatches, corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.matching._seeds import corners_of_seeds, match_seeds, neighbour_support
 from thesisrecon.records import Features, Image, Matches, Seeds
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
@@ -338,14 +338,13 @@ class SeedsAndGrowth:
                 "seeds-and-growth matching needs features with seeds; set "
                 "features.kind=multi-scale-corners, or matching.kind=strength-of-match"
             )
-        start = self._verified_seeds(seeds1, seeds2, estimate_fundamental, rng)
+        start = self._verified_seeds(seeds1, seeds2, pair, estimate_fundamental, rng)
         if start is None:
             return empty_matches(pair)
         if self.growth:
-            one, two, found = self._grow_in_rounds(view1, view2, start, estimate_fundamental, rng)
+            matches = self._grow_in_rounds(view1, view2, start, estimate_fundamental, rng)
         else:
-            one, two, found = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
-        matches = Matches(*pair, one, two, found.xy1, found.xy2, found.score, found.affine)
+            matches = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
         if not self.align:
             return select_matches(matches, strongest_distinct(matches))
         return align_matches(
@@ -353,39 +352,47 @@ class SeedsAndGrowth:
         )
 
     def _verified_seeds(
-        self, seeds1: Seeds, seeds2: Seeds, estimate: EstimateFundamental, rng: np.random.Generator
-    ) -> tuple[SeedMatches, F64] | None:
-        best: tuple[SeedMatches, F64] | None = None
+        self,
+        seeds1: Seeds,
+        seeds2: Seeds,
+        pair: tuple[int, int],
+        estimate: EstimateFundamental,
+        rng: np.random.Generator,
+    ) -> tuple[Matches, F64] | None:
+        """Most seeds that agree with one F, and F."""
+        best: tuple[Matches, F64] | None = None
+        most = 0
         for rotated in {"auto": (False, True), "upright": (False,), "rotated": (True,)}[self.orientation]:
-            seeds = match_seeds(seeds1, seeds2, rotated=rotated, ratio=self.ratio)
+            seeds = match_seeds(seeds1, seeds2, pair, rotated=rotated, ratio=self.ratio)
             for trial in self._trials(seeds):
                 try:
                     fit = estimate(trial.xy1, trial.xy2, rng)
                 except StageFailure:
                     continue
-                if fit.inliers.sum() >= self.min_seeds and (best is None or fit.inliers.sum() > len(best[0])):
-                    best = trial.at(fit.inliers), fit.F
-            if best is not None and len(best[0]) >= max(50, 0.5 * len(seeds)):
+                if fit.inliers.sum() >= max(self.min_seeds, most + 1):
+                    best, most = (select_matches(trial, fit.inliers), fit.F), int(fit.inliers.sum())
+            if most >= max(50, 0.5 * len(seeds.xy1)):
                 break
         return best
 
-    def _trials(self, seeds: SeedMatches) -> tuple[SeedMatches, ...]:
+    def _trials(self, seeds: Matches) -> tuple[Matches, ...]:
         """Sets of seeds to estimate F from; none if there are too few."""
         if self.support == "never":
-            return (seeds,) if len(seeds) >= self.min_seeds else ()
+            return (seeds,) if len(seeds.xy1) >= self.min_seeds else ()
         supported = neighbour_support(seeds) >= self.min_support
         if supported.sum() < self.min_seeds:
             return ()
-        return (seeds.at(supported), seeds) if self.support == "auto" else (seeds.at(supported),)
+        chosen = select_matches(seeds, supported)
+        return (chosen, seeds) if self.support == "auto" else (chosen,)
 
     def _grow_in_rounds(
         self,
         view1: PreparedImage,
         view2: PreparedImage,
-        start: tuple[SeedMatches, F64],
+        start: tuple[Matches, F64],
         estimate: EstimateFundamental,
         rng: np.random.Generator,
-    ) -> tuple[I64, I64, SeedMatches]:
+    ) -> Matches:
         """Match the corners of the coarser scale, then all twice, guided by the previous matches."""
         known, F = start
         scale = view1.features.scale
@@ -393,23 +400,23 @@ class SeedsAndGrowth:
         rounds = [np.flatnonzero(scale > scale.min())] if self.coarse_first else []
         rounds += [everything] * (1 + self.rematch)
         for chosen in rounds[:-1]:
-            one, _, grown = self._grow(view1, view2, chosen, known, F)
-            if len(one) < 8:
+            grown = self._grow(view1, view2, chosen, known, F)
+            if len(grown.xy1) < 8:
                 continue
             try:
                 fit = estimate(grown.xy1, grown.xy2, rng)
             except StageFailure:
                 continue
-            F, known = fit.F, grown.at(fit.inliers)
+            F, known = fit.F, select_matches(grown, fit.inliers)
         return self._grow(view1, view2, everything, known, F)
 
     def _grow(
-        self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: SeedMatches, F: F64
-    ) -> tuple[I64, I64, SeedMatches]:
-        """Corners of both images, and the matches."""
+        self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, F: F64
+    ) -> Matches:
+        """Match the ``chosen`` corners of image 1, guided by F and the local maps of known matches."""
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
         # With a list of ranks the result keeps two dimensions even for one neighbour.
-        ranks = np.arange(1, min(self.neighbours, len(known)) + 1)
+        ranks = np.arange(1, min(self.neighbours, len(known.xy1)) + 1)
         near = scipy.spatial.cKDTree(known.xy1).query(xy1, ranks)[1]
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
@@ -424,5 +431,5 @@ class SeedsAndGrowth:
         )
         index[1.0 - score > self.grown_ratio**2 * (1.0 - second_best)] = -1
         rows = one_to_one(index, score)
-        one, two = chosen[rows], index[rows]
-        return one, two, SeedMatches(xy1[rows], view2.features.xy[two], affine[rows], score[rows])
+        one, two, found = chosen[rows], index[rows], view2.features.xy[index[rows]]
+        return Matches(known.i, known.j, one, two, xy1[rows], found, score[rows], affine[rows])

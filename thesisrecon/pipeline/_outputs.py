@@ -16,13 +16,12 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import read_json, write_json, write_text
+from thesisrecon.io._meshes import write_mesh
 from thesisrecon.io.colmap import write_colmap_model
-from thesisrecon.io.meshes import write_mesh
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.records import Reconstruction, RunResult, TexturedMesh
-from thesisrecon.report._data import ReportData
+from thesisrecon.report._data import ReportData, point_colors, summarize
 from thesisrecon.report._page import render_report
-from thesisrecon.report._summary import point_colors, summarize
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.selfcalibration.stratified import affine_camera_centres, upgrade_to_affine

@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.config import Matcher, PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
-from thesisrecon.io.images import ImageSet
+from thesisrecon.io._images import ImageSet
 from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Features, Image, RunResult
 from thesisrecon.runtime._run import Run

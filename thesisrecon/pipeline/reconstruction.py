@@ -9,12 +9,19 @@ from thesisrecon._settings import tables_from_config
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
-from thesisrecon.io.images import ImageSet, ImageSource, list_images, read_images, scene_name
-from thesisrecon.pipeline._cameras import reconstruct_metric, reconstruct_projective
-from thesisrecon.pipeline._features_to_tracks import build_tracks, find_features, match_pairs, select_pairs
+from thesisrecon.io._images import ImageSet, ImageSource, list_images, read_images, scene_name
 from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
+from thesisrecon.pipeline._stages import (
+    build_model,
+    build_tracks,
+    estimate_depth_maps,
+    find_features,
+    match_pairs,
+    reconstruct_metric,
+    reconstruct_projective,
+    select_pairs,
+)
 from thesisrecon.pipeline._state import PipelineState, name_images
-from thesisrecon.pipeline._surface import build_model, estimate_depth_maps
 from thesisrecon.records import RunResult
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
 

@@ -6,7 +6,7 @@ import pytest
 from tests.surface.sphere import SHAPE, K, paint, photograph, ring_of
 from tests.validation.references.conftest import skip_without
 from thesisrecon.camera import Camera
-from thesisrecon.io.meshes import read_mesh, write_mesh
+from thesisrecon.io._meshes import read_mesh, write_mesh
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel

@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
-from thesisrecon.io.images import read_images
+from thesisrecon.io._images import read_images
 from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place, Task

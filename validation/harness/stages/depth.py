@@ -13,7 +13,7 @@ import PIL.Image
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import preset
 from thesisrecon.io._files import write_text
-from thesisrecon.io.images import read_images
+from thesisrecon.io._images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._neighbours import pinhole_view
 from thesisrecon.stereo.depth import MultiViewStereo

@@ -13,7 +13,7 @@ from thesisrecon.config import preset
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.io.images import read_images
+from thesisrecon.io._images import read_images
 from thesisrecon.records import Image
 from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, Values, each, read_arrays, row

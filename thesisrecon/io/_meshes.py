@@ -1,7 +1,6 @@
 """Surface models as GLB files; their structure is checked before they are parsed.
 
-trimesh is imported on demand: it takes
-longer to import than the rest of the package.
+trimesh is imported on demand: it takes longer to import than the rest of the package.
 """
 
 from __future__ import annotations
@@ -116,18 +115,6 @@ def write_mesh(path: Path, mesh: TexturedMesh) -> None:
     """Write a mesh as GLB, with its texture, or its vertex colours if it has none, and float32 coordinates.
 
     It is rotated by 180 degrees about x, since the y axis of glTF points up and that of cameras down.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mesh : TexturedMesh
-        The mesh.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
     """
     import trimesh
     from trimesh.visual import material as materials
@@ -155,25 +142,10 @@ def write_mesh(path: Path, mesh: TexturedMesh) -> None:
 
 
 def read_mesh(path: Path) -> TexturedMesh:
-    """Read a GLB of :func:`write_mesh`, in its original coordinates.
+    """Read a GLB of :func:`write_mesh` in its original coordinates; UsageError if that fails.
 
     Vertices that were split at texture seams are merged again, in their old order; unused ones are dropped.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    TexturedMesh
-        The mesh.
-
-    Raises
-    ------
-    UsageError
-        If the file is absent, damaged, refers to other files or holds no mesh; memory stays within a multiple
-        of the sizes of the file and its texture.
+    Memory stays within a multiple of the sizes of the file and its texture.
     """
     if not path.is_file():
         raise UsageError(f"there is no mesh {path}")

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.resources import files
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -46,8 +45,6 @@ SUFFIXES = (
     *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
 )
 _GENERIC_FOLDERS = ("images", "photographs", "photos", "pictures", "dcim")
-DEMO_IMAGES = 6
-"""Enough neighbouring views for self-calibration, and a small wheel."""
 MAX_FILE_BYTES = 2**31
 """Uncompressed images of the largest sensors take less than half of it."""
 MAX_DECODED_BYTES = 3 * 2**29
@@ -78,15 +75,7 @@ class _DecodedImage:
 
 @dataclass(frozen=True)
 class ImageSet:
-    """The images of a run.
-
-    Parameters
-    ----------
-    decoded : tuple
-        Usable images with their hashes, EXIF focal lengths and notes, sorted by name.
-    refused : dict
-        Name -> reason of the other files.
-    """
+    """The usable images of a run, sorted by name, and name -> reason of the other files."""
 
     decoded: tuple[_DecodedImage, ...]
     refused: dict[str, str]
@@ -103,23 +92,7 @@ class ImageSet:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List the image files of a folder by suffix, without hidden files and sub-folders.
-
-    Parameters
-    ----------
-    folder : Path
-        A folder.
-
-    Returns
-    -------
-    list of Path
-        Sorted by name.
-
-    Raises
-    ------
-    UsageError
-        If the folder does not exist or cannot be read.
-    """
+    """List the image files of a folder by suffix, sorted, without hidden files and sub-folders."""
     if not folder.exists():
         raise UsageError(f"there is no folder {folder}")
     if not folder.is_dir():
@@ -133,71 +106,14 @@ def list_images(folder: Path) -> list[Path]:
     ]
 
 
-def demo_images() -> list[Path]:
-    """Locate the demo images, in the installed package or in the source tree around it.
-
-    Returns
-    -------
-    list of Path
-        ``DEMO_IMAGES`` files, sorted by name.
-
-    Raises
-    ------
-    UsageError
-        If they are in neither place.
-    """
-    package = Path(str(files("thesisrecon")))
-    for home in (package, package.parent / "fixtures"):
-        found = sorted((home / "courtyard" / "images").glob("*.jpg"))[:DEMO_IMAGES]
-        if len(found) == DEMO_IMAGES:
-            return found
-    raise UsageError(
-        f"the demo images are neither in {package / 'courtyard'} nor in fixtures/courtyard of the source "
-        "tree; reinstall the package, or reconstruct a folder of your own"
-    )
-
-
 def scene_name(folder: Path) -> str:
-    """Name a scene after its image folder, or after the parent of a folder called "images" or similar.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the images.
-
-    Returns
-    -------
-    str
-        Printable name.
-    """
+    """Name a scene after its image folder, or after the parent of a folder called "images" or similar."""
     folder = folder.resolve()
     return printable(folder.parent.name if folder.name.lower() in _GENERIC_FOLDERS else folder.name)
 
 
 def read_image(source: Any, *, max_size_px: int) -> ImageSet:
-    """Read one image.
-
-    Parameters
-    ----------
-    source : str, Path, ndarray (H, W) or (H, W, 3) uint8, or Image
-        The image.
-    max_size_px : int
-        Long side to which larger images are reduced.
-
-    Returns
-    -------
-    ImageSet
-        A set of one image.
-
-    Raises
-    ------
-    UsageError
-        If the file does not exist.
-    StageFailure
-        If the image is unusable.
-    ValueError
-        If an array has another shape or type.
-    """
+    """Read one image; UsageError if the file does not exist, StageFailure if it is unusable."""
     if isinstance(source, str | Path) and not Path(source).is_file():
         raise UsageError(f"there is no image file {source}")
     found = read_images([source], max_size_px=max_size_px)
@@ -212,29 +128,11 @@ def read_images(
     max_size_px: int,
     map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
 ) -> ImageSet:
-    """Read all images of a folder or a list, at working size.
+    """Read all images of a folder or a list, at most ``max_size_px`` long; the rest is refused with a reason.
 
-    Parameters
-    ----------
-    source : str, Path or sequence
-        A folder; or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and :class:`Image` records.
-    max_size_px : int
-        Long side to which larger images are reduced.
-    map_all : callable
-        Ordered map; that of a thread pool reads several images at one time.
-
-    Returns
-    -------
-    ImageSet
-        Files that cannot be decoded, are blank, too small or duplicates are refused. Names are printable;
-        equal names are numbered.
-
-    Raises
-    ------
-    UsageError
-        If the folder does not exist.
-    ValueError
-        If an array has another shape or type.
+    ``source`` is a folder, or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and Image records;
+    ``map_all`` an ordered map: that of a thread pool reads several images at one time. Names are printable;
+    equal names are numbered. Duplicates, blank and small images are refused too.
     """
     items = _named_items(source)
 
