@@ -6,27 +6,33 @@ error over cameras, points and lines (HZ 16.4).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from thesisrecon.arrays import F64
+from thesisrecon.epipolar._tensor_equations import (
+    NEEDED_EQUATIONS,
+    TensorEquations,
+    check_triplets,
+    tensor_equations,
+)
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, unit_normals
 from thesisrecon.geometry.three_view import (
-    NEEDED_EQUATIONS,
-    TensorEquations,
     cameras_from_tensor,
-    check_triplets,
     tensor_epipoles,
-    tensor_equations,
+    tensor_from_cameras,
     unit_tensor,
 )
 from thesisrecon.numerics.levenberg_marquardt import (
+    DenseSystem,
     invert_information,
     minimize_residuals,
+    run_levenberg_marquardt,
 )
+from thesisrecon.numerics.losses import huber
 
 # Largest relative standard deviation of T. Planes, rotations and random matches give 0.5 to 1.5 at any noise;
 # scenes with depth and noise of a hundredth of the parallax below 0.1.
@@ -36,7 +42,9 @@ WEAK = 0.4
 # constraints of the cameras resolve.
 SAME_NOISE, FAMILY = 1.25, 6
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
-OPT={}
+UNDETERMINED = "the matches do not determine the trifocal tensor"
+REMEDY = "use matches off one plane from three different positions, and check for wrong matches"
+_State = tuple[F64, F64]
 
 
 @dataclass(frozen=True)
@@ -121,12 +129,9 @@ def estimate_trifocal(
     try:
         T = _minimize_algebraic_error(equations, equations.solve())
     except ValueError as error:
-        raise StageFailure(
-            "the matches do not determine the trifocal tensor",
-            f"{n} points and {m} lines in a special position",
-            "add matches off the dominant plane",
-        ) from error
-    fit = _minimize_reprojection_error(T, points, segments, equations, loss_px)
+        raise StageFailure(UNDETERMINED, "they are in a special position", REMEDY) from error
+    problem = _ReprojectionProblem(T, points, segments, equations.transforms, loss_px)
+    fit = _minimize_reprojection_error(problem, equations)
     _require_determined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
     return fit
 
@@ -149,102 +154,108 @@ def _minimize_algebraic_error(equations: TensorEquations, start: F64) -> F64:
     return unit_tensor(tensor(found.x))
 
 
-class _Reprojection:
-    """Residuals of conditioned points x (3, N, 3) and segment ends y (3, M, 2, 3) near cameras P (3, 3, 4).
+class _ReprojectionProblem:
+    """Reprojection error of points and lines by 18 coordinates c of P2 and P3 near those of a conditioned T.
 
-    The parameters are 18 moves of P2 and P3, then 3 of each point and 4 of each line (two points), orthogonal
-    to the start: without singularities and independent of the frame of space.
+    A state is c and four coordinates f of each point (the last one unused) and line, all moves orthogonal to
+    the start. Points and lines are fitted to the cameras of each step (variable projection).
     """
 
-    def __init__(self, T: F64, points: F64, segments: F64, transforms: F64) -> None:
+    def __init__(self, T: F64, points: F64, segments: F64, transforms: F64, loss_px: float) -> None:
         H = transforms.swapaxes(1, 2)
-        self.x, self.y, self.scale = homogenize(points) @ H, homogenize(segments) @ H[:, None], H[:, 0, 0]
-        self.P = np.stack(cameras_from_tensor(T))
-        self.P[1:] /= np.linalg.norm(self.P[1:], axis=(1, 2), keepdims=True)
-        # T does not depend on six directions: the scales of P2 and P3 and the frame of space.
-        self.moves = np.linalg.svd(_by_cameras(self.P))[2][:18].reshape(18, 2, 3, 4)
+        self.x, self.y = (homogenize(points) @ H).swapaxes(0, 1), homogenize(segments).swapaxes(0, 1) @ H
+        self.per_pixel, self.loss_px = transforms[:, 0, 0], loss_px
+        self.P, self.moves = np.stack(cameras_from_tensor(T)), np.eye(24)
+        # T does not depend on six of 24 directions: the scales of P2 and P3 and the frame of space.
+        self.moves = np.linalg.svd(_derivatives(self.tensors, np.zeros(24)).reshape(27, 24))[2][:18]
+        # A line is where the planes of its image lines meet, a point where those of axis-parallel lines meet.
         axes = np.eye(3)[:2] - self.x[..., :2, None] * np.eye(3)[2]
-        lines = unit_normals(np.cross(self.y[:, :, 0], self.y[:, :, 1]))[:, :, None]
-        # A point is the intersection of the planes of its axis-parallel image lines, as a line is of its lines.
-        planes = (np.concatenate(list(l @ self.P[:, None]), axis=1) for l in (axes, lines))
-        self.X, self.L = (np.linalg.svd(p)[2] for p in planes)
+        lines = unit_normals(np.cross(self.y[:, :, :1], self.y[:, :, 1:]))
+        self.X = np.linalg.svd((axes @ self.P).reshape(-1, 6, 4))[2]
+        self.L = np.linalg.svd((lines @ self.P).reshape(-1, 3, 4))[2]
 
-    def cameras(self, p: F64) -> F64:
-        return self.P + np.concatenate([np.zeros((1, 3, 4)), np.tensordot(p[:18], self.moves, 1)])
+    def cameras(self, c: F64) -> F64:
+        """Conditioned cameras (..., 3, 3, 4)."""
+        moves = np.reshape(c @ self.moves, (*c.shape[:-1], 2, 3, 4))
+        return self.P + np.insert(moves, 0, 0.0, axis=-3)
 
-    def residuals(self, p: F64) -> F64:
-        """Offsets of the points, then distances of the segment ends, (N + M, 3 views, 2) px."""
-        n, P = len(self.X), self.cameras(p)
-        X = self.X[:, 3:] + p[18 : 18 + 3 * n].reshape(n, 1, 3) @ self.X[:, :3]
-        L = self.L[:, 2:] + p[18 + 3 * n :].reshape(-1, 2, 2) @ self.L[:, :2]
-        image, ends = np.einsum("vab,nkb->kvna", P, X)[0], np.einsum("vab,mkb->kvma", P, L)
+    def tensors(self, c: F64) -> F64:
+        """Conditioned tensors (B, 3, 3, 3) of unit norm for coordinates (B, 18)."""
+        return np.stack([tensor_from_cameras(*P) for P in self.cameras(c)])
+
+    def residual(self, c: F64, f: F64) -> F64:
+        """Offsets of the points, then distances of the segment ends, (..., N + M, 3 views, 2) px."""
+        P, n = self.cameras(c)[..., None, :, :, :], len(self.X)
+        moves = f[..., n:, :].reshape(*f.shape[:-2], len(self.L), 2, 2)
+        X = self.X[:, 3:] + f[..., :n, None, :3] @ self.X[:, :3]
+        L = self.L[:, 2:] + moves @ self.L[:, :2]
+        image, ends = (P @ Y.swapaxes(-1, -2)[..., None, :, :] for Y in (X, L))
         # Points of a principal plane have a distant image instead of none.
-        z = np.where(np.abs(image[..., 2:]) < 1e-12, 1e-12, image[..., 2:])
-        offsets = image[..., :2] / z - self.x[..., :2]
-        distances = (self.y @ unit_normals(np.cross(*ends))[..., None])[..., 0]
-        both = np.concatenate([offsets, distances], axis=1) / self.scale[:, None, None]
-        return np.asarray(both.swapaxes(0, 1))
+        z = np.where(np.abs(image[..., 2:, 0]) < 1e-12, 1e-12, image[..., 2:, 0])
+        seen = unit_normals(np.cross(ends[..., 0], ends[..., 1]))[..., None]
+        offsets, distances = image[..., :2, 0] / z - self.x[..., :2], (self.y @ seen)[..., 0]
+        return np.asarray(np.concatenate([offsets, distances], axis=-3) / self.per_pixel[:, None])
 
-    def sparsity(self) -> scipy.sparse.csr_matrix:
-        n, m = len(self.X), len(self.L)
-        own = scipy.sparse.block_diag([np.ones((6, 3))] * n + [np.ones((6, 4))] * m)
-        return scipy.sparse.hstack([np.ones((6 * (n + m), 18)), own]).tocsr()
+    def losses(self, residual: F64) -> tuple[F64, F64]:
+        """Huber's loss and weight (N + M, 3) of each image of a point or line."""
+        return huber(np.sum(residual**2, axis=2), self.loss_px)
+
+    def cost(self, state: _State) -> float:
+        return 0.5 * float(self.losses(self.residual(*state))[0].sum())
+
+    def linearize(self, state: _State) -> DenseSystem:
+        """The normal equations of the cameras, points and lines eliminated."""
+        c, f = state
+        r, B = self._weighted(state, _derivatives(lambda f: self.residual(c, f), f))
+        _, A = self._weighted(state, _derivatives(lambda c: self.residual(c, f), c))
+        A = A - B @ (np.linalg.pinv(B) @ A)
+        H, g = np.einsum("nri,nrj->ij", A, A), np.einsum("nri,nrj->i", A, r)
+        return DenseSystem(self.cost(state), H, g)
+
+    def retract(self, state: _State, step: F64) -> _State:
+        """Move the cameras, then points and lines by Gauss-Newton steps that lower their cost."""
+        c, f = state[0] + step, state[1]
+        for _ in range(3):
+            r, B = self._weighted((c, f), _derivatives(lambda f: self.residual(c, f), f))
+            moved = f - (np.linalg.pinv(B) @ r)[..., 0]
+            before, after = (self.losses(self.residual(c, g))[0].sum(axis=1) for g in (f, moved))
+            f = np.where((after < before)[:, None], moved, f)
+        return c, f
+
+    def _weighted(self, state: _State, J: F64) -> tuple[F64, F64]:
+        """Residuals (N + M, 6, 1) and derivatives (N + M, 6, D), times the roots of their weights."""
+        residual = self.residual(*state)[..., None]
+        root = np.sqrt(self.losses(residual[..., 0])[1])[..., None, None]
+        return (root * residual).reshape(-1, 6, 1), (root * J).reshape(-1, 6, J.shape[-1])
 
 
-def _minimize_reprojection_error(
-    T: F64, points: F64, segments: F64, equations: TensorEquations, loss_px: float
-) -> TrifocalFit:
-    """The fit, started from a conditioned tensor; whether the matches determine it is not tested."""
-    n, m = points.shape[1], segments.shape[1]
-    problem = _Reprojection(T, points, segments, equations.transforms)
-    found = scipy.optimize.least_squares(
-        lambda p: problem.residuals(p).ravel(),
-        np.zeros(18 + 3 * n + 4 * m),
-        jac_sparsity=problem.sparsity(),
-        x_scale="jac",
-        loss="huber",
-        f_scale=loss_px,
-        max_nfev=50, **OPT
-    )
-    residual, P = problem.residuals(found.x), problem.cameras(found.x)
+def _derivatives(function: Callable[[F64], F64], x: F64) -> F64:
+    """Central differences (..., D) by the last axis (D,) of x; the function takes a batch."""
+    steps = 1e-6 * np.expand_dims(np.eye(x.shape[-1]), tuple(range(1, x.ndim)))
+    return np.moveaxis(function(x + steps) - function(x - steps), 0, -1) / 2e-6
+
+
+def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: TensorEquations) -> TrifocalFit:
+    """The fit; whether the matches determine it is not tested."""
+    n, m = len(problem.X), len(problem.L)
+    start = problem.retract((np.zeros(18), np.zeros((n + m, 4))), np.zeros(18))
+    c, f = run_levenberg_marquardt(problem, start, max_iterations=50, tolerance=1e-9, initial_damping=1e-3)[0]
+    residual = problem.residual(c, f)
     sigma = float(np.sqrt(np.sum(residual**2) / max(3 * n + 2 * m - 18, 1)))
-    J = found.jac.toarray() if hasattr(found.jac,'toarray') else found.jac
-    by_camera = _by_cameras(P) @ problem.moves.reshape(18, 24).T
-    covariance = sigma**2 * invert_information(J.T @ J)[:18, :18]
-    T = _canonical_tensor(P[1], P[2]).ravel()
-    T, covariance = _normalized(T, by_camera @ covariance @ by_camera.T)
-    relative = float(np.sqrt(np.linalg.norm(covariance, ord=2) * (n + m)))
-    H1, (_, H2, H3) = equations.transforms[0], np.linalg.inv(equations.transforms)
-    to_pixels = np.einsum("ri,js,kt->ijkrst", H1, H2, H3).reshape(27, 27)
-    T, covariance = _normalized(to_pixels @ T, to_pixels @ covariance @ to_pixels.T)
+    of_cameras = sigma**2 * invert_information(problem.linearize((c, f)).hessian)
+
+    def tensors_px(c: F64) -> F64:
+        return np.stack([equations.in_pixels(T) for T in problem.tensors(c)])
+
+    J, J_px = (_derivatives(tensors, c).reshape(27, 18) for tensors in (problem.tensors, tensors_px))
     return TrifocalFit(
-        T.reshape(3, 3, 3),
-        np.linalg.norm(residual[:n], axis=2).T,
-        np.abs(residual[n:]).swapaxes(0, 1),
-        sigma,
-        covariance,
-        relative,
+        T=tensors_px(c[None])[0],
+        point_residuals_px=np.linalg.norm(residual[:n], axis=2).T,
+        line_residuals_px=np.abs(residual[n:]).swapaxes(0, 1),
+        sigma_px=sigma,
+        covariance=J_px @ of_cameras @ J_px.T,
+        relative_std=float(np.sqrt((n + m) * np.linalg.norm(J @ of_cameras @ J.T, ord=2))),
     )
-
-
-def _by_cameras(P: F64) -> F64:
-    """Derivatives (27, 24) of the tensor by the entries of P2 and P3."""
-    entries = np.eye(12).reshape(12, 3, 4)
-    columns = np.concatenate([_canonical_tensor(entries, P[2]), _canonical_tensor(P[1], entries)])
-    return columns.reshape(24, 27).T
-
-
-def _canonical_tensor(P2: F64, P3: F64) -> F64:
-    """A_ji b_k - a_j B_ki (..., 3, 3, 3) of cameras [A a] and [B b] (HZ 15.1), linear in either."""
-    left = np.einsum("...ji,...k->...ijk", P2[..., :3], P3[..., 3])
-    return np.asarray(left - np.einsum("...j,...ki->...ijk", P2[..., 3], P3[..., :3]))
-
-
-def _normalized(T: F64, covariance: F64) -> tuple[F64, F64]:
-    """T / |T| (27,) and the covariance (27, 27) of that unit vector."""
-    size = float(np.linalg.norm(T))
-    J = (np.eye(27) - np.outer(T, T) / size**2) / size
-    return T / size, J @ covariance @ J.T
 
 
 def _require_determined(fit: TrifocalFit, equations: TensorEquations, xy: F64) -> None:
@@ -258,9 +269,9 @@ def _require_determined(fit: TrifocalFit, equations: TensorEquations, xy: F64) -
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
     if not (family < FAMILY and fit.relative_std <= WEAK and narrowest > 3.0 * fit.sigma_px):
         raise StageFailure(
-            "the matches do not determine the trifocal tensor",
+            UNDETERMINED,
             f"noise {fit.sigma_px:.2g} px explains {family} independent tensors (at most {FAMILY - 1}); "
             f"narrowest spread of the matches {narrowest:.3g} px; relative standard deviation "
             f"{fit.relative_std:.2g} (at most {WEAK:.2g})",
-            "use matches off one plane from three different positions, and check for wrong matches",
+            REMEDY,
         )
