@@ -90,14 +90,10 @@ def test_degenerate_input_is_guarded():
     )
     assert np.isfinite(flat.P).all()
     assert flat.cost <= start.cost
-    with pytest.raises(ValueError, match="needs"):
-        refine_projective_bundle(P[0], X, block.view, block.point, block.xy)
     with pytest.raises(ValueError, match="finite"):
         refine_projective_bundle(P, X, block.view, block.point, block.xy * np.nan)
     with pytest.raises(ValueError, match="beyond"):
         refine_projective_bundle(P, X, block.view + 99, block.point, block.xy)
-    with pytest.raises(ValueError, match="not zero"):
-        refine_projective_bundle(np.zeros_like(P), X, block.view, block.point, block.xy)
 
 
 def test_whitening_spreads_directions_evenly_and_keeps_orientation():

@@ -159,12 +159,9 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
     noise = max(noise_from_distances(np.linalg.norm(seen - xy, axis=1)), 1e-3)
     intrinsics = cameras.intrinsics[cameras.group[view]]
     free = np.arange(len(intrinsics)) < OWN
-    try:
-        fit = refine_pose(
-            cameras.R[view], cameras.t[view], intrinsics, X, xy, free=free, loss_px=2.0 * noise, iterations=10
-        )
-    except ValueError:
-        return np.nan, np.nan
+    fit = refine_pose(
+        cameras.R[view], cameras.t[view], intrinsics, X, xy, free=free, loss_px=2.0 * noise, iterations=10
+    )
     left = max(noise_from_distances(np.linalg.norm(fit.residual_px, axis=1)), 1e-3)
     std = left * np.sqrt(max(fit.covariance[6, 6], 0.0))
     return float(np.log(fit.intrinsics[0] / intrinsics[0])), float(std)

@@ -68,7 +68,7 @@ def invert_cholesky_3x3(
 @kernel
 def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
     """Invert a symmetric positive matrix by Cholesky factorisation."""
-    positive = invert_cholesky_3x3(M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2], root)
+    positive: bool = invert_cholesky_3x3(M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2], root)
     multiply_transposed_3x3(root, out)
     return positive
 

@@ -66,7 +66,7 @@ class BundleLayout:
         for first, last in self.chunks:
             rows = slice(start[first], start[last])
             part = Observations(seen.view_index[rows], seen.point_index[rows], seen.xy[rows])
-            total += float(work(rows, part))
+            total += work(rows, part)
         return total
 
     def jacobians(self) -> Jacobians:

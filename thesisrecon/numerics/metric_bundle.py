@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes, scene_frame
+from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._covariance import (
     SIMILARITY_DOF,
@@ -23,7 +23,6 @@ from thesisrecon.numerics._intrinsic_unknowns import (
     number_unknowns,
 )
 from thesisrecon.numerics._metric_kernels import (
-    FOCAL,
     POSE_DOF,
     MetricModel,
     linearize_metric,
@@ -79,15 +78,12 @@ class MetricBundleResult:
     ----------
     cameras, X : MetricCameras, ndarray (N, 3)
         Refined cameras and points.
-    residual_px : ndarray (K, 2)
-        Projection minus observation in the caller's order.
-    cost : float
-        1/2 sum rho in units of the given sigma, priors included.
-    intrinsics_covariance : ndarray (G, C, C)
-        Zero for entries that do not move, and without ``covariance``.
-    pose_covariance : ndarray (V, 6, 6), optional
-        Of (rotation vector in rad, translation) of x -> exp(w) x + d in each camera frame, in the inner gauge
-        (no camera is taken as exact).
+    residual_px, cost : ndarray (K, 2), float
+        Projection minus observation in the caller's order, and 1/2 sum rho in units of the given sigma,
+        priors included.
+    intrinsics_covariance, pose_covariance : ndarray (G, C, C), ndarray (V, 6, 6), optional
+        Zero for entries that do not move, and without ``covariance``; poses as (rotation vector in rad,
+        translation) of x -> exp(w) x + d in each camera frame, in the inner gauge (no camera is exact).
     sigma_px : float
         Standard deviation of one image coordinate, estimated from the residuals.
     """
@@ -132,7 +128,7 @@ class _MetricProblem:
 
         def work(rows: slice, obs: Observations) -> float:
             part = Jacobians(*(a[rows] for a in J))
-            return linearize_metric(state.model, obs, self.weighting, c.own, c.common, part)
+            return float(linearize_metric(state.model, obs, self.weighting, c.own, c.common, part))
 
         cost = self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
         if c.pinned.any():
@@ -162,10 +158,10 @@ class _MetricProblem:
         return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
 
     def cost(self, state: _State) -> float:
-        def work(_: slice, obs: Observations) -> float:
-            return metric_cost(state.model, obs, self.weighting)
-
-        return self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
+        data = self.layout.sum_over_observations(
+            lambda _, obs: float(metric_cost(state.model, obs, self.weighting))
+        )
+        return data + self.values.terms.cost(state.values)
 
     def sigma(self, state: _State, residual: F64) -> float:
         """Return the noise of one coordinate, px, from the residuals at the minimum."""
@@ -194,10 +190,8 @@ def refine_metric_bundle(
 
     Parameters
     ----------
-    cameras, X : MetricCameras, ndarray (N, 3)
-        Start, and which intrinsics are shared.
-    observations : Observations
-        Observations in any order.
+    cameras, X, observations : MetricCameras, ndarray (N, 3), Observations
+        Start, which intrinsics are shared, and observations in any order.
     free, prior : ndarray (C,) of bool, IntrinsicsPrior, optional
         Intrinsics that move, and their prior, which may fix single values.
     options : BundleOptions, optional
@@ -211,17 +205,15 @@ def refine_metric_bundle(
     Raises
     ------
     ValueError
-        For wrong shapes, values that are not finite, or focal lengths that are not positive.
+        For pixels that are not finite, or views and points beyond the cameras and X.
     """
     options = options or BundleOptions()
-    X = np.array(X, dtype=np.float64)
-    _check_cameras(cameras, X, free)
     o = sort_observations(observations, len(cameras.R), len(X))
     seen_points = np.diff(o.start) > 0
     origin, scale = scene_frame(X[seen_points])
     problem, values, table = _metric_problem(cameras, o, np.asarray(free, dtype=bool), prior, options)
     start = MetricModel(
-        np.array(cameras.R, dtype=np.float64),
+        np.ascontiguousarray(cameras.R),
         scale * (cameras.t + cameras.R @ origin),
         problem.values.write(table, values),
         np.ascontiguousarray(cameras.group, dtype=np.int64),
@@ -247,24 +239,6 @@ def refine_metric_bundle(
     )  # fmt: skip
 
 
-def _check_cameras(cameras: MetricCameras, X: F64, free: B8) -> None:
-    """Raise ``ValueError`` for wrong shapes and values of cameras and points."""
-    require_shapes(
-        "a metric bundle", R=(cameras.R, ("V", 3, 3)), t=(cameras.t, ("V", 3)), group=(cameras.group, ("V",)),
-        intrinsics=(cameras.intrinsics, ("G", "C")), free=(free, ("C",)), X=(X, ("N", 3)),
-    )  # fmt: skip
-    n_rows, width = cameras.intrinsics.shape
-    if width not in (6, 8):
-        raise ValueError(f"a metric bundle needs 6 or 8 intrinsics; got {width}")
-    if cameras.shared is not None:
-        require_shapes("a metric bundle", shared=(cameras.shared, (n_rows, width)))
-    require_finite("a metric bundle", cameras.R, cameras.t, cameras.intrinsics, X)
-    if not (cameras.intrinsics[:, FOCAL] > 0.0).all():
-        raise ValueError("a metric bundle needs positive focal lengths")
-    if len(cameras.group) and (cameras.group.min() < 0 or cameras.group.max() >= n_rows):
-        raise ValueError(f"groups must lie in 0..{n_rows - 1}")
-
-
 def _minimize(problem: _MetricProblem, state: _State, most: int) -> tuple[_State, float]:
     """Return the minimum and its cost: by reweighting first, nearly Newton's steps where the loss bends."""
     state, cost, iterations = run_levenberg_marquardt(
@@ -288,10 +262,7 @@ def _metric_problem(
     observed = np.bincount(o.seen.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
     values, start, table = number_unknowns(cameras, used, free, prior)
-    fixed = np.zeros(len(group), bool) if options.fixed_views is None else np.asarray(options.fixed_views)
-    if fixed.shape != group.shape:
-        raise ValueError(f"fixed_views is one flag for each of {len(group)} views; got shape {fixed.shape}")
-    free_views = observed & ~fixed.astype(bool)
+    free_views = observed if options.fixed_views is None else observed & ~options.fixed_views
     columns = assign_columns(values, group, np.flatnonzero(free), observed, free_views)
     layout = build_layout(
         o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border

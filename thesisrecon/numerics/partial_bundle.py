@@ -8,12 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import (
-    pixel_conditioning,
-    require_finite,
-    require_shapes,
-    whitening_transform,
-)
+from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
 from thesisrecon.kernels import kernel
 from thesisrecon.numerics._kernels import away_from_zero, invert_positive_3x3, loss_value, loss_weight
 from thesisrecon.numerics._metric_kernels import (
@@ -154,37 +149,16 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
 
 
 @dataclass(frozen=True)
-class CameraRefinement:
-    """Refined projective camera.
-
-    Parameters
-    ----------
-    P : ndarray (3, 4)
-        Camera at the norm and sign of its start.
-    covariance : ndarray (12, 12)
-        Of P's row-major entries for image noise of 1 px; multiply by sigma^2. No part along P itself (the
-        scale); huge variances in undetermined directions.
-    """
-
-    P: F64
-    covariance: F64
-
-
-@dataclass(frozen=True)
 class PoseRefinement:
     """Refined calibrated camera.
 
     Parameters
     ----------
-    R, t : ndarray (3, 3), (3,)
-        Pose, world-to-camera.
-    intrinsics : ndarray (6,) or (8,)
-        Row of ``MetricCameras.intrinsics``.
-    covariance : ndarray (6 + F, 6 + F)
-        For noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x + d of the camera frame;
-        F free intrinsics, the focal length as log f.
-    residual_px : ndarray (M, 2)
-        Projection minus observation.
+    R, t, intrinsics : ndarray (3, 3), (3,), (6,) or (8,)
+        Pose, world-to-camera, and row of ``MetricCameras.intrinsics``.
+    covariance, residual_px : ndarray (6 + F, 6 + F), (M, 2)
+        For noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x + d of the camera frame, F
+        free intrinsics, the focal length as log f; and projection minus observation.
     """
 
     R: F64
@@ -213,10 +187,8 @@ def refine_points(
     ----------
     P, X : ndarray (V, 3, 4), (N, 4)
         Cameras and starting points.
-    view_index, point_index : ndarray (K,) of int
-        View and point of each observation.
-    xy : ndarray (K, 2)
-        Pixels.
+    view_index, point_index, xy : ndarray (K,) of int, (K,) of int, (K, 2)
+        View, point and pixels of each observation.
     loss_px, iterations : float, int
         Turning point of Huber's loss, px, and steps per point.
 
@@ -224,13 +196,8 @@ def refine_points(
     -------
     ndarray (N, 4)
         Points of unchanged norms and signs; unchanged if zero, not finite or observed less than twice.
-
-    Raises
-    ------
-    ValueError
-        For wrong shapes.
     """
-    P, X, o, used = _checked_points("refine_points", P, X, Observations(view_index, point_index, xy))
+    o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
     options = _PointOptions(loss_px, iterations, 1e-9, 1, True)
@@ -252,13 +219,8 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
     -------
     ndarray (N, 4)
         Points as in :func:`refine_points`.
-
-    Raises
-    ------
-    ValueError
-        For wrong shapes.
     """
-    P, X, o, used = _checked_points("minimize_reprojection", P, X, Observations(view_index, point_index, xy))
+    o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
     cameras = _unit_cameras(pixel_conditioning(o.seen.xy) @ P)
@@ -270,14 +232,10 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
     return _refine_in_frame(P, X, o, used, M, options)
 
 
-def _checked_points(
-    caller: str, P: F64, X: F64, observations: Observations
-) -> tuple[F64, F64, SortedObservations, B8]:
-    """Return copies, sorted observations, and the finite non-zero points with two observations or more."""
-    P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
-    require_shapes(caller, P=(P, ("V", 3, 4)), X=(X, ("N", 4)))
+def _usable_points(P: F64, X: F64, observations: Observations) -> tuple[SortedObservations, B8]:
+    """Return sorted observations, and the finite non-zero points with two of them or more."""
     o, norms = sort_observations(observations, len(P), len(X)), np.linalg.norm(X, axis=1)
-    return P, X, o, np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2)
+    return o, np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2)
 
 
 def _unit_cameras(P: F64) -> F64:
@@ -335,7 +293,7 @@ def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
     return DenseSystem(cost, A.T @ A, A.T @ r)
 
 
-def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> CameraRefinement:
+def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> tuple[F64, F64]:
     """Refine one projective camera with the points fixed: resection (section 6.4), 11 unknowns, Huber's loss.
 
     Too few points or points on one plane raise nothing: the covariance shows them.
@@ -349,20 +307,11 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
 
     Returns
     -------
-    CameraRefinement
-        Camera with its covariance.
-
-    Raises
-    ------
-    ValueError
-        For wrong shapes, or values that are zero or not finite.
+    P, covariance : ndarray (3, 4), (12, 12)
+        Camera at the norm and sign of its start, and covariance of its row-major entries for noise of 1 px,
+        without a part along P (the scale); huge variances in undetermined directions.
     """
-    P, X, xy = (np.array(a, dtype=np.float64) for a in (P, X, xy))
-    require_shapes("refine_camera", P=(P, (3, 4)), X=(X, ("M", 4)), xy=(xy, ("M", 2)))
-    norms, size = np.linalg.norm(X, axis=1), float(np.linalg.norm(P))
-    require_finite("refine_camera", P, X, xy)
-    if not len(X) or not (norms > 0.0).all() or not size > 0.0:
-        raise ValueError("refine_camera needs points and a camera that are not zero")
+    size = float(np.linalg.norm(P))
     T, M = pixel_conditioning(xy), whitening_transform(X)
     points = X @ M.T
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -378,16 +327,12 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     raw *= size / np.linalg.norm(raw)
     # The norm is fixed, so the part of an error along P is only a change of scale.
     back -= np.outer(raw, raw @ back) / size**2
-    covariance = back @ _camera_covariance(problem, end) @ back.T * scale**2
-    return CameraRefinement(raw.reshape(3, 4), covariance)
-
-
-def _camera_covariance(problem: _CameraProblem, state: F64) -> F64:
-    """Return the covariance (12, 12) of the unit camera for unit noise in conditioned pixels."""
-    v, beta = np.empty_like(state), np.empty(1)
-    tangent_reflectors(state, v, beta)
+    v, beta = np.empty_like(end), np.empty(1)
+    tangent_reflectors(end, v, beta)
     basis = (np.eye(12) - beta[0] * np.outer(v[0], v[0]))[:, 1:]
-    return np.asarray(basis @ invert_information(problem.linearize(state).hessian) @ basis.T)
+    of_unit_camera = basis @ invert_information(problem.linearize(end).hessian) @ basis.T
+    covariance = back @ of_unit_camera @ back.T * scale**2
+    return raw.reshape(3, 4), covariance
 
 
 @dataclass(frozen=True)
@@ -423,7 +368,7 @@ def refine_pose(
     X: F64,
     xy: F64,
     *,
-    free: B8 | None = None,
+    free: B8,
     loss_px: float = 1.0,
     iterations: int = 20,
 ) -> PoseRefinement:
@@ -435,8 +380,8 @@ def refine_pose(
         Start: pose world-to-camera, and a row of ``MetricCameras.intrinsics``.
     X, xy : ndarray (M, 3), (M, 2)
         Points and their pixels.
-    free : ndarray (6,) or (8,) of bool, optional
-        Intrinsics that move; none by default.
+    free : ndarray (6,) or (8,) of bool
+        Intrinsics that move.
     loss_px, iterations : float, int
         Turning point of Huber's loss, px, and maximum number of linear solves.
 
@@ -444,21 +389,9 @@ def refine_pose(
     -------
     PoseRefinement
         Pose with its covariance.
-
-    Raises
-    ------
-    ValueError
-        For wrong shapes, values that are not finite, or a focal length that is not positive.
     """
-    R, t, q, X, xy = (np.array(a, dtype=np.float64) for a in (R, t, intrinsics, X, xy))
-    require_shapes(
-        "refine_pose", R=(R, (3, 3)), t=(t, (3,)), X=(X, ("M", 3)), xy=(xy, ("M", 2)),
-        intrinsics=(q, (8 if q.shape == (8,) else 6,)),
-    )  # fmt: skip
-    require_finite("refine_pose", R, t, q, X, xy)
-    if not len(X) or not q[0] > 0.0:
-        raise ValueError(f"refine_pose needs points and a positive focal length; got {len(X)} and {q[0]}")
-    columns = np.flatnonzero(np.zeros(len(q), bool) if free is None else free)
+    columns = np.flatnonzero(free)
+    R = np.ascontiguousarray(R)
     # With centred and scaled points the pose unknowns are well conditioned.
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
@@ -466,7 +399,7 @@ def refine_pose(
     weighting = Weighting(1.0, loss_px)
     problem = _PoseProblem(_one_view_observations(xy), columns, weighting)
     moved, points = scale * (t + R @ origin), np.ascontiguousarray(scale * (X - origin))
-    start = MetricModel(R[None], moved[None], q[None], np.zeros(1, dtype=np.int64), points)
+    start = MetricModel(R[None], moved[None], intrinsics[None], np.zeros(1, dtype=np.int64), points)
     end, _, _ = run_levenberg_marquardt(problem, start, max_iterations=iterations)
     units = np.ones(6 + len(columns))
     units[3:6] = 1.0 / scale

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import pixel_conditioning, require_shapes, whitening_transform
+from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
 from thesisrecon.numerics._elimination import revert_crossing_points
-from thesisrecon.numerics._observations import Jacobians, SortedObservations, Weighting, sort_observations
+from thesisrecon.numerics._observations import Jacobians, Weighting, sort_observations
 from thesisrecon.numerics._projective_kernels import (
     UnitState,
     linearize_projective,
@@ -35,10 +35,8 @@ class ProjectiveBundleResult:
     ----------
     P, X : ndarray (V, 3, 4), (N, 4)
         Cameras and points in the caller's frame, norms and signs.
-    residual_px : ndarray (K, 2)
-        Projection minus observation in the caller's order.
-    cost : float
-        1/2 sum rho, px^2.
+    residual_px, cost : ndarray (K, 2), float
+        Projection minus observation in the caller's order, and 1/2 sum rho, px^2.
     """
 
     P: F64
@@ -58,7 +56,7 @@ class _ProjectiveProblem:
     def linearize(self, state: UnitState) -> BundleSystem:
         def work(rows: slice, obs: Observations) -> float:
             part = Jacobians(*(a[rows] for a in self.jacobians))
-            return linearize_projective(state, obs, self.weighting, part)
+            return float(linearize_projective(state, obs, self.weighting, part))
 
         return BundleSystem(self.layout.sum_over_observations(work), self.layout, self.jacobians)
 
@@ -73,10 +71,9 @@ class _ProjectiveProblem:
         return UnitState.at(P, X)
 
     def cost(self, state: UnitState) -> float:
-        def work(_: slice, obs: Observations) -> float:
-            return projective_cost(state, obs, self.weighting)
-
-        return self.layout.sum_over_observations(work)
+        return self.layout.sum_over_observations(
+            lambda _, obs: float(projective_cost(state, obs, self.weighting))
+        )
 
 
 def refine_projective_bundle(
@@ -100,10 +97,8 @@ def refine_projective_bundle(
     ----------
     P, X : ndarray (V, 3, 4), (N, 4)
         Cameras and points of any scale and sign, which are kept.
-    view_index, point_index : ndarray (K,) of int
-        View and point of each observation, in any order; sorted by point is fastest.
-    xy : ndarray (K, 2)
-        Pixels.
+    view_index, point_index, xy : ndarray (K,) of int, (K,) of int, (K, 2)
+        View, point and pixels of each observation, in any order; sorted by point is fastest.
     loss_px, max_iterations : float, int
         Turning point of Huber's loss, px, and maximum number of linear solves.
     fixed_views : ndarray (V,) of bool, optional
@@ -117,27 +112,28 @@ def refine_projective_bundle(
     Raises
     ------
     ValueError
-        For wrong shapes, values that are not finite, or an observed camera or point that is all zero.
+        For pixels that are not finite, or views and points beyond P and X.
     """
-    P, X = np.array(P, dtype=np.float64), np.array(X, dtype=np.float64)
-    require_shapes("refine_projective_bundle", P=(P, ("V", 3, 4)), X=(X, ("N", 4)))
     o = sort_observations(Observations(view_index, point_index, xy), len(P), len(X))
     observed = np.bincount(o.seen.view_index, minlength=len(P)) > 0
     seen_points = np.diff(o.start) > 0
     free = observed & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))
 
     T, M = pixel_conditioning(o.seen.xy), whitening_transform(X[seen_points])
-    conditioned, P_norms = _unit_rows((T @ P @ np.linalg.inv(M)).reshape(-1, 12), observed, "camera")
-    points, X_norms = _unit_rows(X @ M.T, seen_points, "point")
-    problem = _projective_problem(o, T, free, loss_px)
-    start = UnitState.at(conditioned, points)
+    scale = float(T[0, 0])
+    conditioned = replace(o, seen=o.seen._replace(xy=o.seen.xy * scale + T[:2, 2]))
+    block = np.where(free, np.cumsum(free) - 1, -1)
+    none = np.zeros((len(free), 0), dtype=np.int64)
+    layout = build_layout(conditioned, block, width=_VIEW_DOF, common=none, border=0)
+    problem = _ProjectiveProblem(layout, Weighting(1.0, loss_px * scale), layout.jacobians())
+    cameras, P_norms = _unit_rows((T @ P @ np.linalg.inv(M)).reshape(-1, 12), observed)
+    points, X_norms = _unit_rows(X @ M.T, seen_points)
+    start = UnitState.at(cameras, points)
     end, cost, _ = run_levenberg_marquardt(problem, start, max_iterations=max_iterations)
 
-    scale = T[0, 0]
     P_back = np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4) @ M
     X_back = (end.X * X_norms[:, None]) @ np.linalg.inv(M).T
-    conditioned_xy = problem.layout.observations.seen
-    residual = project_projective(end.P.reshape(-1, 3, 4), end.X, conditioned_xy)
+    residual = project_projective(end.P.reshape(-1, 3, 4), end.X, conditioned.seen)
     return ProjectiveBundleResult(
         np.where(free[:, None, None], _with_norms(P_back, P, axis=(1, 2)), P),
         np.where(seen_points[:, None], _with_norms(X_back, X, axis=1), X),
@@ -146,22 +142,9 @@ def refine_projective_bundle(
     )
 
 
-def _projective_problem(o: SortedObservations, T: F64, free: B8, loss_px: float) -> _ProjectiveProblem:
-    """Set up the problem in conditioned pixels."""
-    conditioned = replace(o, seen=o.seen._replace(xy=o.seen.xy * T[0, 0] + T[:2, 2]))
-    block = np.where(free, np.cumsum(free) - 1, -1)
-    none = np.zeros((len(free), 0), dtype=np.int64)
-    layout = build_layout(conditioned, block, width=_VIEW_DOF, common=none, border=0)
-    weighting = Weighting(1.0, loss_px * float(T[0, 0]))
-    return _ProjectiveProblem(layout, weighting, layout.jacobians())
-
-
-def _unit_rows(rows: F64, used: B8, what: str) -> tuple[F64, F64]:
+def _unit_rows(rows: F64, used: B8) -> tuple[F64, F64]:
     """Return rows at unit norm and their norms; unused rows may be zero."""
-    norms = np.linalg.norm(rows, axis=1)
-    if not (np.isfinite(norms[used]).all() and (norms[used] > 0.0).all()):
-        raise ValueError(f"every observed {what} must be finite and not zero")
-    norms = np.where(used, norms, 1.0)
+    norms = np.where(used, np.linalg.norm(rows, axis=1), 1.0)
     return np.ascontiguousarray(np.where(used[:, None], rows / norms[:, None], 0.0)), norms
 
 

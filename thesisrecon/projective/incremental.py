@@ -247,12 +247,11 @@ class IncrementalProjective:
         self, model: ProjectiveModel, view: int, P: F64, X: F64, xy: F64
     ) -> tuple[bool, F64]:
         """Return whether to defer the camera, and the refined camera with positive depths."""
-        refined = refine_camera(P, X, xy, loss_px=LOSS_SIGMAS * model.sigma_px, iterations=20)
-        P = refined.P * np.sign(np.median(X @ refined.P[2]))
+        refined, covariance = refine_camera(P, X, xy, loss_px=LOSS_SIGMAS * model.sigma_px, iterations=20)
+        P = refined * np.sign(np.median(X @ refined[2]))
         if self.max_projection_std_rel is None:
             return False, P
-        covariance = refined.covariance * model.sigma_px**2
-        std_px = projection_std_px(refined.P, covariance, model.X[model.valid])
+        std_px = projection_std_px(refined, covariance * model.sigma_px**2, model.X[model.valid])
         limit = self.max_projection_std_rel * float(model.sizes[view].max())
         quantile = float(np.quantile(std_px, _STD_QUANTILE))
         if quantile < limit:
