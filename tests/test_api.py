@@ -15,7 +15,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._exports import _original_from_working
 from thesisrecon.records import Image, TexturedMesh, Tracks
-from thesisrecon.report._summary import point_colors
+from thesisrecon.report._data import point_colors
 from thesisrecon.runtime._run import stream
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"

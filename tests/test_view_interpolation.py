@@ -12,9 +12,9 @@ import pytest
 import thesisrecon
 from tests.synthetic import texture
 from thesisrecon import view_interpolation as between
-from thesisrecon.cli import _view_sequences as sequences
+from thesisrecon.cli import view_files as sequences
 from thesisrecon.cli.main import run_command
-from thesisrecon.cli.view_files import InterpolateOptions, interpolate_images
+from thesisrecon.cli.view_files import interpolate_images
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
@@ -250,4 +250,4 @@ def test_a_folder_of_other_files_is_refused(tmp_path):
     photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(UsageError, match="which this command did not create"):
-        interpolate_images(tmp_path, InterpolateOptions(photographs))
+        interpolate_images(tmp_path, photographs)

@@ -8,35 +8,11 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from thesisrecon.api import (
-        Camera,
-        DisparityMap,
-        FundamentalFit,
-        Image,
-        PipelineConfig,
-        Reconstruction,
-        RunResult,
-        SelfCalibration,
-        StageFailure,
-        TexturedMesh,
-        Tracks,
-        TwoView,
-        UsageError,
-        estimate_fundamental,
-        interpolate_view,
-        match_pair,
-        match_rectified,
-        reconstruct,
-        render,
-        self_calibrate,
-        synthesize_view,
-        triangulate,
-        upgrade_affine,
-    )
+    from thesisrecon.api import *  # noqa: F403
 
 __version__ = "0.1.0"
 
-__all__ = [
+__all__ = [  # noqa: F405
     "Camera",
     "DisparityMap",
     "FundamentalFit",

@@ -91,10 +91,8 @@ class Camera:
 
         Parameters
         ----------
-        P : ndarray (3, 4)
-            Finite camera matrix; ``ValueError`` if the camera centre is at infinity.
-        size : tuple of int
-            Image (width, height).
+        P, size : ndarray (3, 4), tuple of int
+            Camera matrix (``ValueError`` if the centre is at infinity), and image (width, height).
 
         Returns
         -------
@@ -142,15 +140,13 @@ class Camera:
 
         Parameters
         ----------
-        xy : ndarray (N, 2)
-            Pixels of the (distorted) image.
-        depth : ndarray (N,), optional
-            Depth z in the camera frame. None: return unit viewing directions.
+        xy, depth : ndarray (N, 2), ndarray (N,)
+            Pixels of the (distorted) image and depths z in the camera frame (optional).
 
         Returns
         -------
         ndarray (N, 3)
-            Points, or unit directions from the centre, in the world frame.
+            Points, or without depth unit directions from the centre, in the world frame.
         """
         xy = np.asarray(xy, dtype=np.float64)
         require_shapes("Camera.unproject", xy=(xy, ("N", 2)))

@@ -6,7 +6,7 @@ Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
@@ -48,7 +48,6 @@ from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations
 from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
-from thesisrecon.stereo._depth_fusion import SequenceLinking
 from thesisrecon.stereo.correspondence import PairMatching, RectifiedPair
 from thesisrecon.stereo.depth import MultiViewScene, MultiViewStereo
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
@@ -109,16 +108,7 @@ class Detector(Protocol):
 
 
 class PairSelector(Protocol):
-    """Select the pairs of images to match; ``check`` refuses invalid settings before anything is computed."""
-
-    def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Check the settings against the names of the images and of images that were not used.
-
-        Raises
-        ------
-        UsageError
-            If a listed name is unknown or no pair remains.
-        """
+    """Select the pairs of images to match."""
 
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
@@ -182,14 +172,8 @@ class FundamentalEstimator(Protocol):
         Returns
         -------
         FundamentalFit
-            F, inliers, noise, covariance and competing models; always finite.
-
-        Raises
-        ------
-        ValueError
-            If the shapes differ or coordinates are not finite.
-        StageFailure
-            If there are too few or collinear matches, or no F has 8 inliers.
+            F, inliers, noise, covariance and competing models; always finite. ``StageFailure`` if there are
+            too few or collinear matches, or no F has 8 inliers.
         """
 
 
@@ -247,12 +231,7 @@ class ProjectiveReconstructor(Protocol):
         Returns
         -------
         Reconstruction
-            Projective reconstruction.
-
-        Raises
-        ------
-        StageFailure
-            If no pair is accepted, shows parallax or is left.
+            Projective reconstruction; ``StageFailure`` if no pair is accepted, shows parallax or is left.
         """
 
 
@@ -267,12 +246,8 @@ class SelfCalibrator(Protocol):
         Returns
         -------
         SelfCalibration
-            Upgrades and calibrations, best first, with the identifiability report.
-
-        Raises
-        ------
-        StageFailure
-            If no calibration places the points in front of the cameras.
+            Upgrades and calibrations, best first, with the identifiability report. ``StageFailure`` if none
+            places the points in front of the cameras.
         """
 
 
@@ -309,12 +284,8 @@ class MetricRefiner(Protocol):
         Returns
         -------
         MetricResult
-            Cameras, points, intrinsics with intervals, and the self-check.
-
-        Raises
-        ------
-        StageFailure
-            If no candidate gives a metric model.
+            Cameras, points, intrinsics with intervals, and the self-check; ``StageFailure`` if no candidate
+            gives a metric model.
         """
 
 
@@ -339,7 +310,6 @@ class DepthEstimator(Protocol):
         DisparityMap
             x_right = x_left - d, NaN = unknown or occluded.
         """
-        ...
 
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
@@ -353,7 +323,6 @@ class DepthEstimator(Protocol):
         RectifiedPair
             Rectified images and disparities of both.
         """
-        ...
 
     def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
         """Undistort the images of a metric reconstruction and select the neighbours of each.
@@ -363,7 +332,6 @@ class DepthEstimator(Protocol):
         MultiViewScene
             Input of the other methods.
         """
-        ...
 
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
         """Return the views that the depth map of a view and its confirmation need.
@@ -373,7 +341,6 @@ class DepthEstimator(Protocol):
         frozenset of int
             Numbers of the views, the view among them.
         """
-        ...
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
         """Compute the depth map of one view from its neighbours.
@@ -384,7 +351,6 @@ class DepthEstimator(Protocol):
             NaN = unknown, everywhere if the view has no neighbours or all pairs fail; ``views`` counts the
             neighbours that agree.
         """
-        ...
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
         """Complete a result of ``depth_map``, and keep the depths that the maps of other views confirm.
@@ -394,7 +360,6 @@ class DepthEstimator(Protocol):
         DepthMap
             ``views`` is the number of confirming views.
         """
-        ...
 
 
 class ModelBuilder(Protocol):
@@ -495,7 +460,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
         dense=MultiViewStereo(
             # This matcher also assigns disparities to textureless regions, with low confidence.
             pairs=PairMatching(matcher=MaximumLikelihoodScanline(), min_confidence=0.25),
-            linker=SequenceLinking(),
+            sequence_links=4,
             refinement=False,
         ),
         # "By fitting parametric surfaces through the points ... sampled in a fine scale triangular pattern".

@@ -144,26 +144,19 @@ class OutputError(UsageError):
 
     Parameters
     ----------
-    place : path or str
-        File or folder; its old content is unchanged.
-    error : OSError
-        The cause.
+    place, error : path or str, OSError
+        File or folder, whose old content is unchanged, and the cause.
     kept : path
         Run folder to resume from, if any.
     """
 
     def __init__(self, place: str | PathLike[str], error: OSError, kept: str | PathLike[str] = "") -> None:
         self.place, self.error, self.kept = place, error, kept
-        number = error.errno or 0
-        reason = error.strerror or str(error)
-        sentence = (
-            f"{fspath(place)} cannot be written: {reason}; {REMEDIES.get(number, 'choose another place')}"
-        )
+        remedy = REMEDIES.get(error.errno or 0, "choose another place")
+        sentence = f"{fspath(place)} cannot be written: {error.strerror or error}; {remedy}"
         if fspath(kept):
             sentence += f", then repeat the command to resume from {fspath(kept)}"
         super().__init__(sentence)
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[OutputError], tuple[str | PathLike[str], OSError, str | PathLike[str]]]:
+    def __reduce__(self) -> tuple[type[OutputError], tuple[Any, ...]]:
         return type(self), (self.place, self.error, self.kept)

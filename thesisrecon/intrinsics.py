@@ -176,18 +176,21 @@ class IntrinsicsOptions:
             if getattr(self, intrinsic) == "known" and value != type(self).__dataclass_fields__[name].default:
                 raise ValueError(f"{name} = {value} has no effect with {intrinsic} = known: leave one out")
         if self.focal_std_rel is not None and not focal_given:
-            raise ValueError(
-                f"focal_std_rel = {self.focal_std_rel} has no effect without a focal length: set focal_px, "
-                "or exif = true"
-            )
+            idle = f"focal_std_rel = {self.focal_std_rel} has no effect without a focal length"
+            raise ValueError(f"{idle}: set focal_px, or exif = true")
 
 
 def _camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I64:
     """Camera number (V,) of each image in order of appearance: one per distinct size, or one per image."""
     if cameras == "per-image":
         return np.arange(len(original_sizes), dtype=np.int64)
-    distinct = list(dict.fromkeys(original_sizes))
-    return np.array([distinct.index(size) for size in original_sizes], dtype=np.int64)
+    return _numbered(original_sizes)
+
+
+def _numbered(keys: Sequence[tuple[float, ...]]) -> I64:
+    """Number of each key among the distinct ones, in order of appearance."""
+    distinct = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return np.array([distinct[key] for key in keys], dtype=np.int64)
 
 
 def camera_numbers(
@@ -209,12 +212,9 @@ def camera_numbers(
     exif = np.full(n, np.nan) if exif_focal_px is None else exif_focal_px
     prior = prior_from_options(options, original_sizes, exif, np.ones(n))
     known = prior.std == 0.0
-    tied = np.where(known, -1, prior.shared).tolist()
-    values = np.where(known, prior.mean, 0.0).tolist()
-    group = _camera_groups(original_sizes, options.cameras).tolist()
-    keys = [(g, *t, *v) for g, t, v in zip(group, tied, values, strict=True)]
-    distinct = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    return np.array([distinct[key] for key in keys], dtype=np.int64)
+    tied, values = np.where(known, -1, prior.shared), np.where(known, prior.mean, 0.0)
+    group = _camera_groups(original_sizes, options.cameras)
+    return _numbered(list(map(tuple, np.column_stack([group, tied, values]).tolist())))
 
 
 def prior_from_options(
@@ -224,22 +224,15 @@ def prior_from_options(
 
     Parameters
     ----------
-    options : IntrinsicsOptions
-        The user's settings.
-    original_sizes : sequence of (width, height)
-        Sizes of the original images.
+    options, original_sizes : IntrinsicsOptions, sequence of (width, height)
+        The user's settings, and the sizes of the original images.
     exif_focal_px, scales : ndarray (V,)
         Focal lengths from EXIF in original pixels (NaN if missing), and working over original size.
 
     Returns
     -------
     IntrinsicsPrior
-        One row per view.
-
-    Raises
-    ------
-    UsageError
-        If the given principal point lies far outside an image.
+        One row per view; ``UsageError`` if the given principal point lies far outside an image.
     """
     n = len(original_sizes)
     check_sizes(options, original_sizes)
@@ -273,15 +266,12 @@ def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None 
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        Its ``sizes`` are taken for the original sizes.
-    options : IntrinsicsOptions, optional
-        The user's settings; None: the defaults.
+    reconstruction, options : Reconstruction, IntrinsicsOptions
+        Its ``sizes`` are taken for the original sizes; options None: the defaults.
 
     Returns
     -------
     IntrinsicsPrior
-        One row per view.
     """
     sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
     missing, same = np.full(len(sizes), np.nan), np.ones(len(sizes))
@@ -302,22 +292,19 @@ def check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, 
     for width, height in dict.fromkeys(original_sizes):
         outside = max(-x, x - width, -y, y - height)
         if outside > _MAX_CENTRE_OFFSET * max(width, height):
-            raise UsageError(
-                f"principal_point_px = ({x:g}, {y:g}) is {outside:.0f} px outside an image of "
-                f"{width} x {height} px, more than its long side. Give it in pixels of the original images"
-            )
+            where = f"{outside:.0f} px outside an image of {width} x {height} px, more than its long side"
+            advice = "Give it in pixels of the original images"
+            raise UsageError(f"principal_point_px = ({x:g}, {y:g}) is {where}. {advice}")
 
 
 def _values(options: IntrinsicsOptions, sizes: F64, exif_focal_px: F64) -> tuple[F64, F64]:
     """Means and standard deviations (V, 6) in original pixels, modes ignored."""
     n, one, given = len(sizes), np.ones(len(sizes)), options.principal_point_px
-    focal = options.focal_px * one if options.focal_px is not None else np.nan * one
-    if options.focal_px is None and options.exif:
-        focal = exif_focal_px.astype(np.float64)
+    missing = exif_focal_px.astype(np.float64) if options.exif else np.nan * one
+    focal = missing if options.focal_px is None else options.focal_px * one
     centre = (sizes - 1.0) / 2.0 if given is None else np.tile(given, (n, 1))
-    mean = np.column_stack(
-        [focal, options.aspect_ratio * one, options.skew_px * one, centre, options.k1_value * one]
-    )
+    aspect, skew, k1 = (value * one for value in (options.aspect_ratio, options.skew_px, options.k1_value))
+    mean = np.column_stack([focal, aspect, skew, centre, k1])
     stds = {intrinsic: getattr(options, name) for name, intrinsic in _STD_SETTINGS.items()}
     std = np.tile([np.inf if stds[name] is None else stds[name] for name in _OF_COLUMN], (n, 1))
     std[:, 3:5] *= sizes.max(axis=1, keepdims=True)
@@ -335,7 +322,6 @@ def prior_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
     Returns
     -------
     list of str
-        One sentence, or none.
     """
     missing, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
     if not options.exif or options.focal_px is not None or not missing:
@@ -344,6 +330,6 @@ def prior_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
     instead = ": it is estimated instead, one value per camera (constant)"
     rest = instead if options.focal == "known" else ""
     if missing == total:
-        none = f"No EXIF focal length was found in {counted(total, 'image')}"
-        return [f"{none}{rest or ': no focal prior is used'}"]
+        found = f"No EXIF focal length was found in {counted(total, 'image')}"
+        return [f"{found}{rest or ': no focal prior is used'}"]
     return [f"{missing} of the {total} images have no EXIF focal length{rest or ' and no focal prior'}"]

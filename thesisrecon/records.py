@@ -19,10 +19,8 @@ class Image:
 
     Parameters
     ----------
-    name : str
-        File name.
-    rgb : ndarray (H, W, 3) uint8
-        Pixels.
+    name, rgb : str, ndarray (H, W, 3) uint8
+        File name and pixels.
     original_size : tuple of int
         (width, height) of the file after EXIF rotation.
     """
@@ -111,14 +109,10 @@ class FundamentalFit:
 
     Parameters
     ----------
-    F : ndarray (3, 3)
-        Fundamental matrix, unit Frobenius norm.
-    inliers : ndarray (M,) of bool
-        Inliers.
-    sigma_px : float
-        Standard deviation of one image coordinate, estimated from the inliers.
-    covariance : ndarray (9, 9)
-        Covariance of vec(F), row-major.
+    F, covariance : ndarray (3, 3), ndarray (9, 9)
+        Fundamental matrix of unit Frobenius norm, and the covariance of its entries (row-major).
+    inliers, sigma_px : ndarray (M,) of bool, float
+        Inliers, and the standard deviation of one image coordinate, estimated from them.
     iterations : int
         Number of samples.
     competing_models : ndarray (K, 3, 3)
@@ -144,12 +138,8 @@ class TwoView:
 
     Parameters
     ----------
-    i, j : int
-        View numbers.
-    F : ndarray (3, 3)
-        Fundamental matrix.
-    sigma_px : float
-        Standard deviation of one image coordinate.
+    i, j, F, sigma_px, degeneracy
+        View numbers, and the estimate as in :class:`FundamentalFit`.
     index1, index2, xy1, xy2, affine : ndarray
         Verified matches, as in :class:`Matches`.
     candidates : int
@@ -160,8 +150,6 @@ class TwoView:
         Whether the pair enters the tracks, else why not.
     configuration : str
         "general", "plane", "pure rotation" or "pure translation"; empty for too few matches.
-    degeneracy : DegeneracyReport, optional
-        Whether the matches determine F; None if not tested.
     """
 
     i: int
@@ -214,30 +202,23 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Cameras and points in one stratum, with their tracks.
+    """Cameras and points in one stratum ("projective", "affine" or "metric"), with their tracks.
 
     Parameters
     ----------
-    stratum : {"projective", "affine", "metric"}
-        Stratum of the frame.
     P : ndarray (V, 3, 4)
         Camera matrices, zeros where not registered; K [R t] before distortion in the metric stratum.
     X : ndarray (N, 4)
         Homogeneous points, zeros where not valid; last coordinate 1 in the metric stratum.
     registered, valid, inlier : ndarray (V,), (N,), (K,) of bool
-        Registered views, reconstructed points and inlier observations.
-    tracks : Tracks
-        The K observations.
-    sizes : ndarray (V, 2) of int
-        Image sizes (width, height).
-    sigma_px : float
-        Noise of one image coordinate.
+        Registered views, reconstructed points and inliers among the K observations in ``tracks``.
+    sizes, sigma_px : ndarray (V, 2) of int, float
+        Image sizes (width, height), and the noise of one image coordinate.
     reasons : tuple of str
         Per view why it is not registered; empty where it is.
-    K : ndarray (V, 3, 3), optional
-        Calibration matrices (metric stratum).
-    distortion : ndarray (V, 3), optional
-        Radial coefficients k1, k2, k3 as in :class:`thesisrecon.Camera`. None: no distortion.
+    K, distortion : ndarray (V, 3, 3), ndarray (V, 3), optional
+        Calibration matrices and radial coefficients k1, k2, k3 as in :class:`thesisrecon.Camera` (metric
+        stratum; None: no distortion).
     """
 
     stratum: Stratum
@@ -287,12 +268,10 @@ class SelfCalibration:
     K, K_std : ndarray (V, 3, 3)
         Calibration matrices, zeros where not registered, and the standard deviations of their entries: 0 if
         known, that of the prior if not estimated, NaN if unknown.
-    identifiable, reasons : bool, tuple of str
-        Whether the views determine the calibration, else why not.
+    identifiable, reasons, identifiability : bool, tuple of str, IdentifiabilityReport
+        Whether the views determine the calibration, else why not, and the evidence (None: not tested).
     candidates : tuple of Upgrade
         All candidates, best first.
-    identifiability : IdentifiabilityReport, optional
-        The evidence; None if not tested.
     """
 
     metric_from_projective: F64
@@ -341,10 +320,8 @@ class DisparityMap:
 
     Parameters
     ----------
-    disparity : ndarray (H, W) float32
-        x_right = x_left - d; NaN where unknown or occluded.
-    confidence : ndarray (H, W) float32
-        In [0, 1], 0 where unknown.
+    disparity, confidence : ndarray (H, W) float32
+        x_right = x_left - d, NaN where unknown or occluded; confidence in [0, 1], 0 where unknown.
     sigma_px : float
         Standard deviation of a confident disparity.
     """
@@ -354,23 +331,20 @@ class DisparityMap:
     sigma_px: float
 
     def filled(self) -> F32:
-        """Return the disparity with holes filled from the same row.
+        """Return the disparity (H, W) with holes filled by the farther neighbour of the row.
 
         Returns
         -------
         ndarray (H, W)
-            Unknown pixels get the smaller (farther) of their left and right neighbours; rows without any
-            disparity stay NaN.
+            Rows without any disparity stay NaN.
         """
         known = np.isfinite(self.disparity)
         columns = np.arange(self.disparity.shape[1])
         left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
         right = np.minimum.accumulate(np.where(known, columns, len(columns))[:, ::-1], axis=1)[:, ::-1]
         padded = np.pad(self.disparity, ((0, 0), (1, 1)), constant_values=np.nan)
-        from_left = np.take_along_axis(padded, left + 1, axis=1)
-        from_right = np.take_along_axis(padded, right + 1, axis=1)
-        filled: F32 = np.fmin(from_left, from_right)
-        return filled
+        from_left, from_right = (np.take_along_axis(padded, i + 1, axis=1) for i in (left, right))
+        return np.asarray(np.fmin(from_left, from_right))
 
 
 @dataclass(frozen=True)
@@ -400,12 +374,10 @@ class TexturedMesh:
 
     Parameters
     ----------
-    vertices : ndarray (N, 3)
-        Points.
+    vertices, colors : ndarray (N, 3), ndarray (N, 3) uint8
+        Points and their colours.
     faces : ndarray (M, 3) int64
         Vertex indices, counter-clockwise seen from outside.
-    colors : ndarray (N, 3) uint8, optional
-        Vertex colours.
     uv, texture : ndarray (M, 3, 2), ndarray (H, W, 3) uint8, optional
         Texture, and texture coordinates of the corners in texels, (0, 0) = centre of the top-left texel.
     untextured : ndarray (M,) of bool, optional
@@ -465,30 +437,20 @@ class RunResult:
 
     Parameters
     ----------
-    out : Path
-        Output folder.
-    images, features : tuple of Image, tuple of Features
-        The V views at working size and their corners.
+    out, settings : Path, mapping
+        Output folder, and the settings: stage -> field -> value.
+    images, groups : tuple of Image, ndarray (V,) of int
+        The V views at working size, and the camera number of each.
     unread : mapping
         File name -> reason of unreadable images.
-    pairs : tuple of TwoView
-        All matched pairs, accepted or not.
-    groups : ndarray (V,) of int
-        Camera number of each view.
-    settings : mapping
-        Stage -> field -> value.
-    pair_choice, tracks, projective, calibration, metric, mesh, held_out : optional
-        Results of the stages.
+    features, pair_choice, pairs, tracks, projective, calibration, metric, mesh, held_out
+        Results of the stages; ``pairs`` are all matched ones, accepted or not.
     views, depth_maps : tuple of PinholeView, tuple of DepthMap
         Undistorted images and their depth maps.
-    reports : tuple of StageReport
-        One per stage.
-    warnings : tuple of str
-        All warnings.
+    reports, warnings, failure : tuple of StageReport, tuple of str, str
+        One report per stage, all warnings, and the failure that ended the run, empty otherwise.
     summary : mapping
         Content of ``summary.json``.
-    failure : str
-        The failure that ended the run, empty otherwise.
     """
 
     out: Path
@@ -513,9 +475,14 @@ class RunResult:
     failure: str = ""
 
     @property
+    def best_reconstruction(self) -> Reconstruction | None:
+        """The metric reconstruction, else the projective one, else None."""
+        return self.metric.reconstruction if self.metric is not None else self.projective
+
+    @property
     def refused(self) -> dict[str, str]:
         """File name -> reason of every image without a camera: unreadable or not registered."""
-        best = self.metric.reconstruction if self.metric is not None else self.projective
+        best = self.best_reconstruction
         if best is None:
             return dict(self.unread)
         views = zip(self.images, best.registered, best.reasons, strict=True)

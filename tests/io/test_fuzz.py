@@ -216,7 +216,8 @@ def test_tables_of_other_types_raise_only_documented_errors(reader, content, tmp
 @given(data=st.data())
 def test_settings_of_other_types_are_refused_in_a_sentence(data):
     whole = {"features": {"kind": "harris-corners"}, "intrinsics": {"focal_px": 9.0, "focal_std_rel": 0.1}}
-    whole |= {"dense": {"pairs": {"matcher": {"kind": "maximum-likelihood-scanline"}}}, "images": {"max_size_px": 640}}
+    whole |= {"images": {"max_size_px": 640}}
+    whole |= {"dense": {"pairs": {"matcher": {"kind": "maximum-likelihood-scanline"}}}}
     try:
         reported = data.draw(mistyped(whole).filter(lambda tables: isinstance(tables, dict)))
         toml_from_config(config_from_tables(reported))

@@ -17,8 +17,7 @@ from thesisrecon.report._assessment import (
     key_facts,
     plus_minus,
 )
-from thesisrecon.report._data import ResidualSummary
-from thesisrecon.report._summary import summarize
+from thesisrecon.report._data import ResidualSummary, summarize
 
 TIME = "Computing time"
 

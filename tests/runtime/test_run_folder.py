@@ -25,8 +25,16 @@ from thesisrecon.records import (
     StageReport,
     Tracks,
 )
-from thesisrecon.runtime._record_files import ChangedRecord, _seal, bytes_from_record, read_record
-from thesisrecon.runtime._run_folder import RunDirectory, StageFolder, code_key, key_of
+from thesisrecon.runtime._run_folder import (
+    ChangedRecord,
+    RunDirectory,
+    StageFolder,
+    _seal,
+    bytes_from_record,
+    code_key,
+    key_of,
+    read_record,
+)
 from validation.studies.robustness import (
     Refusal,
     SmallRuns,

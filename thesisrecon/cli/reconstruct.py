@@ -99,14 +99,12 @@ def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0) -> None:
 
 def _option_tables(cameras: str | None, max_size: int | None, pairs: str | None) -> dict[str, dict[str, Any]]:
     """Return the settings that have command-line options of their own, as TOML tables."""
-    options: dict[str, dict[str, Any]] = {}
-    if cameras is not None:
-        options["intrinsics"] = {"cameras": cameras}
-    if max_size is not None:
-        options["images"] = {"max_size_px": max_size}
-    if pairs is not None:
-        options["pairs"] = _pairs_table(pairs)
-    return options
+    options: dict[str, dict[str, Any]] = {
+        "intrinsics": {} if cameras is None else {"cameras": cameras},
+        "images": {} if max_size is None else {"max_size_px": max_size},
+        "pairs": {} if pairs is None else _pairs_table(pairs),
+    }
+    return {stage: table for stage, table in options.items() if table}
 
 
 def _pairs_table(value: str) -> dict[str, Any]:

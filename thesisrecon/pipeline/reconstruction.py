@@ -10,6 +10,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
 from thesisrecon.io._images import ImageSet, ImageSource, list_images, read_images, scene_name
+from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
 from thesisrecon.pipeline._stages import (
     build_model,
@@ -101,9 +102,10 @@ def reconstruct(
     claim = run.directory.claim(_settings_identity(run), overwrite=overwrite)
     with run.workers, claim, run.resumable():
         inputs = _read_inputs(run, images)
-        if until != "features" and len(inputs.images) >= 2:
+        pairs = run.config.pairs
+        if isinstance(pairs, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
-            run.config.pairs.check([image.name for image in inputs.images], inputs.refused)
+            pairs.check([image.name for image in inputs.images], inputs.refused)
         run.directory.adopt(_identity(run, inputs), overwrite=overwrite, results=RESULT_FILES)
         state = PipelineState(run, inputs, _empty_result(run, inputs), until)
         try:

@@ -57,8 +57,8 @@ def assess(data: ReportData) -> Assessment:
         done = _STAGE_RESULTS.get(data.until or "", "the stages below were run")
         return Assessment("open", "Stopped early", f"The run ended as requested: {done}.")
     registered = int(data.metric.reconstruction.registered.sum())
-    have = "has a metric camera" if registered == 1 else "have a metric camera"
-    found = f"{registered} of {count_of(total, 'image')} {have}."
+    have = "has" if registered == 1 else "have"
+    found = f"{registered} of {count_of(total, 'image')} {have} a metric camera."
     if not data.metric.trusted:
         reasons = tuple(_sentence(check) for check in data.metric.failed_checks or ("the self-check failed",))
         return Assessment("doubt", "Not trusted", f"{found} Inspect the result before you use it.", reasons)
@@ -89,8 +89,7 @@ def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
     if data.reports:
         slowest = max(data.reports, key=lambda report: report.seconds)
         share = round(100 * slowest.seconds / seconds) if seconds > 0 else 0
-        note = f"longest stage: {slowest.stage}, {share} %"
-        facts.append(Fact("Computing time", duration(seconds), note))
+        facts.append(Fact("Computing time", duration(seconds), f"longest stage: {slowest.stage}, {share} %"))
     return facts
 
 
@@ -141,9 +140,8 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
     known = [(view, photo) for view, photo in zip(data.original_intrinsics, data.images, strict=True) if view]
     if not known:
         return []
-    focal, x, y = (
-        [view[f"{name}_px"] for view, _ in known] for name in ("focal", "principal_x", "principal_y")
-    )
+    names = ("focal_px", "principal_x_px", "principal_y_px")
+    focal, x, y = ([view[name] for view, _ in known] for name in names)
     sizes = np.array([photo.original_size for _, photo in known], dtype=float)
     angle = np.degrees(2 * np.arctan(sizes[:, 0] / (2 * np.array([f.value for f in focal]))))
     distinct = {photo.original_size for _, photo in known}
@@ -220,17 +218,14 @@ def duration(seconds: float) -> str:
 def _named_number(name: str, value: float) -> tuple[str, str]:
     """Format a key and its value with the unit of its suffix: sigma_px -> ("sigma", "0.31 px")."""
     stem, _, suffix = name.rpartition("_")
-    text = grouped(int(value)) if float(value).is_integer() and abs(value) < 1e15 else _short(value)
+    text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    if float(value).is_integer() and abs(value) < 1e15:
+        text = grouped(int(value))
     if stem and suffix in _UNITS:
         return stem.replace("_", " "), f"{text}{_THIN}{_UNITS[suffix]}"
     if stem and suffix == "rel":
         return stem.replace("_", " "), f"{100 * value:.3g}{_THIN}%"
     return name.replace("_", " "), text
-
-
-def _short(value: float) -> str:
-    """Three significant digits, more only before the decimal point."""
-    return f"{value:.3g}" if not abs(value) >= 1000 else f"{value:.0f}"
 
 
 def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tuple[str, str]]:

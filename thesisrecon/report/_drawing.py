@@ -14,6 +14,8 @@ from PIL import ImageDraw, ImageFont
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.records import HeldOut, Image, TwoView
 
+Point = tuple[float, float]
+
 _THUMBNAIL_BYTES = 2_000_000
 _SAMPLES_PX, _PANEL_LONG_SIDE = 800, 640
 _GAP = 8
@@ -102,24 +104,19 @@ def _spread_matches(xy: F64, count: int) -> I64:
     return np.array(chosen, dtype=np.int64)
 
 
-def _clip_line(
-    line: F64, width: float, height: float
-) -> tuple[tuple[float, float], tuple[float, float]] | None:
+def _clip_line(line: F64, width: float, height: float) -> tuple[Point, Point] | None:
     """Clip a line a x + b y + c = 0 to an image; None if it misses the image."""
     a, b, c = (float(v) for v in line)
     low, right, bottom = -0.5, width - 0.5, height - 0.5
-    hits: list[tuple[float, float]] = []
+    hits: list[Point] = []
     if b != 0:
         hits += [(x, -(a * x + c) / b) for x in (low, right)]
     if a != 0:
         hits += [(-(b * y + c) / a, y) for y in (low, bottom)]
     slack = 1e-6 * max(width, height)
-    inside = [
-        (x, y) for x, y in hits if low - slack <= x <= right + slack and low - slack <= y <= bottom + slack
-    ]
-    if len(inside) < 2:
-        return None
-    return min(inside), max(inside)
+    low, right, bottom = low - slack, right + slack, bottom + slack
+    inside = [(x, y) for x, y in hits if low <= x <= right and low <= y <= bottom]
+    return (min(inside), max(inside)) if len(inside) >= 2 else None
 
 
 def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
@@ -153,23 +150,19 @@ def _faded(image: Image) -> tuple[PillowImage.Image, float]:
     return PillowImage.blend(grey, colour, 0.45).point(lambda v: 0.78 * v), s
 
 
-def _to_drawing(xy: F64, s: float) -> list[tuple[float, float]]:
+def _to_drawing(xy: F64, s: float) -> list[Point]:
     """Convert working pixels to Pillow's drawing coordinates at scale s."""
     return [(float(x), float(y)) for x, y in (xy + 0.5) * s - 0.5]
 
 
 @dataclass(frozen=True)
 class DepthImage:
-    """A coloured depth map; near is bright, far is dark, unknown is grey.
-
-    ``near`` and ``far`` are the ends of the colour scale in scene units, NaN without depths; ``share`` is the
-    fraction of the pixels with a depth.
-    """
+    """A coloured depth map; near is bright, far is dark, unknown is grey."""
 
     picture: EmbeddedImage
-    near: float
+    near: float  #: ends of the colour scale in scene units, NaN without depths
     far: float
-    share: float
+    share: float  #: fraction of the pixels with a depth
 
 
 def draw_depth(depth: F32, *, side: int) -> DepthImage:
@@ -205,10 +198,8 @@ def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedImage, EmbeddedImage, Embe
     difference = np.abs(held_out.real.astype(np.float64) - held_out.rendered).mean(axis=2)
     difference = np.where(held_out.compared, difference / DIFFERENCE_LIMIT, np.nan)
     rendered = np.where(held_out.compared[..., None], held_out.rendered, np.array(UNKNOWN, np.uint8))
-    real, model, apart = (
-        _small(PillowImage.fromarray(pixels), _HELD_OUT_SIDE)
-        for pixels in (held_out.real, rendered, _paint_scale(difference))
-    )
+    sheets = map(PillowImage.fromarray, (held_out.real, rendered, _paint_scale(difference)))
+    real, model, apart = (_small(sheet, _HELD_OUT_SIDE) for sheet in sheets)
     return real, model, apart
 
 

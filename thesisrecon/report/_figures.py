@@ -60,14 +60,12 @@ def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS)
     points = reconstruction.X[index, :3] @ upright.T
     centres_up = centres @ upright.T
     depth = _pyramid_depth(centres_up, points)
-    corners = np.stack(
-        [
-            centre + depth * _corner_rays(K, reconstruction.sizes[i]) @ R @ upright.T
-            for i, (K, R, _), centre in zip(views, parts, centres_up, strict=True)
-        ]
-    )
-    low, high = _box(np.concatenate([points, centres_up, corners.reshape(-1, 3)]))
-    return Scene(points, index, views, centres_up, corners, low, high)
+    cameras = zip(parts, reconstruction.sizes[views], centres_up, strict=True)
+    corners = np.stack([c + depth * _corner_rays(K, size) @ R @ upright.T for (K, R, _), size, c in cameras])
+    everything = np.concatenate([points, centres_up, corners.reshape(-1, 3)])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    margin = 0.03 * float((high - low).max()) or 1.0
+    return Scene(points, index, views, centres_up, corners, low - margin, high + margin)
 
 
 def upright_rotation(rotations: F64) -> F64:
@@ -118,12 +116,6 @@ def _pyramid_depth(centres: F64, points: F64) -> float:
     return float(np.clip(0.4 * np.median(gaps.min(axis=1)), 0.04 * reach, 0.15 * reach))
 
 
-def _box(corners: F64) -> tuple[F64, F64]:
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = 0.03 * float((high - low).max()) or 1.0
-    return low - margin, high + margin
-
-
 Figure = dict[str, Any]
 
 
@@ -137,10 +129,8 @@ def scene_figure(scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] |
     centres = _markers("centres", 4, _ACCENT, _xyz(scene.centres, digits)) | hover
     extent = scene.high - scene.low
     aspect = 1.7 * extent / max(float(extent.max()), 1e-12)
-    axes = {
-        f"{name}axis": {"visible": False, "range": [float(scene.low[d]), float(scene.high[d])]}
-        for d, name in enumerate("xyz")
-    }
+    ranges = zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True)
+    axes = {f"{name}axis": {"visible": False, "range": [low, high]} for name, low, high in ranges}
     ratio = dict(zip("xyz", aspect.tolist(), strict=True))
     layout = {
         "paper_bgcolor": _PANEL,
@@ -187,11 +177,11 @@ def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure
     high = max(1.0, float(np.log10(counts.max(initial=10))))
     low = max(0.0, min(float(np.log10(max(counts.min(initial=10**9), 1))), high - 1.0))
     scale = {"zmin": low, "zmax": high}
-    good = _heat(accepted, labels, "", "verified matches")
+    good = _heat(accepted, labels, "", "verified matches") | scale
     good |= {"colorscale": _PAIR_SCALE, "colorbar": _count_bar()}
-    bad = _heat(refused, labels, "× ", "verified matches, not accepted")
+    bad = _heat(refused, labels, "× ", "verified matches, not accepted") | scale
     bad |= {"colorscale": _REFUSED_SCALE, "showscale": False}
-    return {"data": [good | scale, bad | scale], "layout": _matrix_layout(labels, block)}
+    return {"data": [good, bad], "layout": _matrix_layout(labels, block)}
 
 
 def _count_matrix(pairs: Sequence[TwoView], cells: int, block: int, accepted: bool) -> I64:
@@ -226,13 +216,6 @@ def _heat(counts: I64, labels: list[str], mark: str, words: str) -> Figure:
 
 def _matrix_layout(labels: list[str], block: int) -> Figure:
     step = max(1, -(-len(labels) // 20))
-    axis = {
-        "type": "category",
-        "showgrid": False,
-        "zeroline": False,
-        "fixedrange": True,
-        "constrain": "domain",
-    }
     numbers = [str(first * block + 1) for first in range(0, len(labels), step)]
     ticks = {
         "tickmode": "array",
@@ -241,14 +224,16 @@ def _matrix_layout(labels: list[str], block: int) -> Figure:
         "tickangle": 0,
         "ticks": "",
     }
+    axis = {"type": "category", "showgrid": False, "zeroline": False, "fixedrange": True}
+    axis |= {"constrain": "domain", **ticks}
     return {
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "#e9edf0",
         "margin": {"l": 34, "r": 8, "t": 30, "b": 8},
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": _INK},
         "showlegend": False,
-        "xaxis": {**axis, **ticks, "side": "top"},
-        "yaxis": {**axis, **ticks, "autorange": "reversed", "scaleanchor": "x"},
+        "xaxis": {**axis, "side": "top"},
+        "yaxis": {**axis, "autorange": "reversed", "scaleanchor": "x"},
     }
 
 

@@ -127,7 +127,10 @@ def render_report(data: ReportData) -> str:
     overall = summarize_distances(everything)
     limit_px, bars = histograms(distances, width=_HISTOGRAM_WIDTH, height=_HISTOGRAM_HEIGHT)
     figures, shown = _figures(data)
-    model = _model(data)
+    model = None
+    if data.model is not None and len(data.model.faces) and data.metric is not None:
+        names = [image.name for image in data.images]
+        model = viewer_data(data.model, data.metric.reconstruction, names)
     figure_scripts = [plotly_script(), page_resource("page.js")] if figures else []
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     return render_page(
@@ -143,7 +146,11 @@ def render_report(data: ReportData) -> str:
         intrinsic_columns=_intrinsic_columns(data),
         limit_px=limit_px,
         model=model,
-        **_model_drawings(data),
+        model_text=model_text(data.model) if data.model is not None else "",
+        depths=_depths(data),
+        held_out=draw_held_out(data.held_out) if data.held_out is not None else None,
+        scale=SCALE,
+        difference_limit=round(DIFFERENCE_LIMIT),
         figures=figures,
         shown_points=shown,
         most_points=MAX_POINTS,
@@ -177,24 +184,6 @@ def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
     if data.pairs:
         figures["matrix-figure"] = pair_matrix_figure(data.pairs, names)
     return figures, len(scene.points) if scene is not None else 0
-
-
-def _model(data: ReportData) -> dict[str, Any] | None:
-    """Return the data of the viewer, None without a surface."""
-    if data.model is None or not len(data.model.faces) or data.metric is None:
-        return None
-    return viewer_data(data.model, data.metric.reconstruction, [photo.name for photo in data.images])
-
-
-def _model_drawings(data: ReportData) -> dict[str, Any]:
-    """Return the texts and drawings about the model, depth maps and held-out image."""
-    return {
-        "model_text": model_text(data.model) if data.model is not None else "",
-        "depths": _depths(data),
-        "held_out": draw_held_out(data.held_out) if data.held_out is not None else None,
-        "scale": SCALE,
-        "difference_limit": round(DIFFERENCE_LIMIT),
-    }
 
 
 def _depths(data: ReportData) -> list[tuple[int, str, DepthImage]]:

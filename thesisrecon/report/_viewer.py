@@ -19,16 +19,12 @@ from thesisrecon.report._figures import upright_rotation
 
 LEVELS = 65535
 """Quantization levels along each axis of the bounding box and of the texture."""
-
 MAX_TEXELS = 2100 * 2100
 """Larger textures are reduced: with 150,000 faces they then add less than 8 MB to the page."""
-
 _OUTLIER = 8.0
 """Largest distance of a face from the median, relative to the 95 % quantile."""
-
 _PLAIN = (200, 200, 200)
 """Colour of a model without colours."""
-
 _DIRECTIONS = (
     ("Behind the cameras", (0.35, -1.45, 0.6)),
     ("From above", (0.0, -0.01, 1.9)),
@@ -92,10 +88,8 @@ def _colored(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
     # Sorting one integer key per corner is ten times faster than sorting rows.
     key = (corners[:, 0] * (LEVELS + 1) + corners[:, 1]) * (LEVELS + 1) + corners[:, 2]
     _, first, index = np.unique(key, return_index=True, return_inverse=True)
-    color = {
-        "uv": _packed(corners[first, 1:].astype("<u2")),
-        "texture": embed_jpeg(_within(mesh.texture), quality=82).uri,
-    }
+    texture = embed_jpeg(_within(mesh.texture), quality=82).uri
+    color = {"uv": _packed(corners[first, 1:].astype("<u2")), "texture": texture}
     return color, index.reshape(-1, 3).astype(np.int64), corners[first, 0]
 
 
@@ -127,14 +121,8 @@ def _viewpoints(
             seen = (local[:, 2] > 0) & (np.abs(local[:, :2] / local[:, 2:]) < field).all(axis=1)
         depth = float(np.median(local[seen, 2])) if seen.any() else float(np.linalg.norm(t)) or 1.0
         eye = upright @ (-R.T @ t)
-        found.append(
-            {
-                "name": f"{i + 1} · {names[i]}",
-                "eye": eye.tolist(),
-                "target": (eye + depth * (upright @ R[2])).tolist(),
-                "field": field.tolist(),
-            }
-        )
+        name, target = f"{i + 1} · {names[i]}", eye + depth * (upright @ R[2])
+        found.append({"name": name, "eye": eye.tolist(), "target": target.tolist(), "field": field.tolist()})
     return found
 
 

@@ -98,22 +98,17 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
                 "start one there (dask scheduler) and its workers (dask worker), or correct the address"
             ) from None
         try:
-            _wait_for_worker(client, address)
+            try:
+                client.wait_for_workers(1, timeout=ANSWER_S)
+            except (OSError, futures.TimeoutError):
+                place = address.removeprefix("tcp://")
+                advice = f"start some with: dask worker {address}"
+                raise UsageError(f"the Dask scheduler at {place} has no workers; {advice}") from None
             # pure=False: do not hash all bytes of the tasks.
             yield Cluster(address.removeprefix("tcp://"), client, client.get_executor(pure=False))
         finally:
             with suppress(Exception):
                 client.close(timeout=1.0)
-
-
-def _wait_for_worker(client: Any, address: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=ANSWER_S)
-    except (OSError, futures.TimeoutError):
-        raise UsageError(
-            f"the Dask scheduler at {address.removeprefix('tcp://')} has no workers; start some with: "
-            f"dask worker {address}"
-        ) from None
 
 
 @contextmanager

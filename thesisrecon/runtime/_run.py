@@ -18,8 +18,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import OutputError, UsageError, WorkersLost, unknown_word
 from thesisrecon.records import StageReport
 from thesisrecon.runtime._executors import Workers, available_threads
-from thesisrecon.runtime._record_files import ChangedRecord
-from thesisrecon.runtime._run_folder import RunDirectory, code_key, key_of
+from thesisrecon.runtime._run_folder import ChangedRecord, RunDirectory, code_key, key_of
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total) in the caller's thread when a part of a stage is done."""

@@ -1,4 +1,4 @@
-"""The command ``render``: views of the model of a finished run."""
+"""The commands ``render`` (a finished run) and ``interpolate`` (two or three images): sequences of views."""
 
 from __future__ import annotations
 
@@ -8,8 +8,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from thesisrecon.cli.common import Frames, Threads, cap_threads, interruptible, parse_folder, progress_bars
+from thesisrecon.cli.common import (
+    Frames,
+    MaxSize,
+    Seed,
+    Threads,
+    cap_threads,
+    interruptible,
+    parse_folder,
+    progress_bars,
+)
 from thesisrecon.errors import UsageError
+from thesisrecon.io._files import printable
 from thesisrecon.runtime._executors import available_threads
 
 _MAX_SIDE_PX = 8192
@@ -47,14 +57,21 @@ def render(
     cap_threads(threads)
     if run.is_file():
         raise UsageError(f"render takes the output folder of a run; {run} is a file")
-    from thesisrecon.cli.view_files import RenderOptions, render_run
+    from thesisrecon.cli.view_files import render_run
 
-    wanted = None if size is None else _size(size)
-    options = RenderOptions(path, frames, wanted, light, _color(background))
     with interruptible("repeat the command to render all frames"), progress_bars() as progress:
-        where, workers = folder or run / "views" / path, threads or available_threads()
-        written = render_run(run, where, options, threads=workers, progress=progress)
-    typer.echo(str(written))
+        written = render_run(
+            run,
+            folder or run / "views" / path,
+            path=path,
+            frames=frames,
+            size=None if size is None else _size(size),
+            light=light,
+            background=_color(background),
+            threads=threads or available_threads(),
+            progress=progress,
+        )
+    typer.echo(written)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -76,3 +93,45 @@ def _color(text: str) -> tuple[int, int, int]:
         return PIL.ImageColor.getrgb(text.strip())[:3]
     except ValueError:
         raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None
+
+
+def interpolate(
+    images: Annotated[
+        list[Path],
+        typer.Argument(parser=parse_folder, metavar="IMAGE IMAGE [IMAGE]", help="Two or three image files."),
+    ],
+    method: Annotated[
+        Literal["interpolation", "tensor"],
+        typer.Option("--method", help="Image interpolation (section 1.2) or trilinear tensor (1.3)."),
+    ] = "interpolation",
+    frames: Frames = 21,
+    seed: Seed = 0,
+    max_size: MaxSize = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", parser=parse_folder, metavar="FOLDER", help="Output folder (views/METHOD)."
+        ),
+    ] = None,
+    threads: Threads = 0,
+) -> None:
+    """Compute views between two or three images."""
+    cap_threads(threads)
+    if max_size is not None and max_size < 64:
+        raise UsageError(f"--max-size takes at least 64 px; got {max_size}")
+    from thesisrecon.cli.view_files import STRIP, interpolate_images
+
+    folder = folder or Path("views") / method
+    with interruptible("repeat the command to compute all frames"), progress_bars() as progress:
+        written = interpolate_images(
+            folder,
+            images,
+            method=method,
+            frames=frames,
+            seed=seed,
+            max_size_px=max_size,
+            threads=threads or available_threads(),
+            progress=progress,
+        )
+    typer.echo(written)
+    typer.echo(f"page: {printable(str(folder / STRIP))}")

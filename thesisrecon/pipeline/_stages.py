@@ -1,0 +1,368 @@
+"""The steps of Algorithm 1: features, pairs and tracks (chapters 4 and 5), cameras (6 and 7), surface (2)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.camera import Camera
+from thesisrecon.config import PipelineConfig, with_images
+from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
+from thesisrecon.pipeline.image_pair import match_views
+from thesisrecon.records import (
+    DepthMap,
+    Features,
+    HeldOut,
+    Image,
+    MetricResult,
+    PairChoice,
+    PinholeView,
+    Reconstruction,
+    RunResult,
+    SelfCalibration,
+    TexturedMesh,
+    TwoView,
+)
+from thesisrecon.runtime._run import Batch, stream
+from thesisrecon.runtime._run_folder import code_key
+from thesisrecon.stereo.depth import MultiViewScene
+from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
+from thesisrecon.views.render import render
+
+MIN_CORNERS = 16
+
+# ---------------------------------------------------------------- 4.2.1: features
+
+
+def find_features(state: PipelineState) -> None:
+    """Detect the features of all images (4.2.1); sets ``result.features``."""
+    run, images = state.run, state.result.images
+    variant = run.variant_key("features")
+    digests = enumerate(image.digest for image in state.inputs.decoded)
+    keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        return (([i], (state.config, images[i])) for i in missing)
+
+    features = run.map_cached("features", keys, _detect, batches)
+    state.result = replace(state.result, features=tuple(features))
+    found = [len(f.xy) for f in features]
+    few = [(image, n) for image, n in zip(images, found, strict=True) if n < MIN_CORNERS]
+    poor = [f"{image.name} has only {counted(n, 'corner')}" for image, n in few]
+    counts = {"images": len(images), "corners": sum(found), "fewest_in_one_image": min(found)}
+    run.finish("features", counts=counts, warnings=poor)
+
+
+def _detect(config: PipelineConfig, image: Image) -> list[Features]:
+    return [config.features.detect(image)]
+
+
+# ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
+
+
+def select_pairs(state: PipelineState) -> None:
+    """Select the pairs of images to match; sets ``result.pair_choice``."""
+    run, images, features = state.run, state.result.images, state.result.features
+    names = [image.name for image in images]
+    key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
+    run.progress("pairs", 0, 1)
+    select, map_all, rng = state.config.pairs.select, run.workers.map_all, stream(run.seed, "pairs")
+    choice: PairChoice = run.cached(
+        "pairs", "choice", key, lambda: select(names, features, map_all=map_all, rng=rng)
+    )
+    state.result = replace(state.result, pair_choice=choice)
+    possible = len(images) * (len(images) - 1) // 2
+    run.finish(
+        "pairs", counts={"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
+    )
+    run.progress("pairs", 1, 1)
+
+
+def match_pairs(state: PipelineState) -> None:
+    """Match the pairs and estimate their epipolar geometry (4.2.2, chapter 5); sets ``result.pairs``."""
+    run, result = state.run, state.result
+    assert result.pair_choice is not None
+    pairs = [(int(i), int(j)) for i, j in result.pair_choice.pairs]
+    variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
+    features = list(run.logs["features"].keys.values())
+    inputs = {(i, j): (features[i], features[j], run.seed, i, j) for i, j in pairs}
+    keys = {f"{i:05d}-{j:05d}": run.key("matches", variants, *inputs[i, j]) for i, j in pairs}
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        views, shared = _prepared(state), run.workers.in_process
+        for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel()):
+            some = [pairs[n] for n in numbers]
+            given = views if shared else views.subset({view for pair in some for view in pair})
+            yield numbers, (state.config, given, some, run.seed)
+
+    two_views: list[TwoView] = run.map_cached("matches", keys, _match_all, batches)
+    state.result = replace(result, pairs=tuple(two_views))
+    accepted = [pair for pair in two_views if pair.accepted]
+    counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
+    counts["undetermined"] = sum(pair.undetermined for pair in accepted)
+    metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
+    run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
+
+
+def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
+    """A warning if the epipolar geometry of most pairs is degenerate."""
+    undetermined = [pair for pair in accepted if pair.undetermined]
+    if 2 * len(undetermined) <= len(accepted):
+        return []
+    kinds = Counter(pair.configuration for pair in undetermined)
+    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    of_all = f"{len(undetermined)} of {len(accepted)} accepted pairs"
+    return [f"The epipolar geometry of {of_all} is degenerate ({listed})"]
+
+
+def _prepared(state: PipelineState) -> PreparedViews:
+    """Prepared views, made only if a pair must be computed."""
+    if state.prepared is None:
+        given = zip(state.result.images, state.result.features, strict=True)
+        state.prepared = PreparedViews(state.config.matching, dict(enumerate(given)))
+    return state.prepared
+
+
+def _match_all(
+    config: PipelineConfig, views: Sequence[Any], pairs: Sequence[tuple[int, int]], seed: int
+) -> list[TwoView]:
+    return [match_views(config, views[i], views[j], (i, j), seed) for i, j in pairs]
+
+
+def build_tracks(state: PipelineState) -> None:
+    """Build tracks from the accepted pairs; sets ``result.tracks``."""
+    run, result = state.run, state.result
+    accepted = [pair for pair in result.pairs if pair.accepted]
+    if not accepted:
+        best = max(result.pairs, key=lambda pair: pair.inliers)
+        tried, verified = counted(len(result.pairs), "pair"), counted(best.inliers, "verified match")
+        evidence = f"the best of {tried} has {verified}: {best.reason}"
+        advice = "add images with more overlap, all of one textured scene"
+        raise StageFailure("no two images could be matched", evidence, advice)
+    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
+    build, rng = state.config.tracks.build, stream(run.seed, "tracks")
+    tracks = run.cached("tracks", "tracks", key, lambda: build(_prepared(state), result.pairs, rng))
+    state.result = replace(result, tracks=tracks)
+    seen = np.bincount(tracks.point_index, minlength=tracks.n_points)
+    counts = {"points": tracks.n_points, "observations": len(tracks.xy)}
+    run.finish("tracks", counts=counts | {"seen_3_times": int((seen >= 3).sum())})
+
+
+ATTEMPTS = 3
+"""Maximum number of initial pairs to try until the self-check passes."""
+
+
+def _cached(
+    state: PipelineState, stage: str, attempt: int, inputs: Any, compute: Callable[[np.random.Generator], Any]
+) -> Any:
+    """The record of one attempt, which depends on ``inputs``."""
+    run = state.run
+    key = run.key(stage, run.variant_key(stage), inputs, run.seed, attempt)
+    run.progress(stage, 0, 1)
+    found = run.cached(stage, f"attempt-{attempt}", key, lambda: compute(stream(run.seed, stage, attempt)))
+    run.progress(stage, 1, 1)
+    return found
+
+
+def _sizes_of(reconstruction: Reconstruction) -> dict[str, int]:
+    return {"registered": int(reconstruction.registered.sum()), "points": int(reconstruction.valid.sum())}
+
+
+def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
+    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
+    run, result = state.run, state.result
+    assert result.tracks is not None
+    tracks, sizes = result.tracks, np.array([image.size for image in result.images], dtype=np.int64)
+    method = state.config.projective
+    projective: Reconstruction = _cached(
+        state, "projective", attempt, run.logs["tracks"].keys,
+        lambda rng: method.reconstruct(tracks, result.pairs, sizes, rng=rng, attempt=attempt),
+    )  # fmt: skip
+    state.result = replace(result, projective=projective)
+    run.finish("projective", counts=_sizes_of(projective), metrics={"sigma_px": projective.sigma_px})
+
+
+def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
+    run, prior, projective = state.run, state.prior, state.result.projective
+    assert projective is not None
+    upstream = run.logs["projective"].keys[f"attempt-{attempt}"]
+    method = state.config.selfcalibration
+    calibration: SelfCalibration = _cached(
+        state, "selfcalibration", attempt, [upstream, prior.shared, prior.mean, prior.std, prior.kind],
+        lambda rng: with_images(method, state.result.images).calibrate(projective, prior=prior, rng=rng),
+    )  # fmt: skip
+    state.result = replace(state.result, calibration=calibration)
+    counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
+    warnings = [name_images(text, state.names) for text in _critical(calibration)]
+    run.finish("selfcalibration", counts=counts, warnings=warnings)
+    return calibration
+
+
+def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
+    """A warning about a critical motion that the prior resolves; others fail the self-check."""
+    identifiability = calibration.identifiability
+    if identifiability is None or not (identifiability.critical and identifiability.identifiable):
+        return ()
+    return ("; ".join(identifiability.sentences),)
+
+
+def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) -> MetricResult:
+    run, prior, projective = state.run, state.prior, state.result.projective
+    assert projective is not None
+    metric: MetricResult = _cached(
+        state, "metric", attempt, run.logs["selfcalibration"].keys[f"attempt-{attempt}"],
+        lambda rng: state.config.metric.refine(projective, calibration, prior=prior, rng=rng),
+    )  # fmt: skip
+    state.result = replace(state.result, metric=metric)
+    warnings = [name_images(text, state.names) for text in metric.warnings]
+    best = metric.reconstruction
+    run.finish("metric", counts=_sizes_of(best), metrics={"sigma_px": best.sigma_px}, warnings=warnings)
+    return metric
+
+
+def reconstruct_metric(state: PipelineState) -> None:
+    """Reconstruct, calibrate and refine; try other initial pairs if the self-check fails.
+
+    The first trusted result is used, else the one with most cameras, then most points.
+    """
+    tried: list[RunResult] = []
+    failures: list[StageFailure] = []
+    start = state.result
+    for attempt in range(ATTEMPTS):
+        state.result, trusted = start, False
+        try:
+            reconstruct_projective(state, attempt)
+            trusted = _refine(state, attempt, _calibrate(state, attempt)).trusted
+        except StageFailure as failure:
+            failures.append(failure)
+        tried.append(state.result)
+        if trusted:
+            break
+    state.result = max(tried, key=_quality)
+    if state.result.metric is None:
+        raise failures[0]
+    if len(tried) > 1:
+        state.run.warnings.append(f"{len(tried)} initial pairs were tried; the best result is used")
+
+
+def _quality(result: RunResult) -> tuple[bool, bool, int, int]:
+    best = result.best_reconstruction
+    if best is None:
+        return False, False, 0, 0
+    trusted = result.metric is not None and result.metric.trusted
+    return result.metric is not None, trusted, int(best.registered.sum()), int(best.valid.sum())
+
+
+MIN_VIEWS = 3
+"""With fewer views, others may not see the surface of the held-out one."""
+RENDERER = "thesisrecon.views.render"
+"""Module whose code the held-out comparison depends on, besides that of the model."""
+
+
+def _middle_view(views: Sequence[PinholeView]) -> PinholeView:
+    """The view with the smallest sum of distances to the other cameras."""
+    C = np.array([camera_centre(view.P) for view in views])
+    centres = C[:, :3] / C[:, 3:]
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2).sum(axis=1)
+    return views[int(np.argmin(apart))]
+
+
+def _compare_held_out(state: PipelineState, mesh: TexturedMesh) -> HeldOut | None:
+    """Compare the middle view with the model textured without it; None if they cannot be compared.
+
+    The rendering is exposure-matched, one factor per channel.
+    """
+    views, threads = state.result.views, state.run.workers.threads
+    if len(views) < MIN_VIEWS or not len(mesh.faces):
+        return None
+    view = _middle_view(views)
+    try:
+        painted = state.config.model.color(mesh, views, without=view.view, threads=threads)
+    except StageFailure:
+        return None
+    height, width = view.rgb.shape[:2]
+    rendered = render(painted, Camera.from_matrix(view.P, (width, height)), threads=threads)
+    compared = covered_pixels(rendered) & view.seen
+    if not compared.any():
+        return None
+    matched = match_exposure(view.rgb, rendered.color, compared)
+    similarity = (psnr_db(view.rgb, matched, compared), ssim(view.rgb, matched, compared))
+    return HeldOut(view.view, view.rgb, matched, compared, *similarity)
+
+
+def _depths(config: PipelineConfig, scene: MultiViewScene, view: int) -> list[DepthMap]:
+    return [config.dense.depth_map(scene, view)]
+
+
+def _confirmed(
+    config: PipelineConfig, scene: MultiViewScene, maps: Mapping[int, DepthMap], view: int
+) -> DepthMap:
+    return config.dense.confirm(scene, maps, view)
+
+
+def estimate_depth_maps(state: PipelineState) -> None:
+    """Estimate and cross-check the depth maps of all registered views (2.5)."""
+    run, result = state.run, state.result
+    assert result.metric is not None
+    reconstruction = result.metric.reconstruction
+    with run.clock("dense"):
+        scene = state.config.dense.prepare(result.images, reconstruction)
+    order = sorted(scene.views)
+    r, pixels = reconstruction, [image.rgb for image in result.images]
+    given = [r.P, r.K, r.distortion, r.X, r.registered, r.valid, r.inlier, pixels]
+    keys = {f"{i:05d}": run.key("dense", run.variant_key("dense"), given, i) for i in order}
+
+    def seen_from(view: int) -> tuple[MultiViewScene, frozenset[int]]:
+        """Part of the scene that the depth map of one view needs."""
+        near = state.config.dense.required_views(scene, view)
+        return (scene if run.workers.in_process else scene.subset(near)), near
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        return (([n], (state.config, seen_from(order[n])[0], order[n])) for n in missing)
+
+    found = run.map_cached("dense", keys, _depths, batches)
+    maps, confirmed = dict(zip(order, found, strict=True)), dict[int, DepthMap]()
+
+    def confirmations() -> Iterator[tuple[object, ...]]:
+        for view in order:
+            part, near = seen_from(view)
+            yield state.config, part, {j: maps[j] for j in sorted(near)}, view
+
+    with run.clock("dense"):
+        run.workers.run(_confirmed, confirmations(), lambda n, depths: confirmed.update({order[n]: depths}))
+    final = [confirmed[i] for i in order]
+    state.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))
+    known = [float(np.isfinite(m.depth).mean()) for m in final]
+    counts = {"views": len(order), "depths": int(sum(np.isfinite(m.depth).sum() for m in final))}
+    empty = [result.images[i].name for i, share in zip(order, known, strict=True) if not share]
+    warnings = [f"Image {name} has no depth values" for name in empty]
+    metrics = {"median_share_known": float(np.median(known))}
+    run.finish("dense", counts=counts, metrics=metrics, warnings=warnings)
+    if not counts["depths"]:
+        evidence = f"none of {len(order)} views agrees with another on any surface"
+        advice = "add images with more overlap of a textured scene"
+        raise StageFailure("no depth was found", evidence, advice)
+
+
+def build_model(state: PipelineState) -> None:
+    """Fuse the depth maps to a textured mesh (2.6) and compare it with a held-out view."""
+    run, result = state.run, state.result
+    key = run.key("model", run.variant_key("model"), list(run.logs["dense"].keys.values()))
+    run.progress("model", 0, 1)
+    build, threads = state.config.model.build, run.workers.threads
+    mesh: TexturedMesh = run.cached(
+        "model", "model", key, lambda: build(result.depth_maps, result.views, threads=threads)
+    )
+    held_out_key = run.key("model", key, "held-out", code_key(RENDERER))
+    held_out = run.cached("model", "held-out", held_out_key, lambda: _compare_held_out(state, mesh))
+    state.result = replace(state.result, mesh=mesh, held_out=held_out)
+    without_texture = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
+    counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    run.finish("model", counts=counts, metrics={"share_untextured": without_texture})
+    run.progress("model", 1, 1)
