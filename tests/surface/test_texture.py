@@ -8,7 +8,9 @@ import pytest
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
+from thesisrecon.surface import _texture_blending
 from thesisrecon.surface._mesh import face_neighbours, vertex_normals
+from thesisrecon.surface._texture_blending import _equalizing_gains, blend_colors, prepare_views
 from thesisrecon.surface._texture_kernels import (
     ViewSurface,
     combine_colors,
@@ -21,7 +23,6 @@ from thesisrecon.surface._texture_views import choose_views, face_quality, label
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas, _pack_rectangles
-from thesisrecon.surface.texture_blending import _equalizing_gains, prepare_views
 from thesisrecon.views.render import render
 
 GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
@@ -125,7 +126,7 @@ def test_a_surface_outside_all_views_is_rejected(sphere):
 
 def test_gains_are_found(sphere):
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
-    found = prepare_views(sphere, views).gains
+    found = [view.gain for view in prepare_views(sphere, views)]
     wanted = np.exp(np.log(GAINS).mean()) / np.array(GAINS)
     np.testing.assert_allclose(found, np.repeat(wanted[:, None], 3, axis=1), atol=0.025)
 
@@ -137,7 +138,7 @@ def test_gains_of_views_that_share_nothing_stay():
     np.testing.assert_allclose(_equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4)
 
 
-def test_depths_that_one_image_contradicts_are_removed(sphere):
+def test_depths_that_one_image_contradicts_are_removed(sphere, monkeypatch):
     views = [photograph(m) for m in ring_of(24)]
     spoiled = views[0].rgb.copy()
     spoiled[40:80, 60:100] = [255, 0, 255]
@@ -146,10 +147,10 @@ def test_depths_that_one_image_contradicts_are_removed(sphere):
     x, y = (towards[:, :2] / towards[:, 2:]).T
     facing = (sphere.vertices @ np.linalg.solve(views[0].P[:, :3], views[0].P[:, 3])) < 0
     hit = facing & (np.abs(x - 80) < 15) & (np.abs(y - 60) < 15)
-    error = []
+    prepared, error = prepare_views(sphere, views), []
     for scatter in (1e6, 20.0):
-        prepared = replace(prepare_views(sphere, views), scatter=scatter)
-        color = prepared.colors(sphere.vertices, vertex_normals(sphere))[0]
+        monkeypatch.setattr(_texture_blending, "SCATTER", scatter)
+        color = blend_colors(prepared, sphere.vertices, vertex_normals(sphere))[0]
         error.append(float(np.sqrt(np.mean((color - paint(sphere.vertices))[hit] ** 2))))
     assert error[0] > 12.0
     assert error[1] < 0.3 * error[0]
@@ -200,7 +201,7 @@ def observed(points, normals, P, depth, trust, tolerance):
 
 
 def test_observe_points_matches_its_twin(sphere):
-    view = prepare_views(sphere, [photograph(ring_of()[2])]).views[0]
+    view = prepare_views(sphere, [photograph(ring_of()[2])])[0]
     rng = np.random.default_rng(1)
     points = rng.normal(size=(400, 3))
     points *= 1.01 / np.linalg.norm(points, axis=1, keepdims=True)

@@ -15,7 +15,7 @@ _CONVERGED = 1e-9
 
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
-    """Return P = K [R t].
+    """Return P = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.21).
 
     Parameters
     ----------
@@ -74,10 +74,8 @@ def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: 
 
     Parameters
     ----------
-    f_u, f_v : float
-        Focal length over the width and the height of a pixel, px; positive.
-    u_0, v_0 : float
-        Principal point, px.
+    f_u, f_v, u_0, v_0 : float
+        Focal lengths, positive, and principal point, px.
     skew : float
         f_v tan(alpha), px, for pixel sides that deviate from a right angle by alpha (table 3.1).
 
@@ -93,7 +91,7 @@ def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: 
 def normalize_camera(P: F64) -> F64:
     """Scale P such that det M = 1 (definition 3.5.1): P / det(M)^(1/3), which also corrects the sign.
 
-    The centre of (3.24) then has the last entry 1, and points in front have t > 0 in P X (proposition 3.5.1).
+    Points in front then have t > 0 in P X (proposition 3.5.1).
 
     Parameters
     ----------
@@ -121,8 +119,7 @@ def _left_determinant(P: F64, caller: str) -> F64:
 def principal_ray(P: F64) -> F64:
     """Return the direction of the optical axis towards the front: det(M) m_3, normalised (3.23).
 
-    The last row (m_3, p_34) of P is the principal plane, whose points project to (u, v, 0) (3.22). The
-    principal point is M m_3 (HZ 6.2).
+    The last row (m_3, p_34) of P is the principal plane (3.22); the principal point is M m_3 (HZ 6.2).
 
     Parameters
     ----------
@@ -169,10 +166,9 @@ def camera_centre(P: F64) -> F64:
     Returns
     -------
     ndarray (..., 4)
-        Homogeneous centres with the sign of the minors.
+        Homogeneous, with the sign of the minors.
     """
-    columns = [0, 1, 2, 3]
-    minors = [np.linalg.det(P[..., [c for c in columns if c != k]]) for k in columns]
+    minors = [np.linalg.det(np.delete(P, k, axis=-1)) for k in range(4)]
     return np.stack([-minors[0], minors[1], -minors[2], minors[3]], axis=-1)
 
 
@@ -181,10 +177,8 @@ def project(P: F64, X: F64) -> F64:
 
     Parameters
     ----------
-    P : ndarray (3, 4)
-        Camera.
-    X : ndarray (N, 3) or (N, 4)
-        Points, Euclidean or homogeneous.
+    P, X : ndarray (3, 4), and (N, 3) or (N, 4)
+        Camera, and Euclidean or homogeneous points.
 
     Returns
     -------
@@ -205,10 +199,8 @@ def distort(xy_normalized: F64, distortion: float | F64) -> F64:
 
     Parameters
     ----------
-    xy_normalized : ndarray (N, 2)
-        Normalised image points.
-    distortion : float or ndarray (C,) or (N, C)
-        k1, or the coefficients k1, k2, ...
+    xy_normalized, distortion : ndarray (N, 2); float or ndarray (C,) or (N, C)
+        Normalised image points and k1, or the coefficients k1, k2, ...
 
     Returns
     -------
@@ -223,10 +215,8 @@ def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
 
     Parameters
     ----------
-    xy_normalized : ndarray (N, 2)
-        Distorted normalised points.
-    distortion : float or ndarray (C,) or (N, C)
-        k1, or the coefficients k1, k2, ...
+    xy_normalized, distortion
+        As in :func:`distort`, distorted points.
 
     Returns
     -------
@@ -263,10 +253,8 @@ def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 
 
     Parameters
     ----------
-    K, R, t : ndarray (3, 3), (3, 3) and (3,)
-        Calibration matrix, rotation world-to-camera and translation.
-    X : ndarray (N, 3)
-        Points.
+    K, R, t, X : ndarray (3, 3), (3, 3), (3,) and (N, 3)
+        Calibration matrix, rotation world-to-camera, translation and points.
     distortion : float or ndarray (C,) or (N, C)
         Coefficients of :func:`distort`.
 
@@ -281,15 +269,13 @@ def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 
 def cheirality(P: F64, X: F64) -> F64:
     """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera, 0 at infinity.
 
-    The value does not depend on the scales of X and P, negative ones included. Its magnitude is an inverse
-    depth (the thesis takes it for a depth), without a unit if P is not normalised; :func:`depth` measures.
+    The scales of X and P do not matter, negative ones included. The magnitude is an inverse depth (the thesis
+    takes it for a depth), without a unit if P is not normalised.
 
     Parameters
     ----------
-    P : ndarray (3, 4)
-        Camera.
-    X : ndarray (N, 4)
-        Homogeneous points.
+    P, X : ndarray (3, 4) and (N, 4)
+        Camera and homogeneous points.
 
     Returns
     -------
@@ -301,8 +287,7 @@ def cheirality(P: F64, X: F64) -> F64:
     >>> cheirality(np.eye(3, 4), X).round(9).tolist()
     [0.5, -0.5]
     """
-    t = X @ P[2]
-    return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / t)
+    return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
 
 
 def depth(P: F64, X: F64) -> F64:
@@ -310,15 +295,12 @@ def depth(P: F64, X: F64) -> F64:
 
     Parameters
     ----------
-    P : ndarray (3, 4)
-        Camera of any scale and sign.
-    X : ndarray (N, 4)
-        Homogeneous points.
+    P, X : ndarray (3, 4) and (N, 4)
+        Camera of any scale and sign, homogeneous points.
 
     Returns
     -------
     ndarray (N,)
-        Depths, in units of space.
     """
     M = P[:, :3]
     return np.asarray(np.sign(np.linalg.det(M)) * (X @ P[2]) / (X[:, 3] * np.linalg.norm(M[2])))
@@ -331,25 +313,20 @@ def orient_signs(P: F64, X: F64, view: I64, point: I64) -> tuple[F64, F64, float
 
     Parameters
     ----------
-    P, X : ndarray (V, 3, 4) and (N, 4)
-        Cameras and homogeneous points.
-    view, point : ndarray (K,) of int
-        View and point of each observation.
+    P, X, view, point : ndarray (V, 3, 4), (N, 4), (K,) and (K,), int
+        Cameras, homogeneous points, and view and point of each observation.
 
     Returns
     -------
-    views, points : ndarray (V,) and (N,)
-        Signs +-1 of cameras and points.
-    ratio : float
-        Fraction of the observations with positive depth: 1 up to wrong matches for real points.
+    views, points, ratio : ndarray (V,) and (N,), float
+        Signs +-1 of cameras and points, and the fraction of the observations with positive depth.
 
     References
     ----------
     Hartley, "Chirality", IJCV 26(1), 1998, theorem 17.
     """
     w = np.sign(np.einsum("kj,kj->k", P[view, 2], X[point]))
-    views = np.zeros(len(P))
-    points = np.zeros(len(X))
+    views, points = np.zeros(len(P)), np.zeros(len(X))
     if len(view) == 0:
         return np.ones(len(P)), np.ones(len(X)), 1.0
     views[np.bincount(view, minlength=len(P)).argmax()] = 1.0

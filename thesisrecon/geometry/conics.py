@@ -1,12 +1,11 @@
 """Section 3.4.6: conics, quadrics, their duals, and the absolute conic.
 
-One algebra serves both dimensions: C is a conic (3, 3) of the points x'C x = 0 (3.1) or a quadric (4, 4) with
-X'Q X = 0 (3.8); its dual has l'C* l = 0 (3.3) or Pi'Q* Pi = 0 (3.9). All are symmetric and of any scale. How
-they transform: :func:`thesisrecon.geometry.strata.transform`.
+C is a conic (3, 3) of the points x'C x = 0 (3.1) or a quadric (4, 4) with X'Q X = 0 (3.8); its dual has
+l'C* l = 0 (3.3) or Pi'Q* Pi = 0 (3.9). The tangent line at x is C x, the tangent plane at X is Q X (3.7). All
+are symmetric and of any scale; how they transform: :func:`thesisrecon.geometry.strata.transform`.
 
-The absolute conic Omega is x'x = 0 on the plane at infinity (3.2); its tangent planes form the absolute dual
-quadric. A camera [M m] maps the point (x, 0) of that plane to M x (3.11), so that the image of Omega depends
-on K alone (3.11-3.13): it calibrates the camera and measures angles.
+The absolute conic Omega is x'x = 0 on the plane at infinity (3.2). A camera [M m] maps the point (x, 0) of
+that plane to M x (3.11), so that the image of Omega depends on K alone (3.11-3.13).
 """
 
 from __future__ import annotations
@@ -43,8 +42,7 @@ def bilinear_form(C: F64, x: F64, y: F64) -> F64:
 def dual(C: F64) -> F64:
     """Return the dual C* ~ C^-1 (3.4) or Q* ~ Q^-1 (3.10): tangent lines or tangent planes.
 
-    It is the adjugate, by singular values, so that a conic of rank 2 (two lines) has a dual too: their common
-    point, twice. Lower ranks give zero.
+    It is the adjugate, by singular values: the dual of two lines (rank 2) is their common point, twice.
 
     Parameters
     ----------
@@ -62,48 +60,11 @@ def dual(C: F64) -> F64:
     return np.asarray(sign * (Vt.T * others) @ U.T)
 
 
-def tangent(C: F64, x: F64) -> F64:
-    """Return the tangent line C x (3.7) or tangent plane Q X; the polar for points off the conic or quadric.
-
-    Parameters
-    ----------
-    C : ndarray (d, d)
-        Conic or quadric.
-    x : ndarray (..., d)
-        Homogeneous points.
-
-    Returns
-    -------
-    ndarray (..., d)
-    """
-    return np.asarray(x @ C)
-
-
-def tangency_discriminant(C: F64, x: F64, y: F64) -> F64:
-    """Return S(x, y)^2 - S(x) S(y) (3.6), 0 if the line of x and y is tangent, positive if it intersects.
-
-    Parameters
-    ----------
-    C : ndarray (d, d)
-        Conic or quadric.
-    x, y : ndarray (..., d)
-        Two homogeneous points of the line.
-
-    Returns
-    -------
-    ndarray (...)
-
-    Notes
-    -----
-    The square is missing in (3.6) of the thesis' text.
-    """
-    return np.asarray(bilinear_form(C, x, y) ** 2 - bilinear_form(C, x, x) * bilinear_form(C, y, y))
-
-
 def intersect_line(C: F64, x: F64, y: F64) -> F64:
     """Intersect a conic or quadric with the line of two points (3.5).
 
-    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y.
+    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y. The discriminant S(x, y)^2 -
+    S(x) S(y) is 0 for tangents (3.6, where the thesis' text lost the square).
 
     Parameters
     ----------
@@ -115,7 +76,7 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     Returns
     -------
     ndarray (0, d), (1, d) or (2, d)
-        Real points; one for a tangent (discriminant 0 to rounding), none for a line that lies on the quadric.
+        Real points; one for a tangent, none for a line that lies on the quadric.
     """
     x, y, C = (checked_unit(array, "intersect_line") for array in (x, y, C))
     sxx, sxy, syy = (float(bilinear_form(C, a, b)) for a, b in ((x, x), (x, y), (y, y)))
@@ -176,14 +137,14 @@ def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
     Parameters
     ----------
     image : ndarray (3, 3)
-        Omega, or omega* if ``is_dual``, of any scale and sign. An indefinite one is of no real camera.
+        Omega, or omega* if ``is_dual``, of any scale and sign; an indefinite one is a ``ValueError``.
     is_dual : bool
         Whether the image is omega*.
 
     Returns
     -------
     ndarray (3, 3)
-        K, upper triangular, positive focal lengths, K33 = 1.
+        K with positive focal lengths and K33 = 1.
     """
     if not np.isfinite(image).all() or not (is_dual or np.linalg.cond(image) < 1e15):
         raise ValueError("calibration_from_image needs a finite invertible conic")

@@ -188,10 +188,8 @@ def scene_frame(X: F64) -> tuple[F64, float]:
 
     Returns
     -------
-    origin : ndarray (3,)
-        Median of each coordinate; 0 without points.
-    scale : float
-        1 / median distance from the origin; 1 if all points are equal.
+    origin, scale : ndarray (3,) and float
+        Median of each coordinate and 1 / median distance from it; 0 and 1 without points.
     """
     if len(X) == 0:
         return np.zeros(3), 1.0
@@ -204,14 +202,12 @@ def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
     """Return M for which the unit vectors x = M X / |M X| have sum x x' proportional to I.
 
     Every point counts as a direction, so neither homogeneous scales nor a few far points matter. Directions
-    without extent (points on a plane) are stretched by at most 1e6. Points of norm 0 are ignored.
+    without extent are stretched by at most 1e6.
 
     Parameters
     ----------
-    X : ndarray (N, 4)
-        Homogeneous points.
-    rounds : int
-        Fixed-point iterations.
+    X, rounds : ndarray (N, 4) and int
+        Homogeneous points and number of fixed-point iterations.
 
     Returns
     -------

@@ -7,35 +7,17 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.geometry._checks import checked_unit
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import cross_matrix, require_finite
-from thesisrecon.geometry.two_view import epipoles, unit_norm
-
-
-def image_from_plane(P: F64, plane: F64) -> F64:
-    """Return H_Pi = M - m pi' (3.29), which maps the point (x, -pi'x) of the plane (pi, 1) to its image.
-
-    H_Pi is singular if the plane contains the camera centre. For [I 0] it is the identity (3.32); the camera
-    beside it is [M m] = [H_Pi + e2 pi', e2] with the epipole e2 = m (3.36-3.40).
-
-    Parameters
-    ----------
-    P, plane : ndarray (3, 4) and (4,)
-        Camera [M m] and plane that does not contain the origin, so that x is a coordinate.
-
-    Returns
-    -------
-    ndarray (3, 3)
-    """
-    if not abs(plane[3]) > 1e-14 * np.linalg.norm(plane):
-        raise ValueError("image_from_plane needs a plane that does not contain the origin")
-    return np.asarray(P[:, :3] - np.outer(P[:, 3], plane[:3] / plane[3]))
+from thesisrecon.geometry.homogeneous import require_finite
+from thesisrecon.geometry.two_view import unit_norm
 
 
 def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
     """Return the homography x2 ~ H x1 of unit norm between two images induced by a plane.
 
     H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane and the point
-    is projected. It equals H_Pi2 H_Pi1^-1 (3.30), also for planes through the origin.
+    is projected. For P1 = [I 0], P2 = [M m] and the plane (pi, 1) it is H_Pi = M - m pi' (3.29), which maps
+    the point (x, -pi'x) to its image; [M m] = [H_Pi + e2 pi', e2] with the epipole e2 = m (3.36-3.40). In
+    general it equals H_Pi2 H_Pi1^-1 (3.30), also for planes through the origin.
 
     Parameters
     ----------
@@ -58,9 +40,7 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
 def infinite_homography(P1: F64, P2: F64) -> F64:
     """Return H = M2 M1^-1 (3.31), the homography of the plane (0, 0, 0, 1), of unit norm.
 
-    K2 R2 R1' K1^-1 in a metric frame (3.28, where the thesis' R are transposed), for any centres. In an
-    affine frame it is still the homography of the plane at infinity, in a projective frame that of an
-    ordinary plane.
+    K2 R2 R1' K1^-1 in a metric frame (3.28, where the thesis' R are transposed), for any centres.
 
     Parameters
     ----------
@@ -76,26 +56,3 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
         raise ValueError("infinite_homography needs a finite first camera")
     H = np.linalg.solve(P1[:, :3].T, P2[:, :3].T).T
     return unit_norm(np.asarray(H, dtype=np.float64))
-
-
-def homography_from_fundamental(F: F64, *, plane: F64 | None = None) -> F64:
-    """Return H = -[e2]x F / |e2|^2 + e2 v', the homography of a plane for any v (3.39, 3.41).
-
-    [e2]x H = F, also in sign, for F of unit norm. (3.41) is the member v = 0, up to sign and scale: the plane
-    through the second centre whose image is the line e2, hence singular.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix.
-    plane : ndarray (3,), optional
-        v; 0 by default.
-
-    Returns
-    -------
-    ndarray (3, 3)
-    """
-    F = unit_norm(F)
-    _, e2 = epipoles(F)
-    H = -cross_matrix(e2) @ F
-    return H if plane is None else H + np.outer(e2, plane)

@@ -1,16 +1,13 @@
-"""Section 6.3.3: the polynomial method, optimal triangulation from two views.
+"""Section 6.3.3: the polynomial method, optimal triangulation from two views (Hartley and Sturm 1997).
 
 The pair of points nearest to the measured one that satisfies the epipolar constraint is the best of at most
-six stationary points of a one-parameter cost, the roots of a polynomial of degree 6. Their rays intersect
-exactly. The parameter is the epipolar plane.
+six stationary points of a one-parameter cost over the epipolar planes, the roots of a polynomial of degree 6.
 
 All epipolar planes are q0 A + q1 B; their lines in the two images are L1 q and L2 q, L (3, 2). The distance
 of x = (x, y, 1) from a line is the root of n^2 / (q'Bq) with n = (x'L) q linear in q and B = L[:2]'L[:2] of
-the pair alone, so that a point enters by four numbers. Hartley and Sturm rotate and shift both images
-instead; here the line through the point and its B-orthogonal companion take that role, which needs no finite
-epipole. Forms B are stored as (B00, B01, B11).
-
-References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
+the pair alone, so that a point enters by four numbers. The line through the point and its B-orthogonal
+companion replace the rotated images of the paper, so that epipoles may be at infinity. Forms B are stored as
+(B00, B01, B11).
 """
 
 from __future__ import annotations
@@ -321,15 +318,12 @@ def _balanced(L: F64) -> tuple[F64, F64, F64]:
 def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     """Move matches to the nearest pairs with x2' F x1 = 0: least sum of squared distances.
 
-    The minimum is global: every stationary point is evaluated if more than one may exist (near an epipole),
-    infinity included. A match with a point on its epipole is exact with every partner and is not moved.
+    The minimum is global. A match with a point on its epipole is exact with every partner and is not moved.
 
     Parameters
     ----------
-    F : ndarray (3, 3)
-        Fundamental matrix of rank 2, any scale.
-    xy1, xy2 : ndarray (N, 2)
-        Matches, px.
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix of rank 2, any scale, and matches, px.
 
     Returns
     -------
@@ -357,15 +351,12 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 def triangulate_polynomial(P: F64, xy: F64) -> F64:
     """Triangulate optimally from two views (6.3.3).
 
-    Every match is moved to the nearest pair of points whose rays intersect (:func:`correct_matches`): the sum
-    of squared reprojection errors is the global minimum in any frame. Points behind a camera are possible.
+    The sum of squared reprojection errors is the global minimum in any frame (:func:`correct_matches`).
 
     Parameters
     ----------
-    P : ndarray (2, 3, 4)
-        Cameras of rank 3 with different centres.
-    xy : ndarray (2, N, 2)
-        Pixels; NaN for not observed.
+    P, xy : ndarray (2, 3, 4) and (2, N, 2)
+        Cameras of rank 3 with different centres, and pixels; NaN for not observed.
 
     Returns
     -------

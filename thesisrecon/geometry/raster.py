@@ -113,8 +113,7 @@ def gaussian_taps(sigma_px: float) -> F32:
     radius = max(1, int(np.ceil(3.0 * sigma_px)))
     x = np.arange(-radius, radius + 1)
     taps = np.exp(-0.5 * (x / sigma_px) ** 2)
-    normalized: F32 = (taps / taps.sum()).astype(np.float32)
-    return normalized
+    return np.asarray(taps / taps.sum(), dtype=np.float32)
 
 
 def smooth(image: F32, sigma_px: float) -> F32:
@@ -122,10 +121,8 @@ def smooth(image: F32, sigma_px: float) -> F32:
 
     Parameters
     ----------
-    image : ndarray (H, W) of float32
-        Image.
-    sigma_px : float
-        Standard deviation, px.
+    image, sigma_px : ndarray (H, W) of float32, float
+        Image and standard deviation, px.
 
     Returns
     -------

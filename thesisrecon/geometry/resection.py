@@ -52,15 +52,12 @@ def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
 
     Returns
     -------
-    R, t : ndarray (C, 3, 3) and (C, 3)
-        Rotations world-to-camera and translations, up to four a sample; none for collinear points.
-    sample : ndarray (C,) of int
-        Sample of each candidate.
+    R, t, sample : ndarray (C, 3, 3), (C, 3) and (C,) of int
+        Rotations world-to-camera and translations, up to four a sample, and the sample of each.
 
     References
     ----------
-    Haralick, Lee, Ottenberg and Nolle, "Review and analysis of solutions of the three point perspective pose
-    estimation problem", IJCV 13(3), 1994.
+    Haralick et al., "Review and analysis of solutions of the three point ... problem", IJCV 13(3), 1994.
     """
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
     ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))

@@ -1,12 +1,11 @@
 """Sections 3.3 and 3.4: how entities transform, the four strata, their groups and their invariants.
 
-A transform G (4, 4) maps points X -> G X. The matrices of 3.4.2 to 3.4.5 in the thesis' text have their zeros
-in the fourth column: they act on rows, X' -> X' G, and are the transposes of those here, which follow the
-thesis' table in 3.3.
+A transform G (4, 4) maps points X -> G X, as in the thesis' table 3.3; the matrices of 3.4.2 to 3.4.5 in its
+text act on rows, X' -> X' G, and are the transposes of those here.
 
-Invariants: projective - the cross-ratio (and incidence, tangency, the sign of the Gaussian curvature, see
-``conics``); affine - parallelism, ratios of volumes and of lengths along a line, centroids; metric - angles
-and ratios of lengths; Euclidean - lengths. Points are homogeneous (..., 4) of any scale.
+Invariants: projective - cross-ratio, incidence, tangency, sign of the Gaussian curvature (``conics``);
+affine - parallelism, ratios of volumes and of lengths along a line, centroids; metric - angles, ratios of
+lengths; Euclidean - lengths.
 """
 
 from __future__ import annotations
@@ -38,8 +37,7 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
     G : ndarray (4, 4) or (3, 3)
         Transform of space, or homography; singular ones are a ``ValueError`` where the inverse is needed.
     entity : ndarray
-        (..., d) points, planes or image lines, (..., 3, 4) cameras, (..., d, d) conics or quadrics. Pluecker
-        matrices transform as duals if they are of points, as conics if they are of planes.
+        (..., d) points, planes or image lines, (..., 3, 4) cameras, (..., d, d) conics or quadrics.
     kind : {"points", "planes", "cameras", "conics", "dual conics"}
         Kind of the entity.
 
@@ -63,16 +61,13 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
 def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
     """Return the smallest group that a transform belongs to (figure 3.1).
 
-    Affine: the plane at infinity is fixed, the last row is a multiple of (0, 0, 0, 1). Metric: the absolute
-    conic is fixed too, A'A is a multiple of I and det A > 0 for W = 1 (a reflection is only affine here).
-    Euclidean: the multiple is 1.
+    Affine: the last row is a multiple of (0, 0, 0, 1). Metric: A'A is a multiple of I too, det A > 0 for
+    W = 1. Euclidean: the multiple is 1.
 
     Parameters
     ----------
-    G : ndarray (4, 4)
-        Transform of any scale, finite and invertible.
-    tolerance : float
-        Relative tolerance.
+    G, tolerance : ndarray (4, 4), float
+        Transform of any scale, finite and invertible, and relative tolerance.
 
     Returns
     -------
@@ -93,9 +88,8 @@ def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
 def affine_from_projective(plane: F64) -> F64:
     """Return G_PA, which moves the plane at infinity of a projective frame to (0, 0, 0, 1) (3.4.3).
 
-    The identity with the last row (Pi1/Pi4, Pi2/Pi4, Pi3/Pi4, 1). That row does not exist for a plane through
-    the origin; if Pi4 is below 1e-6 of the plane's norm, the smallest rotation that moves the plane there is
-    used.
+    The identity with the last row (Pi1/Pi4, Pi2/Pi4, Pi3/Pi4, 1). For a plane (nearly) through the origin it
+    is the smallest rotation that moves the plane there.
 
     Parameters
     ----------
@@ -146,8 +140,7 @@ def metric_from_affine(absolute_conic: F64) -> F64:
 def metric_from_projective(dual_quadric: F64) -> F64:
     """Return G_PM, which moves the absolute dual quadric to diag(1, 1, 1, 0), det G_PM > 0.
 
-    Q* = V diag(s1, s2, s3, s4) V' with |s4| least, which is set to 0; G_PM^-1 = V diag(root s1, root s2, root
-    s3, 1).
+    Q* = V diag(s1, s2, s3, s4) V' with |s4| least, set to 0; G_PM^-1 = V diag(roots of s1, s2, s3, 1).
 
     Parameters
     ----------
@@ -174,8 +167,7 @@ def cross_ratio(X: F64) -> float:
     Parameters
     ----------
     X : ndarray (4, d)
-        Homogeneous collinear points of any scale, d = 2, 3 or 4, at most two of them equal; a point may be
-        the base point X' itself (l infinite).
+        Homogeneous collinear points of any scale, d = 2, 3 or 4, at most two of them equal.
 
     Returns
     -------

@@ -189,10 +189,8 @@ def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
 
     Parameters
     ----------
-    P : ndarray (V, 3, 4)
-        Cameras of any scale, V >= 2.
-    xy : ndarray (V, N, 2)
-        Pixels; NaN for not observed.
+    P, xy : ndarray (V, 3, 4) and (V, N, 2)
+        V >= 2 cameras of any scale, and pixels; NaN for not observed.
     method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}
         "polynomial": optimal for exactly two views; "linear" and "iterated": algebraic; "midpoint": metric
         frames only; "optimal": least reprojection error from any number of views.
@@ -200,14 +198,12 @@ def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
     Returns
     -------
     ndarray (N, 4)
-        Homogeneous points in the frame of the cameras; zeros if a point is observed in fewer than two views
-        or its rays do not determine it.
+        Homogeneous points; zeros if a point is observed in fewer than two views or not determined.
 
     Raises
     ------
     ValueError
-        Unknown method, wrong shapes, infinite pixels, or cameras that are zero, not finite, fewer than two or
-        unsuitable for the method.
+        Unknown method, wrong shapes, infinite pixels, or unsuitable cameras.
 
     Examples
     --------
@@ -234,14 +230,8 @@ def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: i
 
     Parameters
     ----------
-    P : ndarray (V, 3, 4)
-        Cameras.
-    view, point : ndarray (K,) of int
-        View and point of each observation, in any order; sorted by point is fastest.
-    xy : ndarray (K, 2)
-        Pixels.
-    n_points : int
-        Number of points.
+    P, view, point, xy, n_points : ndarray (V, 3, 4), (K,), (K,) and (K, 2), int
+        Cameras; view, point and pixel of each observation, in any order; number of points.
 
     Returns
     -------
@@ -305,10 +295,8 @@ def _listed(xy: F64) -> _SortedPixels:
 def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
     """Linear method (6.3.1): least sum of squares of u p3'X - p1'X and v p3'X - p2'X over unit X.
 
-    Of Hartley's normalisation the shift has no effect on these rows; its scale is the weight of a view: the
-    rows are divided by the norm of M's first two, with the pixel origin in the middle of the view's points,
-    in a metric frame the focal length. The result depends on the projective frame. ``passes`` > 0:
-    Iterative-LS, whose limit is near the least reprojection error.
+    The rows of a view are divided by the norm of M's first two, with the pixel origin in the middle of the
+    view's points: in a metric frame the focal length. ``passes`` > 0: Iterative-LS.
     """
     start, view, xy = listed
     P = np.ascontiguousarray(P, dtype=np.float64)

@@ -18,6 +18,7 @@ from thesisrecon.geometry.homogeneous import (
     normalizing_transform,
     require_finite,
     require_shapes,
+    unit_normals,
 )
 
 _PARALLAX_PER_NOISE, _MIN_PARALLAX_PX = 3.0, 0.05
@@ -63,23 +64,16 @@ def enforce_rank_two(F: F64) -> F64:
 
 
 def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
-    """Return F = [e2]x P2 P1^+ of two cameras, of unit norm, e2 = P2 C1 (3.33).
-
-    The line of x joins e2 and the image of P1^+ x, another point of its ray; F has rank 2 (3.35).
+    """Return F = [e2]x P2 P1^+ of two cameras, of unit norm and rank 2, e2 = P2 C1 (3.33, 3.35).
 
     Parameters
     ----------
     P1, P2 : ndarray (3, 4)
-        Cameras of rank 3.
+        Cameras of rank 3 with different centres; others are a ``ValueError``.
 
     Returns
     -------
     ndarray (3, 3)
-
-    Raises
-    ------
-    ValueError
-        The centres coincide (the views are related by a homography), or a camera is unsuitable.
 
     Examples
     --------
@@ -123,19 +117,15 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 
     Parameters
     ----------
-    F : ndarray (3, 3)
-        Fundamental matrix; F' for the lines in image 1 of points of image 2.
-    xy1 : ndarray (N, 2)
-        Pixels.
+    F, xy1 : ndarray (3, 3) and (N, 2)
+        Fundamental matrix, or F' for the lines in image 1, and pixels.
 
     Returns
     -------
     ndarray (N, 3)
         Zero for an epipole.
     """
-    lines = homogenize(xy1) @ F.T
-    norm = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    return lines / np.where(norm > 0.0, norm, 1.0)
+    return unit_normals(homogenize(xy1) @ F.T)
 
 
 def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
@@ -149,7 +139,7 @@ def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
     Returns
     -------
     ndarray (N, 2)
-        Distances in images 1 and 2, px.
+        In images 1 and 2, px.
     """
     of_first = np.sum(homogenize(xy1) * epipolar_lines(F.T, xy2), axis=1)
     of_second = np.sum(homogenize(xy2) * epipolar_lines(F, xy1), axis=1)
@@ -181,8 +171,8 @@ def _gradients(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
     """Return the signed Sampson distances (5.4).
 
-    To first order the distance of (x1, y1, x2, y2) to the nearest exact match. Its standard deviation is that
-    of one image coordinate: the residual is divided by its own, sigma |grad r| (5.3).
+    To first order the distance of (x1, y1, x2, y2) to the nearest exact match, with the standard deviation of
+    one image coordinate (5.3).
 
     Parameters
     ----------
@@ -265,8 +255,7 @@ def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
 def homography_sampson_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
     """Return whitened residuals of x2 ~ H x1 (Sampson distance), px.
 
-    To first order the two parts of the distance to the nearest exact match, each with the standard deviation
-    of one image coordinate.
+    Each has to first order the standard deviation of one image coordinate.
 
     Parameters
     ----------
@@ -299,9 +288,9 @@ def homography_sampson_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
 def quasi_euclidean_planes(F: F64) -> F64:
     """Return the two v that make the left part of P2 (:func:`canonical_cameras`) nearest to a rotation.
 
-    With the singular values s1 >= s2 of F and unit epipoles, v = +-(s1 + s2) / 2 e1 gives the left part the
-    singular values s1, (s1 + s2) / 2, s2. In pixels in which the calibration is near the identity, v is near
-    the plane at infinity. The two differ by half a turn about the baseline; only matches decide.
+    v = +-(s1 + s2) / 2 e1 with the singular values s1 >= s2 of F gives the left part the singular values s1,
+    (s1 + s2) / 2, s2. With a calibration near the identity v is near the plane at infinity. The two differ by
+    half a turn about the baseline; only matches decide.
 
     Parameters
     ----------
@@ -326,18 +315,17 @@ def quasi_euclidean_planes(F: F64) -> F64:
 
 
 def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -> tuple[F64, F64]:
-    """Return P1 = [I 0], P2 = [-[e2]x F + e2 v'  scale e2] (3.42), two cameras with fundamental matrix F.
+    """Return P1 = [I 0], P2 = [H  scale e2] (3.42), H = -[e2]x F + e2 v': two cameras of F.
 
-    With v = 0 the left part of P2 is singular; with the default v its condition number is that of F, s1 / s2.
+    H is the homography of a plane for any v (3.39), [e2]x H = F for F of unit norm. (3.41) is the singular H
+    of v = 0, the plane through the second centre; with the default v its condition number is that of F.
 
     Parameters
     ----------
     F : ndarray (3, 3)
         Fundamental matrix.
-    plane : ndarray (3,), optional
-        v, the plane taken as infinity; by default the first of :func:`quasi_euclidean_planes`.
-    scale : float
-        Last of the four free parameters, not 0.
+    plane, scale : ndarray (3,), optional; float
+        v, by default the first of :func:`quasi_euclidean_planes`, and the scale, not 0.
 
     Returns
     -------
@@ -377,13 +365,12 @@ def require_parallax_of_matches(
     """
     noise = float(np.quantile(np.abs(sampson_residuals(F, xy1, xy2)), 0.9))
     if at_infinity is None:
-        residuals = _homography_residuals(xy1, xy2)
+        what, residuals = "one homography", _homography_residuals(xy1, xy2)
     else:
-        residuals = homography_residuals(at_infinity, xy1, xy2)
+        what, residuals = "a scene at infinity", homography_residuals(at_infinity, xy1, xy2)
     parallax = float(np.quantile(residuals, 0.9))
     if parallax > _PARALLAX_PER_NOISE * noise + _MIN_PARALLAX_PX:
         return
-    what = "one homography" if at_infinity is None else "a scene at infinity"
     raise StageFailure(
         "the images show no parallax: the camera only rotated, or the scene is a plane or too far away",
         f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px; the noise is {noise:.2g} px",

@@ -163,10 +163,8 @@ class Raster:
 
     Parameters
     ----------
-    depth, face : ndarray (H, W) of float32 and int64
-        Depth, inf for none, and face of each pixel, -1 for none.
-    weights : ndarray (H, W, 2) of float32
-        Barycentric coordinates of the face's corners 1 and 2.
+    depth, face, weights : ndarray (H, W), (H, W) and (H, W, 2)
+        Depth, inf for none; face of each pixel, -1 for none; barycentric coordinates of its corners 1 and 2.
     """
 
     depth: F32
@@ -178,10 +176,8 @@ class Raster:
 
         Parameters
         ----------
-        values : ndarray (N, C) or (M, 3, C)
-            Values of the vertices, or of the corners of all faces.
-        faces : ndarray (M, 3) of int, optional
-            Vertices of each face, for values of vertices.
+        values, faces : ndarray (N, C) or (M, 3, C); ndarray (M, 3) of int, optional
+            Values of vertices with the vertices of each face, or values of the corners of all faces.
 
         Returns
         -------
@@ -228,14 +224,10 @@ def rasterize_corners(corners: F64, near: float, shape: tuple[int, int], *, thre
 
     Parameters
     ----------
-    corners : ndarray (M, 3, 3)
-        Three image points K (R X + t) of each face; the last entry is the depth.
-    near : float
-        Nearest depth that is drawn.
-    shape : (int, int)
-        Height and width, px.
-    threads : int
-        As in :func:`rasterize`.
+    corners, near : ndarray (M, 3, 3), float
+        Three image points K (R X + t) of each face, whose last entry is the depth; nearest depth drawn.
+    shape, threads : (int, int), int
+        Height and width, px; number of threads.
 
     Returns
     -------

@@ -82,10 +82,8 @@ class VolumetricFusion:
 
         Parameters
         ----------
-        depth_maps : sequence of DepthMap
-            Depths of the views.
-        threads : int
-            Number of threads; the result does not depend on it.
+        depth_maps, threads : sequence of DepthMap, int
+            Depths of the views, and number of threads; the result does not depend on it.
 
         Returns
         -------
@@ -102,15 +100,17 @@ class VolumetricFusion:
             grid, truncation, measured = self._lay_out(measured)
             value = np.zeros((len(grid.blocks), SIDE, SIDE, SIDE), dtype=np.float32)
             weight = np.zeros_like(value)
-            parts = np.array_split(np.arange(len(grid.blocks)), 4 * max(threads, 1))
+            poses = [decompose_camera(one.P) for one in measured]
+            cameras = [K @ np.column_stack([R, t + R @ grid.origin]) for K, R, t in poses]
 
             def integrate(part: I64) -> None:
-                if len(part):
-                    some = slice(int(part[0]), int(part[-1]) + 1)
-                    for one in measured:
-                        _integrate(grid, truncation, one, some, value, weight)
+                some = slice(int(part[0]), int(part[-1]) + 1)
+                blocks, values, weights = grid.blocks[some], value[some], weight[some]
+                for one, P in zip(measured, cameras, strict=True):
+                    integrate_view(blocks, grid.voxel, P, one.samples, truncation, values, weights)
 
-            list(pool.map(integrate, parts))
+            parts = np.array_split(np.arange(len(grid.blocks)), 4 * max(threads, 1))
+            list(pool.map(integrate, filter(len, parts)))
         mesh = _extract_surface(grid, value, weight)
         if not len(mesh.faces):
             raise _nothing_to_fuse()
@@ -124,10 +124,10 @@ class VolumetricFusion:
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
             truncation = TRUNCATION_VOXELS * voxel
-            without_uncertain_depths = [m.without_uncertain_depths(truncation) for m in measured]
-            grid = _grid(without_uncertain_depths, voxel, truncation)
+            certain = [m.without_uncertain_depths(truncation) for m in measured]
+            grid = _grid(certain, voxel, truncation)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
-                return grid, truncation, without_uncertain_depths
+                return grid, truncation, certain
             voxel *= VOXEL_GROWTH
 
 
@@ -161,14 +161,7 @@ def _measured(depth_map: DepthMap) -> _FusionMap:
     return _FusionMap(depth_map.P, float(np.sqrt(K[0, 0] * K[1, 1])), samples)
 
 
-def _integrate(grid: _Grid, truncation: float, one: _FusionMap, some: slice, value: F32, weight: F32) -> None:
-    K, R, t = decompose_camera(one.P)
-    P = K @ np.column_stack([R, t + R @ grid.origin])
-    integrate_view(grid.blocks[some], grid.voxel, P, one.samples, truncation, value[some], weight[some])
-
-
 def _nothing_to_fuse() -> StageFailure:
-    """Failure of depth maps without depths."""
     return StageFailure(
         "no surface could be built",
         "the depth maps contain no depths that agree",
@@ -179,9 +172,9 @@ def _nothing_to_fuse() -> StageFailure:
 def _incidence_cosines(depth: F32, K: F64) -> F32:
     """n . r (H, W) for the unit surface normal n and the ray r with unit depth, at least ``MIN_COSINE``.
 
-    It is the distance across the surface per unit of depth: 1 for frontal surfaces, towards 0 at grazing
-    incidence. The inverse depth of a plane is linear in the pixel, and its gradient determines the normal.
-    The smaller of the differences to both neighbours is averaged over 3 x 3 pixels.
+    It is the distance across the surface per unit of depth. The inverse depth of a plane is linear in the
+    pixel, and its gradient determines the normal: the smaller of the differences to both neighbours, averaged
+    over 3 x 3 pixels.
     """
     with np.errstate(divide="ignore"):
         inverse = np.float32(1.0) / depth
@@ -209,10 +202,7 @@ def _smaller_difference(values: F32, axis: int) -> F32:
 
 
 def _without_grazing(depth_map: DepthMap, slope: float) -> F32:
-    """Depths without pixels at grazing incidence, which blend into the background.
-
-    The smaller of the differences to both neighbours counts, which preserves occluding borders.
-    """
+    """Depths without pixels at grazing incidence, which blend into the background; borders stay."""
     depth = depth_map.depth
     steepest = np.zeros_like(depth)
     for axis in (0, 1):
@@ -256,9 +246,8 @@ def _extract_surface(grid: _Grid, value: F32, weight: F32) -> TexturedMesh:
     points = np.zeros((count, 3))
     place_vertices(grid.blocks, grid.place, value, weight, vertex, points)
     nothing = np.zeros((0, 3), dtype=np.int64)
-    faces = np.zeros(
-        (join_vertices(grid.blocks, grid.place, value, weight, vertex, points, nothing), 3), np.int64
-    )
+    count = join_vertices(grid.blocks, grid.place, value, weight, vertex, points, nothing)
+    faces = np.zeros((count, 3), dtype=np.int64)
     join_vertices(grid.blocks, grid.place, value, weight, vertex, points, faces)
     return remove_unused_vertices(TexturedMesh(grid.origin + grid.voxel * points, faces))
 
@@ -287,20 +276,13 @@ class DepthSheets:
 
         Parameters
         ----------
-        depth_maps : sequence of DepthMap
-            Depths of the views.
-        threads : int
-            Ignored.
+        depth_maps, threads
+            As in :meth:`VolumetricFusion.fuse`; one thread is used.
 
         Returns
         -------
         TexturedMesh
             Mesh without colours.
-
-        Raises
-        ------
-        StageFailure
-            If the maps contain no depths.
         """
         order = sorted(depth_maps, key=lambda m: (-int(np.isfinite(m.depth).sum()), m.view))
         sheets: list[TexturedMesh] = []

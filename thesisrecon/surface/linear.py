@@ -18,15 +18,12 @@ def surface_from_depth(
     """Triangulate a depth map.
 
     Two pixels belong to one surface if the line between their points deviates from the rays by more than
-    ``grazing_deg``, or if their depths differ by less than three standard deviations: true surfaces at
-    smaller angles are hardly ever matched, whereas the line across an occluding edge runs along the rays.
+    ``grazing_deg``, or if their depths differ by less than three standard deviations.
 
     Parameters
     ----------
-    depth_map : DepthMap
-        Depths of one view.
-    step : int
-        Row and column step, at least 1.
+    depth_map, step : DepthMap, int
+        Depths of one view, and row and column step.
     grazing_deg : float
         Smallest viewing angle of a surface, in (0, 90).
 
@@ -69,6 +66,5 @@ class LinearSurface:
         Returns
         -------
         DepthMap
-            The same depths.
         """
         return depth_map

@@ -48,7 +48,6 @@ class SurfaceModel:
         Returns
         -------
         TexturedMesh
-            The fused surface.
         """
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             fitted = list(pool.map(self.surface.smooth, depth_maps))

@@ -15,17 +15,14 @@ from thesisrecon.surface._mesh import components, face_areas, remove_unused_vert
 def simplify_mesh(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
     """Simplify a mesh by vertex clustering.
 
-    Vertices that are connected within a cell of a cubic grid are merged (Rossignac and Borrel 1993; separate
-    sheets in one cell stay separate) at the point with the least squared distance to the planes of their
-    faces (Lindstrom 2000), which preserves edges and corners. Cells are enlarged until the faces are few
-    enough.
+    Vertices that are connected within a cell of a cubic grid are merged (Rossignac and Borrel 1993) at the
+    point with the least squared distance to the planes of their faces (Lindstrom 2000), which preserves edges
+    and corners. Cells are enlarged until the faces are few enough.
 
     Parameters
     ----------
-    mesh : TexturedMesh
-        Any mesh.
-    max_faces : int
-        Largest number of faces, at least 1.
+    mesh, max_faces : TexturedMesh, int
+        Any mesh, and the largest number of faces.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Texture atlas of a mesh: charts in the geometry of an image, packed into one texture.
 
 A chart consists of connected faces that are assigned to one image and has the outline and resolution of that
-image. Its colours are blended from all images (:func:`paint_texture`).
+image. Its colours are blended from all images.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.raster import resample, smooth
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface._mesh import face_neighbours
+from thesisrecon.surface._texture_blending import paint_texture
 from thesisrecon.surface._texture_views import (
     choose_views,
     face_quality,
@@ -23,7 +24,6 @@ from thesisrecon.surface._texture_views import (
     project_to_view,
     view_camera,
 )
-from thesisrecon.surface.texture_blending import paint_texture
 
 CHART_MARGIN = 2
 """Pixels around each chart, so that reduced textures do not mix charts."""
@@ -54,10 +54,8 @@ class TextureAtlas:
 
         Parameters
         ----------
-        mesh : TexturedMesh
-            The surface.
-        views : sequence of PinholeView
-            Undistorted images with their cameras.
+        mesh, views : TexturedMesh, sequence of PinholeView
+            Surface, and undistorted images with their cameras.
         threads : int
             Number of threads; the result does not depend on it.
 
@@ -97,7 +95,7 @@ class TextureAtlas:
         cut_out = _fill(smaller, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
         seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
         texture = paint_texture(mesh, smaller, seen_uv, cut_out, threads=threads)
-        uv, texture = _swatches(mesh, label, uv, texture)
+        uv, texture = _swatches(neighbours, label, uv, texture)
         return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 
 
@@ -170,14 +168,14 @@ def _fill(
     return texture
 
 
-def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
+def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
     """Append a patch of one colour for each unseen face: that of the nearest seen faces along the surface."""
     unseen = np.flatnonzero(label < 0)
     if not len(unseen):
         return uv, texture
     columns = max(texture.shape[1] // SWATCH, 1)
     rows = -(-len(unseen) // columns)
-    color = _surroundings(mesh, label, uv, texture)[unseen]
+    color = _surroundings(neighbours, label, uv, texture)[unseen]
     strip = np.full((rows * SWATCH, texture.shape[1], 3), 128, dtype=np.uint8)
     row, column = np.divmod(np.arange(len(unseen)), columns)
     for dy in range(SWATCH):
@@ -189,12 +187,11 @@ def _swatches(mesh: TexturedMesh, label: I64, uv: F64, texture: U8) -> tuple[F64
     return uv, np.concatenate([texture, strip])
 
 
-def _surroundings(mesh: TexturedMesh, label: I64, uv: F64, texture: U8) -> U8:
+def _surroundings(neighbours: I64, label: I64, uv: F64, texture: U8) -> U8:
     """(M, 3) uint8 colours of seen faces, propagated from face to face to unseen ones."""
-    neighbours = face_neighbours(mesh.faces)
     x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T
-    color = np.where(label[:, None] >= 0, texture[y, x], 0).astype(np.float64)
     known = label >= 0
+    color = np.where(known[:, None], texture[y, x], 0).astype(np.float64)
     while not known.all():
         open_ = np.flatnonzero(~known)
         around = neighbours[open_]

@@ -12,8 +12,8 @@ import PIL.Image
 from thesisrecon.arrays import B8, U8
 from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
+from thesisrecon.surface._texture_blending import prepare_views
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.surface.texture_blending import prepare_views
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
@@ -141,10 +141,9 @@ def _read_surface(path: Path) -> TexturedMesh:
 
 def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list[PinholeView]:
     """Return the images with equalised exposures, by our texture gains."""
-    gains = prepare_views(surface, views).gains
     return [
-        replace(view, rgb=np.clip(np.rint(view.rgb * gain), 0, 255).astype(np.uint8))
-        for view, gain in zip(views, gains, strict=True)
+        replace(view, rgb=np.clip(np.rint(view.rgb * seen.gain), 0, 255).astype(np.uint8))
+        for view, seen in zip(views, prepare_views(surface, views), strict=True)
     ]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -50,36 +49,14 @@ FEATHER_PX = 8.0
 
 
 def paint_texture(
-    mesh: TexturedMesh,
-    views: Sequence[PinholeView],
-    uv: F64,
-    cut_out: U8,
-    *,
-    threads: int = 1,
+    mesh: TexturedMesh, views: Sequence[PinholeView], uv: F64, cut_out: U8, *, threads: int = 1
 ) -> U8:
-    """Compute the colours of a texture as a robust blend of all images that show a point.
+    """Compute the colours of a texture (H, W, 3) as a robust blend of all images that show a point.
 
     The weight of an image is its number of pixels per area, reduced towards image borders and outlines of
     foreground objects and where its colour contradicts the others (thin objects missing from the surface,
-    reflections, people). Weights vary smoothly, so no seams occur.
-
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        The surface.
-    views : sequence of PinholeView
-        Undistorted images with their cameras.
-    uv : ndarray (M, 3, 2)
-        Corners of the faces in texels, NaN for faces that no view shows.
-    cut_out : ndarray (H, W, 3) uint8
-        Texture with the image rectangle of each chart.
-    threads : int
-        Number of threads; the result does not depend on it.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8
-        The texture; texels that no image shows well keep the colours of ``cut_out``.
+    reflections, people). Weights vary smoothly, so no seams occur. ``uv`` (M, 3, 2): corners of the faces in
+    texels, NaN for faces that no view shows; other texels keep the colours of ``cut_out``.
     """
     prepared = prepare_views(mesh, views, threads=threads)
     normals = vertex_normals(mesh)
@@ -89,7 +66,7 @@ def paint_texture(
     def work(first: int) -> None:
         rows = slice(first, min(first + STRIP_ROWS, len(texture)))
         at, points, towards = _points_of_rows(mesh, normals, uv, rows, texture.shape[1])
-        color, shown = prepared.colors(points, towards)
+        color, shown = blend_colors(prepared, points, towards)
         at = at[shown]
         texture[at[:, 0], at[:, 1]] = np.clip(np.rint(color[shown]), 0, 255)
         drawn[at[:, 0], at[:, 1]] = True
@@ -101,26 +78,35 @@ def paint_texture(
     return texture
 
 
-def prepare_views(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> ViewBlender:
-    """Prepare the views for colour queries.
-
-    Parameters
-    ----------
-    mesh, views, threads
-        As in :func:`paint_texture`.
-
-    Returns
-    -------
-    ViewBlender
-        The prepared views with their gains.
-    """
+def prepare_views(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> list[ViewSurface]:
+    """The surface as each view sees it, with gains that equalise the brightness of the views."""
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         prepared = list(pool.map(lambda view: _prepared(mesh, view), views))
-    blending = ViewBlender(tuple(prepared), np.ones((len(views), 3), dtype=np.float32))
     stride = max(1, len(mesh.vertices) // GAIN_POINTS)
-    normals = vertex_normals(mesh)
-    weight, color = blending._observe(mesh.vertices[::stride], normals[::stride])
-    return ViewBlender(tuple(prepared), _equalizing_gains(weight, color))
+    weight, color = _observe(prepared, mesh.vertices[::stride], vertex_normals(mesh)[::stride])
+    gains = _equalizing_gains(weight, color)
+    return [view._replace(gain=gain) for view, gain in zip(prepared, gains, strict=True)]
+
+
+def _observe(views: Sequence[ViewSurface], points: F64, normals: F64) -> tuple[F32, F32]:
+    """Weights (V, N) of points in all views, 0 where one does not show them, and colours (V, N, 3)."""
+    weight = np.zeros((len(views), len(points)), dtype=np.float32)
+    color = np.zeros((len(views), len(points), 3), dtype=np.float32)
+    for v, view in enumerate(views):
+        observe_points(points, normals, view, weight[v], color[v])
+    return weight, color
+
+
+def blend_colors(views: Sequence[ViewSurface], points: F64, normals: F64) -> tuple[F32, B8]:
+    """Colours (N, 3) of points with outward normals, and whether any view shows the point."""
+    out = np.zeros((len(points), 3), dtype=np.float32)
+    shown = np.zeros(len(points), dtype=bool)
+    for first in range(0, len(points), POINTS_PER_CHUNK):
+        some = slice(first, first + POINTS_PER_CHUNK)
+        weight, color = _observe(views, points[some], normals[some])
+        combine_colors(weight, color, POWER, SCATTER, out[some])
+        shown[some] = weight.max(axis=0, initial=0.0) > 0.0
+    return out, shown
 
 
 def _points_of_rows(
@@ -144,55 +130,6 @@ def _points_of_rows(
     vertex = mesh.faces[some[face[y, x]]]
     points, towards = ((share * values[vertex]).sum(axis=1) for values in (mesh.vertices, normals))
     return np.column_stack([y + rows.start, x]), points, towards
-
-
-@dataclass(frozen=True)
-class ViewBlender:
-    """Views of one surface with brightness gains.
-
-    Parameters
-    ----------
-    views : tuple of ViewSurface
-        Prepared views.
-    gains : ndarray (V, 3) float32
-        Gains that equalise the brightness.
-    scatter : float
-        Distance from the median colour in grey levels at which the weight is a quarter.
-    """
-
-    views: tuple[ViewSurface, ...]
-    gains: F32
-    scatter: float = SCATTER
-
-    def _observe(self, points: F64, normals: F64) -> tuple[F32, F32]:
-        """Weights (V, N) of points in all views, 0 where one does not show them, and colours (V, N, 3)."""
-        weight = np.zeros((len(self.views), len(points)), dtype=np.float32)
-        color = np.zeros((len(self.views), len(points), 3), dtype=np.float32)
-        for v, one in enumerate(self.views):
-            observe_points(points, normals, one._replace(gain=self.gains[v]), weight[v], color[v])
-        return weight, color
-
-    def colors(self, points: F64, normals: F64) -> tuple[F32, B8]:
-        """Blend the colours of points.
-
-        Parameters
-        ----------
-        points, normals : ndarray (N, 3)
-            Points and outward normals.
-
-        Returns
-        -------
-        color, shown : ndarray (N, 3), (N,)
-            Colours, and whether any view shows the point.
-        """
-        out = np.zeros((len(points), 3), dtype=np.float32)
-        shown = np.zeros(len(points), dtype=bool)
-        for first in range(0, len(points), POINTS_PER_CHUNK):
-            some = slice(first, first + POINTS_PER_CHUNK)
-            weight, color = self._observe(points[some], normals[some])
-            combine_colors(weight, color, POWER, self.scatter, out[some])
-            shown[some] = weight.max(axis=0, initial=0.0) > 0.0
-        return out, shown
 
 
 def _prepared(mesh: TexturedMesh, view: PinholeView) -> ViewSurface:
