@@ -45,7 +45,8 @@ def names_of(n):
 
 def choose(selector, n, features=None, map_all=one_by_one):
     names = names_of(n)
-    selector.check(names, ["blank.jpg"])
+    if isinstance(selector, ListedPairs):
+        selector.check(names, ["blank.jpg"])
     rng = np.random.default_rng(0)
     return selector.select(names, features or [NO_FEATURES] * n, map_all=map_all, rng=rng)
 

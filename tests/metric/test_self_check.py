@@ -132,9 +132,8 @@ def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_d
     model = true_model(scene, prior_for(projective_reconstruction(scene)))
     noise = check_views(model, sigmas=SIGMAS).noise_px
     assert noise == pytest.approx(0.5, rel=0.2)
-    xy, _ = reproject_observations(
-        model.cameras, model.X, model.tracks.view_index[model.inlier], model.tracks.point_index[model.inlier]
-    )
+    view, point = model.tracks.view_index[model.inlier], model.tracks.point_index[model.inlier]
+    xy, _ = reproject_observations(model, view, point)
     left = np.linalg.norm(xy - model.tracks.xy[model.inlier], axis=1)
     kept = [np.median(left[model.tracks.view_index[model.inlier] == v]) for v in range(3)]
     assert kept[1] > 1.3 * min(kept[0], kept[2])

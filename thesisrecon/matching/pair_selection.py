@@ -52,9 +52,6 @@ def _pair_array(pairs: Iterable[Iterable[int]]) -> I64:
 class AllPairs:
     """Every image with every other: N (N - 1) / 2 pairs."""
 
-    def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """See `thesisrecon.config.PairSelector.check`."""
-
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
     ) -> PairChoice:
@@ -82,9 +79,6 @@ class SequenceWindow:
             raise ValueError(
                 f"window (number of following images to match) must be at least 1; got {self.window}"
             )
-
-    def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """See `thesisrecon.config.PairSelector.check`."""
 
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
@@ -123,7 +117,18 @@ class ListedPairs:
             seen.add(pair)
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """See `thesisrecon.config.PairSelector.check`."""
+        """Check the list before anything is computed.
+
+        Parameters
+        ----------
+        names, left_out : collection of str
+            Names of the images, and of those that were not used.
+
+        Raises
+        ------
+        UsageError
+            If a listed name is unknown or no pair remains.
+        """
         known = {*names, *left_out}
         unknown = sorted({name for pair in self.listed for name in pair} - known)
         if unknown:
@@ -182,9 +187,6 @@ class OverlapEstimate:
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}; got {getattr(self, name)}")
-
-    def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """See `thesisrecon.config.PairSelector.check`."""
 
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator

@@ -83,7 +83,7 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     count = np.bincount(t.point_index[agree], minlength=t.n_points)
     fixed = count[t.point_index] - agree >= 2
     known = near & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
-    _, depth = reproject_observations(model.cameras, model.X, t.view_index, t.point_index)
+    _, depth = reproject_observations(model, t.view_index, t.point_index)
     own = [_own_camera(model, view, np.flatnonzero(agree & (t.view_index == view))) for view in range(n)]
     return PerViewChecks(
         _share(t.view_index, agree, near, n),
@@ -128,7 +128,7 @@ def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero(agree)
     view, point = t.view_index[k], t.point_index[k]
-    seen, depth = reproject_observations(cameras, model.X, view, point)
+    seen, depth = reproject_observations(model, view, point)
     R = cameras.R[view]
     x = np.einsum("kab,kb->ka", R[:, :2], model.X[point]) + cameras.t[view, :2]
     B = (R[:, :2] - (x / depth[:, None])[:, :, None] * R[:, 2:]) / depth[:, None, None]
@@ -155,7 +155,7 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
     index = index[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]
     t, cameras = model.tracks, model.cameras
     X, xy = model.X[t.point_index[index]], t.xy[index]
-    seen, _ = reproject_observations(cameras, model.X, t.view_index[index], t.point_index[index])
+    seen, _ = reproject_observations(model, t.view_index[index], t.point_index[index])
     noise = max(noise_from_distances(np.linalg.norm(seen - xy, axis=1)), 1e-3)
     intrinsics = cameras.intrinsics[cameras.group[view]]
     free = np.arange(len(intrinsics)) < OWN
@@ -178,50 +178,38 @@ def self_check(
 
     ``intervals`` are the intrinsics of each view as in ``MetricResult``; ``sigmas`` is the gate of inliers.
     """
-    check = _whole(model, calibration, intervals, sigmas)
-    views = check_views(model, sigmas=sigmas)
-    worst = {
-        "explained_share_worst_view": (views.inlier_ratio, np.nanmin),
-        "confirmed_share_worst_view": (views.confirmed, np.nanmin),
-        "behind_share_worst_view": (views.behind, np.nanmax),
-        "noise_ratio_worst_view": (views.noise_ratio, np.nanmax),
-        "own_focal_off_worst_view": (np.abs(views.focal_off), np.nanmax),
-        "own_focal_sigmas_worst_view": (views.focal_off_sigmas, np.nanmax),
-    }
-    check |= {
-        name: float(edge(values)) if np.isfinite(values).any() else np.nan
-        for name, (values, edge) in worst.items()
-    }
-    failed = list(calibration.reasons) if not calibration.identifiable else []
-    return check, [*failed, *_failed_views(views, model), *_failed_model(check)]
-
-
-def _whole(
-    model: MetricEstimate,
-    calibration: SelfCalibration,
-    intervals: Sequence[Mapping[str, IntrinsicInterval]],
-    sigmas: float,
-) -> dict[str, float]:
-    """The numbers of the model as a whole."""
-    views = [int(v) for v in np.flatnonzero(model.registered)]
+    views = np.flatnonzero(model.registered).tolist()
     longest = model.sizes[views].max(axis=1)
     rows = model.cameras.intrinsics[model.cameras.group[views]]
     near = triangulable_observations(model)
     before = calibration.K[views, 0, 0]
     both = before > 0
-    focal_std = [intervals[v]["focal_px"].std / intervals[v]["focal_px"].value for v in views]
+    focals = [intervals[v]["focal_px"] for v in views]
     agree, noise = inlier_mask(model, sigmas=sigmas), residual_norms(model)
     shift = np.linalg.norm(rows[:, 3:5] - (model.sizes[views] - 1) / 2, axis=1) / longest
     change = np.abs(np.log(rows[both, 0] / before[both]))
-    return {
+    check = {
         "focal_min_long_sides": float((rows[:, 0] / longest).min()),
         "focal_max_long_sides": float((rows[:, 0] / longest).max()),
-        "focal_std_rel_max": max(focal_std),
+        "focal_std_rel_max": max(focal.std / focal.value for focal in focals),
         "explained_share": float(agree[near].mean()) if near.any() else 0.0,
         "sigma_rel": float(noise_from_distances(noise) / np.median(longest)) if len(noise) else np.inf,
         "principal_shift_max_long_sides": float(shift.max()),
         "focal_change_since_calibration": float(change.max()) if both.any() else 0.0,
     }
+    each = check_views(model, sigmas=sigmas)
+    worst = {
+        "explained_share_worst_view": (each.inlier_ratio, np.nanmin),
+        "confirmed_share_worst_view": (each.confirmed, np.nanmin),
+        "behind_share_worst_view": (each.behind, np.nanmax),
+        "noise_ratio_worst_view": (each.noise_ratio, np.nanmax),
+        "own_focal_off_worst_view": (np.abs(each.focal_off), np.nanmax),
+        "own_focal_sigmas_worst_view": (each.focal_off_sigmas, np.nanmax),
+    }
+    for name, (values, edge) in worst.items():
+        check[name] = float(edge(values)) if np.isfinite(values).any() else np.nan
+    failed = [] if calibration.identifiable else list(calibration.reasons)
+    return check, [*failed, *_failed_views(each, model), *_failed_model(check)]
 
 
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> list[str]:

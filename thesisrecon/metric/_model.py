@@ -45,9 +45,10 @@ class MetricEstimate:
         return self.sigma_px * self.tail
 
 
-def reproject_observations(cameras: MetricCameras, X: F64, view: I64, point: I64) -> tuple[F64, F64]:
+def reproject_observations(model: MetricEstimate, view: I64, point: I64) -> tuple[F64, F64]:
     """Pixels (K, 2), with distortion, and depths (K,) of the points of observations."""
-    Y = np.einsum("kab,kb->ka", cameras.R[view], X[point]) + cameras.t[view]
+    cameras = model.cameras
+    Y = np.einsum("kab,kb->ka", cameras.R[view], model.X[point]) + cameras.t[view]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         xy = Y[:, :2] / Y[:, 2:]
         rows = cameras.intrinsics[cameras.group[view]]
@@ -106,7 +107,7 @@ def inlier_mask(model: MetricEstimate, *, sigmas: float) -> B8:
     t = model.tracks
     k = np.flatnonzero(model.registered[t.view_index])
     view, point = t.view_index[k], t.point_index[k]
-    xy, depth = reproject_observations(model.cameras, model.X, view, point)
+    xy, depth = reproject_observations(model, view, point)
     residual = np.nan_to_num(np.linalg.norm(xy - t.xy[k], axis=1), nan=np.inf)
     known = np.abs(model.X[point]).sum(axis=1) > 0
     inlier = np.zeros(len(t.xy), dtype=bool)
@@ -129,7 +130,7 @@ def residual_norms(model: MetricEstimate) -> F64:
     """Lengths px of the reprojection residuals of the inliers."""
     t = model.tracks
     view, point = t.view_index[model.inlier], t.point_index[model.inlier]
-    xy, _ = reproject_observations(model.cameras, model.X, view, point)
+    xy, _ = reproject_observations(model, view, point)
     return np.asarray(np.linalg.norm(xy - t.xy[model.inlier], axis=1))
 
 
@@ -200,16 +201,8 @@ def upgraded_model(
     rows = _intrinsics(upgrade.K, reconstruction.registered, reconstruction.sizes, prior)
     cameras = MetricCameras(R, t / spread, rows[np.unique(group, return_index=True)[1]], group, shared)
     inlier = reconstruction.inlier & registered[reconstruction.tracks.view_index]
-    return MetricEstimate(
-        reconstruction.tracks,
-        reconstruction.sizes,
-        cameras,
-        registered,
-        X / spread,
-        finite,
-        inlier,
-        reconstruction.sigma_px,
-    )
+    tracks, sizes, sigma = reconstruction.tracks, reconstruction.sizes, reconstruction.sigma_px
+    return MetricEstimate(tracks, sizes, cameras, registered, X / spread, finite, inlier, sigma)
 
 
 def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F64:
