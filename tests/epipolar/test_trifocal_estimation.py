@@ -13,6 +13,8 @@ from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
     _minimize_algebraic_error,
+    _minimize_reprojection_error,
+    _ReprojectionProblem,
     estimate_trifocal,
 )
 from thesisrecon.errors import StageFailure
@@ -181,6 +183,26 @@ def test_noisy_matches_that_cannot_work_are_named(kind, sigma):
             points = rng.uniform(0.0, 1000.0, points.shape)
         with pytest.raises(StageFailure, match="do not determine"):
             estimate_trifocal(points + rng.normal(0.0, sigma, points.shape))
+
+
+def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():
+    rng = np.random.default_rng(3)
+    points, segments = matches(three_cameras(rng), rng, 9, 8, 1.0)
+    equations = tensor_equations(points, segments)
+    linear, best = equations.solve(), _minimize_algebraic_error(equations, equations.solve())
+    from_linear, from_best = (
+        _ReprojectionProblem(T, points, segments, equations.transforms, 1.0) for T in (linear, best)
+    )
+    state, h = (np.zeros(18), np.zeros((17, 4))), 1e-7
+    for _ in range(20):
+        # The gradient is that of the cameras alone if points and lines fit them.
+        state = from_linear.retract(state, np.zeros(18))
+    gradient = from_linear.linearize(state).gradient
+    for k, slope in enumerate(gradient):
+        ahead, behind = (from_linear.cost(from_linear.retract(state, s * np.eye(18)[k])) for s in (h, -h))
+        assert (ahead - behind) / (2.0 * h) == pytest.approx(slope, rel=1e-3, abs=1e-4 * abs(gradient).max())
+    fits = [_minimize_reprojection_error(problem, equations) for problem in (from_linear, from_best)]
+    assert fits[0].sigma_px == pytest.approx(fits[1].sigma_px, rel=1e-3)
 
 
 def test_a_few_wrong_matches_do_not_spoil_the_tensor():

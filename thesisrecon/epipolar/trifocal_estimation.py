@@ -20,12 +20,7 @@ from thesisrecon.epipolar._tensor_equations import (
 )
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, unit_normals
-from thesisrecon.geometry.three_view import (
-    cameras_from_tensor,
-    tensor_epipoles,
-    tensor_from_cameras,
-    unit_tensor,
-)
+from thesisrecon.geometry.three_view import cameras_from_tensor, tensor_epipoles, tensor_from_cameras
 from thesisrecon.numerics.levenberg_marquardt import (
     DenseSystem,
     invert_information,
@@ -151,7 +146,7 @@ def _minimize_algebraic_error(equations: TensorEquations, start: F64) -> F64:
     found = minimize_residuals(
         lambda e: equations.A @ tensor(e).ravel(), np.concatenate(tensor_epipoles(start))
     )
-    return unit_tensor(tensor(found.x))
+    return tensor(found.x)
 
 
 class _ReprojectionProblem:
@@ -186,9 +181,8 @@ class _ReprojectionProblem:
     def residual(self, c: F64, f: F64) -> F64:
         """Offsets of the points, then distances of the segment ends, (..., N + M, 3 views, 2) px."""
         P, n = self.cameras(c)[..., None, :, :, :], len(self.X)
-        moves = f[..., n:, :].reshape(*f.shape[:-2], len(self.L), 2, 2)
         X = self.X[:, 3:] + f[..., :n, None, :3] @ self.X[:, :3]
-        L = self.L[:, 2:] + moves @ self.L[:, :2]
+        L = self.L[:, 2:] + f.reshape(*f.shape[:-1], 2, 2)[..., n:, :, :] @ self.L[:, :2]
         image, ends = (P @ Y.swapaxes(-1, -2)[..., None, :, :] for Y in (X, L))
         # Points of a principal plane have a distant image instead of none.
         z = np.where(np.abs(image[..., 2:, 0]) < 1e-12, 1e-12, image[..., 2:, 0])
