@@ -166,6 +166,7 @@ class _ReprojectionProblem:
         # A line is where the planes of its image lines meet, a point where those of axis-parallel lines meet.
         axes = np.eye(3)[:2] - self.x[..., :2, None] * np.eye(3)[2]
         lines = unit_normals(np.cross(self.y[:, :, :1], self.y[:, :, 1:]))
+        # The last rows of X and L span the points and lines, the first rows their moves.
         self.X = np.linalg.svd((axes @ self.P).reshape(-1, 6, 4))[2]
         self.L = np.linalg.svd((lines @ self.P).reshape(-1, 3, 4))[2]
 
