@@ -10,7 +10,7 @@ from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
 from validation.references.open3d_surfaces import OpenTsdf
-from validation.scenes.nine_views import read_rgb
+from validation.scenes.image_files import read_rgb
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
 
 STEP = 2

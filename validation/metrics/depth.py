@@ -70,18 +70,16 @@ too."""
 
 def true_depth(scene: Scene, view: int) -> TrueDepth:
     """Return the truth of a view of the courtyard."""
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
+    K, R, C = scene.cameras
     depth, stride = load_fixture_depth(view)
     rows, columns = depth.shape
     x, y = np.meshgrid(stride * np.arange(float(columns)), stride * np.arange(float(rows)))
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(scene.K[view]).T
-    X = (rays * depth[..., None]) @ scene.R[view] + scene.C[view]
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(K[view]).T
+    X = (rays * depth[..., None]) @ R[view] + C[view]
     seen = np.zeros(depth.shape, dtype=bool)
-    for j in range(len(scene.image_paths)):
+    for j in range(len(K)):
         if j != view:
-            q = (X - scene.C[j]) @ (scene.K[j] @ scene.R[j]).T
+            q = (X - C[j]) @ (K[j] @ R[j]).T
             with np.errstate(divide="ignore", invalid="ignore"):
                 at = q[..., :2] / q[..., 2:] / stride
                 inside = (q[..., 2] > 0.0) & np.all((at >= 0) & (at <= [columns - 1, rows - 1]), axis=-1)
@@ -94,10 +92,10 @@ def true_depth(scene: Scene, view: int) -> TrueDepth:
 
 def true_from_maps(maps: Mapping[int, DepthMap], scene: Scene) -> Similarity:
     """Return the similarity that aligns the cameras of depth maps with the true ones."""
-    assert scene.C is not None
+    _, _, C = scene.cameras
     views = sorted(maps)
     centres = [-np.linalg.solve(maps[i].P[:, :3], maps[i].P[:, 3]) for i in views]
-    return estimate_similarity(np.array(centres), scene.C[views])
+    return estimate_similarity(np.array(centres), C[views])
 
 
 def at_true_places(found: DepthMap, shape: tuple[int, int], stride: int, width_px: int) -> tuple[F64, F64]:

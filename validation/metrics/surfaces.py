@@ -37,24 +37,21 @@ class Truth:
 def load_truth() -> Truth:
     """Return the courtyard from its true depth maps, one triangle sheet per view."""
     scene = load_fixture_scene("courtyard")
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
+    calibrations, R, C = scene.cameras
     sheets, points, depths = [], [], []
-    for view in range(len(scene.image_paths)):
+    for view in range(len(C)):
         depth, stride, seen = true_depth(scene, view)
-        K = np.diag([1.0 / stride, 1.0 / stride, 1.0]) @ scene.K[view]
-        P = K @ scene.R[view] @ np.column_stack([np.eye(3), -scene.C[view]])
+        K = np.diag([1.0 / stride, 1.0 / stride, 1.0]) @ calibrations[view]
+        P = K @ R[view] @ np.column_stack([np.eye(3), -C[view]])
         std = np.zeros(depth.shape, dtype=np.float32)
         sheet = DepthMap(view, P, depth.astype(np.float32), std, np.ones(depth.shape, np.uint8))
         sheets.append(surface_from_depth(sheet, grazing_deg=1.0))
         y, x = np.nonzero(seen & (np.indices(depth.shape).sum(axis=0) % 2 == 0))
         rays = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(K).T
-        points.append((rays * depth[y, x, None]) @ scene.R[view] + scene.C[view])
+        points.append((rays * depth[y, x, None]) @ R[view] + C[view])
         depths.append(depth[np.isfinite(depth)])
-    return Truth(
-        scene, Nearest(_together(sheets)), np.concatenate(points), float(np.median(np.concatenate(depths)))
-    )
+    depth_m = float(np.median(np.concatenate(depths)))
+    return Truth(scene, Nearest(_together(sheets)), np.concatenate(points), depth_m)
 
 
 def _together(meshes: Sequence[TexturedMesh]) -> TexturedMesh:
@@ -77,13 +74,11 @@ def points_on(mesh: TexturedMesh, count: int = SAMPLES) -> F64:
 
 def asked_for(points: F64, scene: Scene) -> I64:
     """Return the number of images (N,) that truly show each point."""
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
+    K, R, C = scene.cameras
     count = np.zeros(len(points), dtype=np.int64)
-    for view in range(len(scene.image_paths)):
+    for view in range(len(K)):
         depth, stride = load_fixture_depth(view)
-        q = (points - scene.C[view]) @ (scene.K[view] @ scene.R[view]).T
+        q = (points - C[view]) @ (K[view] @ R[view]).T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = q[:, :2] / q[:, 2:] / stride
             limit = np.array(depth.shape[::-1]) - 1

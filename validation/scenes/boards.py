@@ -18,9 +18,9 @@ from thesisrecon.geometry.camera_matrix import project_camera, undistort
 from thesisrecon.records import TexturedMesh
 from thesisrecon.views.render import render
 from validation.scenes.materials import Material
-from validation.scenes.photograph import Sensor, expose, integrate_pixels
 from validation.scenes.pose import look_at
 from validation.scenes.raycast import Rays, Surface, World, build_world, trace
+from validation.scenes.sensor import Sensor, expose, integrate_pixels
 
 SIZE = (640, 480)
 K = np.array([[612.4, 0.0, 327.3], [0.0, 612.4, 233.6], [0.0, 0.0, 1.0]])

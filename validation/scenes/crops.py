@@ -11,6 +11,7 @@ from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F64, U8
 from thesisrecon.records import Image
+from validation.scenes.image_files import read_rgb
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def make_crops(
     for number, source in enumerate(int(s) for s in order):
         scene, path = sources[source]
         if source not in kept:
-            kept[source] = _read(path)
+            kept[source] = read_rgb(path)
         share = float(np.exp(rng.uniform(np.log(least_share), 0.0)))
         left, top = rng.uniform(0.0, 1.0 - share, 2)
         box = np.array([left, top, left + share, top + share])
@@ -95,11 +96,6 @@ def shared_area(a: Crop, b: Crop) -> float:
     low, high = np.maximum(a.box[:2], b.box[:2]), np.minimum(a.box[2:], b.box[2:])
     area = float(np.prod(np.maximum(high - low, 0.0)))
     return area / min(float(np.prod(c.box[2:] - c.box[:2])) for c in (a, b))
-
-
-def _read(path: Path) -> U8:
-    with PillowImage.open(path) as picture:
-        return np.asarray(picture.convert("RGB"))
 
 
 def _cut(rgb: U8, box: F64, long_side: int) -> U8:

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import cos, pi, sin, tan
 from pathlib import Path
-from typing import Any
 
 import numba
 import numpy as np
@@ -20,13 +19,12 @@ from thesisrecon.arrays import F64, U16
 from thesisrecon.io._files import write_atomically, write_text
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import make_cube
-from validation.scenes.photograph import Sensor, encode_jpeg, expose, integrate_pixels
 from validation.scenes.pose import look_at
 from validation.scenes.raycast import Rays, World, trace
+from validation.scenes.sensor import encode_jpeg, take_image
 
 SIZE = (1024, 768)
 FOCAL, PRINCIPAL = 908.6, (528.9, 367.8)
-SAMPLES_PER_PIXEL = 2
 DEPTH_STRIDE = 2
 DEPTH_UNIT_M = 0.00025
 GAINS = ((1.0, 1.0, 1.0), (1.02, 1.0, 0.98), (0.99, 1.0, 1.01))
@@ -75,20 +73,12 @@ def courtyard_poses() -> list[Pose]:
     return poses
 
 
-def render_photograph(world: World, pose: Pose, view: int) -> tuple[bytes, U16]:
+def render_image(world: World, pose: Pose, view: int) -> tuple[bytes, U16]:
     """JPEG bytes and quantised depth (see README of the fixtures) of one view."""
     rays = Rays(pose.K, pose.R, pose.C)
-    rows = SIZE[1] * SAMPLES_PER_PIXEL
-    light = trace(world, rays, SIZE, per_pixel=SAMPLES_PER_PIXEL, rows=(0, rows))[0]
-    sensor = Sensor()
-    gain = [0.82 * pose.exposure * g for g in GAINS[view % len(GAINS)]]
+    red, green, blue = (0.82 * pose.exposure * g for g in GAINS[view % len(GAINS)])
     rng = np.random.Generator(np.random.PCG64([2000, view]))
-    rgb = expose(
-        integrate_pixels(light, SAMPLES_PER_PIXEL, sensor.blur_px),
-        sensor,
-        gains=(gain[0], gain[1], gain[2]),
-        rng=rng,
-    )
+    rgb = take_image(world, rays, SIZE, gains=(red, green, blue), rng=rng)
     depth = trace(world, rays, SIZE, shade=False)[1][::DEPTH_STRIDE, ::DEPTH_STRIDE]
     return encode_jpeg(rgb), np.asarray(np.floor(depth / DEPTH_UNIT_M + 0.5), dtype=np.uint16)
 
@@ -106,39 +96,26 @@ def versions() -> dict[str, str]:
     return {"pillow": PIL.__version__, "libjpeg": jpeg, "numpy": np.__version__, "numba": numba.__version__}
 
 
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Indented JSON with a final newline."""
-    write_text(path, json.dumps(content, indent=1) + "\n")
-
-
 def write_courtyard(folder: Path, *, threads: int = 2) -> None:
     """Render all views into ``folder``: images/, depth/, cameras.json."""
     world, poses = build_courtyard(), courtyard_poses()
     (folder / "images").mkdir(parents=True, exist_ok=True)
     (folder / "depth").mkdir(exist_ok=True)
     with ThreadPoolExecutor(threads) as pool:
-        views = pool.map(lambda item: render_photograph(world, item[1], item[0]), enumerate(poses))
+        views = pool.map(lambda item: render_image(world, item[1], item[0]), enumerate(poses))
         for k, (jpeg, depth) in enumerate(views):
             write_atomically(folder / "images" / f"{k:04d}.jpg", jpeg)
             write_atomically(folder / "depth" / f"{k:04d}.png", encode_depth(depth))
-    cameras = {
-        f"{k:04d}.jpg": {
-            "width": SIZE[0],
-            "height": SIZE[1],
-            "K": p.K.tolist(),
-            "R": p.R.tolist(),
-            "C": p.C.tolist(),
-        }
-        for k, p in enumerate(poses)
-    }
+    size = {"width": SIZE[0], "height": SIZE[1]}
+    numbers = [{name: getattr(pose, name).tolist() for name in ("K", "R", "C")} for pose in poses]
     content = {
         "scene": "courtyard",
         "convention": "x ~ K R (X - C); pixel (0,0) is the centre of the top-left pixel; metres",
         "depth": {"unit_m": DEPTH_UNIT_M, "stride": DEPTH_STRIDE, "none": 0},
         "made_with": versions(),
-        "cameras": cameras,
+        "cameras": {f"{k:04d}.jpg": size | camera for k, camera in enumerate(numbers)},
     }
-    write_json(folder / "cameras.json", content)
+    write_text(folder / "cameras.json", json.dumps(content, indent=1) + "\n")
 
 
 def write_cube(folder: Path) -> None:

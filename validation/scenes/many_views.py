@@ -6,21 +6,18 @@ n of a longer set are the set of n, spread over the same arc.
 
 from __future__ import annotations
 
-import io
 from concurrent.futures import ThreadPoolExecutor
 from math import cos, pi, sin, tan
 from pathlib import Path
 
 import numpy as np
-from PIL import Image as PillowImage
 
-from thesisrecon.arrays import U8
-from thesisrecon.io._files import write_atomically
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.fixtures import Pose
-from validation.scenes.photograph import Sensor, expose, integrate_pixels
+from validation.scenes.image_files import write_png
 from validation.scenes.pose import look_at
-from validation.scenes.raycast import Rays, World, trace
+from validation.scenes.raycast import Rays
+from validation.scenes.sensor import take_image
 
 FOCAL_REL = 0.9
 """Focal length as a share of the long side."""
@@ -57,15 +54,6 @@ def _van_der_corput(k: int) -> float:
     return value
 
 
-def render(world: World, pose: Pose, size: tuple[int, int], *, seed: int) -> U8:
-    """The image (H, W, 3) of one camera."""
-    rows = (0, 2 * size[1])
-    light = trace(world, Rays(pose.K, pose.R, pose.C), size, per_pixel=2, rows=rows)[0]
-    sensor, gain = Sensor(), 0.82 * pose.exposure
-    linear = integrate_pixels(light, 2, sensor.blur_px)
-    return expose(linear, sensor, gains=(gain, gain, gain), rng=np.random.default_rng([2001, seed]))
-
-
 def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360), threads: int = 2) -> None:
     """Images ``0000.png`` and so on of :func:`walk` in ``folder``; those that are there stay."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -75,10 +63,10 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
     world, poses = build_courtyard(), walk(count, size)
 
     def write(k: int) -> None:
-        picture = io.BytesIO()
-        photograph = PillowImage.fromarray(render(world, poses[k], size, seed=k))
-        photograph.save(picture, "PNG", compress_level=1)
-        write_atomically(folder / f"{k:04d}.png", picture.getvalue())
+        pose = poses[k]
+        gain, rng = 0.82 * pose.exposure, np.random.default_rng([2001, k])
+        rgb = take_image(world, Rays(pose.K, pose.R, pose.C), size, gains=(gain, gain, gain), rng=rng)
+        write_png(folder / f"{k:04d}.png", rgb)
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(write, missing))

@@ -15,6 +15,7 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
 from thesisrecon.views.trilinear import CalibratedPair, default_intrinsics
 from thesisrecon.views.trilinear_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
+from validation.scenes.image_files import read_rgb
 from validation.scenes.real import data_root
 
 ENDS = (2, 6)
@@ -46,12 +47,6 @@ def load_cones() -> NineViews | None:
     images = {k: read_rgb(folder / f"im{k}.png") for k in numbers}
     first, second = (_quarters(folder / f"disp{k}.png") for k in ENDS)
     return NineViews(images, (first, second))
-
-
-def read_rgb(path: Path) -> U8:
-    """(H, W, 3)."""
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
 
 
 def mirrored(image: U8) -> U8:

@@ -11,6 +11,7 @@ everywhere.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,8 +42,7 @@ class Surface:
     offset: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class World:
+class World(NamedTuple):
     """Surfaces packed for the kernels: see :func:`build_world`."""
 
     kind: I64
@@ -191,13 +191,7 @@ def _group_bounds(objects: list[list[Surface]], numbers: F64) -> F64:
 
 
 def trace(
-    world: World,
-    rays: Rays,
-    size: tuple[int, int],
-    *,
-    per_pixel: int = 1,
-    rows: tuple[int, int] | None = None,
-    shade: bool = True,
+    world: World, rays: Rays, size: tuple[int, int], *, per_pixel: int = 1, shade: bool = True
 ) -> tuple[F32, F64]:
     """Linear colour and depth of one view.
 
@@ -205,27 +199,15 @@ def trace(
     ----------
     size : (width, height) in pixels.
     per_pixel : samples per pixel along each axis; sample (r, c) looks at pixel ((c + 0.5) / n - 0.5, ...).
-    rows : half-open range of sample rows, for work split over threads; the whole image when not given.
     shade : False traces depth alone; the colours are then zero.
 
     Returns
     -------
     (H n, W n, 3) float32 linear RGB and (H n, W n) float64 depth (z in the camera frame, metres; 0 = sky).
     """
-    first, last = rows if rows is not None else (0, size[1] * per_pixel)
-    out = np.zeros((last - first, size[0] * per_pixel, 3), np.float32)
+    out = np.zeros((size[1] * per_pixel, size[0] * per_pixel, 3), np.float32)
     depth = np.zeros(out.shape[:2])
     K = rays.K
     camera = np.concatenate([[K[0, 0], K[0, 2], K[1, 2]], rays.centre, rays.R.ravel()])
-    packed = (
-        world.kind,
-        world.numbers,
-        world.groups,
-        world.layout,
-        world.colours,
-        world.heights,
-        world.highest,
-        world.sun,
-    )
-    trace_rows(packed, camera, (per_pixel, first), out, depth, shade)
+    trace_rows((*world,), camera, (per_pixel, 0), out, depth, shade)
     return out, depth

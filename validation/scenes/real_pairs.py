@@ -47,7 +47,7 @@ class RealPair:
     F: F64 | None = None
 
 
-def match_photographs(
+def match_images(
     paths: tuple[Path, Path], cache: Path, *, ratio: float, mutual: bool
 ) -> tuple[F64, F64]:
     """OpenCV's SIFT matches (N, 2), (N, 2) with the nearest descriptor below ``ratio`` times the second;
@@ -83,7 +83,7 @@ def kusvod2_pairs(
     for folder in sorted((root / "kusvod2").iterdir()) if root and (root / "kusvod2").is_dir() else []:
         if folder.is_dir() and (names is None or folder.name in names):
             paths = (folder / "A.jpg", folder / "B.jpg")
-            xy1, xy2 = match_photographs(paths, cache, ratio=HAND_MADE_RATIO, mutual=mutual)
+            xy1, xy2 = match_images(paths, cache, ratio=HAND_MADE_RATIO, mutual=mutual)
             yield RealPair(folder.name, xy1, xy2, truth=np.loadtxt(folder / "validation.txt", ndmin=2)[:, :4])
 
 
@@ -99,7 +99,7 @@ def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2
     for gap in gaps:
         for i in range(len(cameras) - gap):
             paths = (scene.image_paths[i], scene.image_paths[i + gap])
-            xy1, xy2 = match_photographs(paths, cache, ratio=CAMERA_RATIO, mutual=True)
+            xy1, xy2 = match_images(paths, cache, ratio=CAMERA_RATIO, mutual=True)
             F = fundamental_from_cameras(cameras[i], cameras[i + gap])
             truth = exact_correspondences(cameras[i], cameras[i + gap], xy1, xy2)
             yield RealPair(f"{scene.name} {i}-{i + gap}", xy1, xy2, truth=truth, F=F)

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from thesisrecon.arrays import B8, F32, U8
+from validation.scenes.image_files import read_rgb
 from validation.scenes.real import data_root
 
 STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
@@ -53,9 +54,9 @@ def load_stereo_pair(name: str) -> StereoPair | None:
     if name == "Cones":
         truth, other = (_truth(folder / f"disp{k}.png", 4.0) for k in (2, 6))
         judged = seen_by_both(truth, other)
-        return StereoPair(name, _rgb(folder / "im2.png"), _rgb(folder / "im6.png"), truth, judged, 64)
+        return StereoPair(name, read_rgb(folder / "im2.png"), read_rgb(folder / "im6.png"), truth, judged, 64)
     truth = _truth(folder / "disparity.png", 16.0 if name == "Tsukuba" else 4.0)
-    left, right = _rgb(folder / "left.png"), _rgb(folder / "right.png")
+    left, right = read_rgb(folder / "left.png"), read_rgb(folder / "right.png")
     return StereoPair(name, left, right, truth, seen_by_both(truth, None), 16 if name == "Tsukuba" else 64)
 
 
@@ -82,12 +83,8 @@ def seen_by_both(truth: F32, other: F32 | None) -> B8:
 def _motorcycle(folder: Path) -> StereoPair:
     stored = np.load(folder / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
     truth = np.where(np.isfinite(stored), stored, np.float32(np.nan)).astype(np.float32)
-    left, right = (_rgb(folder / f"motorcycle_{side}.png") for side in ("left", "right"))
+    left, right = (read_rgb(folder / f"motorcycle_{side}.png") for side in ("left", "right"))
     return StereoPair("Motorcycle", left, right, truth, seen_by_both(truth, None), 64)
-
-
-def _rgb(path: Path) -> U8:
-    return np.asarray(Image.open(path).convert("RGB"))
 
 
 def _truth(path: Path, scale: float) -> F32:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F64, U8
-from thesisrecon.io._files import write_atomically
+from validation.scenes.image_files import read_rgb, write_png
 from validation.scenes.real import Scene
 
 FEATHER_PX = 24.0
@@ -66,8 +64,15 @@ class Rezoom:
 
 def rezoom_scene(scene: Scene, folder: Path, *, seed: int, how: Rezoom | None = None) -> Scene:
     """The scene with every image in a :class:`Rezoom` frame of its own, written to ``folder``."""
+    calibrations, R, C = scene.cameras
     how, rng = how or Rezoom(), np.random.default_rng(seed)
-    return _framed(scene, folder, lambda K, size: how.frame(K, size, rng), f"zoom-{seed}")
+    paths, K = [], []
+    for path, calibration in zip(scene.image_paths, calibrations, strict=True):
+        rgb = read_rgb(path)
+        part = how.frame(calibration, (rgb.shape[1], rgb.shape[0]), rng)
+        paths.append(_write(folder, path.stem, part.cut(rgb)))
+        K.append(part.calibration(calibration))
+    return Scene(f"{scene.name} zoom-{seed}", tuple(paths), np.array(K), R, C)
 
 
 def windowed_scene(scene: Scene, folder: Path, boxes: dict[int, F64]) -> Scene:
@@ -76,7 +81,7 @@ def windowed_scene(scene: Scene, folder: Path, boxes: dict[int, F64]) -> Scene:
     gives no corners; the camera stays what it was."""
     paths = []
     for number, path in enumerate(scene.image_paths):
-        rgb = _read(path)
+        rgb = read_rgb(path)
         if number in boxes:
             height, width = rgb.shape[:2]
             left, top, right, bottom = boxes[number]
@@ -93,28 +98,9 @@ def _ramp(length: int, low: float, high: float) -> F64:
     return np.asarray(np.clip(inside / FEATHER_PX, 0.0, 1.0))
 
 
-def _framed(scene: Scene, folder: Path, frame: Callable[[F64, tuple[int, int]], Frame], name: str) -> Scene:
-    if scene.K is None:
-        raise ValueError(f"new images need the calibration of the old ones; {scene.name} has none")
-    paths, K = [], []
-    for path, calibration in zip(scene.image_paths, scene.K, strict=True):
-        rgb = _read(path)
-        part = frame(calibration, (rgb.shape[1], rgb.shape[0]))
-        paths.append(_write(folder, path.stem, part.cut(rgb)))
-        K.append(part.calibration(calibration))
-    return Scene(f"{scene.name} {name}", tuple(paths), np.array(K), scene.R, scene.C)
-
-
-def _read(path: Path) -> U8:
-    with PillowImage.open(path) as picture:
-        return np.asarray(picture.convert("RGB"))
-
-
 def _write(folder: Path, stem: str, rgb: U8) -> Path:
-    """Kept as it is where it is there already: the pixels follow from the folder's name."""
+    """Write an image unless it is there: its pixels follow from the folder's name."""
     path = folder / f"{stem}.png"
     if not path.is_file():
-        picture = io.BytesIO()
-        PillowImage.fromarray(rgb).save(picture, "PNG", compress_level=1)
-        write_atomically(path, picture.getvalue())
+        write_png(path, rgb)
     return path

@@ -24,7 +24,8 @@ from validation.scenes.between import (
     pose_of,
     turned,
 )
-from validation.scenes.nine_views import dissolved, read_rgb
+from validation.scenes.image_files import read_rgb
+from validation.scenes.nine_views import dissolved
 from validation.studies.runner import Part, Rows, load_scene
 from validation.studies.tensor_views import save_beside
 

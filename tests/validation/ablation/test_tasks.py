@@ -17,7 +17,7 @@ from validation.ablation.plan import plan_study
 from validation.ablation.tasks import TASKS, Reconstruction
 from validation.ablation.tasks.calibration import CalibrationOverNoise
 from validation.ablation.tasks.fundamental import FundamentalOfCube
-from validation.ablation.tasks.pairs import PairsOfPhotographs
+from validation.ablation.tasks.pairs import ImagePairs
 from validation.ablation.tasks.stereo import RectifiedPairs
 from validation.ablation.tasks.triangulation import TriangulationOverNoise
 from validation.scenes.real import ROOT, data_root
@@ -68,7 +68,7 @@ def test_exact_views_are_calibrated_exactly():
         (FundamentalOfCube(), "cub", "unknown scene 'cub'; did you mean cube"),
         (TriangulationOverNoise(), "six views", "did you mean five views"),
         (CalibrationOverNoise(), "clod", "did you mean cloud"),
-        (PairsOfPhotographs(), "fountain-P11", "unknown pair"),
+        (ImagePairs(), "fountain-P11", "unknown pair"),
         (RectifiedPairs(), "Tedy", "did you mean Teddy"),
         (Reconstruction(), "courtyrd", "a folder of images is one too"),
         (Reconstruction(), str(ROOT / "scripts"), "there are no images in"),

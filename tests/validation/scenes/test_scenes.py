@@ -19,12 +19,11 @@ from validation.scenes.fixtures import (
     SIZE,
     courtyard_poses,
     encode_depth,
-    render_photograph,
+    render_image,
     versions,
     write_cube,
 )
 from validation.scenes.materials import Material, over, smooth
-from validation.scenes.photograph import Sensor, expose, integrate_pixels
 from validation.scenes.procedural import courses, fractal
 from validation.scenes.raycast import Rays, Surface, build_world, trace
 from validation.scenes.real import (
@@ -36,6 +35,7 @@ from validation.scenes.real import (
     load_real_scene,
     read_scene,
 )
+from validation.scenes.sensor import Sensor, expose, integrate_pixels
 from validation.scenes.zoomed import Frame, Rezoom, rezoom_scene, windowed_scene
 
 FOLDER = ROOT / "fixtures" / "courtyard"
@@ -151,7 +151,7 @@ def test_a_visible_point_has_one_colour(scene, i, j):
 
 def test_a_view_is_made_again_byte_for_byte():
     view = 4
-    jpeg, depth = render_photograph(build_courtyard(), courtyard_poses()[view], view)
+    jpeg, depth = render_image(build_courtyard(), courtyard_poses()[view], view)
     kept = (FOLDER / "images" / f"{view:04d}.jpg").read_bytes()
     made_with = json.loads((FOLDER / "cameras.json").read_text(encoding="utf-8"))["made_with"]
     if made_with == versions():
@@ -378,11 +378,6 @@ def test_a_windowed_photograph_keeps_its_window_and_its_camera(spots_scene, tmp_
     assert new.K is spots_scene.K
 
 
-def test_images_without_calibration_are_not_resampled(spots_scene, tmp_path):
-    with pytest.raises(ValueError, match="need the calibration"):
-        rezoom_scene(Scene("bare", spots_scene.image_paths), tmp_path, seed=0)
-
-
 RAY_K = np.array([[90.0, 0.0, 33.0], [0.0, 90.0, 22.0], [0.0, 0.0, 1.0]])
 
 
@@ -442,14 +437,6 @@ def test_cylinder_depth_is_the_closed_form():
     np.testing.assert_allclose(depth, np.tile(expected, (RAY_SIZE[1], 1)), atol=5e-6)
     assert (depth > 0).any()
     assert (depth == 0).any()
-
-
-def test_rows_traced_apart_are_the_same_bytes():
-    world = wall(0.04 * fractal((201, 201), 0.01, 5, wavelengths_m=(0.5, 0.05)))
-    light, depth = view(world, per_pixel=2)
-    parts = [view(world, per_pixel=2, rows=(a, a + 32)) for a in (0, 32, 64)]
-    assert np.array_equal(np.concatenate([p[0] for p in parts]), light)
-    assert np.array_equal(np.concatenate([p[1] for p in parts]), depth)
 
 
 def test_a_block_casts_its_shadow_where_the_sun_is_hidden():

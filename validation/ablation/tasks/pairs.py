@@ -27,7 +27,7 @@ CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 
 
 @dataclass(frozen=True)
-class PairsOfPhotographs(Task):
+class ImagePairs(Task):
     """Images ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side 1536: corners,
     matches, F and verification of the configuration, judged by correspondences of the true cameras."""
 

@@ -18,6 +18,7 @@ from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
 from validation.references.semi_global import OpenCVSemiGlobal
+from validation.scenes.image_files import read_rgb
 from validation.scenes.nine_views import (
     BETWEEN,
     BEYOND,
@@ -28,7 +29,6 @@ from validation.scenes.nine_views import (
     dissolved,
     load_cones,
     our_disparities,
-    read_rgb,
     synthesis_of_disparities,
 )
 

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F32, U8
+from validation.scenes.raycast import Rays, World, trace
 
 JPEG_QUALITY = 91
+PER_PIXEL = 2
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,20 @@ def expose(light: F32, sensor: Sensor, *, gains: tuple[float, float, float], rng
     electrons = np.clip(light * np.array(gains) * falloff[..., None], 0.0, 1.6) * sensor.full_well
     noisy = electrons + np.sqrt(electrons + sensor.read_noise**2) * rng.standard_normal(light.shape)
     return _develop(noisy / sensor.full_well)
+
+
+def take_image(
+    world: World,
+    rays: Rays,
+    size: tuple[int, int],
+    *,
+    gains: tuple[float, float, float],
+    rng: np.random.Generator,
+) -> U8:
+    """Return the image (H, W, 3) of one camera, ``PER_PIXEL`` samples a pixel along each axis."""
+    sensor = Sensor()
+    light = integrate_pixels(trace(world, rays, size, per_pixel=PER_PIXEL)[0], PER_PIXEL, sensor.blur_px)
+    return expose(light, sensor, gains=gains, rng=rng)
 
 
 def _develop(linear: NDArray[np.float64]) -> U8:
