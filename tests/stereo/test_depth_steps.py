@@ -1,22 +1,21 @@
 """Undistorted views, neighbours, correspondences through rectified frames, consistency: each by itself."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
-from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import DepthMap, DisparityMap
-from thesisrecon.stereo._depth_fusion import _concatenated, _inverse_depth_of
+from thesisrecon.stereo._depth_fusion import _concatenated, _measured
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo._neighbours import pinhole_view, select_neighbours, shared_projections, sparse_points
 from thesisrecon.stereo._planar import common_orientation
 from thesisrecon.stereo._polar import polar
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
-from thesisrecon.stereo.depth import _region_sizes, _transfer, complete_depths, confirm_depths
+from thesisrecon.stereo.depth import _complete_depths, _confirm_depths, _region_sizes, _transfer
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +54,6 @@ def test_views_are_refused_with_a_sentence(walled):
         pinhole_view(image, replace(reconstruction, K=None), 0)
     with pytest.raises(ValueError, match="px; got"):
         pinhole_view(image, replace(reconstruction, sizes=reconstruction.sizes + 1), 0)
-    with pytest.raises(StageFailure, match="no camera"):
-        pinhole_view(image, replace(reconstruction, registered=np.zeros(4, dtype=bool)), 0)
 
 
 def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
@@ -65,53 +62,46 @@ def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
     assert set(select_neighbours(points, views, 2, 2)) == {1, 3}
     S = np.diag([1e3, 1e3, 1e3, 1.0])
     larger = {i: replace(view, P=1e3 * view.P @ np.linalg.inv(S)) for i, view in views.items()}
-    assert select_neighbours(replace(points, X=1e3 * points.X), larger, 1) == select_neighbours(
-        points, views, 1
-    )
+    farther = replace(points, X=1e3 * points.X)
+    assert select_neighbours(farther, larger, 1) == select_neighbours(points, views, 1)
 
 
 def test_a_view_without_baseline_or_points_is_not_a_neighbour(walled):
     views, points = views_of(walled), sparse_points(walled.reconstruction)
     same = {0: views[0], 1: replace(views[1], P=views[0].P)}
-    assert select_neighbours(points, same, 0) == []
+    assert not select_neighbours(points, same, 0)
     few = replace(points, seen=points.seen & (np.arange(points.seen.shape[1]) < 5))
-    assert select_neighbours(few, views, 0) == []
+    assert not select_neighbours(few, views, 0)
 
 
-@dataclass(frozen=True)
-class TrueDisparity:
-    """Stands in for a matcher: the disparities that the true depth of the reference has in the frame."""
+def true_correspondence(P, pair, method, larger=1):
+    """Correspondence from the exact disparities of a wall at depth 6 of the first view of a pair.
 
-    walled: object
-    pair: tuple[int, int]
-    method: object
+    It is reported for images that are ``larger`` than those matched.
+    """
+    a, b = P[list(pair)]
+    frame = method(pair_of_cameras(a, b, SIZE, SIZE))
+    width, height = frame.size
+    x, y = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
+    xy = frame.original_from_rectified(0, np.stack([x, y], axis=-1).reshape(-1, 2))
+    right = frame.rectified_from_original(1, project(b, wall_points(a, np.nan_to_num(xy))), within=False)
+    d = np.where(np.isfinite(xy).all(axis=1), x.ravel() - right[:, 0], np.nan)
+    d = d.reshape(height, width).astype(np.float32)
+    found = DisparityMap(d, np.isfinite(d).astype(np.float32), 0.1)
+    shape = SIZE[::-1]
+    return PairMatching()._map_back(
+        frame, found, (shape, shape), ((larger * shape[0], larger * shape[1]),) * 2
+    )
 
-    def frame(self):
-        a, b = (self.walled.reconstruction.P[i] for i in self.pair)
-        return self.method(pair_of_cameras(a, b, SIZE, SIZE))
 
-    def found(self):
-        frame = self.frame()
-        width, height = frame.size
-        x, y = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
-        place = np.stack([x, y], axis=-1).reshape(-1, 2)
-        xy = frame.original_from_rectified(0, place)
-        i, j = self.pair
-        P = self.walled.reconstruction.P
-        # A wall at depth 6 of the reference everywhere: its depth is known between pixels too.
-        X = (homogenize(np.nan_to_num(xy)) * 6.0 - P[i, :, 3]) @ np.linalg.inv(P[i, :, :3]).T
-        right = frame.rectified_from_original(1, project(P[j], X), within=False)
-        d = np.where(np.isfinite(xy).all(axis=1), x.ravel() - right[:, 0], np.nan)
-        d = d.reshape(height, width).astype(np.float32)
-        return DisparityMap(d, np.isfinite(d).astype(np.float32), 0.1)
+def wall_points(P, xy):
+    return (homogenize(xy) * 6.0 - P[:, 3]) @ np.linalg.inv(P[:, :3]).T
 
 
 @pytest.mark.parametrize("method", [common_orientation, polar])
 def test_exact_disparities_give_exact_depth(method):
-    walled = make_walled(on_arc((-6.0, 6.0)))
-    true = TrueDisparity(walled, (0, 1), method)
-    pair = PairMatching()._back(true.frame(), true.found(), (SIZE[::-1],) * 2, (SIZE[::-1],) * 2)
-    rho, std = _inverse_depth_of(walled.reconstruction.P[0], walled.reconstruction.P[1], pair)
+    P = on_arc((-6.0, 6.0))
+    rho, std = _measured(P[0], P[1], true_correspondence(P, (0, 1), method))
     known = np.isfinite(rho)
     assert known.mean() > 0.6
     assert np.nanmedian(np.abs(6.0 * rho - 1.0)) < 1e-5
@@ -121,11 +111,8 @@ def test_exact_disparities_give_exact_depth(method):
 
 
 def test_working_pixels_map_back_to_pixels_of_the_file():
-    walled = make_walled(on_arc((-6.0, 6.0)))
-    true = TrueDisparity(walled, (0, 1), common_orientation)
-    larger = (2 * SIZE[0], 2 * SIZE[1])
-    own = PairMatching()._back(true.frame(), true.found(), (SIZE[::-1],) * 2, (SIZE[::-1],) * 2)
-    reported = PairMatching()._back(true.frame(), true.found(), (SIZE[::-1],) * 2, (larger[::-1],) * 2)
+    P = on_arc((-6.0, 6.0))
+    own, reported = (true_correspondence(P, (0, 1), common_orientation, larger=k) for k in (1, 2))
     assert reported.sigma.shape == (2 * SIZE[1], 2 * SIZE[0])
     # The middle of four pixels is the pixel of the smaller photograph.
     four = np.mean([reported.xy[a::2, b::2] for a in (0, 1) for b in (0, 1)], axis=0)
@@ -138,9 +125,8 @@ def test_working_pixels_map_back_to_pixels_of_the_file():
 def test_disparities_are_interpolated_on_a_surface_and_not_across_its_edge():
     d = np.tile(np.array([1.0, 1.5, 2.0, 9.0, 9.5, np.nan], np.float32), (3, 1))
     found = DisparityMap(d, np.ones_like(d), 0.1)
-    places = np.array(
-        [[0.5, 1.0], [1.25, 0.5], [2.4, 1.0], [2.6, 1.0], [4.4, 1.0], [4.6, 1.0], [np.nan, 0.0]]
-    )
+    x, y = [0.5, 1.25, 2.4, 2.6, 4.4, 4.6, np.nan], [1.0, 0.5, 1.0, 1.0, 1.0, 1.0, 0.0]
+    places = np.column_stack([x, y])
     values, sure = _sample_disparity(found, places)
     np.testing.assert_allclose(values, [1.25, 1.625, 2.0, 9.0, 9.5, np.nan, np.nan])
     assert (sure == np.isfinite(values)).all()
@@ -156,30 +142,25 @@ def test_brightness_is_made_alike(walled):
 
 
 def test_links_of_a_chain_lead_from_view_to_view():
-    walled = make_walled(on_arc((-8.0, 0.0, 8.0)))
-    P = walled.reconstruction.P
-    steps = []
-    for i, j in ((0, 1), (1, 2)):
-        true = TrueDisparity(walled, (i, j), common_orientation)
-        steps.append(PairMatching()._back(true.frame(), true.found(), (SIZE[::-1],) * 2, (SIZE[::-1],) * 2))
+    P = on_arc((-8.0, 0.0, 8.0))
+    steps = [true_correspondence(P, pair, common_orientation) for pair in ((0, 1), (1, 2))]
     linked = _concatenated(*steps)
     known = np.isfinite(linked.sigma)
     assert known.mean() > 0.3
     first = steps[0].xy[known].astype(float)
-    # The stand-in has a plane at depth 6 of either reference: from i to j by the one, on to k by the other.
-    X = (homogenize(first) * 6.0 - P[1, :, 3]) @ np.linalg.inv(P[1, :, :3]).T
-    apart = np.linalg.norm(project(P[2], X) - linked.xy[known], axis=1)
+    # The wall is at depth 6 of either reference: from i to j by the one, on to k by the other.
+    apart = np.linalg.norm(project(P[2], wall_points(P[1], first)) - linked.xy[known], axis=1)
     assert np.median(apart) < 1e-3
     assert np.quantile(apart, 0.98) < 0.05
     assert (linked.sigma[known] >= steps[0].sigma[known]).all()
 
 
 def true_maps(walled):
-    return [
-        DepthMap(i, walled.reconstruction.P[i], d.astype(np.float32), np.full(d.shape, 5e-3, np.float32),
-                 np.ones(d.shape, np.uint8))
-        for i, d in enumerate(walled.depth)
-    ]  # fmt: skip
+    maps = []
+    for i, d in enumerate(walled.depth):
+        std, views = np.full(d.shape, 5e-3, np.float32), np.ones(d.shape, np.uint8)
+        maps.append(DepthMap(i, walled.reconstruction.P[i], d.astype(np.float32), std, views))
+    return maps
 
 
 def test_holes_are_filled_from_views_that_agree():
@@ -191,7 +172,7 @@ def test_holes_are_filled_from_views_that_agree():
     # The other view is wrong there: what the photographs say counts, with the planes around the gap.
     other[120:] *= 0.8
     own, offering = replace(maps[0], depth=depth), replace(maps[1], depth=other)
-    found = complete_depths(own, [offering], views)
+    found = _complete_depths(own, [offering], views)
     kept = np.isfinite(depth)
     assert (found.depth[kept] == depth[kept]).all()
     error = np.abs(found.depth[lacks] / maps[0].depth[lacks] - 1.0)
@@ -204,7 +185,7 @@ def test_holes_are_filled_from_views_that_agree():
     assert np.isfinite(found.std[np.isfinite(found.depth)]).all()
     assert (found.views[lacks][np.isfinite(found.depth[lacks])] == 1).all()
     nothing = replace(offering, depth=np.full_like(other, np.nan))
-    assert complete_depths(own, [nothing], views) is own
+    assert _complete_depths(own, [nothing], views) is own
 
 
 def test_seen_through_and_small_pieces_are_removed():
@@ -214,11 +195,11 @@ def test_seen_through_and_small_pieces_are_removed():
     depth[80:100, 20:40] *= 0.6
     depth[100, 200:203] = np.nan
     depth[101, 199:203] = np.nan
-    found = confirm_depths(replace(maps[0], depth=depth), [maps[1]])
+    found = _confirm_depths(replace(maps[0], depth=depth), [maps[1]])
     assert np.isnan(found.depth[80:100, 20:40]).all()
     assert np.isfinite(found.depth).mean() > 0.7
     assert (found.views == np.isfinite(found.depth)).all()
-    alone = confirm_depths(maps[0], [])
+    alone = _confirm_depths(maps[0], [])
     assert np.isnan(alone.depth).all()
     lonely = np.full((50, 60), np.nan, dtype=np.float32)
     lonely[:20], lonely[30:32, 5:8] = 2.0, 3.0
@@ -235,12 +216,12 @@ def test_unconfirmed_depths_stay_if_they_continue_confirmed_ones():
     other[20:26, 60:200] = np.nan
     depth = maps[0].depth.copy()
     depth[22:25, 100:103] *= 0.98
-    found = confirm_depths(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
+    found = _confirm_depths(replace(maps[0], depth=depth), [replace(maps[1], depth=other)])
     assert np.isnan(found.depth[22:25, 100:103]).all()
     strip = np.isfinite(found.depth[20:26, 110:180])
     assert strip.mean() > 0.95
     other[20:60, 60:200] = np.nan
-    found = confirm_depths(maps[0], [replace(maps[1], depth=other)])
+    found = _confirm_depths(maps[0], [replace(maps[1], depth=other)])
     assert np.isnan(found.depth[35:45, 110:180]).all()
 
 

@@ -1,14 +1,11 @@
 """Integer images of rectified pairs, their noise, and matching costs of rows for all disparities.
 
-Costs are computed strip by strip, which bounds the memory and gives the threads independent work. The inner
-loops of the kernels run over the columns and take row slices without index arithmetic, so that the compiler
-vectorises them for any number of disparities.
+Costs are computed strip by strip, which bounds the memory. The inner loops of the kernels run over the
+columns of row slices without index arithmetic, so that the compiler vectorises them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -35,7 +32,6 @@ MIN_STRIP_ROWS = 32
 ROWS_FOR_NOISE = 24
 """Number of evenly spaced rows used for the median."""
 
-Strip = tuple[int, int, int, int]
 CostFeatures = tuple[I32, I16, U8]
 """Census transform (H, W), channels (K, H, W) and valid pixels (H, W) of rows of an image."""
 
@@ -44,13 +40,12 @@ def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
     """Check that a disparity range is not empty or too large."""
     first, last = (int(d) for d in disparity_range)
     if not 0 <= last - first < MAX_DISPARITIES:
-        raise ValueError(
-            f"a disparity range must obey first <= last < first + {MAX_DISPARITIES}; got {disparity_range}"
-        )
+        limits = f"first <= last < first + {MAX_DISPARITIES}"
+        raise ValueError(f"a disparity range must obey {limits}; got {disparity_range}")
     return first, last
 
 
-def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[Strip]:
+def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[tuple[int, int, int, int]]:
     """Divide the rows of an image into the fewest strips that fit the memory, margins included.
 
     A strip (first, last, from, to) computes rows [first, last) from rows [from, to).
@@ -65,12 +60,6 @@ def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[Str
         (first, last, max(first - STRIP_MARGIN, 0), min(last + STRIP_MARGIN, height))
         for first, last in pairwise(edges)
     ]
-
-
-def run_strips(work: Callable[[Strip], None], strips: Sequence[Strip], threads: int) -> None:
-    """Call ``work`` for every strip."""
-    with ThreadPoolExecutor(max(min(threads, len(strips)), 1)) as pool:
-        list(pool.map(work, strips))
 
 
 @dataclass(frozen=True)
@@ -89,9 +78,8 @@ class StereoImage:
 def prepare_stereo_images(left: ArrayLike, right: ArrayLike) -> tuple[StereoImage, StereoImage]:
     """Convert grey levels 0 .. 255, (H, W) or (H, W, K <= 4), NaN = no pixel, to integer channels."""
     if np.shape(left) != np.shape(right):
-        raise ValueError(
-            f"rectified images must have the same shape; got {np.shape(left)} and {np.shape(right)}"
-        )
+        shapes = f"{np.shape(left)} and {np.shape(right)}"
+        raise ValueError(f"rectified images must have the same shape; got {shapes}")
     return _side(np.asarray(left)), _side(np.asarray(right))
 
 

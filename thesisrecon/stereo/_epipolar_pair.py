@@ -17,11 +17,11 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
 from thesisrecon.geometry.homogeneous import dehomogenize, require_finite, require_shapes
-from thesisrecon.geometry.homographies import infinite_homography
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
     fundamental_from_cameras,
+    infinite_homography,
     quasi_euclidean_planes,
     require_parallax_of_matches,
 )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, distort, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Image, PinholeView, Reconstruction
@@ -21,35 +21,14 @@ MIN_ANGLE_DEG, MIN_POINTS = 1.0, 12
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points of a metric reconstruction.
+    """Points of a metric reconstruction."""
 
-    Parameters
-    ----------
-    X : ndarray (N, 3)
-        Points.
-    seen : ndarray (V, N) bool
-        Whether a view observes a point.
-    """
-
-    X: F64
-    seen: B8
+    X: F64  #: (N, 3)
+    seen: B8  #: (V, N) whether a view observes a point
 
 
 def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
-    """Return the valid points of a metric reconstruction with their inlier observations.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Metric reconstruction.
-
-    Returns
-    -------
-    SparsePoints
-        Points and their visibility.
-    """
-    if reconstruction.stratum != "metric":
-        raise ValueError(f"depth maps need a metric reconstruction; got {reconstruction.stratum}")
+    """The valid points of a metric reconstruction with their inlier observations."""
     tracks = reconstruction.tracks
     seen = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     good = reconstruction.inlier
@@ -60,22 +39,9 @@ def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
 
 
 def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> tuple[F64, F64]:
-    """Project the points that one of two views observes into both.
+    """Pixels (N, 2) in two views of the points that one of them observes, if inside both images.
 
-    All points inside both images are used, also those that only one view observes, because the depth range
-    must cover the whole visible scene.
-
-    Parameters
-    ----------
-    points : SparsePoints
-        Points of the scene.
-    a, b : PinholeView
-        The views.
-
-    Returns
-    -------
-    tuple of ndarray (N, 2)
-        Projections into both views in pixels.
+    Points that only one view observes count too: the depth range must cover the whole visible scene.
     """
     X = points.X[points.seen[a.view] | points.seen[b.view]]
     keep = np.ones(len(X), dtype=bool)
@@ -83,45 +49,29 @@ def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> 
     for view in (a, b):
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = project(view.P, X)
-        size = np.array([view.seen.shape[1], view.seen.shape[0]])
+        size = np.array(view.seen.shape[::-1])
         keep &= (X @ view.P[2, :3] + view.P[2, 3] > 0.0) & np.all((xy >= 0.0) & (xy <= size - 1.0), axis=1)
         places.append(xy)
     return places[0][keep], places[1][keep]
 
 
 def select_neighbours(
-    points: SparsePoints, views: dict[int, PinholeView], view: int, max_neighbours: int = 4
-) -> list[int]:
-    """Select the neighbours of a view greedily.
+    points: SparsePoints, views: Mapping[int, PinholeView], view: int, max_neighbours: int = 4
+) -> tuple[int, ...]:
+    """Select the neighbours of a view greedily, the most useful first.
 
     The weight of a common point is a Gaussian of its triangulation angle. Points that earlier neighbours
     observe count less, and so does a view whose baseline has the direction of an earlier one, because views
     from other sides see what is occluded.
-
-    Parameters
-    ----------
-    points : SparsePoints
-        Points of the scene.
-    views : dict of int to PinholeView
-        All views.
-    view : int
-        Number of the view.
-    max_neighbours : int
-        Largest number of neighbours.
-
-    Returns
-    -------
-    list of int
-        Numbers of the neighbours, the most useful first.
     """
-    centre = _centre(views[view].P)
+    centres = {i: dehomogenize(camera_centre(views[i].P)) for i in views}
     worth: dict[int, F64] = {}
     direction: dict[int, F64] = {}
-    for other in sorted(views):
-        weight = _weights(points, centre, views, view, other)
+    for other in sorted(views.keys() - {view}):
+        weight = _weights(points, centres, view, other)
         if weight is not None:
             worth[other] = weight
-            baseline = _centre(views[other].P) - centre
+            baseline = centres[other] - centres[view]
             direction[other] = baseline / np.linalg.norm(baseline)
     served = np.zeros(len(points.X))
     chosen: list[int] = []
@@ -134,17 +84,15 @@ def select_neighbours(
         best_neighbour = max(gains, key=lambda j: (gains[j], -j))
         served += worth.pop(best_neighbour)
         chosen.append(best_neighbour)
-    return chosen
+    return tuple(chosen)
 
 
-def _weights(
-    points: SparsePoints, centre: F64, views: dict[int, PinholeView], view: int, other: int
-) -> F64 | None:
+def _weights(points: SparsePoints, centres: Mapping[int, F64], view: int, other: int) -> F64 | None:
     """Weights (N,) of the points seen with ``other``, None if it cannot be a neighbour."""
     common = points.seen[view] & points.seen[other]
-    if other == view or int(common.sum()) < MIN_POINTS:
+    if int(common.sum()) < MIN_POINTS:
         return None
-    a, b = points.X[common] - centre, points.X[common] - _centre(views[other].P)
+    a, b = (points.X[common] - centres[i] for i in (view, other))
     sine = np.linalg.norm(np.cross(a, b), axis=1)
     angle = np.degrees(np.arctan2(sine, np.sum(a * b, axis=1)))
     if int(np.sum(angle >= MIN_ANGLE_DEG)) < MIN_POINTS:
@@ -156,42 +104,19 @@ def _weights(
     return weights
 
 
-def _centre(P: F64) -> F64:
-    centre = camera_centre(P)
-    return np.asarray(centre[:3] / centre[3])
-
-
 def pinhole_view(
     image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
 ) -> PinholeView:
-    """Undistort an image.
+    """Undistort an image of a metric reconstruction, its longest side at most ``max_side`` pixels.
 
-    Parameters
-    ----------
-    image : Image
-        The image, in the size that the reconstruction refers to.
-    reconstruction : Reconstruction
-        Metric reconstruction with ``K`` and optional ``distortion``.
-    view : int
-        Number of the image.
-    max_side : int
-        Longest side of the result in pixels; larger images are reduced without aliasing.
-
-    Returns
-    -------
-    PinholeView
-        Undistorted image with its camera, whose third coordinate is the depth. Pixels outside the original
-        image are black and not ``seen``.
+    The third coordinate of its camera is the depth. Pixels outside the original image are black and not
+    ``seen``.
     """
     K = reconstruction.K
     if reconstruction.stratum != "metric" or K is None:
         raise ValueError("undistorted views need a metric reconstruction with K")
     if tuple(reconstruction.sizes[view]) != image.size:
-        raise ValueError(
-            f"image {image.name} must be {tuple(reconstruction.sizes[view])} px; got {image.size}"
-        )
-    if not reconstruction.registered[view]:
-        raise StageFailure(f"image {image.name} has no camera", reconstruction.reasons[view], "")
+        raise ValueError(f"image {image.name} must be {reconstruction.sizes[view]} px; got {image.size}")
     shrink = min(1.0, max_side / max(image.size))
     size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
     sx, sy = np.array(size) / np.array(image.size)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -41,6 +40,8 @@ GATE = 3.0
 SIGMA_PX = 0.4
 """Standard deviation of a position in the neighbours."""
 
+_Search = tuple[PatchViews, PatchWindow]
+
 
 def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth) -> InverseDepth:
     """Refine and extend the inverse depths of a view by propagation and refinement of a plane per pixel.
@@ -52,39 +53,23 @@ def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: 
     deterministic: it starts from the fused correspondences. The cost is 1 - correlation.
 
     A pixel is kept if two neighbours have at most ``MAX_COST``, one has at most half of it, or two of the
-    fused correspondences agree.
-
-    Parameters
-    ----------
-    reference : PinholeView
-        The view.
-    others : sequence of PinholeView
-        Its neighbours.
-    found : InverseDepth
-        Fused correspondences.
-
-    Returns
-    -------
-    InverseDepth
-        Refined inverse depths.
+    fused correspondences ``found`` agree.
     """
     if not others or not np.isfinite(found.value).any():
         return found
-    search = _PlaneSearch.of(reference, others)
+    search = _search_arguments(reference, others)
     planes = _planes(found.value)
-    search.sweep(planes, search.begin(planes), SWEEPS)
+    _sweep(search, planes, _begin_cost(search, planes), SWEEPS)
     rho = planes[..., 0]
-    least, support, slope = search.rate(planes, MAX_COST)
+    least, support, std = _rate(search, planes, MAX_COST)
     seen = _is_supported(least, support)
-    joining, std = _continuing_surfaces(search, planes, seen, least)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        std = np.where(joining, std, SIGMA_PX / slope).astype(np.float32)
-        near = np.abs(rho - found.value) <= GATE * np.hypot(found.std, std)
+    joining, joining_std = _continuing_surfaces(search, planes, seen, least)
+    std = np.where(joining, joining_std, std)
     seen |= joining
-    matched = ~seen & (found.views >= 2)
     # Without texture the fused correspondences are kept.
-    with np.errstate(invalid="ignore"):
-        both = seen & near & (found.views >= 2)
+    matched = ~seen & (found.views >= 2)
+    near = np.abs(rho - found.value) <= GATE * np.hypot(found.std, std)
+    both = seen & near & (found.views >= 2)
     value = np.where(seen, rho, np.where(matched, found.value, np.nan)).astype(np.float32)
     std = np.where(seen, std, np.where(matched, found.std, np.nan)).astype(np.float32)
     views = np.where(both, np.maximum(support, found.views), np.where(seen, support, found.views))
@@ -95,39 +80,19 @@ def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: 
 def search_planes(
     reference: PinholeView, others: Sequence[PinholeView], rho: F32, *, wanted: B8, sweeps: int
 ) -> tuple[F32, F32, U8]:
-    """Search planes of selected pixels from given inverse depths.
+    """Search the planes of ``wanted`` pixels (H, W) from inverse depths ``rho`` (H, W).
 
-    Parameters
-    ----------
-    reference : PinholeView
-        The view.
-    others : sequence of PinholeView
-        Its neighbours.
-    rho : ndarray (H, W) float32
-        Initial inverse depths.
-    wanted : ndarray (H, W) bool
-        Pixels to search; the planes of other pixels stay.
-    sweeps : int
-        Passes over the image.
-
-    Returns
-    -------
-    tuple of ndarray (H, W)
-        Inverse depth, its standard deviation, and number of supporting views; NaN where no plane is
-        accepted.
+    Returns inverse depths, standard deviations and numbers of supporting views (H, W), NaN where no plane is
+    accepted.
     """
-    search = _PlaneSearch.of(reference, others)
+    search, unknown = _search_arguments(reference, others), np.float32(np.nan)
     planes = _planes(rho)
-    begun = np.where(wanted[..., None], planes, np.float32(np.nan))
     # Cost 0 excludes the other pixels from the search.
-    cost = np.where(wanted, search.begin(begun), np.float32(0.0))
-    search.sweep(planes, cost, sweeps)
+    begun = _begin_cost(search, np.where(wanted[..., None], planes, unknown))
+    _sweep(search, planes, np.where(wanted, begun, np.float32(0.0)), sweeps)
     planes[~wanted] = np.nan
-    least, support, slope = search.rate(planes, MAX_COST)
+    least, support, std = _rate(search, planes, MAX_COST)
     seen = _is_supported(least, support)
-    with np.errstate(divide="ignore"):
-        std = (SIGMA_PX / slope).astype(np.float32)
-    unknown = np.float32(np.nan)
     return np.where(seen, planes[..., 0], unknown), np.where(seen, std, unknown), support * seen
 
 
@@ -143,62 +108,56 @@ def _is_supported(least: F32, support: U8) -> B8:
     return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * MAX_COST)))
 
 
-def _continuing_surfaces(search: _PlaneSearch, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
+def _continuing_surfaces(search: _Search, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
     """(H, W) doubtful planes that continue the surface of accepted ones; standard deviations."""
     doubtful = ~seen & (least <= MAX_CONTINUATION_COST)
-    slope = search.rate(np.where(doubtful[..., None], planes, np.float32(np.nan)), MAX_CONTINUATION_COST)[2]
-    with np.errstate(divide="ignore"):
-        std = (SIGMA_PX / slope).astype(np.float32)
+    std = _rate(search, np.where(doubtful[..., None], planes, np.float32(np.nan)), MAX_CONTINUATION_COST)[2]
     joins = np.zeros(seen.shape, dtype=np.uint8)
     rho = np.where(seen | doubtful, planes[..., 0], np.float32(np.nan))
     surface_continuation(rho, std, seen.astype(np.uint8), RADIUS + 1, ALIKE, GATE, joins)
     return joins > 0, std
 
 
-@dataclass(frozen=True)
-class _PlaneSearch:
+def _search_arguments(reference: PinholeView, others: Sequence[PinholeView]) -> _Search:
     """Kernel arguments of a view and its neighbours."""
-
-    views: PatchViews
-    window: PatchWindow
-
-    @classmethod
-    def of(cls, reference: PinholeView, others: Sequence[PinholeView]) -> _PlaneSearch:
-        gray = [_gray(view) for view in (reference, *others)]
-        layout = np.array([(0, *one.shape[::-1]) for one in gray[1:]], dtype=np.int64)
-        layout[1:, 0] = np.cumsum([one.size for one in gray[1:]])[:-1]
-        squares = [np.empty(one.shape, dtype=np.uint32) for one in gray[1:]]
-        for one, words in zip(gray[1:], squares, strict=True):
-            pack_squares(one, words)
-        H, e = map(np.stack, zip(*(pixel_transfer(reference.P, other.P) for other in others), strict=True))
-        table = np.exp(-np.arange(256.0) / INTENSITY_SCALE).astype(np.float32)
-        steps = SPACING * np.arange(-(RADIUS // SPACING), RADIUS // SPACING + 1)
-        offsets = np.stack(np.meshgrid(steps, steps)).reshape(2, -1).astype(np.float32)
-        packed = np.concatenate([words.ravel() for words in squares])
-        return cls(PatchViews(gray[0], packed, layout, H, e), PatchWindow(offsets, table))
-
-    def begin(self, planes: F32) -> F32:
-        """Cost (H, W) of planes (H, W, 3)."""
-        cost = np.empty(planes.shape[:2], dtype=np.float32)
-        begin_planes(self.views, self.window, planes, cost)
-        return cost
-
-    def sweep(self, planes: F32, cost: F32, sweeps: int) -> None:
-        """Propagate and perturb planes (H, W, 3) of cost (H, W) in place."""
-        for k in range(sweeps):
-            step = FIRST_STEP_PX * 0.5**k
-            sweep_planes(self.views, self.window, step, CONVERGED_COST, k % 2 == 1, planes, cost)
-
-    def rate(self, planes: F32, max_cost: float) -> tuple[F32, U8, F32]:
-        """Smallest cost, support and slope (H, W) of planes (H, W, 3)."""
-        shape = planes.shape[:2]
-        least, slope = np.full(shape, UNKNOWN, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-        support = np.zeros(shape, dtype=np.uint8)
-        rate_planes(self.views, self.window, planes, max_cost, least, support, slope)
-        return least, support, slope
+    gray = [_gray(view) for view in others]
+    squares = [np.empty(one.shape, dtype=np.uint32) for one in gray]
+    for one, words in zip(gray, squares, strict=True):
+        pack_squares(one, words)
+    starts = np.cumsum([0, *(one.size for one in gray[:-1])])
+    layout = np.array([(k, *one.shape[::-1]) for k, one in zip(starts, gray, strict=True)], dtype=np.int64)
+    H, e = map(np.stack, zip(*(pixel_transfer(reference.P, other.P) for other in others), strict=True))
+    packed = np.concatenate([words.ravel() for words in squares])
+    steps = SPACING * np.arange(-(RADIUS // SPACING), RADIUS // SPACING + 1)
+    offsets = np.stack(np.meshgrid(steps, steps)).reshape(2, -1).astype(np.float32)
+    weights = np.exp(-np.arange(256.0) / INTENSITY_SCALE).astype(np.float32)
+    return PatchViews(_gray(reference), packed, layout, H, e), PatchWindow(offsets, weights)
 
 
 def _gray(view: PinholeView) -> F32:
     """(H, W) grey levels, NaN outside the original image."""
     gray = view.rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     return np.where(view.seen, gray, np.float32(np.nan)).astype(np.float32)
+
+
+def _begin_cost(search: _Search, planes: F32) -> F32:
+    """Cost (H, W) of planes (H, W, 3)."""
+    cost = np.empty(planes.shape[:2], dtype=np.float32)
+    begin_planes(*search, planes, cost)
+    return cost
+
+
+def _sweep(search: _Search, planes: F32, cost: F32, sweeps: int) -> None:
+    """Propagate and perturb planes (H, W, 3) of cost (H, W) in place."""
+    for k in range(sweeps):
+        sweep_planes(*search, FIRST_STEP_PX * 0.5**k, CONVERGED_COST, k % 2 == 1, planes, cost)
+
+
+def _rate(search: _Search, planes: F32, max_cost: float) -> tuple[F32, U8, F32]:
+    """Smallest cost, support and standard deviation (H, W) of planes (H, W, 3)."""
+    shape = planes.shape[:2]
+    least, slope = np.full(shape, UNKNOWN, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    support = np.zeros(shape, dtype=np.uint8)
+    rate_planes(*search, planes, max_cost, least, support, slope)
+    with np.errstate(divide="ignore"):
+        return least, support, (SIGMA_PX / slope).astype(np.float32)

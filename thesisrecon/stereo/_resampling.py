@@ -120,21 +120,10 @@ def _sample_image(image: F32, xy: F64, out: F32) -> None:
 
 
 def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]) -> F32:
-    """Resample an image into a frame by cubic convolution.
+    """Resample an image (H, W) or (H, W, C) into a frame of (width, height) by cubic convolution.
 
-    Parameters
-    ----------
-    image : ndarray (H, W) or (H, W, C)
-        The original image.
-    lookup : callable
-        Returns the positions (len(rows), width, 2) in the image of a range of rows of the frame.
-    size : tuple of int
-        (width, height) of the frame.
-
-    Returns
-    -------
-    ndarray float32
-        The frame, NaN outside the image.
+    ``lookup`` returns the positions (len(rows), width, 2) in the image of a range of rows of the frame. NaN
+    outside the image.
     """
     pixels = np.ascontiguousarray(image, dtype=np.float32)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
@@ -149,6 +138,19 @@ def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]
         _sample_image(pixels, places, strip)
         out[first:last] = strip[first - start :]
     return out[:, :, 0] if image.ndim == 2 else out
+
+
+def bilinear_samples(values: F32, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]:
+    """Bilinear samples (..., C) of ``values`` (H, W, C), and the range (..., C) of the four pixels around."""
+    height, width = values.shape[:2]
+    x0 = np.clip(np.floor(x).astype(np.int64), 0, max(width - 2, 0))
+    y0 = np.clip(np.floor(y).astype(np.int64), 0, max(height - 2, 0))
+    x1, y1 = np.minimum(x0 + 1, width - 1), np.minimum(y0 + 1, height - 1)
+    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    a, b, c, d = (values[v, u] for v, u in ((y0, x0), (y0, x1), (y1, x0), (y1, x1)))
+    top, bottom = a + fx * (b - a), c + fx * (d - c)
+    spread = np.maximum.reduce([a, b, c, d]) - np.minimum.reduce([a, b, c, d])
+    return top + fy * (bottom - top), spread
 
 
 class Rectification(ABC):
@@ -170,41 +172,14 @@ class Rectification(ABC):
         """Positions (len(rows), width, 2) of rows of the frame in an image."""
 
     def original_from_rectified(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Map positions of the frame to pixels of an image.
+        """Map positions (N, 2) of the frame to pixels, NaN beyond the epipole or the line sent to infinity.
 
-        Parameters
-        ----------
-        side : {0, 1}
-            The image.
-        xy : ndarray (N, 2)
-            Positions in the frame.
-        within : bool
-            Return NaN outside the frame too.
-
-        Returns
-        -------
-        ndarray (N, 2)
-            Pixels, NaN beyond the epipole or the line sent to infinity.
+        NaN outside the frame too if ``within``.
         """
         return self._original(side, self._within(xy) if within else xy)
 
     def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Map pixels of an image to the frame.
-
-        Parameters
-        ----------
-        side : {0, 1}
-            The image.
-        xy : ndarray (N, 2)
-            Pixels.
-        within : bool
-            Return NaN outside the frame too.
-
-        Returns
-        -------
-        ndarray (N, 2)
-            Positions in the frame, NaN beyond the line sent to infinity.
-        """
+        """Map pixels (N, 2) to the frame, NaN beyond the line sent to infinity, and outside if ``within``."""
         moved = self._rectified(side, xy)
         return self._within(moved) if within else moved
 
@@ -213,18 +188,5 @@ class Rectification(ABC):
         return np.where(inside[:, None], xy, np.nan)
 
     def warp(self, image: F32, side: int) -> F32:
-        """Resample an image into the frame.
-
-        Parameters
-        ----------
-        image : ndarray (H, W) or (H, W, C)
-            The image.
-        side : {0, 1}
-            Its side.
-
-        Returns
-        -------
-        ndarray float32
-            The rectified image, NaN outside.
-        """
+        """Resample an image (H, W) or (H, W, C) into the frame, NaN outside."""
         return warp_image(image, partial(self._lookup, side), self.size)

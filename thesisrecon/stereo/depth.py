@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
-from thesisrecon.stereo._depth_fusion import InverseDepth, RobustFusion, SequenceLinking, pixel_transfer
+from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link_sequence, pixel_transfer
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo._neighbours import (
     SparsePoints,
@@ -27,8 +27,6 @@ from thesisrecon.stereo.correspondence import Correspondence, PairMatching, Rect
 
 SURE = 3.0
 """Standard deviations by which an inverse depth must exceed 0, that of infinity."""
-
-
 REPROJECTION_PX, MAX_RELATIVE, MAX_SIGMAS = 1.5, 0.01, 2.0
 """Limits of the reprojection error, and of the depth difference: a share plus standard deviations."""
 MIN_VIEWS = 1
@@ -43,25 +41,13 @@ GAP_PX, SWEEPS = 1, 2
 """Completion also searches gaps of this size between projected pixels, in so many passes."""
 
 
-def confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
+def _confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
     """Keep the depths that the depth maps of other views confirm.
 
     A pixel is projected into another view, and the depth there is projected back (Merrell et al., ICCV 2007;
     fusion in COLMAP). It is confirmed if both agree and contradicted if the other view sees through it. It is
     kept if at least ``MIN_VIEWS`` views and more than contradict it confirm it, or if none contradicts it and
-    it continues the surface of confirmed pixels.
-
-    Parameters
-    ----------
-    depth_map : DepthMap
-        Depths of a view.
-    others : sequence of DepthMap
-        Depths of other views.
-
-    Returns
-    -------
-    DepthMap
-        Confirmed depths; ``views`` is the number of confirming views.
+    it continues the surface of confirmed pixels. ``views`` becomes the number of confirming views.
     """
     agree, contradict, joins = np.zeros((3, *depth_map.depth.shape), dtype=np.uint8)
     limits = np.array([REPROJECTION_PX, MAX_RELATIVE, MAX_SIGMAS])
@@ -101,43 +87,24 @@ def _region_sizes(depth: F32, step: float) -> F64:
         joined = np.abs(log[a] - log[b]) <= step
         pairs.append(np.stack([number[a][joined], number[b][joined]]))
     row, column = np.concatenate(pairs, axis=1)
-    graph = scipy.sparse.coo_matrix(
-        (np.ones(len(row), dtype=bool), (row, column)), shape=(depth.size, depth.size)
-    )
+    edges = np.ones(len(row), dtype=bool)
+    graph = scipy.sparse.coo_matrix((edges, (row, column)), shape=(depth.size, depth.size))
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     sizes = np.bincount(label)[label].reshape(depth.shape)
     return np.where(np.isfinite(depth), sizes, 0.0)
 
 
 def _kept(depth_map: DepthMap, keep: B8) -> DepthMap:
-    return replace(
-        depth_map,
-        depth=np.where(keep, depth_map.depth, np.float32(np.nan)),
-        std=np.where(keep, depth_map.std, np.float32(np.nan)),
-        views=np.where(keep, depth_map.views, np.uint8(0)),
-    )
+    depth, std = (np.where(keep, part, np.float32(np.nan)) for part in (depth_map.depth, depth_map.std))
+    return replace(depth_map, depth=depth, std=std, views=np.where(keep, depth_map.views, np.uint8(0)))
 
 
-def complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[int, PinholeView]) -> DepthMap:
+def _complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[int, PinholeView]) -> DepthMap:
     """Complete a depth map with surfaces that only the depth maps of other views contain.
 
     The depths of other views are projected into the view. Where it has none, the nearest of these initialise
     the plane search against the ``MAX_SOURCES`` images that contribute most pixels. Accepted planes (by the
     rule of :func:`refine_depths`) are measured depths: nothing is interpolated.
-
-    Parameters
-    ----------
-    own : DepthMap
-        Depths of a view.
-    others : sequence of DepthMap
-        Depths of other views.
-    views : mapping of int to PinholeView
-        Images of all views.
-
-    Returns
-    -------
-    DepthMap
-        The depth map with additional depths.
     """
     unknown = np.isnan(own.depth) & views[own.view].seen
     offers = []
@@ -158,35 +125,19 @@ def complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[in
     new = np.isfinite(found)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.float32(1.0) / found
-        std = std * depth * depth
-    return replace(
-        own,
-        depth=np.where(new, depth, own.depth),
-        std=np.where(new, std, own.std),
-        views=np.where(new, support, own.views).astype(np.uint8),
-    )
+        std = np.where(new, std * depth * depth, own.std)
+    completed = np.where(new, support, own.views).astype(np.uint8)
+    return replace(own, depth=np.where(new, depth, own.depth), std=std, views=completed)
 
 
 @dataclass(frozen=True)
 class MultiViewScene:
-    """Input of multi-view stereo.
+    """Input of multi-view stereo."""
 
-    Parameters
-    ----------
-    views : mapping of int to PinholeView
-        Undistorted views by number, in the size of their depth maps.
-    points : SparsePoints
-        Points of the reconstruction.
-    neighbours : mapping of int to tuple of int
-        Neighbours of each view, the most useful first.
-    matched : mapping of int to PinholeView
-        Views in the size used for stereo matching.
-    """
-
-    views: Mapping[int, PinholeView]
-    points: SparsePoints
-    neighbours: Mapping[int, tuple[int, ...]]
-    matched: Mapping[int, PinholeView] = field(default_factory=dict)
+    views: Mapping[int, PinholeView]  #: undistorted views by number, in the size of their depth maps
+    points: SparsePoints  #: points of the reconstruction
+    neighbours: Mapping[int, tuple[int, ...]]  #: neighbours of each view, the most useful first
+    matched: Mapping[int, PinholeView] = field(default_factory=dict)  #: in the size used for stereo matching
 
     def subset(self, numbers: Collection[int]) -> MultiViewScene:
         """Restrict the scene to some views, which reduces the data sent to a worker.
@@ -199,7 +150,6 @@ class MultiViewScene:
         Returns
         -------
         MultiViewScene
-            Images of these views and the points that they observe.
         """
         views, matched = (
             {i: view for i, view in given.items() if i in numbers} for given in (self.views, self.matched)
@@ -221,26 +171,30 @@ class MultiViewStereo:
     pairs : PairMatching
         Dense correspondence of two views.
     max_neighbours : int
-        Largest number of neighbouring views, chosen by :func:`select_neighbours`.
-    linker : RobustFusion or SequenceLinking
-        Fusion of correspondences to one inverse depth.
+        Largest number of neighbouring views.
+    sequence_links : int
+        0: fuse the correspondences with all neighbours; else link them along the image sequence, at most so
+        many in each direction.
     refinement : bool
         Refine depth maps with slanted windows, and complete them from those of other views.
     min_comparison_views : int
         Number of depth maps to compare with, if there are as many.
-    max_side : int
-        Longest side of the depth maps in pixels.
-    match_side : int
-        Longest side of the images for stereo matching; fronto-parallel windows find less in larger images.
+    max_side, match_side : int
+        Longest side in pixels of the depth maps and of the images for stereo matching; fronto-parallel
+        windows find less in larger images.
     """
 
     pairs: PairMatching = field(default_factory=PairMatching)
     max_neighbours: int = 4
-    linker: RobustFusion | SequenceLinking = field(default_factory=RobustFusion)
+    sequence_links: int = 0
     refinement: bool = True
     min_comparison_views: int = 12
     max_side: int = 1024
     match_side: int = 640
+
+    def __post_init__(self) -> None:
+        if self.sequence_links < 0:
+            raise ValueError(f"sequence_links must not be negative; got {self.sequence_links}")
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
         """See `thesisrecon.config.DepthEstimator.match_rectified`."""
@@ -267,9 +221,7 @@ class MultiViewStereo:
             }
             for side in (self.max_side, min(self.match_side, self.max_side))
         )
-        chosen = {
-            i: tuple(select_neighbours(points, views, i, max_neighbours=self.max_neighbours)) for i in views
-        }
+        chosen = {i: select_neighbours(points, views, i, self.max_neighbours) for i in views}
         return MultiViewScene(views, points, chosen, matched)
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
@@ -285,7 +237,10 @@ class MultiViewStereo:
             except StageFailure:
                 return None
 
-        found = self.linker.link(view, scene.views, scene.neighbours[view], correspond)
+        if self.sequence_links:
+            found = link_sequence(view, scene.views, self.sequence_links, correspond)
+        else:
+            found = fuse_neighbours(view, scene.views, scene.neighbours[view], correspond)
         keep = scene.views[view].seen
         if self.refinement:
             found = refine_depths(scene.views[view], [scene.views[j] for j in scene.neighbours[view]], found)
@@ -299,17 +254,14 @@ class MultiViewStereo:
         others = [depth_maps[j] for j in self._comparison_views(scene, view) if j in depth_maps]
         own = depth_maps[view]
         if self.refinement:
-            own = complete_depths(own, others, scene.views)
-        return confirm_depths(own, others)
+            own = _complete_depths(own, others, scene.views)
+        return _confirm_depths(own, others)
 
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
         """See `thesisrecon.config.DepthEstimator.required_views`."""
         order = sorted(scene.views)
-        place, reach = (
-            order.index(view),
-            self.linker.length if isinstance(self.linker, SequenceLinking) else 0,
-        )
-        linked = order[max(place - reach, 0) : place + reach + 1]
+        place = order.index(view)
+        linked = order[max(place - self.sequence_links, 0) : place + self.sequence_links + 1]
         return frozenset({*linked, *scene.neighbours[view], *self._comparison_views(scene, view)})
 
     def _comparison_views(self, scene: MultiViewScene, view: int) -> list[int]:
@@ -335,14 +287,13 @@ class MultiViewStereo:
         images : sequence of Image
             The V images.
         reconstruction : Reconstruction
-            Metric reconstruction of these images.
+            Their metric reconstruction.
         threads : int
             Number of threads; the result does not depend on it.
 
         Returns
         -------
         dict of int to DepthMap
-            Depth maps by view number.
         """
         scene = self.prepare(images, reconstruction)
         order = sorted(scene.views)

@@ -17,12 +17,10 @@ from thesisrecon.kernels import kernel
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import (
     LEVELS,
-    Strip,
     add_squares,
     checked_range,
     estimate_noise,
     prepare_stereo_images,
-    run_strips,
 )
 from thesisrecon.stereo._postprocessing import final_confidence, texture_of
 
@@ -273,6 +271,10 @@ Cohesion = Literal["none", "along", "along and across"]
 
 ROUNDING_PX = float(1.0 / np.sqrt(12.0))
 """Standard deviation of an integer disparity."""
+DETECTION = 0.99
+"""Detection probability P_D."""
+MIN_VARIANCE = 4.0
+"""Variance s^2 of the paper; that of the measured image noise is added."""
 
 
 @dataclass(frozen=True)
@@ -287,10 +289,6 @@ class MaximumLikelihoodScanline:
 
     Parameters
     ----------
-    detection : float
-        Detection probability P_D.
-    min_variance : float
-        Variance s^2 without the measured image noise, which is added; the paper uses 4.
     radius : int
         A measurement consists of the colours within this radius; the paper uses single pixels (0).
     cohesion : {"none", "along", "along and across"}
@@ -299,21 +297,15 @@ class MaximumLikelihoodScanline:
     out_of_view : bool
         Pixels outside the other camera's view cost as much as an expected match, which does not bias the
         disparities; the paper charges them as occluded, which pulls both row ends to disparity 0.
-    threads : int
     """
 
-    detection: float = 0.99
-    min_variance: float = 4.0
     radius: int = 1
     cohesion: Cohesion = "along and across"
     out_of_view: bool = True
-    threads: int = 1
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.detection < 1.0:
-            raise ValueError(f"detection must be in [0.5, 1); got {self.detection}")
-        if not (self.min_variance > 0.0 and 0 <= self.radius <= 4):
-            raise ValueError("min_variance must be above 0, radius in 0 .. 4")
+        if not 0 <= self.radius <= 4:
+            raise ValueError(f"radius must be in 0 .. 4; got {self.radius}")
         if self.cohesion not in ("none", "along", "along and across"):
             raise ValueError(f"cohesion must be none, along, or along and across; got {self.cohesion}")
 
@@ -339,9 +331,9 @@ class MaximumLikelihoodScanline:
         first, last = checked_range(disparity_range)
         sides = prepare_stereo_images(left, right)
         noise = float(np.mean([estimate_noise(side) for side in sides]))
-        variance = self.min_variance + noise**2
+        variance = MIN_VARIANCE + noise**2
         components = len(sides[0].channels) * (2 * self.radius + 1) ** 2
-        occluded = self._occlusion_cost(components, variance)
+        occluded = _occlusion_cost(components, variance)
         model = (
             self.radius,
             STEPS_PER_NAT / (4.0 * variance * LEVELS**2),
@@ -354,9 +346,9 @@ class MaximumLikelihoodScanline:
         likelihood[-1] = 0.0
         height, width = sides[0].valid.shape
         disparity, confidence = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-
-        def work(strip: Strip) -> None:
-            start, stop, top, bottom = strip
+        for start in range(0, height, ROWS):
+            stop, top = min(start + ROWS, height), max(start - WARM_UP, 0)
+            bottom = min(start + ROWS + self.radius, height)
             rows = [(np.ascontiguousarray(s.channels[:, top:bottom]), s.valid[top:bottom]) for s in sides]
             found = np.empty((bottom - top, width), np.int32)
             probable = np.empty((bottom - top, width), np.float32)
@@ -364,15 +356,11 @@ class MaximumLikelihoodScanline:
             own = slice(start - top, stop - top)
             disparity[start:stop] = np.where(found[own] == OCCLUDED, np.float32(np.nan), found[own])
             confidence[start:stop] = probable[own]
-
-        starts = range(0, height, ROWS)
-        strips = [(k, min(k + ROWS, height), k - WARM_UP, k + ROWS + self.radius) for k in starts]
-        strips = [(k, last, max(top, 0), min(bottom, height)) for k, last, top, bottom in strips]
-        run_strips(work, strips, self.threads)
         final_confidence(confidence, disparity, disparity, texture_of(sides[0], noise))
         return DisparityMap(disparity, confidence, ROUNDING_PX)
 
-    def _occlusion_cost(self, components: int, variance: float) -> float:
-        """Cost of an occluded pixel in nats, with m components of one variance s^2."""
-        odds = np.log(self.detection / (1.0 - self.detection))
-        return float(odds + components * np.log(GREY_RANGE / np.sqrt(2.0 * np.pi * variance)))
+
+def _occlusion_cost(components: int, variance: float) -> float:
+    """Cost of an occluded pixel in nats, with m components of one variance s^2."""
+    odds = np.log(DETECTION / (1.0 - DETECTION))
+    return float(odds + components * np.log(GREY_RANGE / np.sqrt(2.0 * np.pi * variance)))

@@ -22,14 +22,12 @@ from thesisrecon.stereo._cost import (
     LEVELS,
     WEIGHT_SHIFT,
     StereoImage,
-    Strip,
     census,
     checked_range,
     cost_volume,
     estimate_noise,
     prepare_stereo_images,
     row_strips,
-    run_strips,
     support_masks,
 )
 from thesisrecon.stereo._path_kernels import TOP, adaptive_P2, scratch_size, sum_paths
@@ -87,8 +85,7 @@ class SemiGlobalMatching:
     smoothing_radius : int
         Radius of the edge-preserving mean over disparities within 1 px of the centre; 0 = none.
     memory_mb : float
-        Memory limit for costs and path sums of one strip of rows; each thread has its own strip.
-    threads : int
+        Memory limit for costs and path sums of one strip of rows.
     """
 
     paths: int = 4
@@ -97,15 +94,12 @@ class SemiGlobalMatching:
     support: bool = True
     smoothing_radius: int = 2
     memory_mb: float = 256.0
-    threads: int = 1
 
     def __post_init__(self) -> None:
         if self.paths not in (4, 8):
             raise ValueError(f"paths must be 4 or 8; got {self.paths}")
         if not (0.0 <= self.census_share <= 1.0 and self.truncation > 0.0 and self.smoothing_radius >= 0):
-            raise ValueError(
-                "census_share must be in [0, 1], truncation positive, smoothing_radius at least 0"
-            )
+            raise ValueError("census_share must be in [0, 1], truncation positive, smoothing_radius >= 0")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
         """Compute the disparities of the left image.
@@ -121,8 +115,7 @@ class SemiGlobalMatching:
         Returns
         -------
         DisparityMap
-            NaN where the pixel is occluded, fails the left-right check or is ambiguous. The result does not
-            depend on the number of threads.
+            NaN where the pixel is occluded, fails the left-right check or is ambiguous.
         """
         first, last = checked_range(disparity_range)
         images = prepare_stereo_images(left, right)
@@ -141,9 +134,10 @@ class SemiGlobalMatching:
         # Confidence 1/2 if the second best disparity costs P1 more on every path.
         half = float(2 * pairs * P1 * MAX_COST)
         found = np.empty((3, height, width), np.float32)
-
-        def work(strip: Strip) -> None:
-            start, stop, top, bottom = strip
+        # One byte per pixel and disparity for the cost, and one for each pair of opposite paths.
+        memory = 1e6 * self.memory_mb
+        room = max(memory - 2 * scratch_size(height, n, width), 0.5 * memory)
+        for start, stop, top, bottom in row_strips(height, (1 + pairs) * width * n, room):
             rows = slice(top, bottom)
             features = [
                 (bits[side, rows], np.ascontiguousarray(image.channels[:, rows]), image.valid[rows])
@@ -158,13 +152,8 @@ class SemiGlobalMatching:
             cost_volume(features[0], features[1], support, first, weights, outside, volume)
             steps = np.ascontiguousarray(penalties[:, rows])
             sum_paths(volume, steps, P1_cost, sums, scratch.reshape(2, transposed))
-            own = found[:, start:stop]
-            best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
-
-        # One byte per pixel and disparity for the cost, and one for each pair of opposite paths.
-        memory = 1e6 * self.memory_mb
-        room = max(memory - 2 * scratch_size(height, n, width), 0.5 * memory)
-        run_strips(work, row_strips(height, (1 + pairs) * width * n, room), self.threads)
+            left, right, confidence = found[:, start:stop]
+            best_disparities(sums, start - top, first, (left, right, confidence), half)
         found[0][images[0].valid == 0] = np.nan
         return self._postprocess(found[0], found[1], found[2], texture_of(images[0], measured))
 
@@ -221,7 +210,7 @@ def match_both_sides(
     Returns
     -------
     tuple of DisparityMap
-        Disparities of the left and of the right image, x_right = x_left - d in both.
+        Of the left and of the right image, x_right = x_left - d in both.
     """
 
     def mirrored(image: NDArray[Any]) -> NDArray[Any]:
