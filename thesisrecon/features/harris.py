@@ -82,19 +82,8 @@ class CornerMeasure:
         if self.integration_taps < 0 or (self.integration_taps and self.integration_taps % 2 == 0):
             raise ValueError(f"integration_taps must be odd, or 0; got {self.integration_taps}")
 
-    def channels(self, image: Image) -> F32:
-        """Return the channels in which corners are detected.
-
-        Parameters
-        ----------
-        image : Image
-            The image.
-
-        Returns
-        -------
-        ndarray (C, H, W)
-            Grey values or three colours, float32.
-        """
+    def _channels(self, image: Image) -> F32:
+        """(C, H, W) grey values or three colours."""
         if not self.colour:
             return image.gray[None]
         return np.ascontiguousarray(np.moveaxis(image.rgb, 2, 0), dtype=np.float32)
@@ -195,7 +184,7 @@ class HarrisCorners:
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
-        xy, response = find_corners(self.measure.channels(image), self.measure)
+        xy, response = find_corners(self.measure._channels(image), self.measure)
         if len(xy):
             strong = response >= self.threshold_rel * float(response[0])
             xy, response = xy[strong], response[strong]

@@ -96,7 +96,7 @@ class MultiScaleCorners:
         grays, scales = _image_pyramid(image.gray, self.levels, doubled=doubled)
         colours = [grays]
         if self.measure.colour:
-            planes = self.measure.channels(image)
+            planes = self.measure._channels(image)
             colours = [_image_pyramid(plane, self.levels, doubled=doubled)[0] for plane in planes]
         channels = [np.stack(size) for size in zip(*colours, strict=True)]
         return [_PyramidLevel(*level) for level in zip(channels, grays, scales, strict=True)]

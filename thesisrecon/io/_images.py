@@ -26,13 +26,10 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import SPECIAL_FILE, printable
 from thesisrecon.io._pixels import (
     EXIF_TRANSFORMS,
-    STORED,
-    ExifTransform,
     MemoryBudget,
     StoredImage,
     UnusableImage,
     decoding_bytes,
-    image_from_array,
     resized_to,
 )
 from thesisrecon.records import Image
@@ -190,7 +187,12 @@ def _read(name: str, item: Any, max_size_px: int) -> _DecodedImage:
     elif isinstance(item, Image):
         decoded = _DecodedImage(item, "")
     else:
-        stored = image_from_array(item)
+        array = np.asarray(item)
+        if array.dtype != np.uint8 or (array.ndim != 2 and array.shape[2:] != (3,)):
+            raise ValueError(
+                f"an image array must be (H, W) or (H, W, 3) uint8; got {array.shape} {array.dtype}"
+            )
+        stored = StoredImage(PIL.Image.fromarray(array))
         decoded = _DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), "")
     rgb = decoded.image.rgb
     if min(rgb.shape[:2]) < MIN_SIDE:
@@ -268,12 +270,12 @@ def _formats() -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in PIL.Image.OPEN)
 
 
-def _exif(file: PIL.Image.Image) -> tuple[float, ExifTransform]:
+def _exif(file: PIL.Image.Image) -> tuple[float, PIL.Image.Transpose | None]:
     """Return the 35 mm focal length (0 = unknown) and the transform to the upright image."""
     try:
         exif = file.getexif()
         orientation, focal = exif.get(_ORIENTATION), float(exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
     except Exception:
         # The pixels may be good even if the header is damaged.
-        return 0.0, STORED
-    return focal, EXIF_TRANSFORMS.get(orientation, STORED) if isinstance(orientation, int) else STORED
+        return 0.0, None
+    return focal, EXIF_TRANSFORMS.get(orientation) if isinstance(orientation, int) else None

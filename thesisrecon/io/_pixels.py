@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
 import PIL.Image
+from PIL.Image import Transpose
 
 from thesisrecon.arrays import F64, U8
 
@@ -64,48 +64,38 @@ def decoding_bytes(file: PIL.Image.Image) -> int:
     return each * file.size[0] * file.size[1]
 
 
-class ExifTransform(NamedTuple):
-    """Transform from the stored image to the upright one: by ``method`` (None = identity).
-
-    The rows of the upright image are ``columns`` or rows of the stored one, counted ``from_end`` or not.
-    """
-
-    method: PIL.Image.Transpose | None = None
-    columns: bool = False
-    from_end: bool = False
-
-
-STORED = ExifTransform()
 EXIF_TRANSFORMS = {
-    2: ExifTransform(PIL.Image.Transpose.FLIP_LEFT_RIGHT),
-    3: ExifTransform(PIL.Image.Transpose.ROTATE_180, from_end=True),
-    4: ExifTransform(PIL.Image.Transpose.FLIP_TOP_BOTTOM, from_end=True),
-    5: ExifTransform(PIL.Image.Transpose.TRANSPOSE, columns=True),
-    6: ExifTransform(PIL.Image.Transpose.ROTATE_270, columns=True),
-    7: ExifTransform(PIL.Image.Transpose.TRANSVERSE, columns=True, from_end=True),
-    8: ExifTransform(PIL.Image.Transpose.ROTATE_90, columns=True, from_end=True),
+    2: Transpose.FLIP_LEFT_RIGHT,
+    3: Transpose.ROTATE_180,
+    4: Transpose.FLIP_TOP_BOTTOM,
+    5: Transpose.TRANSPOSE,
+    6: Transpose.ROTATE_270,
+    7: Transpose.TRANSVERSE,
+    8: Transpose.ROTATE_90,
 }
-"""By EXIF orientation; with any other value the image is used as stored."""
+"""Transform to the upright image by EXIF orientation; with any other value the image is used as stored."""
+_ROWS_ARE_COLUMNS = {EXIF_TRANSFORMS[orientation] for orientation in (5, 6, 7, 8)}
+_ROWS_FROM_END = {EXIF_TRANSFORMS[orientation] for orientation in (3, 4, 7, 8)}
 
 
 @dataclass(frozen=True)
 class StoredImage:
-    """A decoded Pillow image of any mode, seen upright by its ``transform`` and as 8-bit RGB."""
+    """A decoded Pillow image of any mode, seen upright by its ``transform`` (None = as stored) and as RGB."""
 
     stored: PIL.Image.Image
-    transform: ExifTransform = STORED
+    transform: Transpose | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) of the upright image."""
         width, height = self.stored.size
-        return (height, width) if self.transform.columns else (width, height)
+        return (height, width) if self.transform in _ROWS_ARE_COLUMNS else (width, height)
 
     def rows(self, start: int, stop: int) -> PIL.Image.Image:
         """Rows ``start`` to ``stop`` of the upright image in RGB."""
         part = self._stored_part(start, stop)
         rgb = self._eight_bit(part) if self._deep else _rgb(part)
-        return rgb if self.transform.method is None else rgb.transpose(self.transform.method)
+        return rgb if self.transform is None else rgb.transpose(self.transform)
 
     def stripes(self, height: int = _STRIPE_ROWS) -> Iterator[tuple[int, int]]:
         """(start, stop) of stripes of rows of the upright image."""
@@ -113,11 +103,10 @@ class StoredImage:
 
     def _stored_part(self, start: int, stop: int) -> PIL.Image.Image:
         width, height = self.stored.size
-        if self.transform.from_end:
+        if self.transform in _ROWS_FROM_END:
             start, stop = self.size[1] - stop, self.size[1] - start
-        return self.stored.crop(
-            (start, 0, stop, height) if self.transform.columns else (0, start, width, stop)
-        )
+        columns = self.transform in _ROWS_ARE_COLUMNS
+        return self.stored.crop((start, 0, stop, height) if columns else (0, start, width, stop))
 
     @property
     def _deep(self) -> bool:
@@ -165,11 +154,8 @@ def resized_to(image: StoredImage, max_size_px: int) -> U8:
         for start, stop in image.stripes():
             rgb[start:stop] = np.asarray(image.rows(start, stop))
         return rgb
-    size = (
-        (max_size_px, math.floor(height * scale))
-        if width >= height
-        else (math.floor(width * scale), max_size_px)
-    )
+    long, short = max_size_px, math.floor(min(width, height) * scale)
+    size = (long, short) if width >= height else (short, long)
     if min(size) < 1:
         raise UnusableImage(f"has {width} x {height} pixels: too narrow to be reduced to {max_size_px}")
     return _resized(image, size, (min(width, size[0] / scale), min(height, size[1] / scale)))
@@ -188,11 +174,3 @@ def _resized(image: StoredImage, size: tuple[int, int], extent: tuple[float, flo
         box = (0.0, 0.0, extent[0] / by[0], float(part.height))
         narrow.paste(part.resize((size[0], part.height), _LANCZOS, box=box), (0, start // by[1]))
     return np.array(narrow.resize(size, _LANCZOS, box=(0.0, 0.0, float(size[0]), extent[1] / by[1])))
-
-
-def image_from_array(array: Any) -> StoredImage:
-    """Wrap an (H, W) or (H, W, 3) uint8 array as an image."""
-    array = np.asarray(array)
-    if array.dtype != np.uint8 or array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
-        raise ValueError(f"an image array must be (H, W) or (H, W, 3) uint8; got {array.shape} {array.dtype}")
-    return StoredImage(PIL.Image.fromarray(array))
