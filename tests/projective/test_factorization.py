@@ -73,19 +73,7 @@ def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_beg
         assert affine == pytest.approx(often, rel=0.01)
 
 
-def test_wrong_tables_and_trees_are_refused():
-    scene, xy = complete_tracks(0)
-    F = fundamentals(scene)
-    with pytest.raises(ValueError, match="N >= 8"):
-        factorize(xy[:, :7])
-    with pytest.raises(ValueError, match="depths"):
-        factorize(xy, np.ones((2, 2)))
-    with pytest.raises(ValueError, match="finite"):
-        factorize(np.where(xy > 900.0, np.nan, xy))
-    with pytest.raises(ValueError, match="reaches every view"):
-        depths_from_fundamentals(xy, F, STAR[:3])
-    with pytest.raises(ValueError, match="grows from view 0"):
-        depths_from_fundamentals(xy, F, [(0, 1), (2, 3)])
+def test_too_few_core_points_are_refused():
     with pytest.raises(ValueError, match="core_points"):
         Factorization(core_points=3)
 

@@ -116,12 +116,8 @@ class CameraPrior:
     gradient: F64
 
 
-@dataclass(frozen=True)
-class BundleStep:
-    """Steps of the camera columns (D,) and of the points (N, 3)."""
-
-    cameras: F64
-    points: F64
+# Steps of the camera columns (D,) and of the points (N, 3).
+BundleStep = tuple[F64, F64]
 
 
 @dataclass(frozen=True)
@@ -137,14 +133,10 @@ class BundleSystem:
         """Eliminate the points; return the damped system, sums of the points, and the damping terms (D,)."""
         N, layout = len(self.layout.observations.start) - 1, self.layout
         points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
-        parts = []
-        for first, last in layout.chunks:
-            parts.append(layout.sums())
-            eliminate_points(first, last, damping, self.jacobians, layout.index, parts[-1], points)
-        total = parts[0]
-        for part in parts[1:]:
-            for into, values in zip(total, part, strict=True):
-                into += values
+        parts = [layout.sums() for _ in layout.chunks]
+        for (first, last), part in zip(layout.chunks, parts, strict=True):
+            eliminate_points(first, last, damping, self.jacobians, layout.index, part, points)
+        total = ReducedSums(*(sum(arrays[1:], arrays[0]) for arrays in zip(*parts, strict=True)))
         pair = layout.index.pair
         if self.prior is not None:
             _add_prior(pair, total, self.prior)
@@ -165,7 +157,7 @@ class BundleSystem:
             return None
         stiff = float(damped @ cameras**2) + damping * float(np.vdot(points.diagonal, moves**2))
         slope = float(reduced.sums.gradient @ cameras) + float(np.vdot(points.gradient, moves))
-        return BundleStep(cameras, moves), 0.5 * (stiff - slope)
+        return (cameras, moves), 0.5 * (stiff - slope)
 
 
 def _add_prior(pair: I64, total: ReducedSums, prior: CameraPrior) -> None:

@@ -35,15 +35,12 @@ class BlockScatter:
     ----------
     variance : ndarray (G, C)
         Variances by the information matrix for the given noise, relative for the focal length.
-    shared_variance : ndarray (C,)
-        Variances if all views shared one camera, 0 for fixed intrinsics.
-    ratio : ndarray (G, C)
-        Scatter between blocks of points over its expectation, NaN for fixed intrinsics.
-    overdispersion : float
+    shared_variance, ratio : ndarray (C,), ndarray (G, C)
+        Variances if all views shared one camera, 0 for fixed intrinsics; and scatter between blocks of points
+        over its expectation, NaN for fixed intrinsics.
+    overdispersion, blocks : float, int
         Scatter between blocks over that between single points, for all unknowns: 1 if the noise of different
-        points is independent, for any distribution.
-    blocks : int
-        Number of blocks.
+        points is independent, for any distribution; and number of blocks.
     """
 
     variance: F64
@@ -106,10 +103,8 @@ def block_scatter(
 
     Parameters
     ----------
-    cameras, X : MetricCameras, ndarray (N, 3)
-        Cameras and points after the adjustment.
-    observations : Observations
-        Observations.
+    cameras, X, observations : MetricCameras, ndarray (N, 3), Observations
+        Cameras and points after the adjustment, and their observations.
     free, prior : ndarray (C,) of bool, IntrinsicsPrior
         Intrinsics that move, and their prior.
     noise : tuple of float
@@ -120,10 +115,10 @@ def block_scatter(
     BlockScatter
         Variances and their scatter.
     """
-    o, group = observations, np.asarray(cameras.group)
+    o, group = observations, cameras.group
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
-    values = number_unknowns(cameras, used, np.asarray(free, dtype=bool), prior)[0]
+    values = number_unknowns(cameras, used, free, prior)[0]
     views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
     # Centred and scaled to size 1.
     origin, scale = scene_frame(X[np.unique(o.point_index)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class BundleOptions:
     sigma_px: float = 1.0
     loss_px: float = 1.0
     max_iterations: int = 20
-    fixed_views: B8 | None = field(default=None, compare=False)
+    fixed_views: B8 | None = None
     covariance: bool = False
     noise_floor_px: float = 0.0
 
@@ -145,13 +145,14 @@ class _MetricProblem:
 
     def retract(self, state: _State, step: BundleStep) -> _State:
         m, layout, free = state.model, self.layout, self.free_views
-        own = step.cameras[: layout.size - layout.border].reshape(-1, layout.width)
+        camera_step, point_step = step
+        own = camera_step[: layout.size - layout.border].reshape(-1, layout.width)
         poses = np.zeros((len(m.t), POSE_DOF))
         poses[free] = own[layout.index.block[free], :POSE_DOF]
         R, t = np.empty_like(m.R), np.empty_like(m.t)
         move_poses(m.R, m.t, poses, R, t)
-        values = self.values.step(state.values, step.cameras[self.columns.place])
-        X = m.X + step.points
+        values = self.values.step(state.values, camera_step[self.columns.place])
+        X = m.X + point_step
         before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
         o = layout.observations
         revert_crossing_points(o.start, o.seen.view_index, before, after, m.X, X)

@@ -62,10 +62,10 @@ class _ProjectiveProblem:
 
     def retract(self, state: UnitState, step: BundleStep) -> UnitState:
         views = np.zeros((len(state.P), _VIEW_DOF))
-        views[self.layout.index.block >= 0] = step.cameras.reshape(-1, _VIEW_DOF)
+        views[self.layout.index.block >= 0] = step[0].reshape(-1, _VIEW_DOF)
         P, X = np.empty_like(state.P), np.empty_like(state.X)
         tangent_step(state.P, state.vP, state.bP, views, P)
-        tangent_step(state.X, state.vX, state.bX, step.points, X)
+        tangent_step(state.X, state.vX, state.bX, step[1], X)
         o = self.layout.observations
         revert_crossing_points(o.start, o.seen.view_index, state.P[:, 8:], P[:, 8:], state.X, X)
         return UnitState.at(P, X)

@@ -90,38 +90,26 @@ def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
     return np.where(np.isfinite(spread), spread, np.inf)
 
 
-def epipolar_inlier_ratios(P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float) -> F64:
-    """Return the share (M,) of verified matches of each pair within ``threshold_px`` (Sampson) of F.
-
-    NaN for pairs that are not accepted, not registered, or have one camera centre.
-    """
-    shares = np.full(len(pairs), np.nan)
-    for n, pair in enumerate(pairs):
-        if not (pair.accepted and registered[pair.i] and registered[pair.j]):
-            continue
-        try:
-            F = fundamental_from_cameras(P[pair.i], P[pair.j])
-        except ValueError:
-            continue
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = np.abs(sampson_residuals(F, pair.xy1, pair.xy2))
-        shares[n] = float(np.mean(distance < threshold_px))
-    return shares
-
-
 def find_inconsistent_view(
     P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float, min_ratio: float
 ) -> tuple[int, float] | None:
     """Return the view that agrees least with the verified matches of its pairs, and its inlier ratio.
 
-    None if all reach ``min_ratio``. One view at a time: a wrong camera also lowers those of its partners.
+    An inlier is within ``threshold_px`` (Sampson) of the F of the two cameras. None if all views reach
+    ``min_ratio``. One view at a time: a wrong camera also lowers the ratios of its partners.
     """
-    shares = epipolar_inlier_ratios(P, registered, pairs, threshold_px=threshold_px)
     total, agreed = np.zeros(len(P)), np.zeros(len(P))
-    for pair, share in zip(pairs, shares, strict=True):
-        if np.isfinite(share):
-            total[[pair.i, pair.j]] += pair.inliers
-            agreed[[pair.i, pair.j]] += share * pair.inliers
+    for pair in pairs:
+        if not (pair.accepted and registered[pair.i] and registered[pair.j]):
+            continue
+        try:
+            F = fundamental_from_cameras(P[pair.i], P[pair.j])
+        except ValueError:  # one camera centre
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.abs(sampson_residuals(F, pair.xy1, pair.xy2))
+        total[[pair.i, pair.j]] += pair.inliers
+        agreed[[pair.i, pair.j]] += float(np.mean(distance < threshold_px)) * pair.inliers
     share_of_view = np.where(total > 0, agreed / np.maximum(total, 1.0), 1.0)
     worst = int(np.argmin(share_of_view))
     return (worst, float(share_of_view[worst])) if share_of_view[worst] < min_ratio else None

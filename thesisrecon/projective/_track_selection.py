@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.projective.initial_pair import NO_PARALLAX
+from thesisrecon.projective._initial_pair import NO_PARALLAX
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 # Cells of the grid over an image, along each side.

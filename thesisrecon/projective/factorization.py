@@ -15,9 +15,10 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import orient_signs
-from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, require_finite
+from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_sampson_residuals
 from thesisrecon.numerics.noise import noise_from_distances
+from thesisrecon.projective._initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
 from thesisrecon.projective._model import (
     ProjectiveModel,
     adjust_all,
@@ -31,7 +32,6 @@ from thesisrecon.projective._track_selection import (
     subset_tracks,
 )
 from thesisrecon.projective.incremental import IncrementalProjective
-from thesisrecon.projective.initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 _BALANCING_ITERATIONS = 10
@@ -46,9 +46,7 @@ _PLANE_SIGMAS = 3.0
 Edge = tuple[int, int]
 
 
-def depths_from_fundamentals(
-    xy: F64, F: Mapping[tuple[int, int], F64], tree: Sequence[tuple[int, int]]
-) -> F64:
+def depths_from_fundamentals(xy: F64, F: Mapping[Edge, F64], tree: Sequence[Edge]) -> F64:
     """Compute projective depths from fundamental matrices along a tree of views.
 
     For an edge (i, j): w_i F x_i = w_j (e_j x x_j), in least squares (Sturm and Triggs, eq. 3). Points near
@@ -58,32 +56,20 @@ def depths_from_fundamentals(
     ----------
     xy : ndarray (V, N, 2)
         Matches in pixels.
-    F : mapping of (int, int) to ndarray (3, 3)
-        ``F[i, j]`` with x_j' F x_i = 0.
-    tree : sequence of (int, int)
-        Edges (i, j), i reached before j.
+    F, tree : mapping of (int, int) to ndarray (3, 3), sequence of (int, int)
+        ``F[i, j]`` with x_j' F x_i = 0, and edges (i, j) that reach every view once, i before j.
 
     Returns
     -------
     ndarray (V, N)
         Depths, 1 in the first view of the tree.
-
-    Raises
-    ------
-    ValueError
-        If the tree does not reach every view once from its first.
     """
     x = homogenize(xy)
-    depths = np.full(xy.shape[:2], np.nan)
-    depths[tree[0][0] if tree else 0] = 1.0
+    depths = np.ones(xy.shape[:2])
     for i, j in tree:
-        if np.isnan(depths[i]).any() or not np.isnan(depths[j]).all():
-            raise ValueError(f"depths_from_fundamentals needs a tree that grows from view {tree[0][0]}")
         e_cross_x = np.cross(epipoles(F[i, j])[1], x[j])
         squared = np.maximum(np.sum(e_cross_x**2, axis=1), 1e-300)
         depths[j] = depths[i] * np.sum(e_cross_x * (x[i] @ F[i, j].T), axis=1) / squared
-    if np.isnan(depths).any():
-        raise ValueError("depths_from_fundamentals needs a tree that reaches every view")
     return depths
 
 
@@ -108,29 +94,18 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> tup
     Parameters
     ----------
     xy, depths : ndarray (V, N, 2), (V, N)
-        Matches in pixels and initial depths; equal by default, an affine camera, which needs ``iterations``.
+        Eight or more matches in pixels, and initial depths; equal by default, an affine camera, which needs
+        ``iterations``.
     iterations : int
         Maximum number of depth updates; 0 is the published algorithm. Stops when the rank-4 residual of the
         balanced matrix, which approximates the reprojection error, no longer falls.
 
     Returns
     -------
-    P, X : ndarray (V, 3, 4), (N, 4)
-        Cameras for pixels and points of unit norm.
-    residual_px : ndarray (V, N)
-        Reprojection distances.
-
-    Raises
-    ------
-    ValueError
-        Below two views or eight points, or for other shapes or non-finite values.
+    P, X, residual_px : ndarray (V, 3, 4), (N, 4), (V, N)
+        Cameras for pixels, points of unit norm, and reprojection distances.
     """
-    if xy.ndim != 3 or xy.shape[2] != 2 or xy.shape[0] < 2 or xy.shape[1] < 8:
-        raise ValueError(f"factorize needs xy (V >= 2, N >= 8, 2); got {xy.shape}")
     depths = np.ones(xy.shape[:2]) if depths is None else depths
-    if depths.shape != xy.shape[:2]:
-        raise ValueError(f"factorize needs depths {xy.shape[:2]}; got {depths.shape}")
-    require_finite("factorize", xy, depths)
     T = np.stack([normalizing_transform(view) for view in xy])
     x = np.einsum("vab,vnb->vna", T, homogenize(xy))
     sizes = np.linalg.norm(x, axis=2)
@@ -175,10 +150,9 @@ class Factorization:
 
     Parameters
     ----------
-    core_points : int
-        Views join the core while this many tracks are seen in all of it.
-    iterations : int
-        Maximum number of depth updates; 0 is the published algorithm of Sturm and Triggs.
+    core_points, iterations : int
+        Views join the core while this many tracks are seen in all of it; and maximum number of depth updates,
+        0 for the published algorithm of Sturm and Triggs.
     growth : IncrementalProjective
         Adds the other views.
     """
@@ -264,11 +238,9 @@ def _grow_core(seen: B8, pairs: Sequence[TwoView], start: TwoView, *, min_tracks
     """
     tree, views = [(start.i, start.j)], {start.i, start.j}
     weight: dict[Edge, float] = {}
-    for pair in pairs:
-        if pair.accepted and not pair.undetermined:
-            weight[pair.i, pair.j] = weight[pair.j, pair.i] = pair.inliers * (
-                1.0 - pair.homography_inlier_ratio
-            )
+    for p in pairs:
+        if p.accepted and not p.undetermined:
+            weight[p.i, p.j] = weight[p.j, p.i] = p.inliers * (1.0 - p.homography_inlier_ratio)
     common = seen[start.i] & seen[start.j]
     while True:
         edges = [(i, j) for i, j in weight if i in views and j not in views]

@@ -16,6 +16,11 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.numerics.partial_bundle import refine_camera
+from thesisrecon.projective._initial_pair import (
+    initial_cameras,
+    rank_initial_pairs,
+    require_pair_with_parallax,
+)
 from thesisrecon.projective._model import (
     LOSS_SIGMAS,
     ProjectiveModel,
@@ -31,11 +36,6 @@ from thesisrecon.projective._track_selection import (
     select_tracks,
     select_tracks_with_parallax,
     subset_tracks,
-)
-from thesisrecon.projective.initial_pair import (
-    initial_cameras,
-    rank_initial_pairs,
-    require_pair_with_parallax,
 )
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
@@ -158,10 +158,8 @@ class IncrementalProjective:
 
         Parameters
         ----------
-        tracks, pair : Tracks, TwoView
-            Observations and initial pair.
-        sizes : ndarray (V, 2) of int
-            Width and height.
+        tracks, pair, sizes : Tracks, TwoView, ndarray (V, 2) of int
+            Observations, initial pair, and width and height of the images.
 
         Returns
         -------

@@ -9,9 +9,9 @@ import numpy as np
 
 from thesisrecon.arrays import I64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.projective._initial_pair import require_pair_with_parallax
 from thesisrecon.projective._model import adjust_all, to_reconstruction
 from thesisrecon.projective.incremental import IncrementalProjective
-from thesisrecon.projective.initial_pair import require_pair_with_parallax
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 

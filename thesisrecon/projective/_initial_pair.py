@@ -18,11 +18,8 @@ from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
 from thesisrecon.records import Tracks, TwoView
 
-# Homography inlier ratio beyond which a pair shows no parallax: the rest are as many as undetected wrong
-# matches.
+# Homography inlier ratio beyond which a pair shows no parallax: the rest may be undetected wrong matches.
 NO_PARALLAX = 0.95
-
-# Explanation of the configurations of image pairs.
 _NO_PARALLAX_REASONS = {
     "pure rotation": "the camera only rotated about its centre (pure rotation)",
     "plane": (
@@ -38,16 +35,6 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     The score is the number of shared points (those seen in a third view count twice) times the share that no
     homography explains; pairs whose matches leave F undetermined count a tenth. If one initial pair fails,
     another one with the same view would probably fail too: each use of a view halves the score of its pairs.
-
-    Parameters
-    ----------
-    tracks, pairs : Tracks, sequence of TwoView
-        All tracks and verified pairs.
-
-    Returns
-    -------
-    list of TwoView
-        Accepted pairs, best first.
     """
     table = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     table[tracks.view_index, tracks.point_index] = True
@@ -72,18 +59,7 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
 
 def require_pair_with_parallax(pairs: Sequence[TwoView]) -> None:
-    """Raise an error if no accepted pair shows parallax: no F is determined, a reconstruction is arbitrary.
-
-    Parameters
-    ----------
-    pairs : sequence of TwoView
-        Verified pairs.
-
-    Raises
-    ------
-    StageFailure
-        If all accepted pairs are planar, pure rotations, or explained by a homography.
-    """
+    """Raise ``StageFailure`` if every accepted pair is planar, a pure rotation or nearly a homography."""
     accepted = [pair for pair in pairs if pair.accepted]
     if not accepted:
         return
@@ -107,16 +83,6 @@ def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
     The plane pi is chosen in unit-free pixels so that the left part of P2 is nearest to a rotation: the frame
     is then nearly metric with a focal length of one long side. Of the two such planes the one with fewer
     points beyond it is taken, and the sign of P2 that places most points in front of both cameras.
-
-    Parameters
-    ----------
-    pair, sizes : TwoView, ndarray (2, 2) of int
-        Verified pair, and width and height of its images.
-
-    Returns
-    -------
-    P1, P2 : ndarray (3, 4)
-        Projective cameras.
     """
     T1, T2 = pixel_from_unit(sizes)
     F = T2.T @ pair.F @ T1
