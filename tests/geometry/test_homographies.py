@@ -6,7 +6,6 @@ import pytest
 from tests.geometry.properties import gap, holds_for_every, incidence_sine, random_camera, random_points
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
-from thesisrecon.geometry.homographies import infinite_homography, plane_homography
 from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
@@ -14,6 +13,8 @@ from thesisrecon.geometry.two_view import (
     epipoles,
     fundamental_from_cameras,
     homography_residuals,
+    infinite_homography,
+    plane_homography,
     symmetric_residuals,
 )
 from validation.scenes.transforms import random_transform

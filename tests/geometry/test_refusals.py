@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from thesisrecon.geometry import camera_matrix, conics, homographies, strata, three_view, two_view
+from thesisrecon.geometry import camera_matrix, conics, strata, three_view, two_view
 from thesisrecon.geometry.homogeneous import normalizing_transform
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.resection import resect_linear
@@ -46,8 +46,8 @@ def test_numbers_that_are_not_finite_are_rejected():
             (two_view.enforce_rank_two, spoilt(F, v)),
             (two_view.estimate_homography, spoilt(XY, v), XY),
             (normalizing_transform, spoilt(XY, v)),
-            (homographies.infinite_homography, P, spoilt(OTHER, v)),
-            (homographies.plane_homography, P, OTHER, spoilt(np.ones(4), v)),
+            (two_view.infinite_homography, P, spoilt(OTHER, v)),
+            (two_view.plane_homography, P, OTHER, spoilt(np.ones(4), v)),
             (correct_matches, F, spoilt(XY, v), XY),
             (resect_linear, RNG.normal(size=(8, 4)), spoilt(XY, v)),
             (three_view.tensor_from_cameras, P, spoilt(OTHER, v), P),
@@ -67,8 +67,8 @@ def test_singular_and_empty_arrays_are_rejected():
         (camera_matrix.normalize_camera, np.zeros((3, 4))),
         (two_view.fundamental_from_cameras, np.zeros((3, 4)), P),
         (two_view.fundamental_from_cameras, np.ones((3, 4)), P),
-        (homographies.plane_homography, np.ones((3, 4)), P, np.ones(4)),
-        (homographies.plane_homography, P, OTHER, np.zeros(4)),
+        (two_view.plane_homography, np.ones((3, 4)), P, np.ones(4)),
+        (two_view.plane_homography, P, OTHER, np.zeros(4)),
         (three_view.tensor_from_cameras, P, np.zeros((3, 4)), P),
         (correct_matches, np.zeros((3, 3)), XY, XY),
         (strata.transform, np.ones((4, 4)), P, "cameras"),

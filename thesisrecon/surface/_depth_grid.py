@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
@@ -15,27 +13,17 @@ GRAZING_DEG = 10.0
 """Surfaces break where they are seen at a smaller angle."""
 
 
-class GridTriangles(NamedTuple):
-    """Triangles of the squares of a grid (H, W).
-
-    ``rising`` (H - 1, W - 1): whether the diagonal runs from the lower left to the upper right; ``whole``
-    (H - 1, W - 1, 2): which of the two triangles exist.
-    """
-
-    rising: B8
-    whole: B8
-
-
 def max_depth_slope(P: F64, grazing_deg: float) -> float:
     """Largest relative depth step between adjacent pixels of a surface seen at ``grazing_deg`` or more."""
     K = decompose_camera(P)[0]
     return float(1.0 / (np.sqrt(K[0, 0] * K[1, 1]) * np.tan(np.radians(grazing_deg))))
 
 
-def triangulate_grid(depth: F64, std: F64, slope: float) -> GridTriangles:
+def triangulate_grid(depth: F64, std: F64, slope: float) -> tuple[B8, B8]:
     """Divide the squares of depths (H, W) into triangles without surface break along a side.
 
-    Of the two diagonals of a square the one with the smaller depth step is used.
+    Returns ``rising`` (H - 1, W - 1), whether the diagonal, that of the smaller depth step, runs from the
+    lower left to the upper right, and ``whole`` (H - 1, W - 1, 2), which of the two triangles exist.
     """
     corner = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
     z, spread = (np.stack([values[c] for c in corner], axis=-1) for values in (depth, std))
@@ -48,7 +36,7 @@ def triangulate_grid(depth: F64, std: F64, slope: float) -> GridTriangles:
         before, std_before = (np.roll(values, 1, axis=-1) for values in (at, std_at))
         with np.errstate(invalid="ignore"):
             whole[..., k] = same_surface(at, before, std_at, std_before, np.sqrt(2.0) * slope).all(axis=-1)
-    return GridTriangles(rising, whole)
+    return rising, whole
 
 
 def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> B8:

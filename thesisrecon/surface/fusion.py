@@ -306,7 +306,7 @@ class DepthSheets:
         depth = depth_map.depth[:: self.step, :: self.step].astype(np.float64)
         std = depth_map.std[:: self.step, :: self.step].astype(np.float64)
         slope = self.step * max_depth_slope(depth_map.P, GRAZING_DEG)
-        whole: B8 = np.asarray(triangulate_grid(depth, std, slope).whole.all(axis=-1))
+        whole: B8 = np.asarray(triangulate_grid(depth, std, slope)[1].all(axis=-1))
 
         def shown(X: F64) -> B8:
             z = X @ depth_map.P[2, :3] + depth_map.P[2, 3]

@@ -34,11 +34,11 @@ def surface_from_depth(
     """
     depth = depth_map.depth[::step, ::step].astype(np.float64)
     std = depth_map.std[::step, ::step].astype(np.float64)
-    triangles = triangulate_grid(depth, std, step * max_depth_slope(depth_map.P, grazing_deg))
+    diagonal, whole = triangulate_grid(depth, std, step * max_depth_slope(depth_map.P, grazing_deg))
     index = np.arange(depth.size).reshape(depth.shape)
     corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], axis=-1)
     faces = [
-        corners[(triangles.rising == rising) & triangles.whole[..., k]][:, triple]
+        corners[(diagonal == rising) & whole[..., k]][:, triple]
         for rising, triples in ((True, RISING), (False, FALLING))
         for k, triple in enumerate(triples)
     ]
