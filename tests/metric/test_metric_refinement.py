@@ -15,12 +15,12 @@ from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.metrics.similarity import estimate_similarity
 
 
-def run(scene, *, shared=True, reconstruction=None, variant=None, options=None):
+def run(scene, *, shared=True, reconstruction=None, options=None):
     start = projective_reconstruction(scene) if reconstruction is None else reconstruction
     prior = prior_for(start, options or IntrinsicsOptions(cameras="shared" if shared else "per-image"))
     rng = np.random.default_rng(0)
     calibration = HypothesesAndRefinement().calibrate(start, prior=prior, rng=rng)
-    return (variant or MetricRefinement()).refine(start, calibration, prior=prior, rng=rng)
+    return MetricRefinement().refine(start, calibration, prior=prior, rng=rng)
 
 
 def centre_error(result, scene):

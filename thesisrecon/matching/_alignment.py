@@ -39,6 +39,8 @@ SETTLED = 1e-6
 ITERATIONS = 12
 # Maximum distance of aligned matches from their corners, in pixels of the corner's scale.
 MAX_SHIFT = 3.0
+# Prior standard deviation of an affine coefficient, and minimum correlation of an aligned match.
+AFFINE_STD, MIN_CORRELATION = 0.02, 0.8
 # Two matches closer than this in (x1, y1, x2, y2) px are the same.
 APART_PX = 1.0
 # A window of half the width must fit better and stay near the result of the wider one.
@@ -251,7 +253,7 @@ def align_corners(
     matches: tuple[F64, F32, F64, F64],
     *,
     affine_std: float,
-    max_shift: float,
+    max_shift: float = MAX_SHIFT,
 ) -> tuple[F64, F64, F32]:
     """Align corners of image 1 with image 2 to sub-pixel positions.
 
@@ -282,13 +284,13 @@ def align_corners(
 
 
 def align_matches(
-    view1: PreparedImage, view2: PreparedImage, matches: Matches, *, affine_std: float, min_correlation: float
+    view1: PreparedImage, view2: PreparedImage, matches: Matches, *, affine_std: float = AFFINE_STD
 ) -> Matches:
     """Align matches of corners to sub-pixel positions and drop those that fail or repeat a better one."""
     start = (matches.xy1, view1.features.scale[matches.index1], matches.xy2, matches.affine)
-    xy2, affine, score = align_corners(view1, view2, start, affine_std=affine_std, max_shift=MAX_SHIFT)
+    xy2, affine, score = align_corners(view1, view2, start, affine_std=affine_std)
     moved = replace(matches, xy2=xy2, affine=affine, score=score)
-    good = select_matches(moved, np.flatnonzero(score >= min_correlation))
+    good = select_matches(moved, np.flatnonzero(score >= MIN_CORRELATION))
     return select_matches(good, strongest_distinct(good))
 
 

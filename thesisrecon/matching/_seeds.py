@@ -158,6 +158,4 @@ def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
         order = order[np.sort(np.unique(corner[order], return_index=True)[1])]
     order = order[np.argsort(one[order], kind="stable")]
     one, two = one[order].astype(np.int64), two[order].astype(np.int64)
-    return Matches(
-        known.i, known.j, one, two, xy1[one], xy2[two], known.score[order], known.affine[order]
-    )
+    return Matches(known.i, known.j, one, two, xy1[one], xy2[two], known.score[order], known.affine[order])

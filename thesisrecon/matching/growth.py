@@ -32,6 +32,10 @@ from thesisrecon.records import Features, Image, Matches, Seeds
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
 APART = 3.0
+# Minimum strength of match (at most 10) of a seed in the filtered trial, and verified seeds of a pair.
+MIN_SUPPORT, MIN_SEEDS = 2.0, 12
+# Maximum search radius around a prediction relative to the long side, and minimum correlation there.
+RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
 # Rounds of least squares of a local map: the first unweighted, the others reweighted.
 ROUNDS = 3
 # Weight of the prior of a local map, relative to the neighbours' weights along one direction.
@@ -262,15 +266,8 @@ class SeedsAndGrowth:
     ratio, grown_ratio : float
         Maximum ratio of the distances to the best and second best match, of seeds and of guided matches
         (within their part of the epipolar band).
-    min_support : float
-        Minimum strength of match (at most 10) of a seed in the filtered trial.
-    min_seeds : int
-        Minimum number of verified seeds of a pair.
-    band_rel, radius_rel : float
-        Half width of the epipolar band and maximum search radius around the prediction, relative to the long
-        side.
-    min_correlation, aligned_correlation : float
-        Minimum correlation of a guided match, at its corner and after alignment.
+    band_rel : float
+        Half width of the epipolar band, relative to the long side.
     neighbours : int
         Number of matches that define a local affine map.
     affine_std : float
@@ -292,12 +289,7 @@ class SeedsAndGrowth:
     """
 
     ratio: float = 0.8
-    min_support: float = 2.0
-    min_seeds: int = 12
     band_rel: float = 0.002
-    radius_rel: float = 0.025
-    min_correlation: float = 0.7
-    aligned_correlation: float = 0.8
     grown_ratio: float = 0.8
     neighbours: int = 10
     affine_std: float = 0.02
@@ -309,10 +301,9 @@ class SeedsAndGrowth:
     align: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("min_seeds", "neighbours"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
-        for name in ("ratio", "grown_ratio", "band_rel", "radius_rel"):
+        if self.neighbours < 1:
+            raise ValueError(f"neighbours must be at least 1; got {self.neighbours}")
+        for name in ("ratio", "grown_ratio", "band_rel"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
         if not self.affine_std >= 0.0:
@@ -347,9 +338,7 @@ class SeedsAndGrowth:
             matches = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
         if not self.align:
             return select_matches(matches, strongest_distinct(matches))
-        return align_matches(
-            view1, view2, matches, affine_std=self.affine_std, min_correlation=self.aligned_correlation
-        )
+        return align_matches(view1, view2, matches, affine_std=self.affine_std)
 
     def _verified_seeds(
         self,
@@ -369,7 +358,7 @@ class SeedsAndGrowth:
                     fit = estimate(trial.xy1, trial.xy2, rng)
                 except StageFailure:
                     continue
-                if fit.inliers.sum() >= max(self.min_seeds, most + 1):
+                if fit.inliers.sum() >= max(MIN_SEEDS, most + 1):
                     best, most = (select_matches(trial, fit.inliers), fit.F), int(fit.inliers.sum())
             if most >= max(50, 0.5 * len(seeds.xy1)):
                 break
@@ -378,9 +367,9 @@ class SeedsAndGrowth:
     def _trials(self, seeds: Matches) -> tuple[Matches, ...]:
         """Sets of seeds to estimate F from; none if there are too few."""
         if self.support == "never":
-            return (seeds,) if len(seeds.xy1) >= self.min_seeds else ()
-        supported = neighbour_support(seeds) >= self.min_support
-        if supported.sum() < self.min_seeds:
+            return (seeds,) if len(seeds.xy1) >= MIN_SEEDS else ()
+        supported = neighbour_support(seeds) >= MIN_SUPPORT
+        if supported.sum() < MIN_SEEDS:
             return ()
         chosen = select_matches(seeds, supported)
         return (chosen, seeds) if self.support == "auto" else (chosen,)
@@ -420,14 +409,14 @@ class SeedsAndGrowth:
         near = scipy.spatial.cKDTree(known.xy1).query(xy1, ranks)[1]
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
-        radius = np.clip(3.0 * spread, 0.004 * long_side, self.radius_rel * long_side)
+        radius = np.clip(3.0 * spread, 0.004 * long_side, RADIUS_REL * long_side)
         index, score, second_best = _match_guided(
             view1.pyramid,
             (xy1, scale1),
             (affine, position, radius),
             (view2.features.xy, view2.features.scale, view2.patches),
             view2.cells,
-            (F, self.band_rel * long_side, self.min_correlation),
+            (F, self.band_rel * long_side, MIN_CORRELATION),
         )
         index[1.0 - score > self.grown_ratio**2 * (1.0 - second_best)] = -1
         rows = one_to_one(index, score)

@@ -225,7 +225,7 @@ class StrengthOfMatch:
         matches = Matches(*pair, rows, two, xy1[rows], xy2[two], correlation[rows, two], maps)
         if not self.align:
             return matches
-        return align_matches(view1, view2, matches, affine_std=0.02, min_correlation=0.8)
+        return align_matches(view1, view2, matches)
 
 
 def _nearest(xy: F64, count: int, radius: float) -> I64:

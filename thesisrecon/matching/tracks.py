@@ -9,7 +9,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty_integers, empty_matrix, kernel
-from thesisrecon.matching._alignment import align_corners
+from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.numerics.observations import morton_pair_order
 from thesisrecon.records import Tracks, TwoView
@@ -208,20 +208,7 @@ class AlignedTracks:
 
     The middle view of a track has most direct matches in it; local maps to the other views are chained along
     the matches.
-
-    Parameters
-    ----------
-    min_correlation : float
-        Minimum correlation of an observation after alignment.
-    affine_std : float
-        Prior standard deviation of an affine coefficient in the alignment.
-    max_shift : float
-        Maximum shift, in pixels of the corner's scale.
     """
-
-    min_correlation: float = 0.8
-    affine_std: float = 0.02
-    max_shift: float = 3.0
 
     def build(
         self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
@@ -235,10 +222,8 @@ class AlignedTracks:
         for i, j, group in _groups(chains.view[middle], chains.view, len(prepared)):
             view1, corner = prepared[i], chains.corner[middle[group]]
             matches = (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group])
-            found, _, score = align_corners(
-                view1, prepared[j], matches, affine_std=self.affine_std, max_shift=self.max_shift
-            )
-            xy[group], kept[group] = found, score >= self.min_correlation
+            found, _, score = align_corners(view1, prepared[j], matches, affine_std=AFFINE_STD)
+            xy[group], kept[group] = found, score >= MIN_CORRELATION
         return _tracks(chains, xy, kept, len(prepared))
 
 

@@ -16,6 +16,10 @@ from thesisrecon.records import Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.
 FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8
+EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0
+"""Residual gates of the early and the late rounds in noise sigmas."""
+MIN_ANGLE = float(np.radians(0.05))
+"""Smallest triangulation angle of a point."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +11,10 @@ from thesisrecon.errors import counted
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._model import (
+    EARLY_SIGMAS,
     K1,
+    LATE_SIGMAS,
+    MIN_ANGLE,
     WIDTH,
     MetricEstimate,
     inlier_ratios,
@@ -26,6 +29,8 @@ WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
 """k1 is free from the start: without it gates would have to admit wrong points."""
 SAMPLES = 300
 """Three-point samples of one camera."""
+MIN_POINTS = 15
+"""Points of the model that a missing camera must see."""
 MAX_ROUNDS = 6
 MIN_GAIN = 0.003
 """Increase of the inlier ratio below which the rounds end."""
@@ -85,116 +90,107 @@ def _pose_and_focal(
     return best
 
 
-@dataclass(frozen=True)
-class MissingCameraRegistration:
-    """Rounds of triangulation, resection and adjustment that register the missing cameras.
+def register_missing_cameras(
+    model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator
+) -> tuple[MetricEstimate, dict[int, str]]:
+    """Register missing cameras, and those again that disagree with the rest.
 
-    ``gates`` of the early and the late rounds in noise sigmas; ``min_angle`` of triangulation in radians;
-    ``min_points`` of the model that a new camera must see.
+    Returns the complete model, and view -> reason for every view that was not registered.
     """
+    model, rejected = _grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
+    suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)
+    if suspects.any() and (model.registered & ~suspects).sum() >= 3:
+        model, rejected = _register_again(model, adjustment, rng, suspects)
+    return model, rejected
 
-    gates: tuple[float, float]
-    min_angle: float
-    min_points: int
 
-    def run(
-        self, model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator
-    ) -> tuple[MetricEstimate, dict[int, str]]:
-        """Register missing cameras, and those again that disagree with the rest.
-
-        Returns the complete model, and view -> reason for every view that was not registered.
-        """
-        model, rejected = self._grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
-        suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)
-        if suspects.any() and (model.registered & ~suspects).sum() >= 3:
-            model, rejected = self._register_again(model, adjustment, rng, suspects)
-        return model, rejected
-
-    def _grow(
-        self, model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, allowed: B8
-    ) -> tuple[MetricEstimate, dict[int, str]]:
-        """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
-        early, late = self.gates
-        model = retriangulate_tracks(model, sigmas=early, min_angle=self.min_angle)
-        rejected: dict[int, str] = {}
-        share = 0.0
-        for n in range(MAX_ROUNDS):
-            before = int(model.registered.sum())
-            model, rejected = self._register_missing(model, rng, allowed)
-            joined = int(model.registered.sum()) > before
-            if joined:
-                model = retriangulate_tracks(model, sigmas=early, min_angle=self.min_angle)
-            model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=6)[0]
-            # A wide gate in the first round readmits observations that a wrong model had excluded.
-            model = retriangulate_tracks(model, sigmas=early if n == 0 else late, min_angle=self.min_angle)
-            now = float(model.inlier.mean())
-            if not joined and n > 0 and now - share < MIN_GAIN:
-                break
-            share = now
-        return model, rejected
-
-    def _register_missing(
-        self, model: MetricEstimate, rng: np.random.Generator, allowed: B8
-    ) -> tuple[MetricEstimate, dict[int, str]]:
-        """Register every ``allowed`` view that sees enough of the model by calibrated resection."""
-        t = model.tracks
-        counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
-        rejected: dict[int, str] = {}
-        for view in np.argsort(-counts, kind="stable").tolist():
-            if model.registered[view] or not allowed[view]:
-                continue
-            if counts[view] < self.min_points:
-                rejected[view] = (
-                    f"sees only {counted(counts[view], 'point')} of the model (at least {self.min_points} "
-                    "needed): too little overlap"
-                )
-                continue
-            added = self._register(model, view, rng)
-            if isinstance(added, str):
-                rejected[view] = added
-            else:
-                model = added
-        return model, rejected
-
-    def _register(self, model: MetricEstimate, view: int, rng: np.random.Generator) -> MetricEstimate | str:
-        """Add a camera to the model; otherwise the reason against it."""
-        t, cameras = model.tracks, model.cameras
-        k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
-        row = int(cameras.group[view])
-        assert cameras.shared is not None
-        focals = cameras.shared[:, 0]
-        alone = not model.registered[focals[cameras.group] == focals[row]].any()
-        zooms = ZOOMS if alone else (1.0,)
-        found = _pose_and_focal(model, k, row, 2.0 * self.gates[0] * model.gate_px, zooms, rng)
-        support = 0 if found is None else int(found[3].sum())
-        if found is None or support < self.min_points or support < 0.3 * len(k):
-            return f"only {support} of its {counted(len(k), 'point')} are inliers of one camera"
-        R, translation, start, inlier = found
-        pose = refine_pose(
-            R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
-            free=(np.arange(len(start)) == 0) & alone, loss_px=2.0 * model.sigma_px, iterations=20,
-        )  # fmt: skip
-        Rs, ts, intrinsics = cameras.R.copy(), cameras.t.copy(), cameras.intrinsics.copy()
-        Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
-        registered = model.registered | (np.arange(len(Rs)) == view)
-        return replace(
-            model, cameras=replace(cameras, R=Rs, t=ts, intrinsics=intrinsics), registered=registered
+def _grow(
+    model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, allowed: B8
+) -> tuple[MetricEstimate, dict[int, str]]:
+    """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
+    model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS, min_angle=MIN_ANGLE)
+    rejected: dict[int, str] = {}
+    share = 0.0
+    for n in range(MAX_ROUNDS):
+        before = int(model.registered.sum())
+        model, rejected = _register_missing(model, rng, allowed)
+        joined = int(model.registered.sum()) > before
+        if joined:
+            model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS, min_angle=MIN_ANGLE)
+        model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=6)[0]
+        # A wide gate in the first round readmits observations that a wrong model had excluded.
+        model = retriangulate_tracks(
+            model, sigmas=EARLY_SIGMAS if n == 0 else LATE_SIGMAS, min_angle=MIN_ANGLE
         )
+        now = float(model.inlier.mean())
+        if not joined and n > 0 and now - share < MIN_GAIN:
+            break
+        share = now
+    return model, rejected
 
-    def _register_again(
-        self, model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, suspects: B8
-    ) -> tuple[MetricEstimate, dict[int, str]]:
-        """Remove suspects, adjust the rest without them, then register them again if they fit."""
-        none = np.zeros(len(suspects), dtype=bool)
-        inlier = model.inlier & ~suspects[model.tracks.view_index]
-        model = replace(model, registered=model.registered & ~suspects, inlier=inlier)
-        model, _ = self._grow(model, adjustment, rng, none)
-        model, rejected = self._grow(model, adjustment, rng, ~none)
-        share = inlier_ratios(model)
-        wrong = model.registered & (share < MIN_INLIER_RATIO)
-        if wrong.any():
-            for view in np.flatnonzero(wrong):
-                rejected[int(view)] = f"only {share[view]:.0%} of its matches agree with the other images"
-            model = replace(model, registered=model.registered & ~wrong)
-            model = retriangulate_tracks(model, sigmas=self.gates[1], min_angle=self.min_angle)
-        return model, rejected
+
+def _register_missing(
+    model: MetricEstimate, rng: np.random.Generator, allowed: B8
+) -> tuple[MetricEstimate, dict[int, str]]:
+    """Register every ``allowed`` view that sees enough of the model by calibrated resection."""
+    t = model.tracks
+    counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
+    rejected: dict[int, str] = {}
+    for view in np.argsort(-counts, kind="stable").tolist():
+        if model.registered[view] or not allowed[view]:
+            continue
+        if counts[view] < MIN_POINTS:
+            rejected[view] = (
+                f"sees only {counted(counts[view], 'point')} of the model (at least {MIN_POINTS} "
+                "needed): too little overlap"
+            )
+            continue
+        added = _register(model, view, rng)
+        if isinstance(added, str):
+            rejected[view] = added
+        else:
+            model = added
+    return model, rejected
+
+
+def _register(model: MetricEstimate, view: int, rng: np.random.Generator) -> MetricEstimate | str:
+    """Add a camera to the model; otherwise the reason against it."""
+    t, cameras = model.tracks, model.cameras
+    k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
+    row = int(cameras.group[view])
+    assert cameras.shared is not None
+    focals = cameras.shared[:, 0]
+    alone = not model.registered[focals[cameras.group] == focals[row]].any()
+    zooms = ZOOMS if alone else (1.0,)
+    found = _pose_and_focal(model, k, row, 2.0 * EARLY_SIGMAS * model.gate_px, zooms, rng)
+    support = 0 if found is None else int(found[3].sum())
+    if found is None or support < MIN_POINTS or support < 0.3 * len(k):
+        return f"only {support} of its {counted(len(k), 'point')} are inliers of one camera"
+    R, translation, start, inlier = found
+    pose = refine_pose(
+        R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
+        free=(np.arange(len(start)) == 0) & alone, loss_px=2.0 * model.sigma_px, iterations=20,
+    )  # fmt: skip
+    Rs, ts, intrinsics = cameras.R.copy(), cameras.t.copy(), cameras.intrinsics.copy()
+    Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
+    registered = model.registered | (np.arange(len(Rs)) == view)
+    return replace(model, cameras=replace(cameras, R=Rs, t=ts, intrinsics=intrinsics), registered=registered)
+
+
+def _register_again(
+    model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, suspects: B8
+) -> tuple[MetricEstimate, dict[int, str]]:
+    """Remove suspects, adjust the rest without them, then register them again if they fit."""
+    none = np.zeros(len(suspects), dtype=bool)
+    inlier = model.inlier & ~suspects[model.tracks.view_index]
+    model = replace(model, registered=model.registered & ~suspects, inlier=inlier)
+    model, _ = _grow(model, adjustment, rng, none)
+    model, rejected = _grow(model, adjustment, rng, ~none)
+    share = inlier_ratios(model)
+    wrong = model.registered & (share < MIN_INLIER_RATIO)
+    if wrong.any():
+        for view in np.flatnonzero(wrong):
+            rejected[int(view)] = f"only {share[view]:.0%} of its matches agree with the other images"
+        model = replace(model, registered=model.registered & ~wrong)
+        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
+    return model, rejected

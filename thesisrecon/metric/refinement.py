@@ -16,7 +16,10 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import FOCAL_AND_CENTRE, BundleAdjustment, with_initial_gate
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import (
+    EARLY_SIGMAS,
     K1,
+    LATE_SIGMAS,
+    MIN_ANGLE,
     MetricEstimate,
     residual_norms,
     retriangulate_tracks,
@@ -24,7 +27,7 @@ from thesisrecon.metric._model import (
     truncated_cost,
     upgraded_model,
 )
-from thesisrecon.metric._resection import MissingCameraRegistration
+from thesisrecon.metric._resection import register_missing_cameras
 from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
@@ -48,6 +51,8 @@ MIN_CHANGE = 0.002
 START_ROUNDS = 3
 MAX_ROUNDS = 4
 """Final rounds of triangulation and adjustment."""
+LENS_STD = 0.02
+"""Prior standard deviation about 0 of k2 and k3 of a camera with several images."""
 NOISE_FLOOR_PX = 0.02
 """Lower bound of the estimated noise."""
 MAX_ROTATION_RESIDUAL = 0.3
@@ -64,24 +69,7 @@ NO_COMMON_POINTS = "shares no points with the model"
 
 @dataclass(frozen=True)
 class MetricRefinement:
-    """Metric refinement of a calibrated projective reconstruction.
-
-    Parameters
-    ----------
-    outlier_sigmas : tuple of float
-        Residual gates of the early and the late rounds in noise sigmas.
-    min_angle_deg : float
-        Smallest triangulation angle of a point.
-    min_points : int
-        Points of the model that a missing camera must see.
-    lens_std : float
-        Prior standard deviation about 0 of k2 and k3 of a camera with several images; 0 fixes them at 0.
-    """
-
-    outlier_sigmas: tuple[float, float] = (12.0, 7.0)
-    min_angle_deg: float = 0.05
-    min_points: int = 15
-    lens_std: float = 0.02
+    """Metric refinement of a calibrated projective reconstruction."""
 
     def refine(
         self,
@@ -92,23 +80,20 @@ class MetricRefinement:
         rng: np.random.Generator,
     ) -> MetricResult:
         """See `thesisrecon.config.MetricRefiner.refine`."""
-        adjustment = BundleAdjustment(prior, self.lens_std, NOISE_FLOOR_PX)
-        trials = [self._start(reconstruction, u, adjustment) for u in calibration.candidates]
+        adjustment = BundleAdjustment(prior, LENS_STD, NOISE_FLOOR_PX)
+        trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:
             raise _no_candidate(prior, len(trials))
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([truncated_cost(m, gate) for m in models])
-        registration = MissingCameraRegistration(
-            self.outlier_sigmas, np.radians(self.min_angle_deg), self.min_points
-        )
-        model, rejected = registration.run(models[int(costs.argmin())], adjustment, rng)
+        model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
         reasons = tuple(
             "" if model.registered[v] else rejected.get(v, reconstruction.reasons[v] or NO_COMMON_POINTS)
             for v in range(len(model.registered))
         )
-        model, adjustment, own, scatter = self._finish(model, adjustment)
-        model = select_inliers(model, sigmas=self.outlier_sigmas[1], min_angle=np.radians(self.min_angle_deg))
+        model, adjustment, own, scatter = _finish(model, adjustment)
+        model = select_inliers(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
         sharing = check_shared_cameras(model, adjustment)
         shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
         intervals = intrinsic_intervals(
@@ -120,7 +105,7 @@ class MetricRefinement:
             noise_inflation=adjustment.inflation,
         )
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
-        check, failed_checks = self_check(model, calibration, intervals, sigmas=self.outlier_sigmas[1])
+        check, failed_checks = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
         views = np.flatnonzero(model.registered).tolist()
@@ -128,56 +113,57 @@ class MetricRefinement:
         final = _as_reconstruction(model, reasons)
         return MetricResult(final, intervals, check, not failed_checks, tuple(failed_checks), warnings)
 
-    def _start(
-        self, reconstruction: Reconstruction, upgrade: Upgrade, adjustment: BundleAdjustment
-    ) -> MetricEstimate | None:
-        """Upgrade the core cameras and adjust them on the inliers of the projective stage.
 
-        Projective inliers fit any principal point: all are kept at first, the principal point is free, and
-        the gate narrows as the residuals shrink.
-        """
-        model = upgraded_model(reconstruction, upgrade, adjustment.prior, MAX_ROTATION_RESIDUAL)
-        if model is None:
+def _start(
+    reconstruction: Reconstruction, upgrade: Upgrade, adjustment: BundleAdjustment
+) -> MetricEstimate | None:
+    """Upgrade the core cameras and adjust them on the inliers of the projective stage.
+
+    Projective inliers fit any principal point: all are kept at first, the principal point is free, and
+    the gate narrows as the residuals shrink.
+    """
+    model = upgraded_model(reconstruction, upgrade, adjustment.prior, MAX_ROTATION_RESIDUAL)
+    if model is None:
+        return None
+    # Without distortion the noise is overestimated: keep the gate at least as wide as before.
+    gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
+    model = with_initial_gate(model)
+    for _ in range(START_ROUNDS):
+        if model.valid.sum() < 20:
             return None
-        early, _ = self.outlier_sigmas
-        # Without distortion the noise is overestimated: keep the gate at least as wide as before.
-        gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
-        model = with_initial_gate(model)
-        for _ in range(START_ROUNDS):
-            if model.valid.sum() < 20:
-                return None
-            model = select_inliers(model, sigmas=early, min_angle=0.0)
-            model = gentle.run(model, free=FOCAL_AND_CENTRE, iterations=15)[0]
-        return select_inliers(model, sigmas=early, min_angle=0.0)
+        model = select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
+        model = gentle.run(model, free=FOCAL_AND_CENTRE, iterations=15)[0]
+    return select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
 
-    def _finish(
-        self, model: MetricEstimate, adjustment: BundleAdjustment
-    ) -> tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]:
-        """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
-        model = self._iterate_inliers(model, adjustment)
-        scatter = adjustment.scatter(model)
-        own = per_camera_estimates(model, adjustment, scatter, MODEL_FLOOR_REL)
-        assert model.cameras.shared is not None
-        hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
-        if hierarchical is None:
-            return model, adjustment, own, scatter
-        inflation = float(np.sqrt(max(scatter.median_ratio, 1.0)))
-        model, adjustment = apply_hierarchical_prior(
-            model, replace(adjustment, inflation=inflation), hierarchical
-        )
-        model = self._iterate_inliers(model, adjustment)
-        return model, adjustment, own, adjustment.scatter(model)
 
-    def _iterate_inliers(self, model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:
-        """Adjust and triangulate until the inliers stay the same, then adjust to convergence."""
-        late, angle = self.outlier_sigmas[1], np.radians(self.min_angle_deg)
-        for _ in range(MAX_ROUNDS):
-            before = model.inlier
-            model = adjustment.run(model, iterations=10)[0]
-            model = retriangulate_tracks(model, sigmas=late, min_angle=angle)
-            if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
-                break
-        return adjustment.run(model, iterations=LAST_ITERATIONS)[0]
+def _finish(
+    model: MetricEstimate, adjustment: BundleAdjustment
+) -> tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]:
+    """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
+    model = _iterate_inliers(model, adjustment)
+    scatter = adjustment.scatter(model)
+    own = per_camera_estimates(model, adjustment, scatter, MODEL_FLOOR_REL)
+    assert model.cameras.shared is not None
+    hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
+    if hierarchical is None:
+        return model, adjustment, own, scatter
+    inflation = float(np.sqrt(max(scatter.median_ratio, 1.0)))
+    model, adjustment = apply_hierarchical_prior(
+        model, replace(adjustment, inflation=inflation), hierarchical
+    )
+    model = _iterate_inliers(model, adjustment)
+    return model, adjustment, own, adjustment.scatter(model)
+
+
+def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:
+    """Adjust and triangulate until the inliers stay the same, then adjust to convergence."""
+    for _ in range(MAX_ROUNDS):
+        before = model.inlier
+        model = adjustment.run(model, iterations=10)[0]
+        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
+        if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
+            break
+    return adjustment.run(model, iterations=LAST_ITERATIONS)[0]
 
 
 def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:
