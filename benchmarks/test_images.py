@@ -13,7 +13,7 @@ from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.matching._seeds import _scan_correlations as scan_correlations
-from thesisrecon.pipeline.image_pair import match_views
+from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.records import Image
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo._planar import PlanarRectification, hartley
@@ -21,8 +21,7 @@ from thesisrecon.stereo.rectification import rectify
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.references.corners import harris_corners
-from validation.references.pictures import warp_perspective
-from validation.references.rectification import opencv_uncalibrated
+from validation.references.rectification import opencv_uncalibrated, warp_perspective
 from validation.references.semi_global import OpenCVSemiGlobal
 from validation.references.sift import compute_sift, grey_of, nearest_two
 from validation.references.sift_front_end import sift_front_end

@@ -7,7 +7,7 @@ from thesisrecon.errors import StageFailure
 from validation.harness.stages.boards import OURS, _metrics
 from validation.references.chessboard import board_corners, calibrate_from_corners
 from validation.references.libraries import NoReference, load
-from validation.scenes.boards import CORNERS, K1, LENS, RENDERED, SIZE, K, make_board, photographs
+from validation.scenes.boards import CORNERS, K1, LENS, RENDERED, SIZE, K, board_images, make_board
 
 try:
     load("cv2")
@@ -29,7 +29,7 @@ def test_boards_are_seen_whole_and_from_all_sides():
 @pytest.mark.parametrize("way", [RENDERED, LENS])
 def test_a_calibration_finds_the_camera_that_photographed(way):
     board = make_board(way, VIEWS)
-    corners = np.array([board_corners(picture, CORNERS) for picture in photographs(way, board)])
+    corners = np.array([board_corners(picture, CORNERS) for picture in board_images(way, board)])
     found = calibrate_from_corners(board.X, list(corners), SIZE)
     reported = {"corners": corners, "K": found.K, "k1": np.array(found.k1), "std": found.std}
     numbers = {row.name.split(": ")[1]: row.values[OURS] for row in _metrics("boards", way, board, reported)}

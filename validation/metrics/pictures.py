@@ -24,7 +24,7 @@ def psnr_db(picture: NDArray[Any], truth: NDArray[Any], *, where: NDArray[np.boo
 
 def ssim(picture: NDArray[Any], truth: NDArray[Any]) -> float:
     """Mean structural similarity of images (H, W, 3), 1 for equal ones, where whole windows fit."""
-    found = likeness.ssim_map(truth, picture, np.ones(truth.shape[:2], dtype=bool))
+    found = likeness._ssim_map(truth, picture, np.ones(truth.shape[:2], dtype=bool))
     return float(found[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].mean())
 
 

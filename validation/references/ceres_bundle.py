@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,17 +66,12 @@ def refine_with_ceres(
     return CeresResult(refined, moved, report.final_cost, report.initial_cost, steps, wall, cpu)
 
 
-def bundle_adjuster(
-    model: pycolmap.Reconstruction, options: CeresOptions, fixed: Sequence[int] = ()
-) -> pycolmap.CeresBundleAdjuster:
-    """COLMAP's adjuster of all images; the views ``fixed`` hold the frame, else two as in its mapper."""
+def bundle_adjuster(model: pycolmap.Reconstruction, options: CeresOptions) -> pycolmap.CeresBundleAdjuster:
+    """COLMAP's adjuster of all images; two views hold the frame, as in its mapper."""
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.images:
         config.add_image(image)
-    for view in fixed:
-        config.set_constant_rig_from_world_pose(model.images[view + 1].frame_id)
-    if not fixed:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.refine_principal_point = options.principal_point
     adjustment.print_summary = False

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import decompose_camera
@@ -32,6 +35,11 @@ def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
     H1 = new1[:, :3] @ turn1 @ np.linalg.inv(K1)
     H2 = new2[:, :3] @ turn2 @ np.linalg.inv(K2)
     return PlanarRectification(np.stack([_positive(H, size) for H in (H1, H2)]), size)
+
+
+def warp_perspective(image: NDArray[Any], H: F64, size: Size) -> NDArray[Any]:
+    """The image (H, W, C) whose pixel x goes to H x, H (3, 3), by cubic interpolation."""
+    return np.asarray(cv2.warpPerspective(image, H, size, flags=cv2.INTER_CUBIC))
 
 
 def _positive(H: F64, size: Size) -> F64:

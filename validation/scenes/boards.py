@@ -80,7 +80,7 @@ def make_board(way: str, views: int) -> Board:
     return Board(X, R, t, K1 if way == LENS else 0.0)
 
 
-def photographs(way: str, board: Board) -> list[U8]:
+def board_images(way: str, board: Board) -> list[U8]:
     """(480, 640, 3) images, each of a camera of the board; the noise is that of the courtyard's sensor."""
     light = {RAYCAST: _raycast, RENDERED: _rendered, LENS: _through_a_lens}[way](board)
     rng = np.random.default_rng(7)

@@ -47,9 +47,7 @@ class RealPair:
     F: F64 | None = None
 
 
-def match_images(
-    paths: tuple[Path, Path], cache: Path, *, ratio: float, mutual: bool
-) -> tuple[F64, F64]:
+def match_images(paths: tuple[Path, Path], cache: Path, *, ratio: float, mutual: bool) -> tuple[F64, F64]:
     """OpenCV's SIFT matches (N, 2), (N, 2) with the nearest descriptor below ``ratio`` times the second;
     with ``mutual`` each must be the other's nearest."""
     name = "-".join([paths[0].parent.parent.name, *(f"{p.parent.name}-{p.stem}" for p in paths)])
@@ -67,8 +65,8 @@ def match_images(
 
 
 def _sift(path: Path) -> SiftKeypoints:
-    with Image.open(path) as photograph:
-        return detect_sift(np.asarray(photograph.convert("L")))
+    with Image.open(path) as image:
+        return detect_sift(np.asarray(image.convert("L")))
 
 
 def kusvod2_pairs(

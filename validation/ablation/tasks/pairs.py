@@ -15,7 +15,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.io._images import read_images
-from thesisrecon.pipeline.image_pair import match_views
+from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place, Task
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
@@ -54,7 +54,7 @@ class ImagePairs(Task):
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         name, _, first = scene.rpartition("/")
         i = int(first)
-        images, truth = _photographs(name, i, self.gap)
+        images, truth = _read_pair(name, i, self.gap)
         views = [config.matching.prepare(image, config.features.detect(image)) for image in images]
         return numbers_of_pair(config, views, (i, i + self.gap), seed, truth)
 
@@ -76,7 +76,7 @@ def numbers_of_pair(
 
 
 @lru_cache(maxsize=16)
-def _photographs(name: str, i: int, gap: int) -> tuple[tuple[Image, ...], F64]:
+def _read_pair(name: str, i: int, gap: int) -> tuple[tuple[Image, ...], F64]:
     scene = load_real_scene(name)
     assert scene is not None
     images = read_images([scene.image_paths[i], scene.image_paths[i + gap]], max_size_px=MAX_SIZE_PX)

@@ -15,7 +15,7 @@ from validation.harness.rows import OURS, plot, read_arrays, row, scatter
 from validation.metrics.record import Metric
 from validation.references.chessboard import board_corners, calibrate_from_corners
 from validation.references.libraries import one_thread
-from validation.scenes.boards import CORNERS, SIZE, WAYS, Board, K, make_board, photographs
+from validation.scenes.boards import CORNERS, SIZE, WAYS, Board, K, board_images, make_board
 
 OWN = "cv2, stated standard deviation"
 VIEWS, QUICK_VIEWS = 16, 12
@@ -44,7 +44,7 @@ class BoardsStage(Stage):
     def run(self, task: Task, options: ReportOptions) -> None:
         one_thread()
         board = _board(task.method, options)
-        pictures = photographs(task.method, board)
+        pictures = board_images(task.method, board)
         place = options.place(task.stage, task.scene, task.method)
         for n, picture in enumerate(pictures):
             PIL.Image.fromarray(picture).save(place / f"{n:02d}.png")

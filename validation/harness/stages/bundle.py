@@ -39,8 +39,8 @@ class BundleStage(Stage):
         "The final model of our run, every camera and point moved (focal length by 2 %), adjusted to "
         "convergence by ours and by COLMAP's Ceres from the same start, Huber's loss. Cost is computed here, "
         "by one function, from the cameras and points that each leaves. Covariances, ours beside COLMAP's "
-        "estimate_ba_covariance: of the saved model (and of a synthetic street), each at its own optimum, "
-        "squared loss, focal length, principal point and k1 free, two views fixed."
+        "estimate_ba_covariance: of the saved model (and of a synthetic street) at its optimum, squared loss, "
+        "focal length, principal point and k1 free, poses in the inner gauge."
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
@@ -140,12 +140,11 @@ def _cost(kept: Mapping[str, F64], group: np.ndarray, seen: Observations) -> flo
 def _covariances(
     method: str, cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int]
 ) -> tuple[F64, F64]:
-    """Return covariances of poses (V, 6, 6) and (f, cx, cy, k1) for 1 px noise, two views fixed."""
-    if method == CERES:
-        return ceres_covariances(cameras, X, seen, size, (0, 1))
-    fixed = np.arange(len(cameras.R)) < 2
-    options = BundleOptions(loss_px=np.inf, max_iterations=100, covariance=True, fixed_views=fixed)
+    """Return covariances of poses (V, 6, 6), in the inner gauge, and (f, cx, cy, k1) for 1 px noise."""
+    options = BundleOptions(loss_px=np.inf, max_iterations=100, covariance=True)
     fit = refine_metric_bundle(cameras, X, seen, free=WITH_CENTRE, options=options)
+    if method == CERES:
+        return ceres_covariances(fit.cameras, fit.X, seen, size)
     assert fit.pose_covariance is not None
     some = [0, 3, 4, 5]
     camera = fit.intrinsics_covariance[0][np.ix_(some, some)]
@@ -156,7 +155,7 @@ def _covariance_metrics(scene: str, outcomes: Mapping[str, Outcome]) -> list[Met
     ours, ceres = (read_arrays(outcomes[name], "covariances.npz") for name in (OURS, CERES))
     if ours is None or ceres is None:
         return [row(scene, "largest difference of covariances", "std^2", None)]
-    poses, camera = _off(ours["poses"][2:], ceres["poses"][2:]), _off(ours["camera"], ceres["camera"])
+    poses, camera = _off(ours["poses"], ceres["poses"]), _off(ours["camera"], ceres["camera"])
     words = "largest entry of the covariances in units of COLMAP's standard deviations, ours minus COLMAP's"
     return [
         row(scene, "covariance of poses", "std^2", poses, words),
