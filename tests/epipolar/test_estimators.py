@@ -18,7 +18,7 @@ from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.geometry.two_view import (
-    algebraic_residuals,
+    _algebraic_residuals,
     epipolar_distances,
     fundamental_from_cameras,
     sampson_residuals,
@@ -421,7 +421,7 @@ def test_5_3_the_residual_over_its_gradient_has_the_noise_of_a_coordinate():
     for _ in range(20):
         xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (pair.xy1, pair.xy2))
         found.append(sampson_residuals(F, xy1, xy2))
-        raw = algebraic_residuals(F, xy1, xy2)
+        raw = _algebraic_residuals(F, xy1, xy2)
         assert np.std(raw / found[-1]) > 0.0
     assert np.std(found) == pytest.approx(sigma, rel=0.03)
 

@@ -38,13 +38,6 @@ def test_resampling_keeps_the_image_area_in_place(width, height):
     assert np.abs(small - expected).max() < 1e-3
 
 
-def test_halving_follows_the_pixel_convention():
-    y, x = np.mgrid[0:40, 0:40].astype(np.float32)
-    half = halve(x + 10.0 * y)
-    # Pixel 5 of the half image lies at (5 + 0.5) 2 - 0.5 = 10.5 of the full one.
-    assert half[7, 5] == pytest.approx(10.5 + 10.0 * 14.5, abs=1e-3)
-
-
 def test_wrong_sizes_are_named():
     with pytest.raises(ValueError, match="2 x 2"):
         halve(np.zeros((1, 9), np.float32))
@@ -145,17 +138,6 @@ def test_threads_change_nothing():
     one, three = (rasterize(vertices, faces, camera_at(np.random.default_rng(1)), threads=n) for n in (1, 3))
     for name in Raster.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
-
-
-def test_a_camera_is_that_of_its_matrix():
-    camera = camera_at(np.random.default_rng(4), 1.0)
-    again = Camera.from_matrix(-3.0 * camera.P, SIZE)
-    np.testing.assert_allclose(again.P, camera.P, atol=1e-9)
-    np.testing.assert_allclose(camera.P @ np.append(camera.centre, 1.0), 0.0, atol=1e-9)
-    xy = homogenize(np.array([[0.3, -0.1, 4.0]])) @ camera.P.T
-    finer = homogenize(np.array([[0.3, -0.1, 4.0]])) @ camera.scaled(3.0).P.T
-    x, x3 = xy[:, :2] / xy[:, 2:], finer[:, :2] / finer[:, 2:]
-    np.testing.assert_allclose(x3, 3.0 * (x + 0.5) - 0.5, atol=1e-9)
 
 
 def keys_kernel(x):

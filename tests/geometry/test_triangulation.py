@@ -12,7 +12,6 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera_matrix import (
     camera_centre,
     compose_camera,
-    decompose_camera,
     distort,
     orient_signs,
     project,
@@ -25,7 +24,7 @@ from thesisrecon.geometry.optimal_triangulation import (
 )
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
 from thesisrecon.geometry.triangulation import _jacobi_least, triangulate, triangulate_observations
-from thesisrecon.geometry.two_view import fundamental_from_cameras
+from thesisrecon.geometry.two_view import epipolar_distances, fundamental_from_cameras
 from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
 METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]
@@ -140,6 +139,8 @@ def test_the_compiled_polynomial_method_is_its_plain_twin(rng, kind, sigma_px):
     np.testing.assert_allclose(ours, plain, atol=1e-5)
     cost, least = (np.sum((np.stack(a) - xy) ** 2, axis=(0, 2)) for a in (ours, plain))
     np.testing.assert_allclose(cost, least, rtol=1e-7, atol=1e-9)
+    if kind == "general":
+        assert epipolar_distances(-3.0 * F, *ours).max() < 1e-8
 
 
 @holds_for_every(st.sampled_from(KINDS))
@@ -150,16 +151,6 @@ def test_6_3_3_exact_matches_are_left_where_they_are_and_points_found(rng, kind)
         assert np.abs(images(P, triangulate(P, xy, method=method)) - xy).max() < 1e-7
     corrected = np.stack(correct_matches(fundamental_from_cameras(*P), *xy))
     assert np.abs(corrected - xy).max() < 1e-6
-
-
-@holds_for_every()
-def test_6_3_3_corrected_matches_satisfy_the_epipolar_constraint(rng):
-    P, X = two_views("general", rng)
-    F = fundamental_from_cameras(*P)
-    x1, x2 = correct_matches(-3.0 * F, *(images(P, X) + 3.0 * rng.normal(size=(2, 40, 2))))
-    x1, x2 = np.column_stack([x1, np.ones(40)]), np.column_stack([x2, np.ones(40)])
-    lines = x1 @ F.T
-    assert np.abs(np.sum(x2 * lines, axis=1) / np.linalg.norm(lines[:, :2], axis=1)).max() < 1e-8
 
 
 def test_6_3_3_matches_on_epipoles_are_exact():
@@ -330,24 +321,6 @@ def test_single_methods_reject_their_own_failures():
         correct_matches(fundamental_from_cameras(*P), xy[0], xy[1][:3])
 
 
-def test_linear_triangulation_is_exact_on_exact_data():
-    scene = make_scene()
-    t = scene.tracks
-    X = triangulate_observations(scene.P, t.view_index, t.point_index, t.xy, t.n_points)
-    np.testing.assert_allclose(X[:, :3] / X[:, 3:], scene.X, atol=1e-6)
-
-
-def test_triangulation_leaves_points_seen_once_at_zero():
-    scene = make_scene(points=20)
-    xy = np.full((8, 20, 2), np.nan)
-    xy[scene.tracks.view_index, scene.tracks.point_index] = scene.tracks.xy
-    xy[1:, 3] = np.nan
-    X = triangulate(scene.P, xy, method="linear")
-    assert not X[3].any()
-    keep = np.arange(20) != 3
-    np.testing.assert_allclose(X[keep, :3] / X[keep, 3:], scene.X[keep], atol=1e-6)
-
-
 def test_linear_resection_recovers_the_camera():
     scene = make_scene()
     Xh = np.column_stack([scene.X, np.ones(len(scene.X))])
@@ -388,11 +361,6 @@ def test_orientation_makes_every_depth_positive():
     w = np.einsum("kj,kj->k", P[t.view_index, 2], X[t.point_index])
     assert share == 1.0
     assert (w > 0).all() or (w < 0).all()
-
-
-def test_a_camera_at_infinity_is_refused():
-    with pytest.raises(ValueError, match="finite camera"):
-        decompose_camera(np.eye(3, 4) * np.array([[1.0], [1.0], [0.0]]))
 
 
 def test_undistortion_inverts_distortion():

@@ -97,8 +97,13 @@ def test_seen_through_points_are_removed(ring):
 
 def test_hopeless_maps_are_refused(ring):
     empty = DepthMap(0, ring[0].P, np.full(SHAPE, np.nan, np.float32), ring[0].std, ring[0].views)
+    for maps in ([], [empty], [empty, empty]):
+        with pytest.raises(StageFailure, match="no surface"):
+            DepthSheets().fuse(maps)
     with pytest.raises(StageFailure, match="no surface"):
         VolumetricFusion().fuse([empty])
+    with pytest.raises(ValueError, match="must be"):
+        DepthSheets(step=0)
     vague = DepthMap(0, ring[0].P, ring[0].depth, np.full(SHAPE, 10.0, np.float32), ring[0].views)
     with pytest.raises(StageFailure, match="no surface"):
         VolumetricFusion().fuse([vague])
@@ -159,15 +164,6 @@ def test_sheets_show_each_place_once(ring):
     one, two = (DepthSheets(step=3).fuse(ring, threads=n) for n in (1, 2))
     np.testing.assert_array_equal(one.vertices, two.vertices)
     assert len(one.faces) == pytest.approx(len(mesh.faces) / 9, rel=0.25)
-
-
-def test_hopeless_sheets_are_refused(ring):
-    empty = DepthMap(0, ring[0].P, np.full(SHAPE, np.nan, np.float32), ring[0].std, ring[0].views)
-    for maps in ([], [empty], [empty, empty]):
-        with pytest.raises(StageFailure, match="no surface"):
-            DepthSheets().fuse(maps)
-    with pytest.raises(ValueError, match="must be"):
-        DepthSheets(step=0)
 
 
 def test_the_model_uses_fitted_surfaces_on_request():

@@ -22,7 +22,6 @@ from thesisrecon.views._interpolation_kernels import (
 )
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
-    _blending_weights,
     _with_all_rows,
     detect_monotonicity_violations,
     disparity_of_right,
@@ -395,19 +394,6 @@ def test_a_guess_alone_goes_with_those_around():
             expected = around[len(around) // 2]
         np.testing.assert_array_equal(out[y, x], expected)
     assert (out != d).sum() > 20
-
-
-def test_weights_are_confidences_but_at_rims():
-    d = field(4, holes=0.0)
-    sure = np.random.default_rng(4).random(d.shape).astype(np.float32)
-    sure[3:6] = 0.0
-    out = _blending_weights(d, sure)
-    padded = np.pad(d, 1, mode="edge")
-    steps = [padded[1:-1, 2:], padded[1:-1, :-2], padded[2:, 1:-1], padded[:-2, 1:-1]]
-    rim = (np.abs(np.stack(steps) - d) > ONE_SURFACE_PX).any(axis=0)
-    assert rim.any()
-    plain = np.where(sure > 0, np.maximum(sure, 0.2) * np.where(rim, 0.2, 1.0), 0.01)
-    np.testing.assert_allclose(out, plain, rtol=1e-6)
 
 
 def test_two_pictures_become_one_by_the_rules():

@@ -87,11 +87,8 @@ def plain_map(target, near, step):
                 across = np.array([1.0, 0, 0]) if down is None else np.array([down[1], -down[0], 0.0])
             if down is None:
                 down = np.array([-across[1], across[0], 0.0])
-            M, rise, steps = (
-                np.stack([across[:2], down[:2]], axis=1),
-                np.array([across[2], down[2]]),
-                np.eye(2),
-            )
+            M, rise = np.stack([across[:2], down[:2]], axis=1), np.array([across[2], down[2]])
+            steps = np.eye(2)
         if np.linalg.det(M) < 1e-9:
             continue
         uv = q @ np.linalg.inv(M).T
@@ -263,11 +260,7 @@ def shaded(color, points, normals, eye, shading):
 
 def test_light_is_that_of_the_formulas():
     rng = np.random.default_rng(0)
-    color, points, normals = (
-        rng.uniform(0, 255, (500, 3)),
-        rng.normal(size=(500, 3)),
-        rng.normal(size=(500, 3)),
-    )
+    color, (points, normals) = rng.uniform(0, 255, (500, 3)), rng.normal(size=(2, 500, 3))
     normals[:5] = 0.0
     lamps = (Light(direction=(1.0, 2.0, -3.0), color=(0.5, 0.6, 0.2)), Light(position=(0.3, 0.1, -4.0)))
     for lights in ((), lamps[:1], lamps):

@@ -58,7 +58,7 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
 
 
 def trifocal_residuals(T: F64, x1: F64, l2: F64, l3: F64) -> F64:
-    """Return x1^i l2_j l3_k T_i^jk, 0 if the lines l2, l3 pass through the images of a point of the ray of x1.
+    """Return x1^i l2_j l3_k T_i^jk: 0 if l2 and l3 pass through the images of a point on the ray of x1.
 
     Points (lines through x2 and x3) give four independent equations, lines (points of l1) two (HZ 15.1).
 

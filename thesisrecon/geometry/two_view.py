@@ -146,18 +146,8 @@ def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
     return np.asarray(np.abs(np.column_stack([of_first, of_second])))
 
 
-def algebraic_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Return the residuals x2' F x1 of (5.2).
-
-    Parameters
-    ----------
-    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix and matches, px.
-
-    Returns
-    -------
-    ndarray (N,)
-    """
+def _algebraic_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
+    """x2' F x1 (N,) of (5.2)."""
     residuals: F64 = np.einsum("na,ab,nb->n", homogenize(xy2), F, homogenize(xy1))
     return residuals
 
@@ -184,7 +174,7 @@ def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
     ndarray (N,)
     """
     g2, g1 = _gradients(F, xy1, xy2)
-    return algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)
+    return _algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)
 
 
 def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
@@ -200,7 +190,7 @@ def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
     ndarray (N,)
     """
     g2, g1 = _gradients(F, xy1, xy2)
-    return np.abs(algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
+    return np.abs(_algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
 
 
 def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:

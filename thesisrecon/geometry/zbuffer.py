@@ -200,10 +200,8 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
 
     Parameters
     ----------
-    vertices, faces : ndarray (N, 3) and (M, 3) of int
-        Mesh; both sides of a face are visible.
-    camera : Camera
-        Camera with the image size and without distortion.
+    vertices, faces, camera : ndarray (N, 3) and (M, 3) of int, Camera
+        Mesh, visible from both sides, and camera without distortion.
     threads : int
         Threads; each draws a strip of rows. The result does not depend on their number.
 

@@ -61,10 +61,9 @@ class VolumetricFusion:
 
     Parameters
     ----------
-    voxel_px : float
-        Voxel size in pixels of the depth maps at their median depth.
-    max_blocks : int
-        Largest number of blocks of 8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
+    voxel_px, max_blocks : float, int
+        Voxel size in pixels of the depth maps at their median depth, and largest number of blocks of
+        8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
     """
 
     voxel_px: float = 1.5

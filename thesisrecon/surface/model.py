@@ -19,12 +19,8 @@ class SurfaceModel:
 
     Parameters
     ----------
-    surface : LinearSurface or BSplineSurface
-        Surface fitted to each depth map.
-    fusion : VolumetricFusion or DepthSheets
-        Fusion of the fitted surfaces.
-    atlas : TextureAtlas
-        Texture of the fused surface.
+    surface, fusion, atlas
+        Surface fitted to each depth map, fusion of these surfaces, and texture of the result.
     """
 
     surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)

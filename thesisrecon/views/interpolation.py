@@ -52,10 +52,8 @@ def original_from_rectified(H: F64, size: tuple[int, int], s: float) -> F64:
 
     Parameters
     ----------
-    H : ndarray (2, 3, 3)
-        Homographies from the images to the rectified frame.
-    size : tuple of int
-        Width and height of the images.
+    H, size : ndarray (2, 3, 3), tuple of int
+        Homographies from the images to the rectified frame, and width and height of the images.
     s : float
         Position between the images, 0 to 1.
 
@@ -135,10 +133,8 @@ class InterpolatedPair:
 
     Parameters
     ----------
-    images : tuple of ndarray (h, w, 3) of uint8
-        The images.
-    H : ndarray (2, 3, 3)
-        Homographies to the rectified frame, third coordinate positive for visible pixels.
+    images, H : tuple of ndarray (h, w, 3) of uint8, ndarray (2, 3, 3)
+        Images, and homographies to the rectified frame, third coordinate positive for visible pixels.
     left, right : DisparityMap
         Disparities of both images in the rectified frame (x_right = x_left - d in both).
     """

@@ -57,10 +57,8 @@ def orbit(
         At least one registered camera.
     X : ndarray (N, 3)
         Scene points, evenly spread over the surface if there is one; non-finite points are ignored.
-    frames : int
-        Number of cameras, at least 1.
-    size : tuple of int, optional
-        Image size (width, height); default: that of the first camera.
+    frames, size : int; tuple of int, optional
+        Number of cameras, and image size (width, height); default: that of the first camera.
 
     Returns
     -------
@@ -104,10 +102,8 @@ def interpolate_cameras(
     ----------
     cameras : sequence of Camera
         At least one camera, in order.
-    frames : int
-        Number of cameras of the path. One camera or one frame gives the first camera.
-    size : tuple of int, optional
-        Image size (width, height); default: that of the first camera.
+    frames, size : int; tuple of int, optional
+        As in :func:`orbit`. One camera or one frame gives the first camera.
 
     Returns
     -------

@@ -71,10 +71,8 @@ class Light:
 
     Parameters
     ----------
-    direction : tuple of float, optional
-        Direction towards a distant light.
-    position : tuple of float, optional
-        Position of a point light. Exactly one of direction and position is given.
+    direction, position : tuple of float, optional
+        Direction towards a distant light or position of a point light; exactly one of them is given.
     color : tuple of float
         Strength in red, green and blue; 1 leaves the texture as it is.
     """
@@ -102,10 +100,8 @@ class Shading:
 
     Parameters
     ----------
-    ambient : float
-        Ambient light.
-    lights : tuple of Light
-        Light sources.
+    ambient, lights : float, tuple of Light
+        Ambient light and light sources.
     """
 
     ambient: float = 0.3
@@ -134,10 +130,8 @@ def render(
 
     Parameters
     ----------
-    mesh : TexturedMesh
-        Mesh with a texture, vertex colours or neither (light grey).
-    camera : Camera
-        Camera without distortion; it may stand inside the model.
+    mesh, camera : TexturedMesh, Camera
+        Mesh with a texture, vertex colours or neither (light grey), and camera without distortion.
     shading : Shading, optional
         Lighting. None shows the texture as photographed.
     background : tuple of int

@@ -69,10 +69,8 @@ class CalibratedPair:
 
     Parameters
     ----------
-    K1, K2 : ndarray (3, 3)
-        Intrinsics.
-    R, t : ndarray (3, 3), (3,)
-        Rotation and translation from the first to the second camera frame.
+    K1, K2, R, t : ndarray (3, 3), (3, 3), (3, 3) and (3,)
+        Intrinsics, and rotation and translation from the first to the second camera frame.
     """
 
     K1: F64
@@ -249,10 +247,8 @@ class VirtualCamera:
 
     Parameters
     ----------
-    rotation, translation : ndarray (3, 3), (3,)
-        R, and t in baselines.
-    K : ndarray (3, 3)
-        Intrinsics.
+    rotation, translation, K : ndarray (3, 3), (3,) and (3, 3)
+        R, t in baselines, and intrinsics.
     size : tuple of int
         Width and height in pixels.
     """
@@ -278,10 +274,8 @@ def camera_at(
 
     Parameters
     ----------
-    pair : CalibratedPair
-        The cameras.
-    s : float
-        Position in baselines from the first image (0) to the second (1), or beyond.
+    pair, s : CalibratedPair, float
+        Cameras, and position in baselines from the first image (0) to the second (1), or beyond.
     sizes : tuple
         Width and height of both images; the view has the size of the second.
 
@@ -307,10 +301,8 @@ class VirtualTensor:
     ----------
     T : ndarray (3, 3, 3)
         a_i^j b_4^k - a_4^j b_i^k with its scale, which determines signs and depths.
-    P2 : ndarray (3, 4)
-        [a, a_4] beside P1 = [I 0], in the frame of :attr:`CalibratedPair.P2`.
-    K : ndarray (3, 3)
-        Intrinsics of the third camera.
+    P2, K : ndarray (3, 4) and (3, 3)
+        [a, a_4] beside P1 = [I 0], as :attr:`CalibratedPair.P2`, and intrinsics of the third camera.
     """
 
     T: F64
@@ -372,10 +364,8 @@ class VirtualTensor:
 
         Returns
         -------
-        xy : ndarray (N, 2)
-            Pixels of the third image, NaN behind the camera.
-        inverse_depth : ndarray (N,)
-            1 / z in the third camera (z in baselines); negative beyond infinity.
+        xy, inverse_depth : ndarray (N, 2) and (N,)
+            Pixels of the third image, NaN behind the camera, and 1 / z in it (z in baselines).
         """
         x = homogenize(xy1)
         lines = self._perpendicular_lines(xy1, xy2)

@@ -160,14 +160,12 @@ class TensorSynthesis:
 
     Parameters
     ----------
-    pair : CalibratedPair
-        The cameras.
+    pair, gain : CalibratedPair, ndarray (3,)
+        Cameras, and factor of the exposure of the second image.
     levels : tuple of ndarray (H, W, 4)
         Colours, and 1 where the correspondence is known, 0 where it is guessed.
     places : tuple of ndarray (H, W, 2)
         Corresponding pixels in the other image.
-    gain : ndarray (3,)
-        Factor of the exposure of the second image.
     """
 
     pair: CalibratedPair
@@ -186,10 +184,8 @@ class TensorSynthesis:
 
         Parameters
         ----------
-        camera : VirtualCamera
-            The camera.
-        threads : int
-            Number of threads; the result does not depend on it.
+        camera, threads : VirtualCamera, int
+            Camera, and number of threads; the result does not depend on it.
 
         Returns
         -------
@@ -271,10 +267,8 @@ def prepare_synthesis(
 
     Parameters
     ----------
-    pair : CalibratedPair
-        The cameras, guessed or known.
-    images : tuple of array_like (H, W, 3)
-        Levels 0 to 255.
+    pair, images : CalibratedPair, tuple of array_like (H, W, 3)
+        Cameras, guessed or known, and levels 0 to 255.
     places : tuple of ndarray (H, W, 2)
         Corresponding pixels in the other image, NaN if unknown.
     gain : array_like (3,)
