@@ -14,11 +14,7 @@ from thesisrecon.numerics.observations import Observations
 from validation.references.colmap_model import cameras_from_colmap, colmap_model
 from validation.references.libraries import pycolmap
 
-SOLVERS = {
-    "dense": "DENSE_SCHUR",
-    "sparse": "SPARSE_SCHUR",
-    "iterative": "ITERATIVE_SCHUR",
-}
+SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
 
 
 @dataclass(frozen=True)

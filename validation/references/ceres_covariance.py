@@ -19,9 +19,9 @@ def ceres_covariances(
 ) -> tuple[F64, F64]:
     """Covariances (V, 6, 6) of poses and (4, 4) of (f, cx, cy, k1) for noise of 1 px, by COLMAP.
 
-    One camera. Poses as ours: (w, d) of x -> exp(w) x + d, in the inner gauge. COLMAP's own coordinates are half
-    the angle (Ceres' quaternions) and a translation that the rotation leaves alone; it fixes the first pose and
-    the largest coordinate of the translation to the second.
+    One camera. Poses as ours: (w, d) of x -> exp(w) x + d, in the inner gauge. COLMAP's own coordinates are
+    half the angle (Ceres' quaternions) and a translation that the rotation leaves alone; it fixes the first
+    pose and the largest coordinate of the translation to the second.
     """
     model = colmap_model(cameras, X, seen, size)
     adjuster = bundle_adjuster(model, CeresOptions(principal_point=True, function_tolerance=0.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -128,19 +128,12 @@ def wrong_focal(model: MetricEstimate, rng: np.random.Generator) -> MetricEstima
     return _transformed(model, H, factor)
 
 
-@dataclass(frozen=True)
-class Spoiling:
-    """A reconstruction error: its ``name`` and its effect on a model."""
-
-    name: str
-    spoil: Callable[[MetricEstimate, np.random.Generator], MetricEstimate]
-
-
-SPOILINGS = (
-    Spoiling("one camera moved", one_moved),
-    Spoiling("two cameras swapped", two_swapped),
-    Spoiling("all cameras moved", all_moved),
-    Spoiling("mirrored", mirrored),
-    Spoiling("wrong plane at infinity", wrong_infinity),
-    Spoiling("focal halved or doubled", wrong_focal),
-)
+SPOILINGS: dict[str, Callable[[MetricEstimate, np.random.Generator], MetricEstimate]] = {
+    "one camera moved": one_moved,
+    "two cameras swapped": two_swapped,
+    "all cameras moved": all_moved,
+    "mirrored": mirrored,
+    "wrong plane at infinity": wrong_infinity,
+    "focal halved or doubled": wrong_focal,
+}
+"""Reconstruction errors by name."""

@@ -103,10 +103,10 @@ def spoiled_outcomes(
     right = settle(model_from_reconstruction(result.metric.reconstruction, prior), adjustment)
     assert right is not None
     found: dict[str, list[Outcome | None]] = defaultdict(list)
-    for number, spoiling in enumerate(SPOILINGS):
+    for number, (name, spoil) in enumerate(SPOILINGS.items()):
         for seed in range(seeds):
-            bad = spoiling.spoil(right, np.random.default_rng([seed, number]))
-            found[spoiling.name].append(judge(bad, right, result.calibration, adjustment))
+            bad = spoil(right, np.random.default_rng([seed, number]))
+            found[name].append(judge(bad, right, result.calibration, adjustment))
     held, prior_held = _focal_held(right, prior)
     found["focal held 10 % off"].append(
         judge(held, right, result.calibration, BundleAdjustment(prior_held, 0.02, 0.02))

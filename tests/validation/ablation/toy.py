@@ -38,13 +38,7 @@ class Darts:
     def scene_key(self, scene):
         return scene
 
-    def run(
-        self,
-        config,
-        scene,
-        seed,
-        place,
-    ):
+    def run(self, config, scene, seed, place):
         mark(self.log, f"row {scene} {seed} {self.aim:g}")
         time.sleep(self.pause_s)
         if scene == "refuses":

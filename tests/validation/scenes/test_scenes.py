@@ -15,14 +15,7 @@ from validation.scenes.crops import Crop, make_crops, make_separate_crops, share
 from validation.scenes.cube import SIZE as CUBE_SIZE
 from validation.scenes.cube import make_cube
 from validation.scenes.facade import FacadeMaker
-from validation.scenes.fixtures import (
-    SIZE,
-    courtyard_poses,
-    encode_depth,
-    render_image,
-    versions,
-    write_cube,
-)
+from validation.scenes.fixtures import SIZE, courtyard_poses, encode_depth, render_image, versions, write_cube
 from validation.scenes.materials import Material, over, smooth
 from validation.scenes.procedural import courses, fractal
 from validation.scenes.raycast import Rays, Surface, build_world, trace
@@ -36,7 +29,7 @@ from validation.scenes.real import (
     read_scene,
 )
 from validation.scenes.sensor import Sensor, expose, integrate_pixels
-from validation.scenes.zoomed import Frame, Rezoom, rezoom_scene, windowed_scene
+from validation.scenes.zoomed import Rezoom, rezoom_scene, windowed_scene
 
 FOLDER = ROOT / "fixtures" / "courtyard"
 
@@ -208,20 +201,11 @@ def test_a_flat_facade_is_reported_as_a_plane():
     assert deep.off_plane > 10
 
 
-def test_drawn_facades_are_the_same_for_the_same_seed():
-    first, second = (
-        FacadeMaker.drawn(rng).make(rng) for rng in (np.random.default_rng(5), np.random.default_rng(5))
-    )
-    np.testing.assert_array_equal(first.xy2, second.xy2)
-
-
-PHOTOGRAPHS = load_fixture_scene().image_paths[:3]
+IMAGES = load_fixture_scene().image_paths[:3]
 
 
 def crops_of(count, seed=0):
-    return make_crops(
-        [PHOTOGRAPHS[:2], PHOTOGRAPHS[2:]], count, long_side=96, rng=np.random.default_rng(seed)
-    )
+    return make_crops([IMAGES[:2], IMAGES[2:]], count, long_side=96, rng=np.random.default_rng(seed))
 
 
 def test_parts_are_the_same_each_time_and_their_sources_take_turns():
@@ -247,13 +231,13 @@ def test_the_shared_area_is_that_of_the_boxes():
 
 def test_separate_scenes_share_nothing_and_come_again_changed():
     rng = np.random.default_rng(0)
-    crops = make_separate_crops([PHOTOGRAPHS[:1]], 8, long_side=64, rng=rng, per_scene=2)
+    crops = make_separate_crops([IMAGES[:1]], 8, long_side=64, rng=rng, per_scene=2)
     assert [crop.scene for crop in crops] == [0, 0, 1, 1, 2, 2, 3, 3]
     assert all(shared_area(a, b) == 0.0 for a in crops for b in crops if a.scene != b.scene)
     bright = [float(crop.image.rgb.mean()) for crop in crops]
     assert abs(bright[0] + bright[2] - 255.0) < 60.0
     with pytest.raises(ValueError, match="at most 8"):
-        make_separate_crops([PHOTOGRAPHS[:1]], 9, long_side=64, rng=rng, per_scene=2)
+        make_separate_crops([IMAGES[:1]], 9, long_side=64, rng=rng, per_scene=2)
 
 
 SET_SIZES = {"fountain-P11": 11, "Herz-Jesus-P8": 8, "kermit": 11}
@@ -264,7 +248,7 @@ SET_SIZES = {"fountain-P11": 11, "Herz-Jesus-P8": 8, "kermit": 11}
 def test_real_scenes(name):
     scene = load_real_scene(name)
     if scene is None:
-        pytest.skip("the real photographs are not on this machine")
+        pytest.skip("the real images are not on this machine")
     assert len(scene.image_paths) == SET_SIZES[name]
     assert [p.name for p in scene.image_paths] == sorted(p.name for p in scene.image_paths)
     assert scene.has_truth == (name != "kermit")
@@ -273,7 +257,7 @@ def test_real_scenes(name):
         assert scene.K.shape == (SET_SIZES[name], 3, 3)
 
 
-def test_absent_photographs_are_none(monkeypatch, tmp_path):
+def test_absent_images_are_none(monkeypatch, tmp_path):
     monkeypatch.setenv("THESISRECON_DATA", str(tmp_path))
     assert load_real_scene("kermit") is None
     monkeypatch.setenv("THESISRECON_DATA", str(tmp_path / "nowhere"))
@@ -287,7 +271,7 @@ def test_unknown_names_are_refused():
         load_fixture_scene("atlantis")
 
 
-def test_a_photograph_without_its_truth_is_named(tmp_path):
+def test_an_image_without_its_truth_is_named(tmp_path):
     (tmp_path / "images").mkdir()
     for name in ("a.jpg", "b.JPG", "notes.txt"):
         (tmp_path / "images" / name).touch()
@@ -308,7 +292,7 @@ X = np.array([[0.05, -0.03, 1.0], [-0.1, 0.08, 1.0]])
 
 @pytest.fixture
 def spots_scene(tmp_path):
-    """Two photographs of two white spots that stand where K sees the points X."""
+    """Two images of two white spots that stand where K sees the points X."""
     y, x = np.mgrid[: ZOOM_SIZE[1], : ZOOM_SIZE[0]]
     gray = np.zeros(ZOOM_SIZE[::-1])
     for place in spots(ZOOM_K):
@@ -333,7 +317,7 @@ def found_spot(path, near):
     return np.array([np.sum(weight * x), np.sum(weight * y)]) / weight.sum()
 
 
-def test_spots_of_zoomed_photographs_are_where_their_calibration_sees_them(spots_scene, tmp_path):
+def test_spots_of_zoomed_images_are_where_their_calibration_sees_them(spots_scene, tmp_path):
     new = rezoom_scene(spots_scene, tmp_path / "zoom", seed=3, how=Rezoom(0.3, 0.05))
     assert new.K is not None
     for path, calibration in zip(new.image_paths, new.K, strict=True):
@@ -341,7 +325,7 @@ def test_spots_of_zoomed_photographs_are_where_their_calibration_sees_them(spots
             assert found_spot(path, place) == pytest.approx(place, abs=0.05)
 
 
-def test_zoomed_frames_stay_inside_their_photograph_and_move_the_principal_point():
+def test_zoomed_frames_stay_inside_their_image_and_move_the_principal_point():
     rng = np.random.default_rng(0)
     shares = []
     for _ in range(50):
@@ -359,15 +343,7 @@ def test_zoomed_frames_stay_inside_their_photograph_and_move_the_principal_point
     assert np.abs(shares).max() > 0.08
 
 
-def test_a_frame_of_the_whole_image_changes_nothing():
-    rng = np.random.default_rng(1)
-    rgb = rng.integers(0, 256, (12, 18, 3), dtype=np.uint8)
-    frame = Frame(1.0, 0.0, 0.0, (18, 12))
-    assert np.array_equal(frame.cut(rgb), rgb)
-    assert frame.calibration(ZOOM_K) == pytest.approx(ZOOM_K)
-
-
-def test_a_windowed_photograph_keeps_its_window_and_its_camera(spots_scene, tmp_path):
+def test_a_windowed_image_keeps_its_window_and_its_camera(spots_scene, tmp_path):
     new = windowed_scene(spots_scene, tmp_path / "windows", {1: np.array([0.0, 0.0, 0.4, 1.0])})
     with PillowImage.open(new.image_paths[1]) as picture, PillowImage.open(spots_scene.image_paths[1]) as old:
         after, before = np.asarray(picture), np.asarray(old)

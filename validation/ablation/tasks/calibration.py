@@ -14,13 +14,7 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.records import Reconstruction
 from validation.ablation.study import Measure, Place, Task
 from validation.scenes.rigs import Rig
-from validation.studies.selfcalibration import (
-    MODES,
-    SCENES,
-    Cell,
-    assumptions,
-    draw_cell,
-)
+from validation.studies.selfcalibration import MODES, SCENES, Cell, assumptions, draw_cell
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ class BundleStage(Stage):
         "The final model of our run, every camera and point moved (focal length by 2 %), adjusted to "
         "convergence by ours and by COLMAP's Ceres from the same start, Huber's loss. Cost is computed here, "
         "by one function, from the cameras and points that each leaves. Covariances, ours beside COLMAP's "
-        "estimate_ba_covariance: of the saved model (and of a synthetic street) at its optimum, squared loss, "
-        "focal length, principal point and k1 free, poses in the inner gauge."
+        "estimate_ba_covariance: of the saved model (and of a synthetic street) at its optimum, squared "
+        "loss, focal length, principal point and k1 free, poses in the inner gauge."
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:

@@ -176,10 +176,7 @@ def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric
 
 
 def _pictures(
-    scene: Scene,
-    found: Mapping[str, Mapping[int, DepthMap]],
-    model: Reconstruction,
-    options: ReportOptions,
+    scene: Scene, found: Mapping[str, Mapping[int, DepthMap]], model: Reconstruction, options: ReportOptions
 ) -> list[Picture]:
     """Draw two views: image, maps, and, if known, truth and errors."""
     views = sorted(set.intersection(*(set(maps) for maps in found.values()))) if found else []

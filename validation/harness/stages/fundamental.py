@@ -20,14 +20,7 @@ from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
 
 MATCHES = "SIFT matches"
 VARIANTS, MINIMAL = ("ours (thesis)", "ours (eight points)"), "ours (seven points)"
-REFERENCES = (
-    "FM_RANSAC",
-    "FM_LMEDS",
-    "USAC_ACCURATE",
-    "USAC_MAGSAC",
-    "COLMAP",
-    "PoseLib",
-)
+REFERENCES = ("FM_RANSAC", "FM_LMEDS", "USAC_ACCURATE", "USAC_MAGSAC", "COLMAP", "PoseLib")
 QUICK = ("USAC_MAGSAC", "PoseLib")
 THRESHOLD_PX = 1.0
 FAILED_PX = 5.0
@@ -116,10 +109,7 @@ def _errors(answers: Answers, pairs: list[RealPair]) -> F64:
 
 
 def _metrics(
-    scene: str,
-    pairs: list[RealPair],
-    answers: Mapping[str, Answers | None],
-    errors: Mapping[str, F64 | None],
+    scene: str, pairs: list[RealPair], answers: Mapping[str, Answers | None], errors: Mapping[str, F64 | None]
 ) -> list[Metric]:
     median, worst = each(errors, np.median), each(errors, lambda e: np.quantile(e, 0.9))
     failed = each(errors, lambda e: 100.0 * np.mean(e > FAILED_PX))

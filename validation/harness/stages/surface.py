@@ -17,13 +17,7 @@ from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, Values, each, ratio, read_arrays, row
 from validation.harness.scenes import load_images
-from validation.harness.stages.depth import (
-    COURTYARD,
-    PRESETS,
-    THESIS,
-    our_maps,
-    views_of,
-)
+from validation.harness.stages.depth import COURTYARD, PRESETS, THESIS, our_maps, views_of
 from validation.metrics.depth import coloured, true_from_maps
 from validation.metrics.record import Metric
 from validation.metrics.surfaces import CAPPED, SAMPLES, judge_surface, load_truth

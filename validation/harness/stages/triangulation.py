@@ -155,10 +155,7 @@ def _problems(options: ReportOptions) -> Iterator[Problem]:
 
 
 def _metrics(
-    scene: str,
-    where: str,
-    problems: Mapping[int, Problem],
-    found: Mapping[str, Mapping[str, F64] | None],
+    scene: str, where: str, problems: Mapping[int, Problem], found: Mapping[str, Mapping[str, F64] | None]
 ) -> list[Metric]:
     best = {n: _least_squared_distances(n, p, found) for n, p in problems.items()}
     above: dict[str, float | None] = {}
