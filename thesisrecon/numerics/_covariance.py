@@ -45,16 +45,12 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
 
 @dataclass(frozen=True)
 class CovarianceInput:
-    """Information of the cameras, and poses; ``block`` (V,) is -1 for views whose pose does not move.
-
-    ``fixed_frame``: observed views are fixed, and the frame with them.
-    """
+    """Information of the cameras, and poses; ``block`` (V,) is -1 for views without observations."""
 
     reduced: ReducedSystem
     block: I64
     R: F64
     t: F64
-    fixed_frame: bool
 
 
 def bundle_covariances(inputs: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
@@ -87,10 +83,7 @@ def _dense_blocks(inputs: CovarianceInput, views: I64) -> F64:
     b, C, e = inputs.reduced.sums.border.shape
     S = inputs.reduced.dense()
     S = np.triu(S) + np.triu(S, 1).T
-    if inputs.fixed_frame or not len(views):
-        covariance = invert_information(S)
-    else:
-        covariance = invert_in_inner_gauge(S, _gauge_basis(inputs, views))
+    covariance = invert_in_inner_gauge(S, _gauge_basis(inputs, views)) if b else invert_information(S)
     index = np.concatenate(
         [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
     )
@@ -116,14 +109,11 @@ def _band_blocks(inputs: CovarianceInput, views: I64) -> F64:
     """
     reduced = inputs.reduced
     b, C, e = reduced.sums.border.shape
-    if not inputs.fixed_frame:
-        _fix_gauge(inputs, views)
+    _fix_gauge(inputs, views)
     factored = order_views(reduced.row, reduced.column, b).factor(reduced)
     if factored is None:
         return np.full((b, C + e, C + e), np.inf)
     blocks = factored.inverse_blocks()
-    if inputs.fixed_frame:
-        return blocks
     N = _gauge_basis(inputs, views)
     moved = factored.solve(N)
     if moved is None:

@@ -203,19 +203,16 @@ class IntrinsicColumns:
         return np.append(self.place, NONE)[number]
 
 
-def assign_columns(
-    values: IntrinsicUnknowns, group: I64, free: I64, observed: B8, free_views: B8
-) -> IntrinsicColumns:
+def assign_columns(values: IntrinsicUnknowns, group: I64, free: I64, observed: B8) -> IntrinsicColumns:
     """Distribute the unknowns over blocks and border; ``free`` are the intrinsics that move in some view."""
     number = np.where(observed[:, None], values.number[group], NONE)
     repeated = [len(np.unique(m)) < len(m) for m in (number[number[:, c] >= 0, c] for c in free)]
     own, common = free[np.logical_not(repeated)], free[np.array(repeated, dtype=bool)]
     own_unknowns = number[:, own]
-    moves = free_views | (own_unknowns >= 0).any(axis=1)
-    block = np.where(moves, np.cumsum(moves) - 1, NONE)
-    pose = np.repeat(~free_views[:, None], POSE_DOF, axis=1)
-    pinned = np.concatenate([pose, own_unknowns < 0], axis=1) & moves[:, None]
-    width, n_blocks = POSE_DOF + len(own), int(moves.sum())
+    block = np.where(observed, np.cumsum(observed) - 1, NONE)
+    pose = np.zeros((len(group), POSE_DOF), dtype=bool)
+    pinned = np.concatenate([pose, own_unknowns < 0], axis=1) & observed[:, None]
+    width, n_blocks = POSE_DOF + len(own), int(observed.sum())
     place = np.full(values.size, NONE, dtype=np.int64)
     for c in range(len(own)):
         v = np.flatnonzero(own_unknowns[:, c] >= 0)

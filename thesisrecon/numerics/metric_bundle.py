@@ -9,12 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._covariance import (
-    SIMILARITY_DOF,
-    CovarianceInput,
-    bundle_covariances,
-    robust_sigma,
-)
+from thesisrecon.numerics._covariance import SIMILARITY_DOF, CovarianceInput, bundle_covariances, robust_sigma
 from thesisrecon.numerics._elimination import revert_crossing_points, sum_leverages
 from thesisrecon.numerics._intrinsic_unknowns import (
     IntrinsicColumns,
@@ -52,8 +47,6 @@ class BundleOptions:
         point of Huber's loss; infinite for least squares.
     max_iterations : int
         Maximum number of linear solves.
-    fixed_views : ndarray (V,) of bool, optional
-        Poses that must not move.
     covariance, noise_floor_px : bool, float
         Whether to compute covariances (one more linear system), and the least noise assumed for them.
     """
@@ -61,7 +54,6 @@ class BundleOptions:
     sigma_px: float = 1.0
     loss_px: float = 1.0
     max_iterations: int = 20
-    fixed_views: B8 | None = None
     covariance: bool = False
     noise_floor_px: float = 0.0
 
@@ -113,15 +105,10 @@ class _MetricProblem:
 
     layout: BundleLayout
     columns: IntrinsicColumns
-    free_views: B8
+    observed: B8
     values: IntrinsicUnknowns
     weighting: Weighting
     jacobians: Jacobians
-
-    @property
-    def fixed_frame(self) -> bool:
-        """Whether an observed view is fixed."""
-        return not self.free_views[self.layout.observations.seen.view_index].all()
 
     def linearize(self, state: _State) -> BundleSystem:
         J, c = self.jacobians, self.columns
@@ -144,11 +131,11 @@ class _MetricProblem:
         return CameraPrior(c.columns_of(terms.first), c.columns_of(terms.second), terms.weight, gradient)
 
     def retract(self, state: _State, step: BundleStep) -> _State:
-        m, layout, free = state.model, self.layout, self.free_views
+        m, layout = state.model, self.layout
         camera_step, point_step = step
         own = camera_step[: layout.size - layout.border].reshape(-1, layout.width)
         poses = np.zeros((len(m.t), POSE_DOF))
-        poses[free] = own[layout.index.block[free], :POSE_DOF]
+        poses[self.observed] = own[:, :POSE_DOF]
         R, t = np.empty_like(m.R), np.empty_like(m.t)
         move_poses(m.R, m.t, poses, R, t)
         values = self.values.step(state.values, camera_step[self.columns.place])
@@ -169,8 +156,8 @@ class _MetricProblem:
         leverage = np.empty_like(residual)
         self.linearize(state)
         sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
-        dof = POSE_DOF * int(self.free_views.sum()) + self.values.size
-        return robust_sigma(residual, leverage, dof - (0 if self.fixed_frame else SIMILARITY_DOF))
+        dof = POSE_DOF * int(self.observed.sum()) + self.values.size - SIMILARITY_DOF
+        return robust_sigma(residual, leverage, dof)
 
 
 def refine_metric_bundle(
@@ -221,7 +208,7 @@ def refine_metric_bundle(
         np.ascontiguousarray(scale * (X - origin)),
     )
     state, cost = _minimize(problem, _State(start, values), options.max_iterations)
-    end, moved = state.model, problem.free_views
+    end, moved = state.model, problem.observed
     refined = replace(
         cameras,
         R=np.where(moved[:, None, None], end.R, cameras.R),
@@ -263,20 +250,19 @@ def _metric_problem(
     observed = np.bincount(o.seen.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
     values, start, table = number_unknowns(cameras, used, free, prior)
-    free_views = observed if options.fixed_views is None else observed & ~options.fixed_views
-    columns = assign_columns(values, group, np.flatnonzero(free), observed, free_views)
+    columns = assign_columns(values, group, np.flatnonzero(free), observed)
     layout = build_layout(
         o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border
     )
     weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
-    return _MetricProblem(layout, columns, free_views, values, weighting, layout.jacobians()), start, table
+    return _MetricProblem(layout, columns, observed, values, weighting, layout.jacobians()), start, table
 
 
 def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
     """Return covariances of intrinsics (G, C, C) and poses (V, 6, 6), t in the caller's unit."""
     problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
     reduced, _, _ = problem.linearize(state).reduce(1e-10)
-    m, block = state.model, np.where(problem.free_views, problem.layout.index.block, -1)
-    found = CovarianceInput(reduced, block, m.R, m.t, problem.fixed_frame)
+    m = state.model
+    found = CovarianceInput(reduced, problem.layout.index.block, m.R, m.t)
     number = problem.columns.columns_of(problem.values.number)
     return bundle_covariances(found, number, m.intrinsics[:, 0], scale)

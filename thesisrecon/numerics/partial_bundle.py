@@ -169,14 +169,7 @@ class PoseRefinement:
 
 
 def refine_points(
-    P: F64,
-    X: F64,
-    view_index: I64,
-    point_index: I64,
-    xy: F64,
-    *,
-    loss_px: float = 1.0,
-    iterations: int = 5,
+    P: F64, X: F64, view_index: I64, point_index: I64, xy: F64, *, loss_px: float = 1.0, iterations: int = 5
 ) -> F64:
     """Refine each point with the cameras fixed: least sum of rho(|x - P X|^2), Huber's loss.
 
@@ -362,15 +355,7 @@ class _PoseProblem:
 
 
 def refine_pose(
-    R: F64,
-    t: F64,
-    intrinsics: F64,
-    X: F64,
-    xy: F64,
-    *,
-    free: B8,
-    loss_px: float = 1.0,
-    iterations: int = 20,
+    R: F64, t: F64, intrinsics: F64, X: F64, xy: F64, *, free: B8, loss_px: float = 1.0, iterations: int = 20
 ) -> PoseRefinement:
     """Refine one pose and its free intrinsics with the points fixed, Huber's loss.
 

@@ -142,9 +142,11 @@ def _covariances(
 ) -> tuple[F64, F64]:
     """Return covariances of poses (V, 6, 6), in the inner gauge, and (f, cx, cy, k1) for 1 px noise."""
     options = BundleOptions(loss_px=np.inf, max_iterations=100, covariance=True)
-    fit = refine_metric_bundle(cameras, X, seen, free=WITH_CENTRE, options=options)
+    for _ in range(2):  # the second run ends closer to the optimum
+        fit = refine_metric_bundle(cameras, X, seen, free=WITH_CENTRE, options=options)
+        cameras, X = fit.cameras, fit.X
     if method == CERES:
-        return ceres_covariances(fit.cameras, fit.X, seen, size)
+        return ceres_covariances(cameras, X, seen, size)
     assert fit.pose_covariance is not None
     some = [0, 3, 4, 5]
     camera = fit.intrinsics_covariance[0][np.ix_(some, some)]
