@@ -15,7 +15,8 @@ import pytest
 import trimesh
 
 from tests.fake_stages import FakeMetric, fake_config
-from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, photograph_scene, tunnel
+from tests.stereo.depth_scenes import photograph_scene
+from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, tunnel
 from tests.synthetic import texture
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import preset

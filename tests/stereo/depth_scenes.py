@@ -1,11 +1,11 @@
-"""A wall with a board in front of it, photographed from an arc: everything about it is known exactly."""
+"""Photographs of textured rectangles with exact depth; a wall with a board before it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tests.synthetic import reconstruction_of, texture
+from tests.synthetic import photograph, reconstruction_of, texture
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import (
     camera_from_centre,
@@ -18,12 +18,23 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Image, Reconstruction, Tracks
 
 SIZE = (240, 180)
-FOCAL = 260.0
 RADIAL = np.array([-0.08, 0.02, 0.0])
+PER_UNIT = 60.0
+"""Texels a unit of length."""
 
 
 @dataclass(frozen=True)
-class Walled:
+class Rectangle:
+    """A corner and two edges; its grey levels, or one for all of it."""
+
+    corner: tuple[float, float, float]
+    along: tuple[float, float, float]
+    up: tuple[float, float, float]
+    levels: F64 | float
+
+
+@dataclass(frozen=True)
+class Scene:
     """Photographs, their reconstruction, and true depth (H, W) of every view without distortion."""
 
     images: tuple[Image, ...]
@@ -31,63 +42,67 @@ class Walled:
     depth: tuple[F64, ...]
 
 
-def calibration():
-    return np.array([[FOCAL, 0.0, 121.0], [0.0, FOCAL, 88.0], [0.0, 0.0, 1.0]])
-
-
 def on_arc(angles_deg, *, distance=6.0):
     """Cameras (V, 3, 4) about a point on the wall."""
+    K = np.array([[260.0, 0.0, 121.0], [0.0, 260.0, 88.0], [0.0, 0.0, 1.0]])
     cameras = []
     for k, angle in enumerate(np.radians(angles_deg)):
         centre = distance * np.array([np.sin(angle), 0.06 * (-1) ** k, -np.cos(angle)])
         z = -centre / np.linalg.norm(centre)
         x = np.cross([0.0, 1.0, 0.0], z)
         x /= np.linalg.norm(x)
-        cameras.append(camera_from_centre(calibration(), np.array([x, np.cross(z, x), z]), centre))
+        cameras.append(camera_from_centre(K, np.array([x, np.cross(z, x), z]), centre))
     return np.array(cameras)
 
 
-def make_walled(P, *, distortion=None, plain=False, seed=0):
-    """Photographs by cameras P (V, 3, 4) through a lens; a ``plain`` wall and board have no texture."""
-    textures = [
-        np.full((900, 900), 90.0 + 60.0 * k) if plain else texture(900, 900, seed + k) for k in (0, 1)
-    ]
+def make_walled(P, *, distortion=None, plain=False):
+    """A board at Z = -0.8 before a wall that leans away; both are blank if ``plain``."""
+    levels = [np.full((900, 900), 90.0 + 60.0 * k) if plain else texture(900, 900, k) for k in (0, 1)]
+    wall = Rectangle((-10.0, -7.5, -2.0), (20.0, 0, 4.0), (0, 15.0, 0), levels[0])
+    board = Rectangle((-0.7, -0.7, -0.8), (1.4, 0, 0), (0, 1.4, 0), levels[1])
     lens = np.zeros(3) if distortion is None else distortion
-    x, y = np.meshgrid(np.arange(float(SIZE[0])), np.arange(float(SIZE[1])))
-    xy = np.stack([x, y], axis=-1).reshape(-1, 2)
-    images, depths = [], []
-    for view, camera in enumerate(P):
-        depths.append(_trace(camera, xy, textures)[0].reshape(x.shape))
+    return photograph_scene(P, [wall, board], sizes=[SIZE] * len(P), noise=0.0, lens=lens)
+
+
+def photograph_scene(P, rectangles, *, sizes=None, noise=1.0, points=400, seed=0, lens=(0.0, 0.0, 0.0)):
+    """What cameras P (V, 3, 4) see, with noise in grey levels, and exact sparse points of every view."""
+    rng = np.random.default_rng(seed)
+    images, depths, X = [], [], []
+    for view, (camera, size) in enumerate(zip(P, sizes or [(200, 150)] * len(P), strict=True)):
+        shape = size[::-1]
+        xy = np.indices(shape)[::-1].reshape(2, -1).T.astype(float)
         K = decompose_camera(camera)[0]
         straight = undistort((xy - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, lens) @ K[:2, :2].T + K[:2, 2]
-        gray = _trace(camera, straight, textures)[1].reshape(x.shape)
-        rgb = np.repeat(np.clip(np.rint(gray), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-        images.append(Image(f"{view}.png", rgb, SIZE))
-    return Walled(tuple(images), _reconstruction(P, lens, depths, seed), tuple(depths))
+        gray = trace(camera, rectangles, straight)[1].reshape(shape)
+        images.append(photograph(gray + noise * rng.normal(size=shape), f"{view}.png"))
+        depth, _, textured = trace(camera, rectangles, xy)
+        chosen = rng.choice(np.flatnonzero(textured), min(points, int(textured.sum())), replace=False)
+        rays = homogenize(xy[chosen]) * depth[chosen, None] - camera[:, 3]
+        X.append(rays @ np.linalg.inv(camera[:, :3]).T)
+        depths.append(depth.reshape(shape))
+    return Scene(tuple(images), observed_points(P, depths, np.concatenate(X), lens), tuple(depths))
 
 
-def _trace(P, xy, textures):
-    """Depth and grey level (N,): a board |X|, |Y| < 0.7 at Z = -0.8 before a leaning wall Z = 0.2 X."""
+def trace(P, rectangles, xy):
+    """Depth (inf where nothing is), grey level, and whether it has texture, of pixels (N, 2)."""
     M = np.linalg.inv(P[:, :3])
     centre, rays = -M @ P[:, 3], homogenize(xy) @ M.T
-    board = (-0.8 - centre[2]) / rays[:, 2]
-    wall = (0.2 * centre[0] - centre[2]) / (rays[:, 2] - 0.2 * rays[:, 0])
-    hit = centre + board[:, None] * rays
-    near = (np.abs(hit[:, :2]) < 0.7).all(axis=1)
-    depth = np.where(near, board, wall)
-    X = centre + depth[:, None] * rays
-    places = 450.0 + 70.0 * X[:, :2].T[::-1]
-    levels = [map_coordinates(t, places, order=3, mode="reflect") for t in textures]
-    return depth, np.where(near, levels[1], levels[0])
-
-
-def _reconstruction(P, lens, depths, seed):
-    """Points on the surface seen in view 0, observed by every view that sees them."""
-    rng = np.random.default_rng(seed)
-    pixel = np.stack([rng.integers(4, SIZE[0] - 4, 400), rng.integers(4, SIZE[1] - 4, 400)], axis=1)
-    M = np.linalg.inv(P[0, :, :3])
-    X = M @ (homogenize(pixel.astype(np.float64)).T * depths[0][pixel[:, 1], pixel[:, 0]] - P[0, :, 3:])
-    return observed_points(P, depths, X.T, lens)
+    best, level, textured = np.full(len(rays), np.inf), np.full(len(rays), 90.0), np.zeros(len(rays), bool)
+    for r in rectangles:
+        along, up = np.array(r.along, dtype=float), np.array(r.up, dtype=float)
+        A = np.linalg.inv(np.stack([along, up, np.cross(along, up)], axis=1))
+        start, step = A @ (centre - np.array(r.corner)), rays @ A.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -start[2] / step[:, 2]
+            u, v = start[:2, None] + t * step[:, :2].T
+        hit = (t > 1e-6) & (t < best) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        best[hit], textured[hit] = t[hit], not isinstance(r.levels, float)
+        if isinstance(r.levels, float):
+            level[hit] = r.levels
+        else:
+            places = PER_UNIT * np.stack([v[hit] * np.linalg.norm(up), u[hit] * np.linalg.norm(along)])
+            level[hit] = map_coordinates(r.levels, places, order=1, mode="reflect")
+    return best, level, textured
 
 
 def observed_points(P, depths, X, lens):

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, photograph_scene, tunnel
+from tests.stereo.depth_scenes import photograph_scene
+from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, tunnel
 from thesisrecon.config import preset
 
 DEFAULT, THESIS = (preset(name).dense for name in ("default", "thesis"))

@@ -40,8 +40,7 @@ def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
     """Check that a disparity range is not empty or too large."""
     first, last = (int(d) for d in disparity_range)
     if not 0 <= last - first < MAX_DISPARITIES:
-        limits = f"first <= last < first + {MAX_DISPARITIES}"
-        raise ValueError(f"a disparity range must obey {limits}; got {disparity_range}")
+        raise ValueError(f"disparities need first <= last < first + {MAX_DISPARITIES}; got {disparity_range}")
     return first, last
 
 
@@ -64,22 +63,17 @@ def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[tup
 
 @dataclass(frozen=True)
 class StereoImage:
-    """One image of a rectified pair.
+    """One image of a rectified pair."""
 
-    ``channels`` (K, H, W) are in quarters of a grey level, 0 where there is no pixel, ``grey`` (H, W) is
-    their sum, and ``valid`` (H, W) is 255 where there is a pixel, else 0.
-    """
-
-    channels: I16
-    grey: I16
-    valid: U8
+    channels: I16  #: (K, H, W) in quarters of a grey level, 0 where there is no pixel
+    grey: I16  #: (H, W) their sum
+    valid: U8  #: (H, W) 255 where there is a pixel, else 0
 
 
 def prepare_stereo_images(left: ArrayLike, right: ArrayLike) -> tuple[StereoImage, StereoImage]:
     """Convert grey levels 0 .. 255, (H, W) or (H, W, K <= 4), NaN = no pixel, to integer channels."""
     if np.shape(left) != np.shape(right):
-        shapes = f"{np.shape(left)} and {np.shape(right)}"
-        raise ValueError(f"rectified images must have the same shape; got {shapes}")
+        raise ValueError(f"rectified images need the same shape; got {np.shape(left)}, {np.shape(right)}")
     return _side(np.asarray(left)), _side(np.asarray(right))
 
 

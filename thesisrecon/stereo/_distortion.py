@@ -20,22 +20,15 @@ MAX_MATCHES = 300
 
 @dataclass(frozen=True)
 class RectificationQuality:
-    """Distortion measures of a rectified pair; pairs of numbers refer to both images.
+    """Distortion measures of a rectified pair; pairs of numbers refer to both images."""
 
-    ``orthogonality_deg`` is the angle of the mapped image midlines, ``aspect`` the ratio of their lengths
-    relative to the original, ``size_ratio`` the pixels of the frame relative to the larger image, and
-    ``min_scale`` and ``max_scale`` are the extreme local scales along any direction. ``stretch`` is exp of
-    the standard deviation of the log singular values, 1 for similarities; ``disparity_slope`` is the RMS
-    gradient of a quadratic polynomial fitted to the disparities, NaN with fewer than 3 matches.
-    """
-
-    orthogonality_deg: tuple[float, float]
-    aspect: tuple[float, float]
-    size_ratio: float
-    min_scale: float
+    orthogonality_deg: tuple[float, float]  #: angle of the mapped image midlines
+    aspect: tuple[float, float]  #: ratio of their lengths relative to the original
+    size_ratio: float  #: pixels of the frame relative to the larger image
+    min_scale: float  #: extreme local scales along any direction
     max_scale: float
-    stretch: float
-    disparity_slope: float
+    stretch: float  #: exp of the standard deviation of the log singular values, 1 for similarities
+    disparity_slope: float  #: RMS gradient of the fitted disparities, NaN with fewer than 3 matches
 
     @property
     def distortion(self) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
-from thesisrecon.geometry.homogeneous import dehomogenize, require_finite, require_shapes
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, require_finite, require_shapes
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
@@ -46,18 +46,14 @@ CROP_MARGIN = 1.0
 
 @dataclass(frozen=True)
 class EpipolarPencil:
-    """Epipolar lines of two views, parametrised by the angle phi of the epipolar plane.
+    """Epipolar lines of two views, parametrised by the angle phi of the epipolar plane."""
 
-    ``lines`` (2, 3, 2) are L of each view in normalised coordinates, oriented so that matches have equal phi;
-    ``centres`` (2, 2) and ``units`` (2,) are in pixels. If ``flipped``, rows run against phi and columns
-    against the half-lines, so that larger disparities are nearer.
-    """
-
-    lines: F64
-    centres: F64
-    units: F64
+    lines: F64  #: (2, 3, 2) L of each view in normalised coordinates; matches have equal phi
+    centres: F64  #: (2, 2) in pixels
+    units: F64  #: (2,) in pixels
     sizes: tuple[Size, Size]
     flipped: bool = False
+    """Rows run against phi and columns against the half-lines, so that larger disparities are nearer."""
 
     @property
     def normalization(self) -> F64:
@@ -128,14 +124,13 @@ class EpipolarPencil:
 class HalfLines:
     """Half epipolar lines of a view in normalised coordinates.
 
-    ``foot`` (N, 2) is nearest to the image centre, ``distance`` (N,) from it. Along the unit ``direction``
-    (N, 2) d(z - e) grows, or falls if the third coordinate of the ``epipole`` (3,) is negative.
+    d(z - e) grows along the ``direction``, or falls if the third coordinate of the ``epipole`` is negative.
     """
 
-    foot: F64
-    direction: F64
-    distance: F64
-    epipole: F64
+    foot: F64  #: (N, 2) nearest to the image centre
+    direction: F64  #: (N, 2) unit vectors
+    distance: F64  #: (N,) of the foot from the centre
+    epipole: F64  #: (3,)
 
     @property
     def sagitta(self) -> F64:
@@ -185,18 +180,13 @@ def scale_and_shift(scale: F64 | float, shift: F64) -> F64:
 
 @dataclass(frozen=True)
 class EpipolarPair:
-    """An image pair prepared for rectification.
-
-    ``matches`` are two arrays (N, 2) of pixels, possibly empty; ``arc`` is the interval of phi that both
-    images see; ``regions`` are pixels (M, 2) of each image inside the arc, beginning with the corners of that
-    polygon; ``cameras`` (2, 3, 4) are metric, if known.
-    """
+    """An image pair prepared for rectification."""
 
     pencil: EpipolarPencil
-    matches: tuple[F64, F64]
-    arc: tuple[float, float]
-    regions: tuple[F64, F64]
-    cameras: F64 | None = None
+    matches: tuple[F64, F64]  #: (N, 2) pixels, possibly none
+    arc: tuple[float, float]  #: interval of phi that both images see
+    regions: tuple[F64, F64]  #: (M, 2) pixels of each image inside the arc, first the corners of that polygon
+    cameras: F64 | None = None  #: (2, 3, 4) metric, if known
 
     @property
     def sizes(self) -> tuple[Size, Size]:
@@ -261,10 +251,9 @@ def _pencil_of_fundamental(F: F64, sizes: tuple[Size, Size]) -> tuple[EpipolarPe
     centres = (np.array(sizes, dtype=np.float64) - 1.0) / 2.0
     T = scale_and_shift(units, centres)
     U, s, Vt = np.linalg.svd(T[1].T @ F @ T[0])
-    ratio = float(s[1] / s[0]) if s[0] > 0.0 else 0.0
     # F z1 = U S V'z1, and V'z1 = J p with p the plane of z1.
-    lines = np.stack([Vt[:2].T, (U[:, :2] * s[:2]) @ _J / max(s[0], 1e-300)])
-    return EpipolarPencil(lines, centres, units, sizes), ratio
+    lines = np.stack([Vt[:2].T, (U[:, :2] * s[:2]) @ _J / s[0]])
+    return EpipolarPencil(lines, centres, units, sizes), float(s[1] / s[0])
 
 
 def _complete(pencil: EpipolarPencil, matches: tuple[F64, F64], P: F64 | None) -> EpipolarPair:
@@ -290,14 +279,12 @@ def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:
 
 def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[tuple[F64, F64], F64]:
     """Pixels of points at many depths in front of both cameras, and the cameras in normalised coordinates."""
-    (width, height), C = pencil.sizes[0], dehomogenize(camera_centre(P))
-    x, y = np.meshgrid(np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7))
-    grid = np.stack([x, y], axis=-1).reshape(-1, 2)
-    rays = np.linalg.solve(P[0, :, :3], np.column_stack([grid, np.ones(len(grid))]).T).T
+    C = dehomogenize(camera_centre(P))
+    rays = np.linalg.solve(P[0, :, :3], homogenize(_image_grid(pencil.sizes[0], 7)).T).T
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     steps = np.linalg.norm(C[1] - C[0]) * np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0, 256.0])
     X = (C[0] + steps[:, None, None] * rays).reshape(-1, 3)
-    X = X[np.column_stack([X, np.ones(len(X))]) @ P[1, 2] > 0.0]
+    X = X[homogenize(X) @ P[1, 2] > 0.0]
     if len(X) == 0:
         evidence = "their fields of view do not intersect"
         raise StageFailure("no point is in front of both cameras", evidence, "choose another pair")
@@ -373,9 +360,7 @@ def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
 
 def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     """Samples of the part of an image within the arc: the corners of that polygon, then a grid."""
-    width, height = pencil.sizes[side]
-    x, y = np.linspace(0.0, width - 1.0, SAMPLES), np.linspace(0.0, height - 1.0, SAMPLES)
-    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    grid = _image_grid(pencil.sizes[side], SAMPLES)
     middle, half = 0.5 * (arc[0] + arc[1]), 0.5 * (arc[1] - arc[0])
     # The tolerance keeps the corners that bound the arc despite rounding.
     inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half + 1e-9
@@ -385,6 +370,12 @@ def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     corner = [0, SAMPLES - 1, -SAMPLES, -1]
     corners = grid[corner][inside[corner]]
     return np.concatenate([*ends, corners, grid[inside]])
+
+
+def _image_grid(size: Size, count: int) -> F64:
+    """Pixels (N, 2) of a grid over an image."""
+    x, y = (np.linspace(0.0, length - 1.0, count) for length in size)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def image_corners(size: Size) -> F64:

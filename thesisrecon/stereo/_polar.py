@@ -36,7 +36,7 @@ class PolarRectification(Rectification):
 
     Row r shows the half-plane ``angles[r]``, with linear interpolation between rows. The point s px farther
     from the epipole than the image centre (nearer if the pencil is flipped) has the column ``scales[side]`` s
-    + ``shears[side]`` r - ``origins[side]``; these arrays are (2,).
+    + ``shears[side]`` r - ``origins[side]``.
     """
 
     pencil: EpipolarPencil

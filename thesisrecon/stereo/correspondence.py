@@ -63,11 +63,6 @@ class PairMatching:
         Returns
         -------
         Correspondence
-
-        Raises
-        ------
-        StageFailure
-            If the pair cannot be rectified or no point lies in the rectified frame.
         """
         own = reference.seen.shape, other.seen.shape
         frame = rectify_cameras(reference.P, other.P, own[0][::-1], own[1][::-1], xy1=xy1, xy2=xy2)
@@ -175,11 +170,9 @@ def _patch_means(rgb: U8, xy: F64) -> F64:
     reach = GAIN_PATCH
     inside = np.all((at >= reach) & (at < np.array([width, height]) - reach), axis=1)
     at = np.where(inside[:, None], at, reach)
-    total = np.zeros((len(xy), 3))
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            total += rgb[at[:, 1] + dy, at[:, 0] + dx]
-    return np.where(inside[:, None], total / (2 * reach + 1) ** 2, np.nan)
+    dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    patches = rgb[at[:, 1, None, None] + dy, at[:, 0, None, None] + dx]
+    return np.where(inside[:, None], patches.mean(axis=(1, 2)), np.nan)
 
 
 def _levels(view: PinholeView) -> F32:

@@ -165,32 +165,18 @@ class MultiViewStereo:
 
     The depth map of a view depends on images and cameras only, so views can be processed in any order and in
     parallel: :meth:`prepare`, then :meth:`depth_map` of each view, then :meth:`confirm` of each view.
-
-    Parameters
-    ----------
-    pairs : PairMatching
-        Dense correspondence of two views.
-    max_neighbours : int
-        Largest number of neighbouring views.
-    sequence_links : int
-        0: fuse the correspondences with all neighbours; else link them along the image sequence, at most so
-        many in each direction.
-    refinement : bool
-        Refine depth maps with slanted windows, and complete them from those of other views.
-    min_comparison_views : int
-        Number of depth maps to compare with, if there are as many.
-    max_side, match_side : int
-        Longest side in pixels of the depth maps and of the images for stereo matching; fronto-parallel
-        windows find less in larger images.
     """
 
-    pairs: PairMatching = field(default_factory=PairMatching)
-    max_neighbours: int = 4
+    pairs: PairMatching = field(default_factory=PairMatching)  #: dense correspondence of two views
+    max_neighbours: int = 4  #: largest number of neighbouring views
     sequence_links: int = 0
+    """0: fuse the correspondences with all neighbours; else link so many along the sequence each way."""
     refinement: bool = True
-    min_comparison_views: int = 12
-    max_side: int = 1024
+    """Refine depth maps with slanted windows, and complete them from those of other views."""
+    min_comparison_views: int = 12  #: number of depth maps to compare with, if there are as many
+    max_side: int = 1024  #: longest side of the depth maps in pixels
     match_side: int = 640
+    """Longest side of the images for stereo matching; fronto-parallel windows find less in larger images."""
 
     def __post_init__(self) -> None:
         if self.sequence_links < 0:
@@ -213,12 +199,9 @@ class MultiViewStereo:
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
         points = sparse_points(reconstruction)
+        registered = np.flatnonzero(reconstruction.registered).tolist()
         views, matched = (
-            {
-                i: pinhole_view(image, reconstruction, i, max_side=side)
-                for i, image in enumerate(images)
-                if reconstruction.registered[i]
-            }
+            {i: pinhole_view(images[i], reconstruction, i, max_side=side) for i in registered}
             for side in (self.max_side, min(self.match_side, self.max_side))
         )
         chosen = {i: select_neighbours(points, views, i, self.max_neighbours) for i in views}

@@ -38,7 +38,8 @@ METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar
 def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:
     """Return the rectification of least distortion among several methods.
 
-    Those within the angle and aspect limits take precedence; methods that fail are skipped.
+    Those within the angle and aspect limits take precedence; methods that fail are skipped. If all fail, the
+    ``StageFailure`` of the last is raised.
 
     Parameters
     ----------
@@ -50,11 +51,6 @@ def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectific
     Returns
     -------
     Rectification
-
-    Raises
-    ------
-    StageFailure
-        If all methods fail (the failure of the last).
     """
     best: Rectification | None = None
     least, failure = (True, np.inf), StageFailure("no method of rectification is given")
@@ -129,11 +125,6 @@ def rectify_cameras(
     Returns
     -------
     Rectification
-
-    Raises
-    ------
-    ValueError, StageFailure
-        As in :func:`rectify_pair`.
     """
     return rectify(pair_of_cameras(P1, P2, size1, size2, xy1=xy1, xy2=xy2))
 

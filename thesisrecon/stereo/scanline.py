@@ -286,22 +286,16 @@ class MaximumLikelihoodScanline:
     costs ln(P_D phi^m / ((1 - P_D) (2 pi s^2)^(m / 2))) with the detection probability P_D and values uniform
     over phi = 256 grey levels. Ordering and uniqueness hold by construction, and occlusions are part of the
     solution.
-
-    Parameters
-    ----------
-    radius : int
-        A measurement consists of the colours within this radius; the paper uses single pixels (0).
-    cohesion : {"none", "along", "along and across"}
-        Minimise the discontinuities among solutions of equal likelihood along the row (MLMH), or along the
-        row and against the previous row (MLMH+V).
-    out_of_view : bool
-        Pixels outside the other camera's view cost as much as an expected match, which does not bias the
-        disparities; the paper charges them as occluded, which pulls both row ends to disparity 0.
     """
 
     radius: int = 1
+    """A measurement consists of the colours within this radius; the paper uses single pixels (0)."""
     cohesion: Cohesion = "along and across"
+    """Minimise the discontinuities among solutions of equal likelihood along the row (MLMH), or also against
+    the previous row (MLMH+V)."""
     out_of_view: bool = True
+    """Pixels outside the other camera's view cost as much as an expected match, which does not bias the
+    disparities; the paper charges them as occluded, which pulls both row ends to disparity 0."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.radius <= 4:
@@ -314,7 +308,7 @@ class MaximumLikelihoodScanline:
 
         The confidence is the probability of the disparity (or an adjacent one) among the range given the two
         measurements alone, 3 / D if they are indistinguishable. It is reduced where texture is missing,
-        because errors of neighbouring pixels are then not independent. The memory is a few rows of D costs.
+        because errors of neighbouring pixels are then not independent.
 
         Parameters
         ----------

@@ -71,29 +71,15 @@ class SemiGlobalMatching:
     to exposure, plus the truncated colour difference, which distinguishes regions of equal pattern. The
     default has four paths: costs that are averaged over an adaptive support gain little from the diagonals,
     which extend foreground disparities past the corners of objects.
-
-    Parameters
-    ----------
-    paths : int
-        4 (rows and columns) or 8 (with diagonals).
-    census_share : float
-        Share of the census in the maximal cost; the colours have the rest.
-    truncation : float
-        Truncation of the colour difference, in standard deviations of the noise.
-    support : bool
-        Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels.
-    smoothing_radius : int
-        Radius of the edge-preserving mean over disparities within 1 px of the centre; 0 = none.
-    memory_mb : float
-        Memory limit for costs and path sums of one strip of rows.
     """
 
-    paths: int = 4
-    census_share: float = 0.56
-    truncation: float = 10.0
+    paths: int = 4  #: 4 (rows and columns) or 8 (with diagonals)
+    census_share: float = 0.56  #: share of the census in the maximal cost; the colours have the rest
+    truncation: float = 10.0  #: of the colour difference, in standard deviations of the noise
     support: bool = True
-    smoothing_radius: int = 2
-    memory_mb: float = 256.0
+    """Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels."""
+    smoothing_radius: int = 2  #: of the edge-preserving mean over similar disparities; 0 = none
+    memory_mb: float = 256.0  #: limit for costs and path sums of one strip of rows
 
     def __post_init__(self) -> None:
         if self.paths not in (4, 8):
@@ -152,8 +138,8 @@ class SemiGlobalMatching:
             cost_volume(features[0], features[1], support, first, weights, outside, volume)
             steps = np.ascontiguousarray(penalties[:, rows])
             sum_paths(volume, steps, P1_cost, sums, scratch.reshape(2, transposed))
-            left, right, confidence = found[:, start:stop]
-            best_disparities(sums, start - top, first, (left, right, confidence), half)
+            own = found[:, start:stop]
+            best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
         found[0][images[0].valid == 0] = np.nan
         return self._postprocess(found[0], found[1], found[2], texture_of(images[0], measured))
 
