@@ -22,8 +22,8 @@ from thesisrecon.intrinsics import (
     IntrinsicsOptions,
     camera_numbers,
     prior_from_options,
-    prior_warnings,
 )
+from thesisrecon.pipeline.reconstruction import _exif_warnings
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.stratified import Stratified
@@ -260,7 +260,7 @@ def test_a_known_focal_without_exif_is_constant_and_reported():
     assert got.group.tolist() == [0, 0, 1]
     assert np.isinf(got.std[:, 0]).all()
     assert camera_numbers(SIZES, options, silent).tolist() == [0, 0, 1]
-    (sentence,) = prior_warnings(options, silent)
+    (sentence,) = _exif_warnings(options, silent)
     assert "found in 3 images" in sentence
     assert "constant" in sentence
     each = IntrinsicsOptions(focal="known", exif=True, cameras="per-image")
@@ -277,8 +277,8 @@ def test_images_without_exif_share_one_focal():
     assert got.shared[1, 0] not in got.shared[[0, 2, 4], 0]
     # Cameras are counted by what they have in common: known to be alike, tied, or neither.
     assert camera_numbers(sizes, options, exif).tolist() == [0, 1, 0, 1, 2]
-    assert "2 of the 5 images" in prior_warnings(options, exif)[0]
-    assert "constant" in prior_warnings(options, exif)[0]
+    assert "2 of the 5 images" in _exif_warnings(options, exif)[0]
+    assert "constant" in _exif_warnings(options, exif)[0]
 
 
 def test_a_principal_point_far_outside_of_the_picture_is_refused():

@@ -17,10 +17,10 @@ from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.intrinsics import IntrinsicsOptions, camera_numbers, prior_warnings
+from thesisrecon.intrinsics import IntrinsicsOptions, camera_numbers
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline._state import name_images
-from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.pipeline.reconstruction import _exif_warnings, reconstruct
 from thesisrecon.records import Image
 from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import stream
@@ -422,7 +422,7 @@ def test_a_request_for_exif_without_exif_data_is_reported(tmp_path):
     ],
 )
 def test_only_an_ignored_option_gives_a_warning(knowledge, focal_px, words):
-    warnings = prior_warnings(knowledge, np.array(focal_px))
+    warnings = _exif_warnings(knowledge, np.array(focal_px))
     assert [words in warning for warning in warnings] == ([True] if words else [])
 
 

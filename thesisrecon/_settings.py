@@ -205,7 +205,11 @@ def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any
     """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
-        return _coerce_optional(value, arguments, where, current)
+        if value is None or value == _NONE:
+            return None
+        if several := _alternatives(arguments):
+            return _coerce_alternative(value, several, where, current)
+        return _coerce(value, next(a for a in arguments if a is not type(None)), where, current)
     if origin is Literal:
         if value in arguments and isinstance(value, str):
             return value
@@ -220,14 +224,6 @@ def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any
     if type(value) is annotation and (annotation in (str, bool) or whole):
         return value
     raise UsageError(f"{where} takes {_type_words(annotation)}; got {in_words(value)}")
-
-
-def _coerce_optional(value: Any, arguments: tuple[Any, ...], where: str, current: Any) -> Any:
-    if value is None or value == _NONE:
-        return None
-    if several := _alternatives(arguments):
-        return _coerce_alternative(value, several, where, current)
-    return _coerce(value, next(a for a in arguments if a is not type(None)), where, current)
 
 
 def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str, current: Any) -> Any:

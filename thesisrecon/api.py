@@ -14,7 +14,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.io._images import read_image
-from thesisrecon.pipeline.image_pair import ImageInput, match_pair
+from thesisrecon.pipeline._image_pair import ImageInput, match_pair
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import (
     DisparityMap,
@@ -115,10 +115,8 @@ def self_calibrate(
     config : PipelineConfig, optional
         ``config.selfcalibration`` is the method, ``config.intrinsics`` the prior knowledge; by default images
         of one size share one camera.
-    images : sequence of Image
-        The images, one per view, for methods that detect parallel lines.
-    seed : int
-        Random seed.
+    images, seed : sequence of Image, int
+        The images, one per view, for methods that detect parallel lines; and the random seed.
 
     Returns
     -------
@@ -127,10 +125,8 @@ def self_calibrate(
 
     Raises
     ------
-    ValueError
-        If the reconstruction is not projective or the seed is not a whole number of at least 0.
-    StageFailure
-        If the views do not determine a calibration.
+    ValueError, StageFailure
+        If the reconstruction is not projective or the seed is invalid; if no calibration is determined.
 
     Examples
     --------
@@ -192,10 +188,9 @@ def upgrade_affine(
 
     Raises
     ------
-    ValueError
-        If the reconstruction is not projective, the plane is zero or not finite, or the seed is invalid.
-    StageFailure
-        If the plane at infinity cannot be located.
+    ValueError, StageFailure
+        If the reconstruction is not projective, the plane is zero or not finite, or the seed is invalid; if
+        the plane at infinity cannot be located.
 
     Examples
     --------

@@ -69,10 +69,8 @@ class Camera:
         require_finite("Camera", *fields.values())
         low = np.append(K[[1, 2, 2], [0, 0, 1]], K[2, 2] - 1.0)
         if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= _TRIANGULAR):
-            raise ValueError(
-                "Camera needs K upper triangular with positive focal lengths and K33 = 1; "
-                f"got {K.round(6).tolist()}"
-            )
+            needed = "K upper triangular with positive focal lengths and K33 = 1"
+            raise ValueError(f"Camera needs {needed}; got {K.round(6).tolist()}")
         apart = np.abs(R.T @ R - np.eye(3)).max()
         if not apart <= _ORTHOGONAL:
             raise ValueError(f"Camera needs a rotation R; R'R deviates from the identity by {apart:.2g}")

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.errors import UsageError, counted
+from thesisrecon.errors import UsageError
 from thesisrecon.records import Reconstruction
 
 Mode = Literal["known", "constant", "free"]
@@ -235,7 +235,7 @@ def prior_from_options(
         One row per view; ``UsageError`` if the given principal point lies far outside an image.
     """
     n = len(original_sizes)
-    check_sizes(options, original_sizes)
+    _check_sizes(options, original_sizes)
     group, own = _camera_groups(original_sizes, options.cameras), np.arange(n, dtype=np.int64)
     # A known value is known for every view: sharing it would add nothing.
     modes = [getattr(options, name) for name in _OF_COLUMN]
@@ -278,14 +278,8 @@ def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None 
     return prior_from_options(options or IntrinsicsOptions(), sizes, missing, same)
 
 
-def check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise ``UsageError`` if the given principal point lies more than one long side outside an image.
-
-    Parameters
-    ----------
-    options, original_sizes
-        As for :func:`prior_from_options`.
-    """
+def _check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]]) -> None:
+    """Refuse a principal point that lies more than one long side outside an image."""
     if options.principal_point_px is None:
         return
     x, y = options.principal_point_px
@@ -309,27 +303,3 @@ def _values(options: IntrinsicsOptions, sizes: F64, exif_focal_px: F64) -> tuple
     std = np.tile([np.inf if stds[name] is None else stds[name] for name in _OF_COLUMN], (n, 1))
     std[:, 3:5] *= sizes.max(axis=1, keepdims=True)
     return mean, std
-
-
-def prior_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
-    """Return a warning about requested EXIF focal lengths that are missing.
-
-    Parameters
-    ----------
-    options, exif_focal_px
-        As for :func:`prior_from_options`.
-
-    Returns
-    -------
-    list of str
-    """
-    missing, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
-    if not options.exif or options.focal_px is not None or not missing:
-        return []
-    # A known focal that is estimated instead must be reported.
-    instead = ": it is estimated instead, one value per camera (constant)"
-    rest = instead if options.focal == "known" else ""
-    if missing == total:
-        found = f"No EXIF focal length was found in {counted(total, 'image')}"
-        return [f"{found}{rest or ': no focal prior is used'}"]
-    return [f"{missing} of the {total} images have no EXIF focal length{rest or ' and no focal prior'}"]

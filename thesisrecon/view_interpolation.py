@@ -14,7 +14,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io._images import read_image
-from thesisrecon.pipeline.image_pair import match_pair
+from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo._planar import PlanarRectification
 from thesisrecon.stereo.semi_global import match_both_sides
@@ -220,8 +220,6 @@ def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None
         if -0.5 <= x <= size[0] - 0.5 and -0.5 <= y <= size[1] - 0.5:
             # Without parallax F is not unique, and neither are its epipoles.
             require_parallax_of_matches(pair.F, pair.xy1, pair.xy2)
-            raise StageFailure(
-                "there is no view between the images: the camera moved towards the scene or away from it",
-                f"the epipole lies at ({x:.0f}, {y:.0f}) px, inside {image.name}",
-                _SIDE_BY_SIDE,
-            )
+            reason = "there is no view between the images: the camera moved towards the scene or away from it"
+            evidence = f"the epipole lies at ({x:.0f}, {y:.0f}) px, inside {image.name}"
+            raise StageFailure(reason, evidence, _SIDE_BY_SIDE)

@@ -13,7 +13,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.intrinsics import prior_from_options
 from thesisrecon.io._images import read_image
-from thesisrecon.pipeline.image_pair import match_pair
+from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.views.trilinear import VirtualCamera, default_intrinsics, pair_from_fundamental

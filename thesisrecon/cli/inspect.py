@@ -30,11 +30,9 @@ def inspect(
 def summary_text(summary: Mapping[str, Any], out: Path) -> str:
     """Format ``summary.json`` for a terminal, one fact per line, without control characters."""
     lines = [_result(summary)]
-    if summary["reprojection_rms_px"] is not None:
-        lines.append(
-            f"reprojection residual {summary['reprojection_rms_px']:.3f} px RMS, "
-            f"{summary['reprojection_median_px']:.3f} px median"
-        )
+    rms, median = summary["reprojection_rms_px"], summary["reprojection_median_px"]
+    if rms is not None:
+        lines.append(f"reprojection residual {rms:.3f} px RMS, {median:.3f} px median")
     lines += _intrinsic_lines(summary["cameras"])
     if summary.get("model"):
         lines.append(f"model with {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
@@ -63,10 +61,8 @@ def _result(summary: Mapping[str, Any]) -> str:
     if pairs["matched"]:
         possible = pairs.get("possible", pairs["matched"])
         chosen = f" ({possible} are possible)" if possible > pairs["matched"] else ""
-        return (
-            f"{pairs['accepted']} of {counted(pairs['matched'], 'image pair')} accepted{chosen}, "
-            f"{counted(pairs['verified_matches'], 'verified match')}"
-        )
+        accepted = f"{pairs['accepted']} of {counted(pairs['matched'], 'image pair')} accepted{chosen}"
+        return f"{accepted}, {counted(pairs['verified_matches'], 'verified match')}"
     corners = [view["corners"] for view in summary["cameras"] if view["corners"] is not None]
     if corners:
         return f"{counted(sum(corners), 'corner')} in {counted(len(corners), 'image')}"

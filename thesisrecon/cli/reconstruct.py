@@ -119,9 +119,8 @@ def _pairs_table(value: str) -> dict[str, Any]:
         except ValueError:
             raise UsageError(f"--pairs window:N takes a whole number of images; got {value!r}") from None
     if not Path(value).is_file():
-        raise UsageError(
-            f"--pairs takes all, overlap, window:N, or a file of pairs; there is no file {value!r}"
-        )
+        known = "all, overlap, window:N, or a file of pairs"
+        raise UsageError(f"--pairs takes {known}; there is no file {value!r}")
     from thesisrecon.io._files import read_pairs
 
     return {"kind": "listed-pairs", "listed": read_pairs(Path(value))}

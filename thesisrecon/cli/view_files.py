@@ -21,6 +21,7 @@ from thesisrecon.io._meshes import read_mesh
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
+from thesisrecon.runtime._run import Progress
 from thesisrecon.view_interpolation import prepare_pair, require_comparable_images
 from thesisrecon.view_synthesis import match_images, prepare_trilinear_views
 from thesisrecon.views.interpolation import InterpolatedPair, detect_monotonicity_violations
@@ -28,6 +29,13 @@ from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sam
 from thesisrecon.views.render import Light, Shading, render
 from thesisrecon.views.trilinear import camera_at
 
+MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
+PATHS = ("orbit", "interpolate")
+_FRAME_MS = 100
+"""Time per frame of an animation of ``interpolate``."""
+_DEFAULT_SIDE_PX = 1000
+_NO_MODEL = "No surface model was built"
+"""Beginning of the warning of a run whose surface stage failed."""
 _MIDWAY = 0.5
 _BEYOND = 0.5
 """Baselines by which a sequence of the tensor extends beyond either camera."""
@@ -40,11 +48,11 @@ class ViewSequence:
     ``draw`` takes the number of a view and of threads; ``notes`` are sentences about the whole sequence.
     """
 
-    captions: tuple[str, ...]
+    captions: list[str]
     draw: Callable[[int, int], U8]
-    notes: tuple[str, ...]
+    notes: list[str]
     metadata: dict[str, Any]
-    frame_metadata: tuple[dict[str, Any], ...]
+    frame_metadata: list[dict[str, Any]]
 
 
 def interpolated_sequence(
@@ -56,19 +64,14 @@ def interpolated_sequence(
     way is matched with the third image, so its pixels are resampled twice.
     """
     require_comparable_images(images)
-    path = np.linspace(0.0, 1.0, frames) if frames > 1 else np.array([_MIDWAY])
-    pair = prepare_pair(images[0], images[1], config=config, seed=seed)
-    weights: list[tuple[float, ...]]
-    if len(images) == 2:
-        weights = [(1.0 - float(s), float(s)) for s in path]
-        legs, stops = [pair], [(0, float(s)) for s in path]
-    else:
-        middle = Image("the interpolated view", pair.view(_MIDWAY), images[0].original_size)
-        legs = [pair, prepare_pair(middle, images[2], config=config, seed=seed)]
-        stops = [(0, float(u)) if u <= _MIDWAY else (1, float(2.0 * u - 1.0)) for u in path]
-        weights = [
-            (1 - s, s, 0.0) if leg == 0 else (_MIDWAY * (1 - s), _MIDWAY * (1 - s), s) for leg, s in stops
-        ]
+    path = np.linspace(0.0, 1.0, frames).tolist() if frames > 1 else [_MIDWAY]
+    legs = [prepare_pair(images[0], images[1], config=config, seed=seed)]
+    stops, weights = [(0, s) for s in path], [[1.0 - s, s] for s in path]
+    if len(images) == 3:
+        middle = Image("the interpolated view", legs[0].view(_MIDWAY), images[0].original_size)
+        legs.append(prepare_pair(middle, images[2], config=config, seed=seed))
+        stops = [(0, u) if u <= _MIDWAY else (1, 2.0 * u - 1.0) for u in path]
+        weights = [[1 - s, s, 0.0] if leg == 0 else [0.5 * (1 - s), 0.5 * (1 - s), s] for leg, s in stops]
 
     def draw(k: int, threads: int) -> U8:
         leg, s = stops[k]
@@ -77,15 +80,13 @@ def interpolated_sequence(
     names = [image.name for image in images]
     violations = [_violating(leg) for leg in legs]
     metadata = {"images": names, "violating_monotonicity": violations, "known": [leg.known for leg in legs]}
-    captions = tuple(
-        ", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights
-    )
-    notes = tuple(
+    captions = [", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights]
+    notes = [
         f"{100.0 * leg.known:.0f} % of the pixels have a correspondence; {100.0 * share:.1f} % of these "
         "violate monotonicity, where near surfaces occlude far ones"
         for share, leg in zip(violations, legs, strict=True)
-    )
-    return ViewSequence(captions, draw, notes, metadata, tuple({"weights": list(w)} for w in weights))
+    ]
+    return ViewSequence(captions, draw, notes, metadata, [{"weights": w} for w in weights])
 
 
 def _violating(pair: InterpolatedPair) -> float:
@@ -109,23 +110,19 @@ def trilinear_sequence(
     pair, sizes = views.pair, (first.size, second.size)
     positions = np.linspace(-_BEYOND, 1.0 + _BEYOND, frames).tolist() if frames > 1 else [_MIDWAY]
     path = [camera_at(pair, s, sizes=sizes) for s in positions]
-    metadata = {
-        "images": [first.name, second.name],
-        "K": [pair.K1, pair.K2],
-        "second_from_first": {"R": pair.R, "t": pair.t},
-    }
-    frame_metadata = tuple(
-        {"baselines": s, "R": camera.rotation, "t": camera.translation, "K": camera.K}
-        for s, camera in zip(positions, path, strict=True)
-    )
-    captions = tuple(_caption(s, first.name, second.name) for s in positions)
+
+    def draw(k: int, threads: int) -> U8:
+        return views.render(path[k], threads=threads)
+
+    names, motion = [first.name, second.name], {"R": pair.R, "t": pair.t}
+    metadata = {"images": names, "K": [pair.K1, pair.K2], "second_from_first": motion}
+    cameras = [{"R": camera.rotation, "t": camera.translation, "K": camera.K} for camera in path]
+    frame_metadata = [{"baselines": s, **camera} for s, camera in zip(positions, cameras, strict=True)]
     note = (
         f"the focal lengths are assumed to be {pair.K1[0, 0]:.0f} and {pair.K2[0, 0]:.0f} px; lengths are in "
         "units of the distance between the two cameras"
     )
-    return ViewSequence(
-        captions, lambda k, threads: views.render(path[k], threads=threads), (note,), metadata, frame_metadata
-    )
+    return ViewSequence([_caption(s, *names) for s in positions], draw, [note], metadata, frame_metadata)
 
 
 def _caption(s: float, first: str, second: str) -> str:
@@ -136,17 +133,8 @@ def _caption(s: float, first: str, second: str) -> str:
     return f"{100.0 * s:.0f} % of the way from {first} to {second}"
 
 
-MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
-PATHS = ("orbit", "interpolate")
 METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
 """Method -> function that returns its :class:`ViewSequence`."""
-_FRAME_MS = 100
-"""Time per frame of an animation of ``interpolate``."""
-_DEFAULT_SIDE_PX = 1000
-_NO_MODEL = "No surface model was built"
-"""Beginning of the warning of a run whose surface stage failed."""
-
-Progress = Callable[[str, int, int], None]
 
 
 def render_run(
@@ -258,7 +246,6 @@ def _written(folder: Path, frames: int, size: Sequence[int], animation: Path) ->
 
 
 def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:
-    """Read the model and the cameras of a finished run."""
     if not out.is_dir() or not any((out / name).is_file() for name in (MODEL, CAMERAS, "run.json")):
         raise UsageError(f"{out} holds no run; create one with thesisrecon reconstruct IMAGES -o {out}")
     if not (out / MODEL).is_file():

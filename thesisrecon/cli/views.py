@@ -75,7 +75,6 @@ def render(
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Parse ``WIDTHxHEIGHT``."""
     found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
     if found is None:
         raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")

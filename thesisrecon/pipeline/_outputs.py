@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -38,13 +39,6 @@ MAX_AFFINE = 1e3
 """Largest affine coordinate written to affine.ply, in standard deviations of the points."""
 
 
-def _affine_stratum(result: RunResult) -> Reconstruction:
-    """The projective reconstruction upgraded by the plane at infinity of self-calibration."""
-    assert result.projective is not None
-    assert result.calibration is not None
-    return upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
-
-
 def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
     """Write the affine points within ``MAX_AFFINE`` and the camera centres (red) as a PLY file."""
     X = affine.X[:, :3]
@@ -64,9 +58,8 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
     later = _later_end(run.directory.path, until) if failure is None else None
     if later is None:
         return _write(run, result, until, failure)
-    run.warnings.append(
-        f"the folder holds the result of this run up to {later}: its summary and report are kept"
-    )
+    kept = "its summary and report are kept"
+    run.warnings.append(f"the folder holds the result of this run up to {later}: {kept}")
     return _described(run, result, until, failure)
 
 
@@ -83,8 +76,7 @@ def _with_image_names(result: RunResult) -> RunResult:
         metric = replace(metric, failed_checks=failed, warnings=named(metric.warnings))
     if calibration is not None:
         calibration = replace(calibration, reasons=named(calibration.reasons))
-        if calibration.identifiability is not None:
-            report = calibration.identifiability
+        if (report := calibration.identifiability) is not None:
             report = replace(report, sentences=named(report.sentences))
             calibration = replace(calibration, identifiability=report)
     return replace(result, metric=metric, calibration=calibration)
@@ -113,10 +105,10 @@ def _described(run: Run, result: RunResult, until: str, failure: StageFailure | 
 def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
     out, colors, affine = run.directory.path, None, None
     with run.clock("outputs"):
-        if result.metric is not None:
+        if result.metric is not None and result.projective is not None and result.calibration is not None:
             colors = point_colors(result.metric.reconstruction, result.images)
             run.warnings.extend(_write_model(run.directory, result, result.metric.reconstruction, colors))
-            affine = _affine_stratum(result)
+            affine = upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
             write_affine(out / "affine.ply", affine, colors)
             if result.mesh is not None:
                 write_mesh(out / "model.glb", result.mesh)
@@ -207,7 +199,7 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "threads": run.workers.threads,
         "executor": run.workers.name,
         "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
-        "elapsed_seconds": round(run.elapsed_s, 3),
+        "elapsed_seconds": round(time.perf_counter() - run.started, 3),
         "resumed": list(run.resumed),
         "peak_memory_mb": round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1),
     }

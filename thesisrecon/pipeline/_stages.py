@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig, with_images
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
-from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import (
     DepthMap,
     Features,
@@ -36,8 +37,12 @@ from thesisrecon.views.image_similarity import covered_pixels, match_exposure, p
 from thesisrecon.views.render import render
 
 MIN_CORNERS = 16
-
-# ---------------------------------------------------------------- 4.2.1: features
+ATTEMPTS = 3
+"""Maximum number of initial pairs to try until the self-check passes."""
+MIN_VIEWS = 3
+"""With fewer views, others may not see the surface of the held-out one."""
+RENDERER = "thesisrecon.views.render"
+"""Module whose code the held-out comparison depends on, besides that of the model."""
 
 
 def find_features(state: PipelineState) -> None:
@@ -63,9 +68,6 @@ def _detect(config: PipelineConfig, image: Image) -> list[Features]:
     return [config.features.detect(image)]
 
 
-# ---------------------------------------------------------------- 4.2.2 and chapter 5: pairs of views
-
-
 def select_pairs(state: PipelineState) -> None:
     """Select the pairs of images to match; sets ``result.pair_choice``."""
     run, images, features = state.run, state.result.images, state.result.features
@@ -73,14 +75,12 @@ def select_pairs(state: PipelineState) -> None:
     key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
     run.progress("pairs", 0, 1)
     select, map_all, rng = state.config.pairs.select, run.workers.map_all, stream(run.seed, "pairs")
-    choice: PairChoice = run.cached(
-        "pairs", "choice", key, lambda: select(names, features, map_all=map_all, rng=rng)
-    )
+    compute = partial(select, names, features, map_all=map_all, rng=rng)
+    choice: PairChoice = run.cached("pairs", "choice", key, compute)
     state.result = replace(state.result, pair_choice=choice)
     possible = len(images) * (len(images) - 1) // 2
-    run.finish(
-        "pairs", counts={"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
-    )
+    counts = {"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
+    run.finish("pairs", counts=counts)
     run.progress("pairs", 1, 1)
 
 
@@ -154,10 +154,6 @@ def build_tracks(state: PipelineState) -> None:
     run.finish("tracks", counts=counts | {"seen_3_times": int((seen >= 3).sum())})
 
 
-ATTEMPTS = 3
-"""Maximum number of initial pairs to try until the self-check passes."""
-
-
 def _cached(
     state: PipelineState, stage: str, attempt: int, inputs: Any, compute: Callable[[np.random.Generator], Any]
 ) -> Any:
@@ -206,10 +202,9 @@ def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
 
 def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
     """A warning about a critical motion that the prior resolves; others fail the self-check."""
-    identifiability = calibration.identifiability
-    if identifiability is None or not (identifiability.critical and identifiability.identifiable):
-        return ()
-    return ("; ".join(identifiability.sentences),)
+    found = calibration.identifiability
+    resolved = found is not None and found.critical and found.identifiable
+    return ("; ".join(found.sentences),) if found is not None and resolved else ()
 
 
 def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) -> MetricResult:
@@ -259,12 +254,6 @@ def _quality(result: RunResult) -> tuple[bool, bool, int, int]:
     return result.metric is not None, trusted, int(best.registered.sum()), int(best.valid.sum())
 
 
-MIN_VIEWS = 3
-"""With fewer views, others may not see the surface of the held-out one."""
-RENDERER = "thesisrecon.views.render"
-"""Module whose code the held-out comparison depends on, besides that of the model."""
-
-
 def _middle_view(views: Sequence[PinholeView]) -> PinholeView:
     """The view with the smallest sum of distances to the other cameras."""
     C = np.array([camera_centre(view.P) for view in views])
@@ -300,12 +289,6 @@ def _depths(config: PipelineConfig, scene: MultiViewScene, view: int) -> list[De
     return [config.dense.depth_map(scene, view)]
 
 
-def _confirmed(
-    config: PipelineConfig, scene: MultiViewScene, maps: Mapping[int, DepthMap], view: int
-) -> DepthMap:
-    return config.dense.confirm(scene, maps, view)
-
-
 def estimate_depth_maps(state: PipelineState) -> None:
     """Estimate and cross-check the depth maps of all registered views (2.5)."""
     run, result = state.run, state.result
@@ -332,10 +315,11 @@ def estimate_depth_maps(state: PipelineState) -> None:
     def confirmations() -> Iterator[tuple[object, ...]]:
         for view in order:
             part, near = seen_from(view)
-            yield state.config, part, {j: maps[j] for j in sorted(near)}, view
+            yield part, {j: maps[j] for j in sorted(near)}, view
 
+    confirm = state.config.dense.confirm
     with run.clock("dense"):
-        run.workers.run(_confirmed, confirmations(), lambda n, depths: confirmed.update({order[n]: depths}))
+        run.workers.run(confirm, confirmations(), lambda n, depths: confirmed.update({order[n]: depths}))
     final = [confirmed[i] for i in order]
     state.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))
     known = [float(np.isfinite(m.depth).mean()) for m in final]
@@ -355,10 +339,8 @@ def build_model(state: PipelineState) -> None:
     run, result = state.run, state.result
     key = run.key("model", run.variant_key("model"), list(run.logs["dense"].keys.values()))
     run.progress("model", 0, 1)
-    build, threads = state.config.model.build, run.workers.threads
-    mesh: TexturedMesh = run.cached(
-        "model", "model", key, lambda: build(result.depth_maps, result.views, threads=threads)
-    )
+    build = partial(state.config.model.build, result.depth_maps, result.views, threads=run.workers.threads)
+    mesh: TexturedMesh = run.cached("model", "model", key, build)
     held_out_key = run.key("model", key, "held-out", code_key(RENDERER))
     held_out = run.cached("model", "held-out", held_out_key, lambda: _compare_held_out(state, mesh))
     state.result = replace(state.result, mesh=mesh, held_out=held_out)

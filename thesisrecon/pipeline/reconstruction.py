@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Unpack
 
+import numpy as np
+
 from thesisrecon._settings import tables_from_config
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.intrinsics import camera_numbers, check_sizes, prior_warnings
+from thesisrecon.errors import StageFailure, UsageError, counted
+from thesisrecon.intrinsics import IntrinsicsOptions, camera_numbers
 from thesisrecon.io._images import ImageSet, ImageSource, list_images, read_images, scene_name
 from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
@@ -106,8 +109,8 @@ def reconstruct(
         if isinstance(pairs, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
             pairs.check([image.name for image in inputs.images], inputs.refused)
-        run.directory.adopt(_identity(run, inputs), overwrite=overwrite, results=RESULT_FILES)
         state = PipelineState(run, inputs, _empty_result(run, inputs), until)
+        run.directory.adopt(_identity(run, inputs), overwrite=overwrite, results=RESULT_FILES)
         try:
             state.require_images()
             _run_steps(state, surface_required=options.get("until") is not None)
@@ -138,13 +141,25 @@ def _read_inputs(run: Run, images: ImageSource) -> ImageSet:
     found, refused = len(inputs.decoded), len(inputs.refused)
     if found + refused == 0:
         raise UsageError("no images")
-    intrinsics = run.config.intrinsics
-    check_sizes(intrinsics, [image.original_size for image in inputs.images])
     warnings = [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
     warnings += [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
-    warnings += prior_warnings(intrinsics, inputs.exif_focal_px)
+    warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
     run.finish("images", counts={"read": found, "refused": refused}, warnings=warnings)
     return inputs
+
+
+def _exif_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
+    """A warning about requested EXIF focal lengths that are missing."""
+    missing, total = int((~np.isfinite(exif_focal_px)).sum()), len(exif_focal_px)
+    if not options.exif or options.focal_px is not None or not missing:
+        return []
+    # A known focal that is estimated instead must be reported.
+    instead = ": it is estimated instead, one value per camera (constant)"
+    rest = instead if options.focal == "known" else ""
+    if missing == total:
+        found = f"No EXIF focal length was found in {counted(total, 'image')}"
+        return [f"{found}{rest or ': no focal prior is used'}"]
+    return [f"{missing} of the {total} images have no EXIF focal length{rest or ' and no focal prior'}"]
 
 
 def _settings_identity(run: Run) -> dict[str, Any]:

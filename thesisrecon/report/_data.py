@@ -176,7 +176,6 @@ def summarize(result: RunResult) -> dict[str, Any]:
 
 
 def _motion(result: RunResult) -> dict[str, Any] | None:
-    """Return the nearest critical motion and its evidence."""
     found = None if result.calibration is None else result.calibration.identifiability
     if found is None:
         return None

@@ -72,7 +72,6 @@ def embed_jpeg(picture: PillowImage.Image, *, quality: int) -> EmbeddedImage:
 
 
 def _sampled(image: Image) -> PillowImage.Image:
-    """Every n-th pixel of an image."""
     step = max(1, max(image.size) // _SAMPLES_PX)
     return PillowImage.fromarray(image.rgb[::step, ::step])
 

@@ -177,11 +177,11 @@ def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure
     high = max(1.0, float(np.log10(counts.max(initial=10))))
     low = max(0.0, min(float(np.log10(max(counts.min(initial=10**9), 1))), high - 1.0))
     scale = {"zmin": low, "zmax": high}
-    good = _heat(accepted, labels, "", "verified matches") | scale
+    good = _heat(accepted, labels, "", "verified matches")
     good |= {"colorscale": _PAIR_SCALE, "colorbar": _count_bar()}
-    bad = _heat(refused, labels, "× ", "verified matches, not accepted") | scale
+    bad = _heat(refused, labels, "× ", "verified matches, not accepted")
     bad |= {"colorscale": _REFUSED_SCALE, "showscale": False}
-    return {"data": [good, bad], "layout": _matrix_layout(labels, block)}
+    return {"data": [good | scale, bad | scale], "layout": _matrix_layout(labels, block)}
 
 
 def _count_matrix(pairs: Sequence[TwoView], cells: int, block: int, accepted: bool) -> I64:
@@ -217,15 +217,9 @@ def _heat(counts: I64, labels: list[str], mark: str, words: str) -> Figure:
 def _matrix_layout(labels: list[str], block: int) -> Figure:
     step = max(1, -(-len(labels) // 20))
     numbers = [str(first * block + 1) for first in range(0, len(labels), step)]
-    ticks = {
-        "tickmode": "array",
-        "tickvals": labels[::step],
-        "ticktext": numbers,
-        "tickangle": 0,
-        "ticks": "",
-    }
-    axis = {"type": "category", "showgrid": False, "zeroline": False, "fixedrange": True}
-    axis |= {"constrain": "domain", **ticks}
+    axis: Figure = {"type": "category", "showgrid": False, "zeroline": False, "fixedrange": True}
+    axis |= {"constrain": "domain", "tickmode": "array", "tickvals": labels[::step], "ticktext": numbers}
+    axis |= {"tickangle": 0, "ticks": ""}
     return {
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "#e9edf0",

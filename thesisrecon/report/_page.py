@@ -37,7 +37,6 @@ from thesisrecon.report._data import ReportData, reprojection_distances, summari
 from thesisrecon.report._drawing import (
     DIFFERENCE_LIMIT,
     SCALE,
-    DepthImage,
     depth_side,
     draw_depth,
     draw_held_out,
@@ -131,6 +130,7 @@ def render_report(data: ReportData) -> str:
     if data.model is not None and len(data.model.faces) and data.metric is not None:
         names = [image.name for image in data.images]
         model = viewer_data(data.model, data.metric.reconstruction, names)
+    depths, side = sorted(data.depth_maps.items()), depth_side(len(data.depth_maps))
     figure_scripts = [plotly_script(), page_resource("page.js")] if figures else []
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     return render_page(
@@ -147,7 +147,7 @@ def render_report(data: ReportData) -> str:
         limit_px=limit_px,
         model=model,
         model_text=model_text(data.model) if data.model is not None else "",
-        depths=_depths(data),
+        depths=[(i + 1, data.images[i].name, draw_depth(depth, side=side)) for i, depth in depths],
         held_out=draw_held_out(data.held_out) if data.held_out is not None else None,
         scale=SCALE,
         difference_limit=round(DIFFERENCE_LIMIT),
@@ -186,15 +186,6 @@ def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
     return figures, len(scene.points) if scene is not None else 0
 
 
-def _depths(data: ReportData) -> list[tuple[int, str, DepthImage]]:
-    """Return (number, name, drawing) of every view with a depth map."""
-    side = depth_side(len(data.depth_maps))
-    return [
-        (view + 1, data.images[view].name, draw_depth(depth, side=side))
-        for view, depth in sorted(data.depth_maps.items())
-    ]
-
-
 def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict[str, Any]]:
     """Each image on the page: its state, the reason, and its residuals if it has a camera."""
     cards, intrinsics = [], data.original_intrinsics
@@ -220,9 +211,8 @@ def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict
 
 def _intrinsic_columns(data: ReportData) -> list[tuple[str, str]]:
     """Return (name, heading) of the table columns: the usual intrinsics and all estimated ones."""
-    estimated = {
-        name for view in data.original_intrinsics for name, interval in view.items() if interval.std != 0.0
-    }
+    views = data.original_intrinsics
+    estimated = {name for view in views for name, interval in view.items() if interval.std != 0.0}
     return [(name, text) for name, text in _INTRINSICS.items() if name in _ALWAYS_SHOWN or name in estimated]
 
 
@@ -255,7 +245,6 @@ def _drawn_pairs(data: ReportData) -> list[dict[str, Any]]:
 
 
 def _pair_text(pair: TwoView) -> str:
-    """Format the numbers of a pair."""
     share = f" ({100 * pair.inliers / pair.candidates:.0f} %)" if pair.candidates else ""
     words = f"{grouped(pair.inliers)} verified of {grouped(pair.candidates)} candidate matches{share}"
     if np.isfinite(pair.sigma_px):
@@ -270,11 +259,9 @@ def _pair_text(pair: TwoView) -> str:
 def _warnings(data: ReportData) -> list[tuple[str, str]]:
     """Return (stage, sentence) of every warning; those of the whole run are only in its summary."""
     found = [(report.stage, text) for report in data.reports for text in report.warnings]
-    of_run = data.summary.get("warnings")
-    if isinstance(of_run, list | tuple):
-        known = {text for _, text in found}
-        found += [("run", str(text)) for text in of_run if str(text) not in known]
-    return found
+    of_run, known = data.summary.get("warnings"), {text for _, text in found}
+    rest = of_run if isinstance(of_run, list | tuple) else ()
+    return found + [("run", str(text)) for text in rest if str(text) not in known]
 
 
 def _stages(reports: tuple[StageReport, ...]) -> list[dict[str, Any]]:

@@ -30,10 +30,8 @@ def tcp_address(executor: str) -> str:
     """Convert ``dask://HOST:PORT`` to ``tcp://HOST:PORT``."""
     found = _ADDRESS.fullmatch(executor.removeprefix(SCHEME)) if executor.startswith(SCHEME) else None
     if found is None or not 0 < int(found["port"]) < 65536:
-        raise UsageError(
-            "a Dask scheduler must be given as dask://HOST:PORT, for example dask://localhost:8786; "
-            f"got {executor!r}"
-        )
+        form = "dask://HOST:PORT, for example dask://localhost:8786"
+        raise UsageError(f"a Dask scheduler must be given as {form}; got {executor!r}")
     return f"tcp://{found[0]}"
 
 
@@ -58,9 +56,8 @@ class Cluster:
         now = time.monotonic()
         self._alone_since = self._alone_since or now
         if now - self._alone_since > WORKERLESS_S:
-            raise WorkersLost(
-                f"the Dask scheduler at {self.address} has had no worker for {WORKERLESS_S:.0f} s"
-            )
+            alone = f"has had no worker for {WORKERLESS_S:.0f} s"
+            raise WorkersLost(f"the Dask scheduler at {self.address} {alone}")
 
     def lost(self) -> WorkersLost:
         """The error for tasks that were cancelled."""
@@ -83,29 +80,27 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
         import dask
         from distributed import Client
     except ImportError:
-        raise UsageError(
-            f"--executor {executor} needs the package distributed, which is not installed; install "
-            "thesisrecon[distributed]"
-        ) from None
+        missing = "needs the package distributed, which is not installed; install thesisrecon[distributed]"
+        raise UsageError(f"--executor {executor} {missing}") from None
     # Errors are reported by this module; large tasks are intended.
     settings = {"distributed.admin.large-graph-warning-threshold": "1TiB"}
+    place = address.removeprefix("tcp://")
     with _quiet("distributed"), dask.config.set(settings):
         try:
             client = Client(address, timeout=ANSWER_S, set_as_default=False)
         except (OSError, futures.TimeoutError):
             raise UsageError(
-                f"no Dask scheduler answers at {address.removeprefix('tcp://')} within {ANSWER_S:.0f} s; "
+                f"no Dask scheduler answers at {place} within {ANSWER_S:.0f} s; "
                 "start one there (dask scheduler) and its workers (dask worker), or correct the address"
             ) from None
         try:
             try:
                 client.wait_for_workers(1, timeout=ANSWER_S)
             except (OSError, futures.TimeoutError):
-                place = address.removeprefix("tcp://")
                 advice = f"start some with: dask worker {address}"
                 raise UsageError(f"the Dask scheduler at {place} has no workers; {advice}") from None
             # pure=False: do not hash all bytes of the tasks.
-            yield Cluster(address.removeprefix("tcp://"), client, client.get_executor(pure=False))
+            yield Cluster(place, client, client.get_executor(pure=False))
         finally:
             with suppress(Exception):
                 client.close(timeout=1.0)

@@ -87,11 +87,6 @@ class Run:
     started: float = field(default_factory=time.perf_counter)
     _stage: str = ""  # the one being computed
 
-    @property
-    def elapsed_s(self) -> float:
-        """Wall time (s) since the start; times of cached stages are those of the run that computed them."""
-        return time.perf_counter() - self.started
-
     @contextmanager
     def clock(self, stage: str) -> Iterator[_StageLog]:
         """Add the time of the block to a stage; yields the log of the stage."""
@@ -179,10 +174,9 @@ class Run:
         try:
             yield
         except WorkersLost as lost:
-            raise WorkersLost(
-                f"{lost} (in the stage {self._stage}). Finished work is kept in {self.directory.path}: "
-                "repeat the command to resume, with this executor or another"
-            ) from None
+            kept = f"Finished work is kept in {self.directory.path}"
+            advice = "repeat the command to resume, with this executor or another"
+            raise WorkersLost(f"{lost} (in the stage {self._stage}). {kept}: {advice}") from None
         except OutputError as refused:
             raise OutputError(refused.place, refused.error, self.directory.path) from None
 
@@ -204,15 +198,11 @@ class Run:
                 self.resumed.append(stage)
                 report = old
             else:
-                folder.finish(report, self._settings_of(stage), log.keys)
+                tables = tables_from_config(self.config)
+                stages = ("matching", "epipolar", "verification") if stage == "matches" else (stage,)
+                folder.finish(report, {s: tables[s] for s in stages}, log.keys)
         self.reports[stage] = report
         self.warnings.extend(w for w in warnings if w not in self.warnings)
-
-    def _settings_of(self, stage: str) -> dict[str, Any]:
-        """Settings tables of a stage."""
-        stages = ("matching", "epipolar", "verification") if stage == "matches" else (stage,)
-        tables = tables_from_config(self.config)
-        return {s: tables[s] for s in stages}
 
     def key(self, stage: str, *parts: Any) -> str:
         """Cache key of an item; ``parts`` are everything it depends on: settings, code and inputs."""

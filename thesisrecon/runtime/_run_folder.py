@@ -7,6 +7,7 @@ and its key, made from settings, code and all inputs, is the same.
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import hashlib
 import io
 import json
@@ -27,6 +28,10 @@ from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import as_read, is_partial, link, read_json, write_atomically, write_json
 from thesisrecon.records import StageReport
 
+FORMAT = 2
+RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
+_FOUNDATIONS = ("arrays.py", "camera.py", "errors.py", "intrinsics.py", "records.py", "geometry", "numerics")
+"""Code that every stage may use."""
 _DESCRIPTION = "description"
 
 
@@ -127,17 +132,6 @@ def _seal_of_plain(stream: BinaryIO) -> bytes:
     return seal
 
 
-try:
-    import fcntl
-except ImportError:  # pragma: no cover - only where there is no POSIX
-    fcntl = None  # type: ignore[assignment]
-
-FORMAT = 2
-RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
-_FOUNDATIONS = ("arrays.py", "camera.py", "errors.py", "intrinsics.py", "records.py", "geometry", "numerics")
-"""Code that every stage may use."""
-
-
 def key_of(*parts: Any) -> str:
     """Digest (32 hexadecimal digits) of JSON-like parts and arrays, equal on every machine."""
     text = json.dumps(parts, sort_keys=True, default=_json_value, ensure_ascii=True)
@@ -160,18 +154,15 @@ def code_key(module: str) -> str:
     """
     package = Path(__file__).parent.parent
     parts = module.split(".")
-    own = [package / parts[1]] if parts[0] == package.name and len(parts) > 1 else _file_of(module)
+    file = getattr(sys.modules.get(module), "__file__", None)
+    own = [Path(file)] if file is not None and Path(file).is_file() else []
+    if parts[0] == package.name and len(parts) > 1:
+        own = [package / parts[1]]
     content = hashlib.sha256(f"{module} {FORMAT}".encode())
     for root in [*own, *(package / part for part in _FOUNDATIONS)]:
         for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
             content.update(path.read_bytes())
     return content.hexdigest()[:32]
-
-
-def _file_of(module: str) -> list[Path]:
-    """The file of a loaded module, if it has one."""
-    file = getattr(sys.modules.get(module), "__file__", None)
-    return [Path(file)] if file is not None and Path(file).is_file() else []
 
 
 @dataclass(frozen=True)
@@ -277,9 +268,8 @@ class RunDirectory:
                     if parent.is_dir() and not any(parent.iterdir()):
                         parent.rmdir()
         except OSError as error:
-            raise OutputError(
-                f"the output folder {self.path}, whose old results must be removed,", error
-            ) from None
+            place = f"the output folder {self.path}, whose old results must be removed,"
+            raise OutputError(place, error) from None
 
     def _check(self, identity: Mapping[str, Any], overwrite: bool) -> bool:
         """Whether the folder holds another run."""
@@ -287,20 +277,16 @@ class RunDirectory:
         if there is None:
             strange = sorted(p.name for p in self.path.iterdir() if p.name != LOCK_FILE)
             if strange and RUN_FILE not in strange and not all(map(is_partial, strange)):
-                raise UsageError(
-                    f"the output folder {self.path} holds {strange[0]!r}, which thesisrecon did not create; "
-                    "choose an empty or a new folder"
-                )
+                foreign = f"{strange[0]!r}, which thesisrecon did not create; choose an empty or a new folder"
+                raise UsageError(f"the output folder {self.path} holds {foreign}")
             # A damaged run file identifies no run: other files count as another run.
             return bool(strange)
         if isinstance(there, dict):
             there = {name: value for name, value in there.items() if name in identity}
         difference = next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
-            raise UsageError(
-                f"the output folder {self.path} holds another run ({difference}); choose another folder, or "
-                "use --overwrite to replace it (unaffected stages are reused)"
-            )
+            advice = "choose another folder, or use --overwrite to replace it (unaffected stages are reused)"
+            raise UsageError(f"the output folder {self.path} holds another run ({difference}); {advice}")
         return bool(difference)
 
 
@@ -335,17 +321,15 @@ def _locked(folder: Path) -> Iterator[None]:
     """Create and lock the folder; the lock ends with the process."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
     except OSError as error:
         raise OutputError(f"the output folder {folder}", error) from None
     try:
-        if fcntl is not None:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(handle)
-        raise UsageError(
-            f"another run is writing to the output folder {folder}; choose another one"
-        ) from None
+        message = f"another run is writing to the output folder {folder}; choose another one"
+        raise UsageError(message) from None
     try:
         yield
     finally:

@@ -19,7 +19,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.io._images import read_images
-from thesisrecon.pipeline.image_pair import match_views
+from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.records import Image, TwoView
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric

@@ -63,21 +63,7 @@ def match_pair(
 
 
 def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
-    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason.
-
-    Parameters
-    ----------
-    config : PipelineConfig
-        Settings.
-    view1, view2 : object
-        Views prepared by ``config.matching``.
-    pair, seed : tuple of int, int
-        Their numbers, and the random seed.
-
-    Returns
-    -------
-    TwoView
-    """
+    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason."""
     rng = stream(seed, "matches", *pair)
     candidates = 0
     try:
