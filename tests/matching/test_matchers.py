@@ -160,7 +160,7 @@ def test_relative_difference_and_thresholds_drop_wrong_matches():
     assert wrong[2] < 0.2 * wrong[1]
 
 
-WRONG_STRENGTH = {"window": 8, "radius_rel": 0.0, "candidates": 0, "tolerance": 0.0, "min_strength": 5.0}
+WRONG_STRENGTH = {"window": 8, "radius_rel": 0.0, "candidates": 0, "min_strength": 5.0}
 WRONG_GROWTH = {"neighbours": 0, "ratio": 0.0, "grown_ratio": -1.0}
 WRONG_GROWTH |= {"band_rel": 0.0, "affine_std": -1.0}
 

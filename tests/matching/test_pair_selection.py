@@ -195,18 +195,16 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
     one, other = (detector.detect(view).seeds for view in (image, rotated))
     strange = [f.seeds for f in windows.features]
     for kind, least in ((True, 20.0), (False, -10.0)):
-        sketch = _subset_seeds(one, rotated=kind, per_scale=200)
-        assert _overlap_evidence(sketch, _subset_seeds(other, rotated=kind, per_scale=200)) > least
+        sketch = _subset_seeds(one, rotated=kind)
+        assert _overlap_evidence(sketch, _subset_seeds(other, rotated=kind)) > least
         assert _overlap_evidence(sketch, sketch) > 20.0
         # The number of false alarms bounds how often chance reaches an evidence.
-        chance = [
-            _overlap_evidence(sketch, _subset_seeds(s, rotated=kind, per_scale=200)) for s in strange if s
-        ]
+        chance = [_overlap_evidence(sketch, _subset_seeds(s, rotated=kind)) for s in strange if s]
         assert max(chance) < 2.0
 
 
 def test_photographs_of_one_wall_use_the_same_words(windows):
-    sketches = [_subset_seeds(f.seeds, rotated=False, per_scale=200) for f in windows.features if f.seeds]
+    sketches = [_subset_seeds(f.seeds, rotated=False) for f in windows.features if f.seeds]
     alike = _bow_similarity(
         [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
     )

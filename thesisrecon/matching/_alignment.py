@@ -258,11 +258,9 @@ def align_corners(
     """Align corners of image 1 with image 2 to sub-pixel positions.
 
     Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and
-    affine map, the latter with a prior at its start (standard deviation ``affine_std``; 0 keeps it). Corners
-    of a coarser scale are aligned there first (wide convergence) and then at the finest scale (smaller
-    noise), which is used if it fits. ``matches`` = xy1 (M, 2), scale1 (M,), start of xy2 (M, 2), start of the
-    maps (M, 2, 2); ``max_shift`` in pixels of the corner's scale. Returns xy2, maps and correlations, 0 if
-    the alignment failed or its expected error exceeds MAX_STD px of the scale.
+    affine map, the latter with a prior at its start. Corners of a coarser scale are aligned there (wide
+    convergence) and then at the finest scale (smaller noise), which is used if it fits. Arguments and results
+    are those of :func:`_align_windows`.
     """
     xy1, scale1, _, _ = matches
     base = view1.pyramid[2]

@@ -37,6 +37,8 @@ RADIUS_REL, LOG_SCALE, ANGLE_RAD = 0.1, 0.8, 0.8
 DECIDED = 6.0
 # Below this the tail of the binomial distribution underflows.
 MIN_LOG10 = -300.0
+# Seeds of each scale that represent an image, upright and rotated.
+PER_SCALE = 200
 SAMPLES_PER_WORD = 8
 ROUNDS = 4
 ROWS_AT_ONCE = 4096
@@ -163,8 +165,6 @@ class OverlapEstimate:
     ----------
     all_up_to : int
         Number of images up to which all pairs are taken.
-    per_scale : int
-        Seeds of each scale that represent an image, upright and rotated.
     min_evidence : float
         Minimum -log10 of the number of false alarms.
     nearest : int
@@ -176,14 +176,13 @@ class OverlapEstimate:
     """
 
     all_up_to: int = 30
-    per_scale: int = 200
     min_evidence: float = 0.5
     nearest: int = 3
     shortlist: int = 40
     words: int = 1024
 
     def __post_init__(self) -> None:
-        least = {"all_up_to": 0, "per_scale": 1, "nearest": 1, "shortlist": 1, "words": 1}
+        least = {"all_up_to": 0, "nearest": 1, "shortlist": 1, "words": 1}
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}; got {getattr(self, name)}")
@@ -219,11 +218,7 @@ class OverlapEstimate:
                 f"the overlap of more than {self.all_up_to} images is estimated from seeds, which these "
                 "features do not have; set features.kind=multi-scale-corners, or pairs.kind=all-pairs"
             )
-        upright, rotated = (
-            _subset_seeds(features.seeds, rotated=rotated, per_scale=self.per_scale)
-            for rotated in (False, True)
-        )
-        return upright, rotated
+        return _subset_seeds(features.seeds, rotated=False), _subset_seeds(features.seeds, rotated=True)
 
     def _evidence(
         self, a: tuple[_FeatureSubset, _FeatureSubset], b: tuple[_FeatureSubset, _FeatureSubset]
@@ -302,10 +297,10 @@ class _FeatureSubset:
     size: F64
 
 
-def _subset_seeds(seeds: Seeds, *, rotated: bool, per_scale: int) -> _FeatureSubset:
+def _subset_seeds(seeds: Seeds, *, rotated: bool) -> _FeatureSubset:
     """Select the strongest seeds of each scale, of patches ``rotated`` to their dominant gradient or not."""
     use = np.flatnonzero((seeds.angle != 0.0) == rotated)
-    parts = [use[seeds.scale[use] == scale][:per_scale] for scale in np.unique(seeds.scale[use])]
+    parts = [use[seeds.scale[use] == scale][:PER_SCALE] for scale in np.unique(seeds.scale[use])]
     kept = np.concatenate([np.empty(0, np.int64), *parts])
     extent = np.ptp(seeds.xy, axis=0) + 1.0 if len(seeds.xy) else np.ones(2)
     return _FeatureSubset(

@@ -21,6 +21,9 @@ from thesisrecon.matching._prepared import (
 )
 from thesisrecon.records import Features, Image, Matches
 
+# Tolerance of the relative difference of two displacements.
+TOLERANCE = 0.3
+
 
 @kernel
 def _displacement_weight(a: F64, b: F64, closeness: float) -> float:
@@ -151,11 +154,8 @@ class StrengthOfMatch:
     colour : bool
         Mean correlation of red, green and blue instead of grey values.
     weight : {"product", "relative-difference"}
-        Product of figure 4.4, or exp(-1/2 (|d_m - d| / (tolerance |u_m - u| + 1 px))^2) of displacements d,
-        which also suits short displacements and
-        deep scenes.
-    tolerance : float
-        Tolerance of the relative difference.
+        Product of figure 4.4, or exp(-1/2 (|d_m - d| / (0.3 |u_m - u| + 1 px))^2) of displacements d, which
+        also suits short displacements and deep scenes.
     min_correlation : float
         Correlation that a candidate must exceed.
     min_strength : float
@@ -170,7 +170,6 @@ class StrengthOfMatch:
     window: int = SIDE
     colour: bool = False
     weight: Literal["product", "relative-difference"] = "product"
-    tolerance: float = 0.3
     min_correlation: float = 0.0
     min_strength: float = 0.0
     align: bool = False
@@ -182,10 +181,8 @@ class StrengthOfMatch:
             )
         if self.window < 3 or self.window % 2 == 0:
             raise ValueError(f"window must be odd and at least 3; got {self.window}")
-        if not (self.radius_rel > 0.0 and self.tolerance > 0.0):
-            raise ValueError(
-                f"radius_rel and tolerance must be above 0; got {self.radius_rel} and {self.tolerance}"
-            )
+        if not self.radius_rel > 0.0:
+            raise ValueError(f"radius_rel must be above 0; got {self.radius_rel}")
         if not 0.0 <= self.min_strength < 1.0:
             raise ValueError(f"min_strength must lie in [0, 1); got {self.min_strength}")
 
@@ -216,7 +213,7 @@ class StrengthOfMatch:
             (xy1, xy2),
             (near1, near2),
             (radius, self.candidates, self.min_correlation),
-            self.tolerance if self.weight == "relative-difference" else 0.0,
+            TOLERANCE if self.weight == "relative-difference" else 0.0,
         )
         index[strength < self.min_strength * self.neighbours] = -1
         rows = one_to_one(index, strength)

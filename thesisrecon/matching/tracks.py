@@ -142,11 +142,7 @@ class _Chains:
 
 
 def _link_matches(corners: Sequence[F64], pairs: Sequence[TwoView]) -> _Chains:
-    """Unite the matches of all pairs, pairs with more verified matches first.
-
-    A union that puts two corners of one view into a track is rejected, so that the track splits at the weaker
-    link.
-    """
+    """Unite the matches of all pairs in their order; a track that would see a view twice splits there."""
     counts = [len(xy) for xy in corners]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     view_of = np.repeat(np.arange(len(corners)), counts).astype(np.int64)
@@ -166,10 +162,9 @@ def _link_matches(corners: Sequence[F64], pairs: Sequence[TwoView]) -> _Chains:
 
 
 def _affines_from_middle_view(chains: _Chains, pairs: Sequence[TwoView]) -> tuple[F64, F64, I64]:
-    """Predict the corner of each track's middle view in the other views by chaining local affine maps.
+    """Position (K, 2) px and map (K, 2, 2) of observations, chained from the middle one of their track (K,).
 
-    Returns the position (K, 2) px, the map from the middle view (K, 2, 2) and the middle observation (K,) of
-    the track: the one with most matches in the track, the first of equals.
+    The middle observation has most matches in the track.
     """
     xy, edges = chains.xy, chains.edges
     if not len(edges):

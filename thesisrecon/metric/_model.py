@@ -72,7 +72,9 @@ def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
     return undistort(distorted, distortion) if distortion.any() else distorted
 
 
-def retriangulate_tracks(model: MetricEstimate, *, sigmas: float, min_angle: float) -> MetricEstimate:
+def retriangulate_tracks(
+    model: MetricEstimate, *, sigmas: float, min_angle: float = MIN_ANGLE
+) -> MetricEstimate:
     """Triangulate all tracks from the registered views and select the inliers.
 
     Observations are undistorted first. Points with outliers are triangulated again from their inliers.

@@ -14,7 +14,6 @@ from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
     LATE_SIGMAS,
-    MIN_ANGLE,
     WIDTH,
     MetricEstimate,
     inlier_ratios,
@@ -108,7 +107,7 @@ def _grow(
     model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, allowed: B8
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
-    model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS, min_angle=MIN_ANGLE)
+    model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
     rejected: dict[int, str] = {}
     share = 0.0
     for n in range(MAX_ROUNDS):
@@ -116,12 +115,10 @@ def _grow(
         model, rejected = _register_missing(model, rng, allowed)
         joined = int(model.registered.sum()) > before
         if joined:
-            model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS, min_angle=MIN_ANGLE)
+            model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
         model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=6)[0]
         # A wide gate in the first round readmits observations that a wrong model had excluded.
-        model = retriangulate_tracks(
-            model, sigmas=EARLY_SIGMAS if n == 0 else LATE_SIGMAS, min_angle=MIN_ANGLE
-        )
+        model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS if n == 0 else LATE_SIGMAS)
         now = float(model.inlier.mean())
         if not joined and n > 0 and now - share < MIN_GAIN:
             break
@@ -192,5 +189,5 @@ def _register_again(
         for view in np.flatnonzero(wrong):
             rejected[int(view)] = f"only {share[view]:.0%} of its matches agree with the other images"
         model = replace(model, registered=model.registered & ~wrong)
-        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
+        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
     return model, rejected

@@ -44,13 +44,13 @@ MAX_OVERDISPERSION = 8.0
 """Variance ratio of blocks over points: 1.5 to 5 for correct models of real images, 11 to 28 if deformed."""
 
 
-def _subsample_inliers(model: MetricEstimate) -> I64:
+def _subsample_inliers(model: MetricEstimate) -> Observations:
     """Inliers of every n-th point, at most about ``MAX_OBSERVATIONS``."""
-    index = np.flatnonzero(model.inlier)
-    point = model.tracks.point_index[index]
-    chosen = np.zeros(model.tracks.n_points, dtype=bool)
-    chosen[np.unique(point)[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]] = True
-    return np.asarray(index[chosen[point]], dtype=np.int64)
+    t, index = model.tracks, np.flatnonzero(model.inlier)
+    chosen = np.zeros(t.n_points, dtype=bool)
+    chosen[np.unique(t.point_index[index])[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]] = True
+    index = index[chosen[t.point_index[index]]]
+    return Observations(t.view_index[index], t.point_index[index], t.xy[index])
 
 
 def _adjust_per_view(
@@ -66,7 +66,7 @@ def _adjust_per_view(
     prior.
     """
     views, adjustment = np.flatnonzero(model.registered), replace(adjustment, hierarchical=None)
-    t, cameras, index = model.tracks, model.cameras, _subsample_inliers(model)
+    cameras, seen = model.cameras, _subsample_inliers(model)
     assert cameras.shared is not None
     rows = cameras.group[views]
     shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
@@ -84,7 +84,7 @@ def _adjust_per_view(
     return refine_metric_bundle(
         MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
         model.X,
-        Observations(np.searchsorted(views, t.view_index[index]), t.point_index[index], t.xy[index]),
+        seen._replace(view_index=np.searchsorted(views, seen.view_index)),
         free=free,
         prior=known,
         options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
@@ -290,7 +290,7 @@ def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment) -> tuple[F
 
     Known focals of one value share a number.
     """
-    t, cameras, index = model.tracks, model.cameras, _subsample_inliers(model)
+    cameras = model.cameras
     assert cameras.shared is not None
     prior, shared = adjustment.row_prior(model), cameras.shared.copy()
     known = np.flatnonzero(prior.std[:, FOCAL] == 0.0)
@@ -302,7 +302,7 @@ def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment) -> tuple[F
     result = refine_metric_bundle(
         replace(cameras, shared=shared),
         model.X,
-        Observations(t.view_index[index], t.point_index[index], t.xy[index]),
+        _subsample_inliers(model),
         free=free,
         prior=IntrinsicsPrior.unshared(prior.mean, std),
         options=replace(options, covariance=True, noise_floor_px=model.sigma_px),

@@ -19,7 +19,6 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import BundleAdjustment, HierarchicalPrior
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.numerics.block_scatter import BlockScatter
@@ -27,6 +26,9 @@ from thesisrecon.records import IntrinsicInterval
 
 USUAL_INFLATION = 4.0
 """Inflation of standard deviations if it cannot be measured; measured values are 2 to 5."""
+MODEL_FLOOR_REL = 1e-3
+"""Floor of standard deviations, relative to the focal length, if the data show lack of fit: pixels are square
+to one or two parts in a thousand."""
 MIN_BLOCKS = 4
 """Fewer blocks give no inflation."""
 OVERDISPERSION_RANGE = (1.3, 1.8)
@@ -62,13 +64,13 @@ def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
     return max(float(np.clip((value - low) / (high - low), 0.0, 1.0)) for value, (low, high) in measured)
 
 
-def _std_floor(model: MetricEstimate, scatter: BlockScatter, floor_rel: float) -> F64:
+def _std_floor(model: MetricEstimate, scatter: BlockScatter) -> F64:
     """Lower bound of the standard deviations due to model error."""
     with np.errstate(divide="ignore", invalid="ignore"):
         alone = np.maximum(np.nan_to_num(scatter.variance / scatter.shared_variance), 1.0) ** 0.25
     units = np.ones_like(model.cameras.intrinsics)
     units[:, (SKEW, *CENTRE)] = model.cameras.intrinsics[:, :1]
-    return np.asarray(floor_rel * lack_of_fit(scatter, model.tail) * alone * units)
+    return np.asarray(MODEL_FLOOR_REL * lack_of_fit(scatter, model.tail) * alone * units)
 
 
 @dataclass(frozen=True)
@@ -85,12 +87,11 @@ class PerCameraEstimates:
 
 
 def per_camera_estimates(
-    model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter, floor_rel: float
+    model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter
 ) -> PerCameraEstimates:
     """Intrinsics of each camera of a model that was adjusted without hierarchical prior.
 
-    ``floor_rel`` is the lower bound of their standard deviations due to model error, relative to the focal
-    length. Cameras without a registered view have kind -1.
+    Cameras without a registered view have kind -1.
     """
     group = model.cameras.group
     first = np.unique(group, return_index=True)[1]
@@ -101,7 +102,7 @@ def per_camera_estimates(
     inflation = np.sqrt(np.maximum(scatter.median_ratio, 1.0))
     kind = np.where(registered, kind, -1)
     std = inflation * np.sqrt(np.maximum(scatter.variance, 0.0))
-    return PerCameraEstimates(value, std, _std_floor(model, scatter, floor_rel), kind)
+    return PerCameraEstimates(value, std, _std_floor(model, scatter), kind)
 
 
 def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> HierarchicalPrior | None:
@@ -215,20 +216,15 @@ def focal_shrinkage(
 
 def intrinsic_intervals(
     model: MetricEstimate,
+    adjustment: BundleAdjustment,
     scatter: BlockScatter,
-    prior: IntrinsicsPrior,
-    *,
-    floor_rel: float,
     shrinkage: FocalShrinkage,
-    noise_inflation: float = 1.0,
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
     """Value, standard deviation and source of each intrinsic of each view; empty where not registered.
 
-    +- 1.96 std is a 95 % interval: the inflation contains Student's t for the number of blocks. ``prior`` is
-    that of each row of intrinsics, ``noise_inflation`` the factor on the noise in the weights of the
-    adjustment.
+    +- 1.96 std is a 95 % interval: the inflation contains Student's t for the number of blocks.
     """
-    floors = _std_floor(model, scatter, floor_rel)
+    floors, prior = _std_floor(model, scatter), adjustment.row_prior(model)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for view in range(len(model.registered)):
         if not model.registered[view]:
@@ -250,7 +246,7 @@ def intrinsic_intervals(
                 how += f" of {floor:.1%}" if column == FOCAL else ""
             else:
                 how = (
-                    f"bundle adjustment; standard deviation x {inflation * noise_inflation:.1f} "
+                    f"bundle adjustment; standard deviation x {inflation * adjustment.inflation:.1f} "
                     "from the scatter between blocks of the scene"
                 )
             if column == FOCAL and shrinkage.is_shrunk(view, std):

@@ -57,9 +57,6 @@ NOISE_FLOOR_PX = 0.02
 """Lower bound of the estimated noise."""
 MAX_ROTATION_RESIDUAL = 0.3
 """Upgraded cameras further from a scaled rotation (norm of 3 C C' / tr(C C') - I) are resected again."""
-MODEL_FLOOR_REL = 1e-3
-"""Floor of standard deviations, relative to the focal length, if the data show lack of fit: pixels are square
-to one or two parts in a thousand."""
 UNDETERMINED_REL = 0.1
 """Focal lengths that their own matches determine worse than this (95 %, relative) are reported."""
 LAST_ITERATIONS = 25
@@ -96,14 +93,7 @@ class MetricRefinement:
         model = select_inliers(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
         sharing = check_shared_cameras(model, adjustment)
         shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
-        intervals = intrinsic_intervals(
-            model,
-            scatter,
-            adjustment.row_prior(model),
-            floor_rel=MODEL_FLOOR_REL,
-            shrinkage=shrinkage,
-            noise_inflation=adjustment.inflation,
-        )
+        intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
         check, failed_checks = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
@@ -142,7 +132,7 @@ def _finish(
     """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
     model = _iterate_inliers(model, adjustment)
     scatter = adjustment.scatter(model)
-    own = per_camera_estimates(model, adjustment, scatter, MODEL_FLOOR_REL)
+    own = per_camera_estimates(model, adjustment, scatter)
     assert model.cameras.shared is not None
     hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
     if hierarchical is None:
@@ -160,7 +150,7 @@ def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> Met
     for _ in range(MAX_ROUNDS):
         before = model.inlier
         model = adjustment.run(model, iterations=10)[0]
-        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
+        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
         if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
             break
     return adjustment.run(model, iterations=LAST_ITERATIONS)[0]
