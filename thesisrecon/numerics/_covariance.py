@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
@@ -43,51 +41,40 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     return sigma
 
 
-@dataclass(frozen=True)
-class CovarianceInput:
-    """Information of the cameras, and poses; ``block`` (V,) is -1 for views without observations."""
-
-    reduced: ReducedSystem
-    block: I64
-    R: F64
-    t: F64
-
-
-def bundle_covariances(inputs: CovarianceInput, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
-    """Return covariances of intrinsics (G, C, C) and poses (V, 6, 6), with unit of length 1 / ``scale``.
+def bundle_covariances(
+    reduced: ReducedSystem, R: F64, t: F64, number: I64, focal: F64, scale: float
+) -> tuple[F64, F64]:
+    """Return covariances of intrinsics (G, C, C) and poses (b, 6, 6), with unit of length 1 / ``scale``.
 
     Poses refer to the inner gauge: of all solutions that differ by a similarity, the one that moved the
-    cameras least. ``number`` (G, C) is the column of each intrinsic; ``focal`` (G,) converts log f to f.
+    cameras least. ``R`` and ``t`` are those of the b views with observations, ``number`` (G, C) is the column
+    of each intrinsic; ``focal`` (G,) converts log f to f.
     """
-    b, C, e = inputs.reduced.sums.border.shape
-    width, edge = (C if b else 0), b * C
-    views = np.flatnonzero(inputs.block >= 0)
-    blocks = _dense_blocks(inputs, views) if edge + e <= MAX_DENSE or not b else _band_blocks(inputs, views)
-    poses = np.zeros((len(inputs.t), POSE_DOF, POSE_DOF))
+    b, C, e = reduced.sums.border.shape
+    intrinsics, edge = np.zeros((*number.shape, number.shape[1])), b * C
+    if not b:
+        return intrinsics, np.zeros((0, POSE_DOF, POSE_DOF))
+    blocks = _dense_blocks(reduced, R, t) if edge + e <= MAX_DENSE else _band_blocks(reduced, R, t)
     units = np.array([1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale, 1.0 / scale])
-    if len(views):
-        poses[views] = blocks[inputs.block[views], :POSE_DOF, :POSE_DOF] * units * units[:, None]
-    intrinsics = np.zeros((*number.shape, number.shape[1]))
+    poses = blocks[:, :POSE_DOF, :POSE_DOF] * units * units[:, None]
     for g, row in enumerate(number):
         moves = np.flatnonzero(row >= 0)
-        own = row[moves][row[moves] < edge] // width if width else row[:0]
+        own = row[moves][row[moves] < edge] // C
         block = int(own[0]) if len(own) else 0
-        index = np.where(row[moves] < edge, row[moves] - width * block, row[moves] - edge + width)
+        index = np.where(row[moves] < edge, row[moves] - C * block, row[moves] - edge + C)
         units = np.where(moves == FOCAL, focal[g], 1.0)
         intrinsics[g][np.ix_(moves, moves)] = blocks[block][np.ix_(index, index)] * units * units[:, None]
     return intrinsics, poses
 
 
-def _dense_blocks(inputs: CovarianceInput, views: I64) -> F64:
+def _dense_blocks(reduced: ReducedSystem, R: F64, t: F64) -> F64:
     """Return the covariance blocks of each view and the border by dense inversion."""
-    b, C, e = inputs.reduced.sums.border.shape
-    S = inputs.reduced.dense()
-    S = np.triu(S) + np.triu(S, 1).T
-    covariance = invert_in_inner_gauge(S, _gauge_basis(inputs, views)) if b else invert_information(S)
+    b, C, e = reduced.sums.border.shape
+    S = reduced.dense()
+    covariance = invert_in_inner_gauge(np.triu(S) + np.triu(S, 1).T, _gauge_basis(reduced, R, t))
     index = np.concatenate(
         [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
     )
-    index = index if b else np.arange(e)[None]
     return np.asarray(covariance[index[:, :, None], index[:, None, :]])
 
 
@@ -101,22 +88,18 @@ def invert_in_inner_gauge(information: F64, N: F64) -> F64:
     return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
 
 
-def _band_blocks(inputs: CovarianceInput, views: I64) -> F64:
+def _band_blocks(reduced: ReducedSystem, R: F64, t: F64) -> F64:
     """Return the covariance blocks from a banded factor.
 
     Seven coordinates fix the frame; Baarda's S-transformation (I - N N') Q (I - N N') changes to the inner
     gauge.
     """
-    reduced = inputs.reduced
     b, C, e = reduced.sums.border.shape
-    _fix_gauge(inputs, views)
+    _fix_gauge(reduced, R, t)
     factored = order_views(reduced.row, reduced.column, b).factor(reduced)
-    if factored is None:
-        return np.full((b, C + e, C + e), np.inf)
-    blocks = factored.inverse_blocks()
-    N = _gauge_basis(inputs, views)
-    moved = factored.solve(N)
-    if moved is None:
+    N = _gauge_basis(reduced, R, t)
+    moved = None if factored is None else factored.solve(N)
+    if factored is None or moved is None:
         return np.full((b, C + e, C + e), np.inf)
 
     def rows(matrix: F64) -> F64:
@@ -125,28 +108,27 @@ def _band_blocks(inputs: CovarianceInput, views: I64) -> F64:
 
     n, m, middle = rows(N), rows(moved), N.T @ moved
     cross = m @ np.swapaxes(n, 1, 2)
+    blocks = factored.inverse_blocks()
     return np.asarray(blocks - cross - np.swapaxes(cross, 1, 2) + n @ middle @ np.swapaxes(n, 1, 2))
 
 
-def _fix_gauge(inputs: CovarianceInput, views: I64) -> None:
+def _fix_gauge(reduced: ReducedSystem, R: F64, t: F64) -> None:
     """Add weight to seven coordinates: one pose, and the distance to the farthest camera."""
-    sums, C = inputs.reduced.sums, inputs.reduced.sums.border.shape[1]
-    centres = -np.einsum("vba,vb->va", inputs.R[views], inputs.t[views])
+    sums, C = reduced.sums, reduced.sums.border.shape[1]
+    centres = -np.einsum("vba,vb->va", R, t)
     far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
-    line = inputs.R[views[far]] @ (centres[far] - centres[0])
-    diagonal = (inputs.reduced.row == inputs.reduced.column).nonzero()[0]
+    line = R[far] @ (centres[far] - centres[0])
+    diagonal = (reduced.row == reduced.column).nonzero()[0]
     weight = float(np.median(sums.blocks[diagonal][:, np.arange(C), np.arange(C)]))
-    first, other = diagonal[inputs.block[views[0]]], diagonal[inputs.block[views[far]]]
-    sums.blocks[first, np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
-    sums.blocks[other, 3:6, 3:6] += weight * np.outer(line, line) / max(float(line @ line), 1e-300)
+    sums.blocks[diagonal[0], np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
+    sums.blocks[diagonal[far], 3:6, 3:6] += weight * np.outer(line, line) / max(float(line @ line), 1e-300)
 
 
-def _gauge_basis(inputs: CovarianceInput, views: I64) -> F64:
+def _gauge_basis(reduced: ReducedSystem, R: F64, t: F64) -> F64:
     """Return the orthonormal motion (D, 7) of all columns under similarities of the world."""
-    width = inputs.reduced.sums.border.shape[1]
-    N = np.zeros((len(inputs.reduced.sums.rhs), SIMILARITY_DOF))
-    columns = width * inputs.block[views, None] + np.arange(POSE_DOF)
-    N[columns.ravel()] = gauge_directions(inputs.R[views], inputs.t[views])
+    N = np.zeros((len(reduced.sums.rhs), SIMILARITY_DOF))
+    columns = reduced.sums.border.shape[1] * np.arange(len(t))[:, None] + np.arange(POSE_DOF)
+    N[columns.ravel()] = gauge_directions(R, t)
     return N
 
 

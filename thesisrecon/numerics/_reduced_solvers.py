@@ -92,14 +92,10 @@ class ReducedSystem:
         return S
 
 
-@dataclass(frozen=True)
-class DenseCholesky:
-    """Dense factorisation by LAPACK: D^3 / 3 operations."""
-
-    def solve(self, system: ReducedSystem) -> F64 | None:
-        """Return x (D,), or None if the system is not positive."""
-        # Row-major upper is column-major lower: LAPACK reads the transpose without a copy.
-        return solve_positive(system.dense().T, system.sums.rhs)
+def solve_dense(system: ReducedSystem) -> F64 | None:
+    """Return x (D,) by Cholesky, D^3 / 3 operations, or None if the system is not positive."""
+    # Row-major upper is column-major lower: LAPACK reads the transpose without a copy.
+    return solve_positive(system.dense().T, system.sums.rhs)
 
 
 @dataclass(frozen=True)
@@ -181,16 +177,14 @@ class BandedCholesky:
         return _BandedFactor(self.place, factor, s.border, moved, s.corner - flat.T @ moved)
 
 
-def choose_solver(
-    row: I64, column: I64, n_views: int, width: int, border: int
-) -> DenseCholesky | BandedCholesky:
-    """Choose the solver with less work for blocks of ``width`` and a border; dense for small systems."""
+def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) -> BandedCholesky | None:
+    """Return the banded solver for blocks of ``width`` and a border, None if dense Cholesky is less work."""
     D = float(n_views * width + border)
     if D <= SMALL:
-        return DenseCholesky()
+        return None
     banded = order_views(row, column, n_views)
     band = float((banded.reach + 1) * width)
-    return banded if BAND_COST * D * band * (band + 4.0 * (border + 1)) < D**3 / 3.0 else DenseCholesky()
+    return banded if BAND_COST * D * band * (band + 4.0 * (border + 1)) < D**3 / 3.0 else None
 
 
 def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:

@@ -26,10 +26,10 @@ from thesisrecon.numerics._kernels import floored_diagonal
 from thesisrecon.numerics._observations import Jacobians, SortedObservations
 from thesisrecon.numerics._reduced_solvers import (
     BandedCholesky,
-    DenseCholesky,
     ReducedSystem,
     add_diagonal,
     choose_solver,
+    solve_dense,
 )
 from thesisrecon.numerics.observations import Observations
 
@@ -53,7 +53,7 @@ class BundleLayout:
     row: I64
     column: I64
     chunks: tuple[tuple[int, int], ...]
-    solver: DenseCholesky | BandedCholesky
+    solver: BandedCholesky | None
 
     @property
     def size(self) -> int:
@@ -103,18 +103,9 @@ def build_layout(
     return BundleLayout(observations, index, width, border, row, column, chunks, solver)
 
 
-@dataclass(frozen=True)
-class CameraPrior:
-    """Gaussian terms of ``weight`` (L,) between camera columns ``first`` and ``second`` (L,).
-
-    ``second`` is one of the border, or -1 for a number instead; ``gradient`` (D,) is that of all terms.
-    """
-
-    first: I64
-    second: I64
-    weight: F64
-    gradient: F64
-
+# Gaussian terms between camera columns: first (L,), second (L,) of the border or -1 for a number instead,
+# weight (L,), and the gradient (D,) of all terms.
+CameraPrior = tuple[I64, I64, F64, F64]
 
 # Steps of the camera columns (D,) and of the points (N, 3).
 BundleStep = tuple[F64, F64]
@@ -148,7 +139,8 @@ class BundleSystem:
     def solve(self, damping: float) -> tuple[BundleStep, float] | None:
         """Return the damped step and its predicted gain of cost; None if the system is not positive."""
         reduced, points, damped = self.reduce(damping)
-        cameras = self.layout.solver.solve(reduced)
+        solver = self.layout.solver
+        cameras = solve_dense(reduced) if solver is None else solver.solve(reduced)
         if cameras is None:
             return None
         moves = np.zeros_like(points.gradient)
@@ -163,9 +155,9 @@ class BundleSystem:
 def _add_prior(pair: I64, total: ReducedSums, prior: CameraPrior) -> None:
     """Add the information and gradient of the prior."""
     size, border = len(total.rhs), len(total.corner)
-    first, second, w, edge = prior.first, prior.second, prior.weight, size - border
-    total.rhs[:] -= prior.gradient
-    total.gradient[:] += prior.gradient
+    (first, second, w, gradient), edge = prior, size - border
+    total.rhs[:] -= gradient
+    total.gradient[:] += gradient
     both = second >= 0
     weight = np.bincount(first, w, minlength=size).astype(np.float64)
     weight += np.bincount(second[both], w[both], minlength=size)

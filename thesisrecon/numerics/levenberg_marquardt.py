@@ -103,10 +103,8 @@ class DenseSystem:
 
     Parameters
     ----------
-    cost : float
-        1/2 sum rho.
-    hessian, gradient : ndarray (D, D), (D,)
-        J'J and J'r.
+    cost, hessian, gradient : float, ndarray (D, D), ndarray (D,)
+        1/2 sum rho, J'J and J'r.
     """
 
     cost: float
@@ -139,10 +137,8 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
 
     Parameters
     ----------
-    H, g, damping : ndarray (n, n), ndarray (n,), float
-        J'J, J'r and Levenberg-Marquardt damping.
-    step : ndarray (n,)
-        Output.
+    H, g, damping, step : ndarray (n, n), ndarray (n,), float, ndarray (n,)
+        J'J, J'r and Levenberg-Marquardt damping; and the output.
 
     Returns
     -------
@@ -213,10 +209,8 @@ class ResidualMinimum:
 
     Parameters
     ----------
-    x, cost, residual : ndarray (D,), float, ndarray (M,)
-        Minimum, 1/2 sum rho and residuals.
-    covariance : ndarray (D, D)
-        sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D).
+    x, cost, covariance, residual : ndarray (D,), float, ndarray (D, D), ndarray (M,)
+        Minimum, 1/2 sum rho, sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D), and residuals.
     """
 
     x: F64
@@ -276,10 +270,8 @@ def minimize_residuals(
     ----------
     residual_fn, x0 : callable, ndarray (D,)
         (D,) -> (M,), not finite where a state is rejected; and the start.
-    jacobian : callable, optional
-        (D,) -> (M, D); forward differences by default.
-    loss : callable, optional
-        Robust loss of squared residuals and its derivative (:mod:`~thesisrecon.numerics.losses`).
+    jacobian, loss : callable, optional
+        (D,) -> (M, D), forward differences by default; and the loss of squared residuals with its derivative.
     max_iterations, tolerance : int, float
         As in :func:`run_levenberg_marquardt`.
 
@@ -292,16 +284,9 @@ def minimize_residuals(
     ------
     ValueError
         If x0 or its residuals are not finite.
-
-    Examples
-    --------
-    >>> result = minimize_residuals(lambda x: x - np.array([1.0, 2.0]), np.zeros(2))
-    >>> result.x.round(6).tolist()
-    [1.0, 2.0]
     """
-    x0 = np.array(x0, dtype=np.float64)
-    if x0.ndim != 1 or not np.isfinite(x0).all() or not np.isfinite(residual_fn(x0)).all():
-        raise ValueError(f"minimize_residuals needs a finite vector and residuals; got shape {x0.shape}")
+    if not (np.isfinite(x0).all() and np.isfinite(residual_fn(x0)).all()):
+        raise ValueError("minimize_residuals needs a start with finite residuals")
     problem = _VectorProblem(residual_fn, jacobian, loss)
     x, cost, _ = run_levenberg_marquardt(
         problem, x0, max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3

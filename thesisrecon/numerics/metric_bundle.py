@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._covariance import SIMILARITY_DOF, CovarianceInput, bundle_covariances, robust_sigma
+from thesisrecon.numerics._covariance import SIMILARITY_DOF, bundle_covariances, robust_sigma
 from thesisrecon.numerics._elimination import revert_crossing_points, sum_leverages
 from thesisrecon.numerics._intrinsic_unknowns import (
     IntrinsicColumns,
@@ -45,10 +45,8 @@ class BundleOptions:
     sigma_px, loss_px : float
         Standard deviation of one image coordinate, the weight of the data against the priors, and turning
         point of Huber's loss; infinite for least squares.
-    max_iterations : int
-        Maximum number of linear solves.
-    covariance, noise_floor_px : bool, float
-        Whether to compute covariances (one more linear system), and the least noise assumed for them.
+    max_iterations, covariance, noise_floor_px : int, bool, float
+        Maximum number of linear solves, whether to compute covariances, and the least noise assumed for them.
     """
 
     sigma_px: float = 1.0
@@ -128,7 +126,7 @@ class _MetricProblem:
             return None
         gradient = np.zeros(self.layout.size)
         gradient[c.place] = terms.gradient(state.values)
-        return CameraPrior(c.columns_of(terms.first), c.columns_of(terms.second), terms.weight, gradient)
+        return c.columns_of(terms.first), c.columns_of(terms.second), terms.weight, gradient
 
     def retract(self, state: _State, step: BundleStep) -> _State:
         m, layout = state.model, self.layout
@@ -173,8 +171,7 @@ def refine_metric_bundle(
 
     The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
     Levenberg-Marquardt; the focal length is stepped as log f, the seven gauge freedoms are left to the
-    damping, and the scene is centred and scaled inside. The cost never rises; singular systems end the
-    iterations.
+    damping, and the scene is centred and scaled inside. The cost never rises.
 
     Parameters
     ----------
@@ -262,7 +259,10 @@ def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale:
     """Return covariances of intrinsics (G, C, C) and poses (V, 6, 6), t in the caller's unit."""
     problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
     reduced, _, _ = problem.linearize(state).reduce(1e-10)
-    m = state.model
-    found = CovarianceInput(reduced, problem.layout.index.block, m.R, m.t)
+    m, seen = state.model, problem.observed
     number = problem.columns.columns_of(problem.values.number)
-    return bundle_covariances(found, number, m.intrinsics[:, 0], scale)
+    poses = np.zeros((len(m.t), POSE_DOF, POSE_DOF))
+    intrinsics, poses[seen] = bundle_covariances(
+        reduced, m.R[seen], m.t[seen], number, m.intrinsics[:, 0], scale
+    )
+    return intrinsics, poses

@@ -17,7 +17,7 @@ _CORE_COUNT, _TAIL_COUNT, _WRONG_COUNT = 1.0, 0.5, 1.0
 MAD_FACTOR = 1.4826022185056018
 _MEDIAN_RATIO, _MAX_WIDENINGS = 0.22, 6
 _RAYLEIGH_MEDIAN = 1.1774
-# Trimming point in standard deviations, variance of a standard normal variable trimmed there, and rounds.
+# Trimming point in standard deviations, variance of a normal variable trimmed there, and rounds.
 _TRIM, _TRIMMED_VARIANCE, _TRIM_ROUNDS = 2.5, 0.91125, 5
 # EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more.
 _EM_ROUNDS, _QUANTILES = 6, 300
@@ -69,7 +69,7 @@ def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, 
 
 
 def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
-    """Estimate the standard deviation by 1.4826 (1 + 5 / (n - p)) median |r|.
+    """Estimate the standard deviation by 1.4826 (1 + 5 / (n - p)) median |r| (Rousseeuw and Leroy 1987).
 
     Parameters
     ----------
@@ -85,10 +85,6 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
     ------
     ValueError
         If N <= p, or a residual is not finite.
-
-    References
-    ----------
-    Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987; Torr and Murray, IJCV 24(3), 1997.
     """
     n = len(residuals)
     if n <= parameters or not np.isfinite(residuals).all():
@@ -99,9 +95,8 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
     """Return the width that contains the noise: ``threshold``, or more if the residuals continue.
 
-    Normal noise has its median at no more than 0.22 of a width of 3 standard deviations. The width grows by
-    steps of 1.5 until its median is; if that does not happen within 11 thresholds, the residuals are of wrong
-    matches and the threshold is kept.
+    Normal noise has its median at 0.22 of a width of 3 standard deviations. The width grows by steps of 1.5
+    until its median is there; if that takes more than 11 thresholds, the residuals are of wrong matches.
 
     Parameters
     ----------

@@ -17,10 +17,8 @@ class Observations(NamedTuple):
 
     Parameters
     ----------
-    view_index, point_index : ndarray (K,) of int
-        View and point of each observation.
-    xy : ndarray (K, 2)
-        Pixels.
+    view_index, point_index, xy : ndarray (K,) of int, (K,) of int, (K, 2)
+        View, point and pixels of each observation.
     """
 
     view_index: I64
@@ -31,8 +29,7 @@ class Observations(NamedTuple):
 def morton_pair_order(first: ArrayLike, second: ArrayLike) -> I64:
     """Return an order of view pairs in which cached data of a view are reused.
 
-    Ranges of any size of Morton's curve (IBM, 1966) contain few different views: of V views with a cache of M
-    some V^2 / M are computed, instead of one for each pair.
+    Ranges of Morton's curve (IBM, 1966) contain few different views: a cache of M of V computes V^2 / M.
 
     Parameters
     ----------

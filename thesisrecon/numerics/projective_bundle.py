@@ -90,8 +90,7 @@ def refine_projective_bundle(
     """Minimise sum rho(|x - P X|^2) over all cameras and points with Huber's loss.
 
     Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the
-    damping handles the 15 gauge freedoms (methods 6.7). The cost never rises; singular systems end the
-    iterations.
+    damping handles the 15 gauge freedoms (methods 6.7). The cost never rises.
 
     Parameters
     ----------

@@ -18,10 +18,8 @@ def draw_sample(uniforms: F64, n: int, out: I64) -> None:
 
     Parameters
     ----------
-    uniforms, n : ndarray (s,), int
-        Numbers in [0, 1), and number of data.
-    out : ndarray (s,) of int
-        Output, indices below n.
+    uniforms, n, out : ndarray (s,), int, ndarray (s,) of int
+        Numbers in [0, 1), number of data, and the output, indices below n.
     """
     for k in range(len(out)):
         index = min(int(uniforms[k] * (n - k)), n - k - 1)
@@ -42,10 +40,8 @@ def required_samples(inlier_ratio: float, sample_size: int, confidence: float, l
 
     Parameters
     ----------
-    inlier_ratio, sample_size, confidence : float, int, float
-        Fraction of inliers, data in a minimal sample, and required probability.
-    largest : int
-        Upper bound.
+    inlier_ratio, sample_size, confidence, largest : float, int, float, int
+        Fraction of inliers, data in a minimal sample, required probability, and upper bound.
 
     Returns
     -------
@@ -74,10 +70,8 @@ class SampleConsensus:
 
     Parameters
     ----------
-    threshold, max_samples : float, int
-        Largest residual of an inlier, and number of samples.
-    stop_inlier_ratio : float
-        The search ends if a model has more inliers than this share of the data.
+    threshold, max_samples, stop_inlier_ratio : float, int, float
+        Largest residual of an inlier, number of samples, and share of inliers that ends the search.
     least_median : bool
         Rank models by the median of their residuals instead (Rousseeuw, 1984).
     """
@@ -101,10 +95,8 @@ class SampleConsensus:
         ----------
         solve, residuals : callable
             Models of the data with indices (sample_size,), possibly none; and the distances (n,) of a model.
-        sample_size, n : int
-            Data in a minimal sample, and all.
-        rng : numpy.random.Generator
-            Source of randomness.
+        sample_size, n, rng : int, int, numpy.random.Generator
+            Data in a minimal sample, and all; and source of randomness.
 
         Returns
         -------
