@@ -3,7 +3,7 @@ import pytest
 from scipy.special import erf
 
 from tests.synthetic import photograph, texture
-from thesisrecon.features.harris import CornerMeasure, HarrisCorners, find_corners, select_spread
+from thesisrecon.features.harris import CornerMeasure, HarrisCorners, select_spread
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.records import Image
 
@@ -109,7 +109,7 @@ def test_turned_patches_turn_with_the_photograph():
 @pytest.mark.parametrize("formula", ["noble", "harris"])
 def test_both_formulas_find_the_same_corner_and_no_edge(formula):
     measure = CornerMeasure(formula=formula)
-    xy, response = find_corners(chessboard(0.3, -0.2).gray[None], measure)
+    xy, response = measure._find(chessboard(0.3, -0.2).gray[None])
     # det - k trace^2 has the flatter top.
     assert np.linalg.norm(xy[0] - (60.3, 49.8)) < (0.25 if formula == "noble" else 0.5)
     assert (response[1:] < 0.01 * response[0]).all()
@@ -145,7 +145,7 @@ def test_without_surface_fit_corners_stay_on_pixels_and_with_it_they_are_nearer(
     for dx, dy in np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)):
         for subpixel, reported in error.items():
             measure = CornerMeasure(subpixel=subpixel)
-            xy, _ = find_corners(chessboard(dx, dy).gray[None], measure)
+            xy, _ = measure._find(chessboard(dx, dy).gray[None])
             assert subpixel or not (xy % 1.0).any()
             reported.append(np.linalg.norm(xy[0] - (60 + dx, 50 + dy)))
     assert np.mean(error[True]) < 0.5 * np.mean(error[False])
@@ -218,10 +218,3 @@ def test_a_measure_that_cannot_be_is_refused(field, value):
 def test_a_detector_that_cannot_be_is_refused(kind, field, value):
     with pytest.raises(ValueError, match=field):
         kind(**{field: value})
-
-
-def test_values_that_are_not_finite_are_refused():
-    gray = texture(60, 60).astype(np.float32)
-    gray[30, 30] = np.nan
-    with pytest.raises(ValueError, match="NaN"):
-        find_corners(gray[None], CornerMeasure())

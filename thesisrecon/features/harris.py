@@ -100,6 +100,15 @@ class CornerMeasure:
         weight = self.harris_k if self.formula == "harris" else 0.0
         return corner_response(channels, derivative, taps, weight)
 
+    def _find(self, channels: F32) -> tuple[F64, F32]:
+        """Corners (N, 2) above the noise and their responses (N,), strongest first; none in tiny images."""
+        if min(channels.shape[1:]) < 2 * len(self._integration()):
+            return np.empty((0, 2)), np.empty(0, np.float32)
+        xy, value = fit_maxima(self._response(channels), self._noise_response(), self.subpixel)
+        # Equal responses keep the reading order.
+        order = np.argsort(-value, kind="stable")
+        return xy[order], value[order]
+
     def _noise_response(self) -> float:
         """R of an isotropic corner whose det / trace is ``NOISE_RESPONSE``."""
         if self.formula == "noble":
@@ -117,37 +126,6 @@ class CornerMeasure:
 
 def _slope(taps: F64) -> float:
     return float(taps @ (np.arange(len(taps)) - len(taps) // 2))
-
-
-def find_corners(channels: F32, measure: CornerMeasure) -> tuple[F64, F32]:
-    """Detect all corners above the noise, strongest first; equal responses keep the reading order.
-
-    Parameters
-    ----------
-    channels : ndarray (C, H, W)
-        Channels, float32.
-    measure : CornerMeasure
-        Response and its parameters.
-
-    Returns
-    -------
-    xy : ndarray (N, 2)
-        Positions, px; none if the image is smaller than two windows.
-    response : ndarray (N,)
-        Responses.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite.
-    """
-    if min(channels.shape[1:]) < 2 * len(measure._integration()):
-        return np.empty((0, 2)), np.empty(0, np.float32)
-    if not np.isfinite(channels).all():
-        raise ValueError("corners are found in finite grey values; got NaN or infinity among them")
-    xy, value = fit_maxima(measure._response(channels), measure._noise_response(), measure.subpixel)
-    order = np.argsort(-value, kind="stable")
-    return xy[order], value[order]
 
 
 @dataclass(frozen=True)
@@ -184,7 +162,7 @@ class HarrisCorners:
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
-        xy, response = find_corners(self.measure._channels(image), self.measure)
+        xy, response = self.measure._find(self.measure._channels(image))
         if len(xy):
             strong = response >= self.threshold_rel * float(response[0])
             xy, response = xy[strong], response[strong]

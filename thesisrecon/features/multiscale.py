@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features._kernels import sample_patches
-from thesisrecon.features.harris import CornerMeasure, find_corners, select_spread
+from thesisrecon.features.harris import CornerMeasure, select_spread
 from thesisrecon.geometry.raster import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
@@ -73,7 +73,7 @@ class MultiScaleCorners:
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
         levels = self._pyramid(image)
-        found = [find_corners(level.channels, self.measure) for level in levels]
+        found = [self.measure._find(level.channels) for level in levels]
         parts = []
         for index, count in ((0, self.full_corners), (2, self.half_corners)):
             if index < len(levels):
