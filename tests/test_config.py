@@ -17,12 +17,7 @@ from thesisrecon._settings import (
 )
 from thesisrecon.config import KINDS, PRESETS, preset
 from thesisrecon.errors import UsageError
-from thesisrecon.intrinsics import (
-    INTRINSICS,
-    IntrinsicsOptions,
-    camera_numbers,
-    prior_from_options,
-)
+from thesisrecon.intrinsics import INTRINSICS, IntrinsicsOptions, camera_numbers, prior_from_options
 from thesisrecon.pipeline.reconstruction import _exif_warnings
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
@@ -192,8 +187,6 @@ def test_surface_and_fusion_are_chosen_by_their_words():
 
 
 SIZES = [(4000, 3000), (4000, 3000), (3000, 4000)]
-
-
 SCALES = np.array([0.4, 0.4, 0.25])
 
 

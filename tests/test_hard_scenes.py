@@ -70,8 +70,6 @@ HOPELESS = {
     "no texture": lambda: blank(0.0),
     "no points": without_points,
 }
-
-
 PARTLY = {
     "forward": ahead,
     "tiny baseline": lambda: abreast(0.05),
@@ -80,8 +78,6 @@ PARTLY = {
     "a small photograph": far_smaller,
     "burnt out": burnt_out,
 }
-
-
 MADE = {}
 
 

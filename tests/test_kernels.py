@@ -102,7 +102,6 @@ def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(packag
     assert run_in(package, RUN.replace("3.0", "3")) == ["8.0", "0"]
 
 
-
 def test_two_processes_at_once_compile_once(package):
     with ThreadPoolExecutor() as pool:
         done = list(pool.map(lambda _: run_in(package), range(3)))

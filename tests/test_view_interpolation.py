@@ -156,7 +156,7 @@ def test_a_film_of_two_goes_from_one_to_the_other(still):
     assert film.metadata["violating_monotonicity"] == [0.0]
     assert "0.0 % of these violate monotonicity" in film.notes[0]
     assert still == [("a", "b")]
-    assert interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ("50 % a, 50 % b",)
+    assert interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ["50 % a, 50 % b"]
 
 
 def test_a_film_of_three_crosses_the_triangle(still):

@@ -13,31 +13,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [  # noqa: F405
-    "Camera",
-    "DisparityMap",
-    "FundamentalFit",
-    "Image",
-    "PipelineConfig",
-    "Reconstruction",
-    "RunResult",
-    "SelfCalibration",
-    "StageFailure",
-    "TexturedMesh",
-    "Tracks",
-    "TwoView",
-    "UsageError",
-    "__version__",
-    "estimate_fundamental",
-    "interpolate_view",
-    "match_pair",
-    "match_rectified",
-    "reconstruct",
-    "render",
-    "self_calibrate",
-    "synthesize_view",
-    "triangulate",
-    "upgrade_affine",
-]
+    "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
+    "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__",
+    "estimate_fundamental", "interpolate_view", "match_pair", "match_rectified", "reconstruct", "render",
+    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -34,30 +34,11 @@ from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
-    "Camera",
-    "DisparityMap",
-    "FundamentalFit",
-    "Image",
-    "PipelineConfig",
-    "Reconstruction",
-    "RunResult",
-    "SelfCalibration",
-    "StageFailure",
-    "TexturedMesh",
-    "Tracks",
-    "TwoView",
-    "UsageError",
-    "estimate_fundamental",
-    "interpolate_view",
-    "match_pair",
-    "match_rectified",
-    "reconstruct",
-    "render",
-    "self_calibrate",
-    "synthesize_view",
-    "triangulate",
-    "upgrade_affine",
-]
+    "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
+    "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError",
+    "estimate_fundamental", "interpolate_view", "match_pair", "match_rectified", "reconstruct", "render",
+    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+]  # fmt: skip
 
 
 def match_rectified(

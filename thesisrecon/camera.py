@@ -147,9 +147,8 @@ class Camera:
             Points, or without depth unit directions from the centre, in the world frame.
         """
         xy = np.asarray(xy, dtype=np.float64)
-        require_shapes("Camera.unproject", xy=(xy, ("N", 2)))
-        if depth is not None:
-            require_shapes("Camera.unproject", xy=(xy, ("N", 2)), depth=(depth, ("N",)))
+        given = {} if depth is None else {"depth": (depth, ("N",))}
+        require_shapes("Camera.unproject", xy=(xy, ("N", 2)), **given)
         xh = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(self.K).T
         rays = np.column_stack([undistort(xh[:, :2] / xh[:, 2:], self._coefficients), np.ones(len(xy))])
         if depth is None:

@@ -33,10 +33,8 @@ def counted(number: int, noun: str, shown: str = "") -> str:
 
     Parameters
     ----------
-    number, noun : int, str
-        The number and the singular noun.
-    shown : str
-        Formatted number, if other than ``str(number)``.
+    number, noun, shown : int, str, str
+        The number, the singular noun, and the formatted number if other than ``str(number)``.
 
     Returns
     -------
@@ -71,10 +69,8 @@ def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
 
     Parameters
     ----------
-    where, key : str
-        Dotted name of the table, and the key.
-    names : iterable of str
-        Its known keys.
+    where, key, names : str, str, iterable of str
+        Dotted name of the table, the key, and the known keys.
 
     Returns
     -------
@@ -91,10 +87,8 @@ def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
 
     Parameters
     ----------
-    what, word : str, object
-        Kind of word, and the word.
-    known : iterable of str
-        Known words.
+    what, word, known : str, object, iterable of str
+        Kind of word, the word, and the known words.
 
     Returns
     -------

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from thesisrecon.cli import common
-from thesisrecon.cli import reconstruct as cli
-from thesisrecon.cli.inspect import _duration, _intrinsic_lines
+from thesisrecon.cli import runs as cli
 from thesisrecon.cli.main import run_command
+from thesisrecon.cli.runs import _duration, _intrinsic_lines
 from thesisrecon.io import demo
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
 

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 from functools import cache
+from html.parser import HTMLParser
 
 import numpy as np
 from PIL import Image as PillowImage
@@ -20,17 +21,9 @@ from thesisrecon.surface.simplification import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 SIZE = (480, 320)
-
-
 K = np.array([[520.0, 0.0, 231.0], [0.0, 520.0, 166.0], [0.0, 0.0, 1.0]])
-
-
 K1 = -0.03
-
-
 NOISE_PX = 0.3
-
-
 CONFIG = (
     '[features]\nkind = "corners"\n\n[matching]\n# a </script> in a comment must not hurt\nradius = 0.2\n'
 )
@@ -226,8 +219,6 @@ class Witness:
 
 
 SPHERE_SIZE = (SHAPE[1], SHAPE[0])
-
-
 SPHERE_NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
 
 
@@ -265,3 +256,44 @@ def sphere_run():
         depth_maps={m.view: m.depth for m in maps[:-1]},
         held_out=HeldOut(2, rgb[2], shifted, seen, psnr_db=27.3456, ssim=0.9123),
     )
+
+
+class Structure(HTMLParser):
+    """Elements of a page with the names of their attributes, in order, and its text without scripts."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.elements, self.attributes, self.words, self._inside = [], [], [], ""
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, tuple(name for name, _ in attrs)))
+        self.attributes += [(name, value or "") for name, value in attrs]
+        self._inside = tag
+
+    def handle_endtag(self, tag):
+        self.elements.append((f"/{tag}", ()))
+        self._inside = ""
+
+    def handle_comment(self, data):
+        self.elements.append((f"comment {data}", ()))
+
+    def handle_data(self, data):
+        if self._inside not in ("script", "style"):
+            self.words.append(data)
+
+    def count(self, tag):
+        return sum(element == tag for element, _ in self.elements)
+
+    @property
+    def addresses(self):
+        return [value for name, value in self.attributes if name in ("src", "href")]
+
+    @property
+    def ids(self):
+        return [value for name, value in self.attributes if name == "id"]
+
+    @property
+    def handlers(self):
+        return [name for name, _ in self.attributes if name.startswith("on")]

@@ -4,15 +4,21 @@ import base64
 import dataclasses
 import hashlib
 import html
-import json
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from tests.report.synthetic import NOISE_PX, SPHERE_NAMES, Witness, made_up_run, projective_run, sphere_run
+from tests.report.synthetic import (
+    NOISE_PX,
+    SPHERE_NAMES,
+    Structure,
+    Witness,
+    made_up_run,
+    projective_run,
+    sphere_run,
+)
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.records import Image, IntrinsicInterval, TexturedMesh
@@ -25,40 +31,6 @@ from thesisrecon.report._data import (
 from thesisrecon.report._figures import _BINS, _common_limit_px, _histogram_shares
 from thesisrecon.report._page import render_report, strip_page
 
-EVIL = [
-    "<img src=x onerror=alert(1)>.jpg",
-    "\"quote'&.png",
-    "</script><script>alert(2)</script>.jpg",
-    "{{ 7*7 }}.jpg",
-]
-
-
-class Structure(HTMLParser):
-    """Tags, attributes that fetch, and the text of the data block of a page."""
-
-    def __init__(self):
-        super().__init__()
-        self.tags = []
-        self.addresses = []
-        self.handlers = []
-        self.ids = []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        for name, value in attrs:
-            if name in {"src", "href"}:
-                self.addresses.append(value or "")
-            if name == "id":
-                self.ids.append(value or "")
-            if name.startswith("on"):
-                self.handlers.append(name)
-
-
-def structure_of(page):
-    parser = Structure()
-    parser.feed(page)
-    return parser
-
 
 @pytest.fixture(scope="module")
 def page():
@@ -66,19 +38,19 @@ def page():
 
 
 def test_the_page_fetches_nothing_and_is_small(page):
-    structure = structure_of(page)
+    structure = Structure(page)
     assert all(address.startswith(("data:", "#")) for address in structure.addresses)
     assert len(page.encode()) < 10_000_000
     assert page.count("plotly.js v") == 1
 
 
 def test_the_page_holds_every_section_and_its_links_lead_somewhere(page):
-    structure = structure_of(page)
+    structure = Structure(page)
     wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
     assert wanted == {"main", "view", "images", "pairs", "stages", "warnings", "config"}
     assert wanted <= set(structure.ids)
-    assert structure.tags.count("svg") == 8  # a histogram of each registered view
-    assert structure.tags.count("img") == 9 + 2  # thumbnails, best and weakest pair
+    assert structure.count("svg") == 8  # a histogram of each registered view
+    assert structure.count("img") == 9 + 2  # thumbnails, best and weakest pair
     for text in (
         "Computing time",
         "2081.4 ± 1.7",
@@ -93,24 +65,12 @@ def test_the_same_data_gives_the_same_page(page):
     assert render_report(made_up_run()) == page
 
 
-def test_names_are_text_everywhere():
-    page = render_report(dataclasses.replace(made_up_run(names=EVIL, points=200), title=EVIL[2]))
-    structure = structure_of(page)
-    assert structure.handlers == []
-    assert structure.tags.count("script") == 3
-    for name in EVIL:
-        assert html.escape(name, quote=True).replace("&quot;", "&#34;").replace("&#x27;", "&#39;") in page
-    block = re.search(r'<script type="application/json" id="figures">(.*?)</script>', page, re.S)
-    figures = json.loads(block.group(1))
-    assert figures["matrix-figure"]["data"][0]["x"][0] == "1 · " + html.escape(EVIL[0])
-
-
 def test_runs_that_stopped_early_say_how_far_they_got():
     early = projective_run()
     page = render_report(early)
     assert "Stopped early" in page
     assert 'id="scene-figure"' not in page
-    assert structure_of(page).tags.count("svg") == 8
+    assert Structure(page).count("svg") == 8
     only_features = dataclasses.replace(early, reconstruction=None, pairs=(), until="features")
     page = render_report(only_features)
     assert "corners were detected" in page
@@ -159,7 +119,7 @@ def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
     page = render_report(dataclasses.replace(data, pairs=[nothing]))
     assert "too few matches for an F" in page
     assert "<td>–</td><td>–</td>" in page
-    assert structure_of(page).tags.count("figure") == 1  # the matrix
+    assert Structure(page).count("figure") == 1  # the matrix
 
 
 def test_warnings_of_the_run_stand_beside_those_of_its_stages():
@@ -198,15 +158,15 @@ def test_the_affine_stratum_is_drawn_where_there_is_one(page):
 def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
     data = sphere_run()
     page = render_report(data)
-    structure = structure_of(page)
+    structure = Structure(page)
     assert {"model", "depth", "held-out", "model-data", "model-figure"} <= set(structure.ids)
     assert len(structure.ids) == len(set(structure.ids))
     wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
     assert wanted <= set(structure.ids)
     assert all(address.startswith(("data:", "#")) for address in structure.addresses)
     assert structure.handlers == []
-    assert structure.tags.count("img") == 8 + 7 + 3
-    assert structure.tags.count("option") == 8 + 1
+    assert structure.count("img") == 8 + 7 + 3
+    assert structure.count("option") == 8 + 1
     texels = f"{data.model.texture.shape[1]} × {data.model.texture.shape[0]} texels"
     for text in (texels, "27.3 dB", "0.912", html.escape(SPHERE_NAMES[2])):
         assert text in page
@@ -285,12 +245,8 @@ def strip():
     return strip_page("Between <a> and b", frames, notes=["all is well"])
 
 
-def test_names_are_escaped_and_nothing_is_loaded():
-    text = strip()
-    assert "Between &lt;a&gt; and b" in text
-    assert "picture <1>" not in text
-    assert "all is well." in text
-    assert 'src="http' not in text
+def test_a_strip_has_its_notes_and_at_least_one_frame():
+    assert "all is well." in strip()
     with pytest.raises(ValueError, match="at least one"):
         strip_page("nothing", [])
 
@@ -312,13 +268,6 @@ def test_one_turns_through_the_pictures(browser, tmp_path):
     assert seen.errors == []
     assert not [url for url in seen.requests if not url.startswith(("file:", "data:"))]
     seen.context.close()
-
-
-def test_the_metric_reconstruction_goes_before_the_projective_one():
-    data, early = made_up_run(points=100), projective_run()
-    assert data.best_reconstruction is data.metric.reconstruction
-    assert early.best_reconstruction is early.reconstruction
-    assert dataclasses.replace(early, reconstruction=None).best_reconstruction is None
 
 
 def test_intrinsics_are_reported_in_pixels_of_the_file():

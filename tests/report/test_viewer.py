@@ -181,19 +181,6 @@ def test_the_canvas_shows_points_and_cameras(witness):
 
 
 @pytest.mark.browser
-def test_the_matrix_is_drawn_in_colour(witness):
-    assert (np.ptp(witness.pixels("#matrix-figure"), axis=2) > 30).mean() > 0.2
-
-
-@pytest.mark.browser
-def test_names_are_shown_as_they_are(witness):
-    shown = witness.page.locator(".card .name").all_inner_texts()
-    assert [text.split(" ", 1)[1] for text in shown[: len(EVIL)]] == EVIL
-    assert witness.page.locator("h1").inner_text() == "<img src=x onerror=alert(9)>"
-    assert witness.page.locator("img[src='x']").count() == 0
-
-
-@pytest.mark.browser
 def test_the_page_fits_the_screen(witness):
     width = witness.page.evaluate("document.documentElement.scrollWidth")
     assert width <= witness.page.viewport_size["width"]
@@ -226,8 +213,6 @@ def test_the_numbers_of_the_cameras_unfold(witness):
 
 
 CANVAS = "#model-figure canvas"
-
-
 RECORD_VIEWS = """
 window.views = new Set();
 const before = WebGL2RenderingContext.prototype.uniformMatrix4fv;
@@ -236,8 +221,6 @@ WebGL2RenderingContext.prototype.uniformMatrix4fv = function (place, turned, val
   return before.call(this, place, turned, values);
 };
 """
-
-
 WITHOUT_WEBGL = """
 const before = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {

@@ -24,7 +24,7 @@ from thesisrecon.io._files import read_json
 from thesisrecon.pipeline import _state as preparing
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.runtime import _dask_cluster as cluster
+from thesisrecon.runtime import _executors as cluster
 from thesisrecon.runtime import _executors as workers
 from thesisrecon.runtime._executors import Workers
 

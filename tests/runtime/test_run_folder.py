@@ -3,7 +3,6 @@
 import errno
 import importlib
 import json
-import os
 import shutil
 import sys
 import zipfile
@@ -36,13 +35,11 @@ from thesisrecon.runtime._run_folder import (
     read_record,
 )
 from validation.studies.robustness import (
-    Refusal,
     SmallRuns,
     different,
     disk_ends,
     filled,
     outputs,
-    refusal_table,
     refused_at,
 )
 
@@ -128,10 +125,6 @@ def test_keys_distinguish_values_types_and_arrays():
     assert key_of({"a": 1, "b": 2}) == key_of({"b": 2, "a": 1})
     with pytest.raises(TypeError, match="plain values"):
         key_of(object())
-
-
-def test_stages_have_different_code():
-    assert code_key("thesisrecon.features.harris") != code_key("thesisrecon.matching.strength")
 
 
 IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.jpg": "1", "b.jpg": "2"}}
@@ -314,8 +307,6 @@ def test_nothing_is_unpacked(tmp_path):
 
 
 TRACKS = Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3)
-
-
 CHANGES = [
     ("beyond the views", lambda parts: parts["array0"].__setitem__(1, 10**9)),
     ("below zero", lambda parts: parts["array1"].__setitem__(1, -1)),
@@ -428,16 +419,3 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
     assert said == (
         "thesisrecon: kernels/index.nbi cannot be written: No space left on device; free space there\n"
     )
-
-
-def test_the_check_names_the_fault():
-    said = "thesisrecon: a cannot be written: no; free space there, then repeat the command\n"
-    well = Refusal("file 1: No space left on device", 2, said, (), ())
-    bad = Refusal("a disk of 3 KiB", 1, "Traceback\nOSError\n", ("points.ply",), ("model.glb",))
-    assert well.wrong == ""
-    assert bad.wrong == (
-        "exit code 1; not one sentence; names no place; does not say what to do; strange files: points.ply; "
-        "differs: model.glb"
-    )
-    assert refusal_table([well]).splitlines()[2:] == [f"| {well.when} | 2 | {said.strip()} | nothing |"]
-    assert os.strerror(errno.ENOSPC) in well.when

@@ -57,9 +57,14 @@ MaxSize = Annotated[
     typer.Option("--max-size", help="Long side (px) to which larger images are reduced (default: 1600)."),
 ]
 Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
-OutputFolder = Annotated[
-    Path, typer.Option("-o", "--out", parser=parse_folder, metavar="FOLDER", help="Output folder.")
-]
+
+
+def folder_option(words: str) -> Any:
+    """The option ``-o`` with this help."""
+    return typer.Option("-o", "--out", parser=parse_folder, metavar="FOLDER", help=words)
+
+
+OutputFolder = Annotated[Path, folder_option("Output folder.")]
 
 
 def cap_threads(threads: int) -> None:

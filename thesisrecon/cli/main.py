@@ -12,8 +12,7 @@ import typer
 
 from thesisrecon import __version__
 from thesisrecon.cli.common import DEBUG_VARIABLE, exit_code_of
-from thesisrecon.cli.inspect import inspect
-from thesisrecon.cli.reconstruct import demo, reconstruct
+from thesisrecon.cli.runs import demo, inspect, reconstruct
 from thesisrecon.cli.views import interpolate, render
 from thesisrecon.runtime._signals import set_error_stream
 

@@ -14,6 +14,7 @@ from thesisrecon.cli.common import (
     Seed,
     Threads,
     cap_threads,
+    folder_option,
     interruptible,
     parse_folder,
     progress_bars,
@@ -45,12 +46,7 @@ def render(
     background: Annotated[
         str, typer.Option("--background", help="Background colour, such as white or #20304f.")
     ] = "black",
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", parser=parse_folder, metavar="FOLDER", help="Output folder (OUT/views/PATH)."
-        ),
-    ] = None,
+    folder: Annotated[Path | None, folder_option("Output folder (OUT/views/PATH).")] = None,
     threads: Threads = 0,
 ) -> None:
     """Render the model of a run along a camera path."""
@@ -106,12 +102,7 @@ def interpolate(
     frames: Frames = 21,
     seed: Seed = 0,
     max_size: MaxSize = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", parser=parse_folder, metavar="FOLDER", help="Output folder (views/METHOD)."
-        ),
-    ] = None,
+    folder: Annotated[Path | None, folder_option("Output folder (views/METHOD).")] = None,
     threads: Threads = 0,
 ) -> None:
     """Compute views between two or three images."""

@@ -92,7 +92,6 @@ def _later_end(out: Path, until: str) -> str | None:
 
 
 def _described(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
-    """The result with its warnings, reports and summary."""
     result = replace(
         result,
         warnings=(*run.warnings, *_failure_warnings(result)),
@@ -189,7 +188,6 @@ def _write_model(
 
 
 def _run_facts(run: Run, until: str) -> dict[str, Any]:
-    """Summary entries about the run itself."""
     seconds = {stage: round(report.seconds, 3) for stage, report in run.reports.items()}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
@@ -206,7 +204,6 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
 
 
 def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
-    """The model, simplified for the report."""
     if result.mesh is None:
         return None
     coarse = simplify_mesh(result.mesh, PAGE_FACES)
@@ -214,6 +211,5 @@ def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
 
 
 def _thinned(depth: F32) -> F32:
-    """Every n-th pixel, for the report."""
     step = max(1, -(-max(depth.shape) // DEPTH_PX))
     return depth[::step, ::step]

@@ -122,7 +122,6 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
 
 
 def _prepared(state: PipelineState) -> PreparedViews:
-    """Prepared views, made only if a pair must be computed."""
     if state.prepared is None:
         given = zip(state.result.images, state.result.features, strict=True)
         state.prepared = PreparedViews(state.config.matching, dict(enumerate(given)))

@@ -184,7 +184,6 @@ def _motion(result: RunResult) -> dict[str, Any] | None:
 
 
 def _depth_maps(result: RunResult) -> list[dict[str, Any]] | None:
-    """Return coverage and precision of the depth maps; None if there are none."""
     if not result.depth_maps:
         return None
     return [

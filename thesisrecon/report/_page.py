@@ -217,7 +217,6 @@ def _intrinsic_columns(data: ReportData) -> list[tuple[str, str]]:
 
 
 def _state(data: ReportData, i: int) -> tuple[str, str, str]:
-    """Return (word, level, reason) of a view."""
     best = data.best_reconstruction
     if best is None:
         return "read", "open", ""

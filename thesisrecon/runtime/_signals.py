@@ -94,7 +94,6 @@ def starting_processes() -> Iterator[None]:
 
 
 def _forget() -> None:
-    """Reset signal handling in a fork."""
     signal.set_wakeup_fd(-1)
     for number in CODES:
         if signal.getsignal(number) is not signal.SIG_IGN:
