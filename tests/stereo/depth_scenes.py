@@ -55,12 +55,10 @@ def on_arc(angles_deg, *, distance=6.0):
     return np.array(cameras)
 
 
-def make_walled(P, *, distortion=None, plain=False):
-    """A board at Z = -0.8 before a wall that leans away; both are blank if ``plain``."""
-    levels = [np.full((900, 900), 90.0 + 60.0 * k) if plain else texture(900, 900, k) for k in (0, 1)]
-    wall = Rectangle((-10.0, -7.5, -2.0), (20.0, 0, 4.0), (0, 15.0, 0), levels[0])
-    board = Rectangle((-0.7, -0.7, -0.8), (1.4, 0, 0), (0, 1.4, 0), levels[1])
-    lens = np.zeros(3) if distortion is None else distortion
+def make_walled(P, *, lens=(0.0, 0.0, 0.0)):
+    """A board at Z = -0.8 before a wall that leans away."""
+    wall = Rectangle((-10.0, -7.5, -2.0), (20.0, 0, 4.0), (0, 15.0, 0), texture(900, 900, 0))
+    board = Rectangle((-0.7, -0.7, -0.8), (1.4, 0, 0), (0, 1.4, 0), texture(900, 900, 1))
     return photograph_scene(P, [wall, board], sizes=[SIZE] * len(P), noise=0.0, lens=lens)
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import PIL.Image
 import pytest
-from scipy.ndimage import map_coordinates
 
 from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
@@ -17,24 +16,14 @@ from validation.scenes.real import load_fixture_depth, load_fixture_scene
 STEREO = MultiViewStereo()
 
 
-SMALL = replace(STEREO, max_side=160, match_side=160)
-
-
 @pytest.fixture(scope="module")
 def walled():
-    return make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)), distortion=RADIAL)
-
-
-def at_size(depth, shape):
-    """Depths between pixels as the inverse depths interpolate them."""
-    rows, columns = ((np.arange(n) + 0.5) * m / n - 0.5 for n, m in zip(shape, depth.shape, strict=True))
-    places = np.meshgrid(rows, columns, indexing="ij")
-    return 1.0 / map_coordinates(1.0 / depth, places, order=1, mode="nearest")
+    return make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)), lens=RADIAL)
 
 
 def errors(walled, maps):
     """Relative errors of known pixels, and the share of all that is known."""
-    apart = [maps[i].depth / at_size(walled.depth[i], maps[i].depth.shape) - 1.0 for i in maps]
+    apart = [maps[i].depth / walled.depth[i] - 1.0 for i in maps]
     known = np.concatenate([a[np.isfinite(a)] for a in apart])
     return np.abs(known), len(known) / sum(a.size for a in apart)
 
@@ -92,46 +81,11 @@ def test_the_surroundings_of_a_view_are_enough_for_its_map(links):
             assert whole.std.tobytes() == alone.std.tobytes()
 
 
-def test_pairs_are_matched_smaller_and_depths_are_as_exact(walled):
-    stereo = replace(STEREO, match_side=160)
-    scene = stereo.prepare(walled.images, walled.reconstruction)
-    assert scene.matched[1].seen.shape == (120, 160)
-    error, known = errors(walled, {1: stereo.depth_map(scene, 1)})
-    assert np.median(error) < 0.002
-    assert np.mean(error < 0.01) > 0.93
-    assert known > 0.75
-
-
-def known_share(maps):
-    return float(np.mean([np.isfinite(found.depth).mean() for found in maps.values()]))
-
-
 def test_one_baseline_gives_depth_though_nothing_is_seen_by_a_third_view():
     walled = make_walled(on_arc((-5.0, 5.0)))
-    error, known = errors(walled, SMALL.map_all(walled.images, walled.reconstruction))
+    error, known = errors(walled, STEREO.map_all(walled.images, walled.reconstruction))
     assert known > 0.5
     assert np.median(error) < 0.003
-
-
-def test_no_baseline_gives_no_depth():
-    walled = make_walled(on_arc((0.0, 0.0)))
-    still = replace(walled.reconstruction, P=np.stack([walled.reconstruction.P[0]] * 2))
-    maps = SMALL.map_all(walled.images, still)
-    assert known_share(maps) == 0.0
-    assert all((found.views == 0).all() for found in maps.values())
-
-
-def test_a_wall_without_texture_is_unknown():
-    plain = make_walled(on_arc((-5.0, 5.0)), plain=True)
-    assert known_share(SMALL.map_all(plain.images, plain.reconstruction)) < 0.3
-
-
-def test_forward_motion_is_right_where_it_is_known():
-    P = np.concatenate([on_arc((0.0,), distance=d) for d in (6.0, 5.3, 4.6)])
-    walled = make_walled(P)
-    error, known = errors(walled, SMALL.map_all(walled.images, walled.reconstruction))
-    assert known > 0.1
-    assert np.median(error) < 0.01
 
 
 def test_views_without_a_camera_are_omitted_and_cannot_be_requested(walled):
@@ -175,40 +129,24 @@ def courtyard():
     return images, P, correspondences
 
 
-def photographs(images):
-    return [Image(f"{k}.png", rgb, SIZE) for k, rgb in enumerate(images)]
-
-
 def test_both_photographs_know_where_their_pixels_are_in_the_other(courtyard):
     images, P, truth = courtyard
-    F = fundamental_from_cameras(P[0], P[1])
     here, there = (part[::12, ::12].reshape(-1, 2) for part in truth[0])
     seen = np.all((there > 0) & (there < np.array(SIZE)), axis=1)
-    pair = STEREO.match_two_views(*photographs(images), F, here[seen], there[seen])
-    for side in (0, 1):
-        found = pair.correspondences(side, SIZE)
-        assert found.shape == (384, 512, 2)
-        at, to = truth[side]
-        slope = to - at
-        off = np.linalg.norm(found - (np.indices((384, 512))[::-1].transpose(1, 2, 0) + slope), axis=2)
+    darker = (images[1] * 0.8).astype(np.uint8)
+    photographs = [Image(f"{k}.png", rgb, SIZE) for k, rgb in enumerate((images[0], darker))]
+    pair = STEREO.match_two_views(*photographs, fundamental_from_cameras(*P), here[seen], there[seen])
+    np.testing.assert_allclose(pair.gain, 1.25 * np.ones(3), rtol=0.2)
+    pixels = np.indices(SIZE[::-1])[::-1].transpose(1, 2, 0)
+    forth, back = (pair.correspondences(side, SIZE) for side in (0, 1))
+    for found, (at, to) in zip((forth, back), truth, strict=True):
+        off = np.linalg.norm(found - (pixels + to - at), axis=2)
         inside = np.all((to > 2) & (to < np.array(SIZE) - 3), axis=2)
         assert np.isfinite(off[inside]).mean() > 0.97
         assert np.nanmedian(off[inside]) < 0.35
         assert np.nanmean(off[inside] < 1.5) > 0.8
-
-
-def test_there_and_back_is_where_one_was(courtyard):
-    images, P, truth = courtyard
-    F = fundamental_from_cameras(P[0], P[1])
-    here, there = (part[::12, ::12].reshape(-1, 2) for part in truth[0])
-    seen = np.all((there > 0) & (there < np.array(SIZE)), axis=1)
-    darker = (images[1] * 0.8).astype(np.uint8)
-    pair = STEREO.match_two_views(*photographs((images[0], darker)), F, here[seen], there[seen])
-    np.testing.assert_allclose(pair.gain, 1.25 * np.ones(3), rtol=0.2)
-    forth, back = pair.correspondences(0, SIZE), pair.correspondences(1, SIZE)
-    at = np.rint(forth)
-    inside = np.all((at >= 0) & (at <= np.array(SIZE) - 1), axis=2)
-    x, y = at[inside].astype(int).T
-    again = back[y, x] + forth[inside] - at[inside]
-    off = np.linalg.norm(again - np.indices((384, 512))[::-1].transpose(1, 2, 0)[inside], axis=1)
-    assert np.nanmedian(off) < 0.3
+    near = np.rint(forth)
+    inside = np.all((near >= 0) & (near <= np.array(SIZE) - 1), axis=2)
+    x, y = near[inside].astype(int).T
+    again = back[y, x] + forth[inside] - near[inside]
+    assert np.nanmedian(np.linalg.norm(again - pixels[inside], axis=1)) < 0.3

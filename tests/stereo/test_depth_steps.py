@@ -15,12 +15,12 @@ from thesisrecon.stereo._neighbours import pinhole_view, select_neighbours, shar
 from thesisrecon.stereo._planar import common_orientation
 from thesisrecon.stereo._polar import polar
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
-from thesisrecon.stereo.depth import _complete_depths, _confirm_depths, _region_sizes, _transfer
+from thesisrecon.stereo.depth import _complete_depths, _confirm_depths, _region_sizes
 
 
 @pytest.fixture(scope="module")
 def walled():
-    return make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)), distortion=RADIAL)
+    return make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)), lens=RADIAL)
 
 
 def views_of(walled, **options):
@@ -223,11 +223,3 @@ def test_unconfirmed_depths_stay_if_they_continue_confirmed_ones():
     other[20:60, 60:200] = np.nan
     found = _confirm_depths(maps[0], [replace(maps[1], depth=other)])
     assert np.isnan(found.depth[35:45, 110:180]).all()
-
-
-def test_a_pixel_goes_to_another_view_and_back():
-    P = on_arc((-6.0, 6.0))
-    to, back = _transfer(P[0], P[1]), _transfer(P[1], P[0])
-    q = to @ np.array([6.0 * 100.0, 6.0 * 80.0, 6.0, 1.0])
-    there = np.append(q, 1.0)
-    np.testing.assert_allclose(back @ there, [600.0, 480.0, 6.0], atol=1e-9)

@@ -6,14 +6,8 @@ import numpy as np
 import pytest
 
 from tests.stereo import twins
-from thesisrecon.stereo._cost import _count_ones, census, cost_volume, split_channels, support_masks
-from thesisrecon.stereo._path_kernels import (
-    _transpose_back,
-    _transpose_rows,
-    adaptive_P2,
-    scratch_size,
-    sum_paths,
-)
+from thesisrecon.stereo._cost import census, cost_volume, split_channels, support_masks
+from thesisrecon.stereo._path_kernels import adaptive_P2, scratch_size, sum_paths
 from thesisrecon.stereo._postprocessing import (
     _squared_gradient,
     best_disparities,
@@ -43,13 +37,6 @@ def test_channels_are_quarter_levels_and_invalid_pixels_are_rejected():
     assert channels[0].tolist() == [[0, 40], [1020, 0]]
     assert channels[1].tolist() == [[1020, 0], [0, 4]]
     assert (grey == channels.sum(axis=0)).all()
-
-
-def test_ones_are_counted():
-    words = np.random.default_rng(0).integers(0, 2**31 - 1, 100).astype(np.int32)
-    expected = [int(word).bit_count() for word in words]
-    assert [_count_ones(word) for word in words] == expected
-    assert twins.ones(words).tolist() == expected
 
 
 def test_census():
@@ -83,18 +70,6 @@ def test_costs_over_supports():
     pixels = twins.costs(left, right, -2, 7, weights, 33)
     assert np.abs(volume - twins.mean_over_support(pixels, arms)).max() <= 1
     assert np.mean(volume == twins.mean_over_support(pixels, arms)) > 0.99
-
-
-@pytest.mark.parametrize("shape", [(9, 5, 7), (24, 3, 64), (17, 2, 130)])
-def test_rows_turn_and_turn_back(shape):
-    rows, n, width = shape
-    source = np.random.default_rng(4).integers(0, 256, shape).astype(np.uint8)
-    turned = np.zeros(((width + 7) // 8 * 8, n, (rows + 7) // 8 * 8), np.uint8)
-    _transpose_rows(source, turned)
-    assert (turned[:width, :, :rows] == source.transpose(2, 1, 0)).all()
-    back = np.empty_like(source)
-    _transpose_back(turned, back)
-    assert (back == source).all()
 
 
 @pytest.mark.parametrize("pairs", [2, 4])

@@ -7,7 +7,6 @@ from scipy.ndimage import map_coordinates
 from tests.stereo.twins import Setting, squares
 from tests.synthetic import texture
 from thesisrecon.stereo._plane_kernels import (
-    UNKNOWN,
     PatchViews,
     PatchWindow,
     begin_planes,
@@ -111,20 +110,3 @@ def test_a_pass_equals_that_of_plain_numpy(scene, backward):
     assert np.mean(np.isclose(cost, wanted_cost, atol=5e-4)) > 0.97
     same = np.isclose(planes, wanted, atol=1e-4, equal_nan=True).all(axis=-1)
     assert same.mean() > 0.95
-
-
-def test_passes_find_the_plane_and_fill_holes(scene):
-    _, given, (x, y) = scene
-    planes = planes_about((x, y), 0.5, seed=2)
-    cost = np.empty(SHAPE, np.float32)
-    begin_planes(*given, planes, cost)
-    before = cost.copy()
-    for k in range(4):
-        sweep_planes(*given, 0.5 * 0.5**k, 0.0, k % 2 == 1, planes, cost)
-    assert (cost <= before).all()
-    off = 5.0 * np.abs(planes[..., 0] - (PLANE[0] + x * PLANE[1] + y * PLANE[2]))
-    seen = np.isfinite(given[0].gray)
-    assert np.isfinite(planes[seen]).mean() > 0.98
-    assert np.nanmedian(off[seen]) < 0.05
-    assert np.mean(off[seen] < 0.5) > 0.8
-    assert (cost[~seen] == UNKNOWN).all()

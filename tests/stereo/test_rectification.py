@@ -111,15 +111,12 @@ def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
 def test_a_parallel_pair_stays_as_it_is():
     scene = make_pair("parallel", np.random.default_rng(3))
     for method in (loop_zhang, minimum_distortion, common_orientation):
-        rectified = method(both_pairs(scene)[1])
-        for H in rectified.H:
+        for H in method(both_pairs(scene)[1]).H:
             expected = np.eye(3)
             expected[:2, 2] = (H / H[2, 2])[:2, 2]
-            if method is minimum_distortion:
-                # The disparities of any scene slope a little; a shear takes part of that.
-                assert np.abs(H / H[2, 2] - expected).max() < 0.1
-            else:
-                np.testing.assert_allclose(H / H[2, 2], expected, atol=1e-6)
+            # The disparities of any scene slope a little; a shear takes part of that.
+            atol = 0.1 if method is minimum_distortion else 1e-6
+            np.testing.assert_allclose(H / H[2, 2], expected, atol=atol)
 
 
 def test_disparities_of_a_common_orientation_are_inverse_depths():
@@ -159,15 +156,6 @@ def test_loop_and_zhang_keep_angles_and_ratios_and_the_least_distorted_is_not_be
         assert found[minimum_distortion].distortion < least + 0.01
 
 
-def test_noise_of_matches_is_the_noise_of_rows():
-    scene = make_pair("beside", np.random.default_rng(7), noise_px=0.2)
-    pair = both_pairs(scene)[1]
-    for method in (*PLANAR_METHODS, polar):
-        rectified = method(pair)
-        rms_dy_px = np.sqrt(np.mean(matched(rectified, pair)[:, 1] ** 2))
-        assert 0.2 < rms_dy_px / np.sqrt(2.0) / measure_quality(rectified, pair).max_scale + 0.1 < 0.35
-
-
 @pytest.mark.parametrize("motion", ["forward", "diagonal", "half forward"])
 def test_epipoles_inside_are_for_polar_frames_alone(motion):
     scene = make_pair(motion, np.random.default_rng(8))
@@ -181,7 +169,7 @@ def test_epipoles_inside_are_for_polar_frames_alone(motion):
         rectify_cameras(*scene.P, *scene.sizes),
     ):
         assert isinstance(best, PolarRectification)
-        for side, size in enumerate(pair.sizes):
+        for side, size in enumerate(pair.pencil.sizes):
             pixels = np.random.default_rng(0).uniform([0.0, 0.0], np.array(size) - 1.0, (500, 2))
             assert np.isfinite(best.rectified_from_original(side, pixels)).all(axis=1).mean() > 0.5
 
@@ -203,13 +191,8 @@ def test_matches_bound_the_disparities_and_a_few_wrong_ones_do_not():
     d = left[:, 0] - rectified.rectified_from_original(1, scene.xy2)[:, 0]
     assert low < d.min()
     assert d.max() < high
-    shifted = left.copy()
-    shifted[:2, 0] -= 300.0
-    wrong = np.where(
-        np.arange(len(left))[:, None] < 2,
-        rectified.original_from_rectified(0, shifted, within=False),
-        scene.xy1,
-    )
+    wrong = scene.xy1.copy()
+    wrong[:2] = rectified.original_from_rectified(0, left[:2] - [300.0, 0.0], within=False)
     again = disparity_range(rectified, wrong, scene.xy2)
     assert abs(again[0] - low) + abs(again[1] - high) < 0.2 * (high - low)
     with pytest.raises(StageFailure, match="disparity range"):
@@ -307,20 +290,15 @@ def sample_plainly(image, xy, rows):
     return out
 
 
-def a_map(scale):
-    """A homography that shows the photograph ``1 / scale`` as large, turned."""
-    c, s = scale * np.cos(0.3), scale * np.sin(0.3)
-    H = np.linalg.inv(np.array([[c, -s, 20.0], [s, c, -4.0], [1e-4, 2e-4, 1.0]]))
-    return planar_frame(H / H[2, 2], (60, 50))
-
-
 @pytest.mark.parametrize("scale", [0.6, 1.0, 2.3])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_the_kernel_is_its_plain_twin(scale, channels):
     rng = np.random.default_rng(0)
     image = rng.uniform(0.0, 255.0, (70, 90, channels)).astype(np.float32)
     image[30:33, 40:44] = np.nan
-    xy = a_map(scale)._lookup(0, range(51))
+    c, s = scale * np.cos(0.3), scale * np.sin(0.3)
+    H = np.linalg.inv(np.array([[c, -s, 20.0], [s, c, -4.0], [1e-4, 2e-4, 1.0]]))
+    xy = planar_frame(H / H[2, 2], (60, 50))._lookup(0, range(51))
     out = np.empty((50, 60, channels), np.float32)
     _sample_image(image, xy, out)
     plain = sample_plainly(image, xy, 50)
@@ -355,14 +333,6 @@ def test_whole_pixels_are_kept_and_quadratics_are_reproduced():
     inner = (u > 2) & (u < 47) & (v > 2) & (v < 37)
     expected = 0.05 * u**2 - 0.03 * u * v + 0.02 * v**2 + u
     np.testing.assert_allclose(found[inner], expected[inner], atol=1e-3)
-
-
-def test_fine_patterns_become_grey_without_aliasing():
-    stripes = np.zeros((200, 200), np.float32)
-    stripes[:, ::2] = 200.0
-    third = planar_frame(np.diag([1 / 3, 1 / 3, 1.0]), (66, 66))
-    inner = third.warp(stripes, 0)[5:-5, 5:-5]
-    assert np.abs(inner - 100.0).max() < 8.0
 
 
 def test_small_frames():

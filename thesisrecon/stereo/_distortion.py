@@ -25,8 +25,7 @@ class RectificationQuality:
     orthogonality_deg: tuple[float, float]  #: angle of the mapped image midlines
     aspect: tuple[float, float]  #: ratio of their lengths relative to the original
     size_ratio: float  #: pixels of the frame relative to the larger image
-    min_scale: float  #: extreme local scales along any direction
-    max_scale: float
+    min_scale: float  #: least local scale along any direction
     stretch: float  #: exp of the standard deviation of the log singular values, 1 for similarities
     disparity_slope: float  #: RMS gradient of the fitted disparities, NaN with fewer than 3 matches
 
@@ -47,7 +46,7 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
         inside = np.isfinite(rectification.rectified_from_original(side, samples)).all(axis=1)
         J = jacobians(rectification, side, samples[inside])
         values.append(singular_values(J[np.isfinite(J).all(axis=(1, 2))]))
-        midlines.append(_midlines(rectification, side, pair.sizes[side]))
+        midlines.append(_midlines(rectification, side, pair.pencil.sizes[side]))
     found = np.concatenate(values)
     found = found if len(found) else np.full((1, 2), np.nan)
     angles, aspects = zip(*midlines, strict=True)
@@ -59,9 +58,8 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
     return RectificationQuality(
         orthogonality_deg=angles,
         aspect=aspects,
-        size_ratio=width * height / max(w * h for w, h in pair.sizes),
+        size_ratio=width * height / max(w * h for w, h in pair.pencil.sizes),
         min_scale=float(found[:, 1].min()),
-        max_scale=float(found[:, 0].max()),
         stretch=float(np.exp(np.std(np.log(np.maximum(found, 1e-12))))),
         disparity_slope=slope,
     )

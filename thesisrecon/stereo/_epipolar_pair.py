@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -188,11 +189,6 @@ class EpipolarPair:
     regions: tuple[F64, F64]  #: (M, 2) pixels of each image inside the arc, first the corners of that polygon
     cameras: F64 | None = None  #: (2, 3, 4) metric, if known
 
-    @property
-    def sizes(self) -> tuple[Size, Size]:
-        """(width, height) of the images."""
-        return self.pencil.sizes
-
 
 def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
     """Prepare a pair with known F and matches, see :func:`thesisrecon.stereo.rectification.rectify_pair`.
@@ -294,16 +290,15 @@ def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[tuple[F64, F64], F
 def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
     """Normalised cameras (2, 3, 4) of the pencil: the candidate with most points in front."""
     z, F = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)]), pencil.fundamental
-    best, most = np.empty((2, 3, 4)), -1
-    for plane in quasi_euclidean_planes(F):
-        for scale in (1.0, -1.0):
-            P = np.stack(canonical_cameras(F, plane=plane, scale=scale))
-            X = triangulate(P, z, method="linear")
-            with np.errstate(divide="ignore", invalid="ignore"):
-                front = int(np.sum((depth(P[0], X) > 0.0) & (depth(P[1], X) > 0.0)))
-            if front > most:
-                best, most = P, front
-    return best
+
+    def points_in_front(P: F64) -> int:
+        X = triangulate(P, z, method="linear")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return int(np.sum((depth(P[0], X) > 0.0) & (depth(P[1], X) > 0.0)))
+
+    choices = product(quasi_euclidean_planes(F), (1.0, -1.0))
+    candidates = [np.stack(canonical_cameras(F, plane=plane, scale=scale)) for plane, scale in choices]
+    return max(candidates, key=points_in_front)
 
 
 def _depth_increases_along_half_lines(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
@@ -387,7 +382,7 @@ def image_corners(size: Size) -> F64:
 def frame_size(extent: F64, pair: EpipolarPair) -> tuple[int, int]:
     """(width, height) of a frame of some extent (2,), rounded up; ``StageFailure`` if too large or empty."""
     width, height = float(extent[0]), float(extent[1])
-    most = MAX_GROWTH * max(w * h for w, h in pair.sizes)
+    most = MAX_GROWTH * max(w * h for w, h in pair.pencil.sizes)
     if not width * height <= most:
         evidence = f"they need {width * height / 1e6:.3g} million pixels, the limit is {most / 1e6:.3g}"
         advice = "rectify in polar coordinates, or choose views with less forward motion"

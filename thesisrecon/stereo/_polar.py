@@ -136,7 +136,7 @@ def _align_disparities(frame: PolarRectification, pair: EpipolarPair) -> PolarRe
 def _half_planes(pair: EpipolarPair) -> F64:
     """Angles over the arc, including those of the image corners, where the row spacing is extreme."""
     low, high = pair.arc
-    corners, about = [image_corners(size) for size in pair.sizes], 0.5 * (low + high)
+    corners, about = [image_corners(size) for size in pair.pencil.sizes], 0.5 * (low + high)
     peaks = np.concatenate([pair.pencil.angles(side, xy, about=about) for side, xy in enumerate(corners)])
     return np.unique(np.concatenate([np.linspace(low, high, ANGLES), peaks[(peaks > low) & (peaks < high)]]))
 

@@ -1,7 +1,6 @@
-"""Maximum-likelihood scanline matching (thesis, section 2.5).
+"""Maximum-likelihood scanline matching by dynamic programming (thesis, section 2.5).
 
-The dynamic program of Cox, Hingorani, Rao and Maggs, "A maximum likelihood stereo algorithm", CVIU 63(3),
-1996, [26] of the thesis.
+Cox, Hingorani, Rao and Maggs, "A maximum likelihood stereo algorithm", CVIU 63(3), 1996, [26] of the thesis.
 """
 
 from __future__ import annotations

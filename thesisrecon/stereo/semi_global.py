@@ -1,8 +1,7 @@
 """Semi-global matching of rectified pairs (thesis, section 2.5; Hirschmüller, PAMI 30(2), 2008).
 
-The dynamic programming of reference [26] solves every row alone, which causes streaks. Semi-global
-matching sums the minimal costs of the paths that reach a pixel along its row and column (4 paths), or along
-the diagonals as well (8 paths). Occlusions are found afterwards by the left-right check.
+It sums the minimal costs of the paths that reach a pixel along its row and column (4 paths), or along the
+diagonals as well (8 paths). Occlusions are found afterwards by the left-right check.
 """
 
 from __future__ import annotations
@@ -68,9 +67,9 @@ class SemiGlobalMatching:
     """Semi-global matching with census and colour costs.
 
     The cost is the Hamming distance of 5 x 5 census transforms (Zabih and Woodfill 1994), which are invariant
-    to exposure, plus the truncated colour difference, which distinguishes regions of equal pattern. The
-    default has four paths: costs that are averaged over an adaptive support gain little from the diagonals,
-    which extend foreground disparities past the corners of objects.
+    to exposure, plus the truncated colour difference, which distinguishes regions of equal pattern. Costs
+    averaged over an adaptive support gain little from the diagonals, which extend foreground disparities past
+    the corners of objects.
     """
 
     paths: int = 4  #: 4 (rows and columns) or 8 (with diagonals)
@@ -95,8 +94,7 @@ class SemiGlobalMatching:
         left, right : array_like (H, W) or (H, W, K <= 4)
             Grey levels 0 .. 255 of a rectified pair, NaN = no pixel.
         disparity_range : tuple of int
-            First and last disparity in pixels, both included; x_right = x_left - d. Disparities are positive
-            for parallel cameras and have either sign for converging ones.
+            First and last disparity in pixels, both included; x_right = x_left - d, of either sign.
 
         Returns
         -------

@@ -90,12 +90,12 @@ def pairs_of(pairs: Sequence[TwoView], model: Reconstruction, sizes: F64) -> lis
 def _opencv_f(pair: RealPair) -> PlanarRectification | None:
     loose, T = pair.loose, pair.loose.pencil.normalization
     F = T[1].T @ loose.pencil.fundamental @ T[0]
-    return opencv_uncalibrated(F / np.linalg.norm(F), *loose.matches, loose.sizes[0])
+    return opencv_uncalibrated(F / np.linalg.norm(F), *loose.matches, loose.pencil.sizes[0])
 
 
 def _opencv_cameras(pair: RealPair) -> PlanarRectification:
     assert pair.metric.cameras is not None
-    return opencv_calibrated(pair.metric.cameras[0], pair.metric.cameras[1], pair.metric.sizes[0])
+    return opencv_calibrated(pair.metric.cameras[0], pair.metric.cameras[1], pair.metric.pencil.sizes[0])
 
 
 METHODS: Mapping[str, tuple[bool, Callable[[RealPair], Rectification | None]]] = {
@@ -121,14 +121,14 @@ def seen_by_other(pair: EpipolarPair, side: int) -> F64:
     P = pair.cameras if side == 0 else pair.cameras[::-1]
     X = dehomogenize(triangulate(pair.cameras, np.stack(pair.matches), method="linear"))
     z = np.quantile(X @ P[0, 2, :3] + P[0, 2, 3], [0.01, 0.99])
-    width, height = pair.sizes[side]
+    width, height = pair.pencil.sizes[side]
     x, y = ((np.arange(GRID) + 0.5) / GRID * length - 0.5 for length in (width, height))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     shown = np.zeros(len(grid), dtype=bool)
     for depth in 1.0 / np.linspace(1.125 / z[0], 0.875 / z[1], 16):
         at = np.linalg.solve(P[0, :, :3], (depth * homogenize(grid) - P[0, :, 3]).T).T
         other = project(P[1], at)
-        limit = np.array(pair.sizes[1 - side]) - 1.0
+        limit = np.array(pair.pencil.sizes[1 - side]) - 1.0
         front = at @ P[1, 2, :3] + P[1, 2, 3] > 0.0
         shown |= front & np.all((other >= 0.0) & (other <= limit), axis=1)
     return grid[shown]
