@@ -9,11 +9,11 @@ from tests.epipolar.pairs import make_pair, oriented
 from thesisrecon.epipolar import _refinement as rank2
 from thesisrecon.epipolar import _sampling as kernels
 from thesisrecon.epipolar import linear
+from thesisrecon.epipolar._consensus import draw_sample
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals
 from thesisrecon.numerics.levenberg_marquardt import solve_damped
-from thesisrecon.numerics.ransac import draw_sample
 
 seeds = st.integers(0, 2**31)
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.epipolar._consensus import draw_sample, required_samples
 from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.kernels import empty_integers, empty_matrix, empty_vector, kernel
-from thesisrecon.numerics.ransac import draw_sample, required_samples
 
 LANES = 32
 # Rows of a solved batch: 0 and 9 the transforms to the bases (9 each), 18 the orientation of the first three

@@ -18,6 +18,7 @@ import scipy
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._chance import chance_of_agreement, log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._frame import PairFrame, check_matches, check_start
+from thesisrecon.epipolar._noise import noise_scale, trimmed_noise_scale
 from thesisrecon.epipolar._planes import (
     find_dominant_plane,
     fundamentals_of_plane,
@@ -29,7 +30,6 @@ from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.geometry.two_view import homography_sampson_residuals
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics.noise import noise_scale, trimmed_noise_scale
 
 # Initial focal lengths in units of the point spread: fields of view of 150 to 10 degrees.
 FOCALS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)

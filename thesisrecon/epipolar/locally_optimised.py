@@ -10,18 +10,13 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
+from thesisrecon.epipolar._noise import NoiseMixture, noise_scale, noise_width
 from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.errors import StageFailure
-from thesisrecon.numerics.noise import (
-    NoiseMixture,
-    best_huber_width,
-    effective_noise,
-    noise_scale,
-    noise_width,
-)
+from thesisrecon.numerics.noise import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit
 
 BATCH = 512

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.epipolar._consensus import SampleConsensus
 from thesisrecon.epipolar._frame import PairFrame, as_matches, check_matches
+from thesisrecon.epipolar._noise import noise_scale
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.linear import seven_point
 from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.epipolar.refinement import Criterion, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import epipolar_distances, sampson_residuals, symmetric_residuals
-from thesisrecon.numerics.noise import noise_scale
-from thesisrecon.numerics.ransac import SampleConsensus
 from thesisrecon.records import FundamentalFit
 
 # 95 % quantiles of the chi-square distribution with one and two degrees of freedom.

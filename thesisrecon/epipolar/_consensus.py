@@ -14,13 +14,7 @@ from thesisrecon.kernels import kernel
 
 @kernel
 def draw_sample(uniforms: F64, n: int, out: I64) -> None:
-    """Turn uniform random numbers into distinct sorted indices; every subset is equally likely.
-
-    Parameters
-    ----------
-    uniforms, n, out : ndarray (s,), int, ndarray (s,) of int
-        Numbers in [0, 1), number of data, and the output, indices below n.
-    """
+    """Turn uniform numbers (s,) into distinct sorted indices below n; every subset is equally likely."""
     for k in range(len(out)):
         index = min(int(uniforms[k] * (n - k)), n - k - 1)
         place = 0
@@ -36,17 +30,7 @@ def draw_sample(uniforms: F64, n: int, out: I64) -> None:
 def required_samples(inlier_ratio: float, sample_size: int, confidence: float, largest: int) -> int:
     """Return the number of samples of which one is free of outliers with probability ``confidence``.
 
-    N = log(1 - confidence) / log(1 - ratio^size) (Fischler and Bolles 1981).
-
-    Parameters
-    ----------
-    inlier_ratio, sample_size, confidence, largest : float, int, float, int
-        Fraction of inliers, data in a minimal sample, required probability, and upper bound.
-
-    Returns
-    -------
-    int
-        Number of samples.
+    N = log(1 - confidence) / log(1 - ratio^size) (Fischler and Bolles 1981), at most ``largest``.
     """
     good = inlier_ratio**sample_size
     if good <= 1e-12:
@@ -66,14 +50,8 @@ class SampleConsensus:
 
     Of two models with equally many inliers the one with the lower standard deviation wins (Fischler and
     Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
-    n! / s!).
-
-    Parameters
-    ----------
-    threshold, max_samples, stop_inlier_ratio : float, int, float
-        Largest residual of an inlier, number of samples, and share of inliers that ends the search.
-    least_median : bool
-        Rank models by the median of their residuals instead (Rousseeuw, 1984).
+    n! / s!). ``stop_inlier_ratio`` ends the search; ``least_median`` ranks models by the median of their
+    residuals instead (Rousseeuw, 1984).
     """
 
     threshold: float
@@ -89,19 +67,9 @@ class SampleConsensus:
         n: int,
         rng: np.random.Generator,
     ) -> tuple[Model, B8, int] | None:
-        """Search the best model of n data.
+        """Return the best model of n data, its inliers (n,) and the number of samples; None without a model.
 
-        Parameters
-        ----------
-        solve, residuals : callable
-            Models of the data with indices (sample_size,), possibly none; and the distances (n,) of a model.
-        sample_size, n, rng : int, int, numpy.random.Generator
-            Data in a minimal sample, and all; and source of randomness.
-
-        Returns
-        -------
-        tuple or None
-            Best model, its inliers (n,) and the number of samples drawn; None if no sample gave a model.
+        ``solve`` gives the models of some data by their indices, ``residuals`` the distances (n,) of a model.
         """
         best: tuple[Model, B8] | None = None
         best_rank, drawn = (-np.inf, 0.0), 0

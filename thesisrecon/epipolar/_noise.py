@@ -1,0 +1,156 @@
+"""Section 5.4: standard deviation of the noise from residuals that contain wrong matches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon.arrays import F64
+from thesisrecon.kernels import kernel
+from thesisrecon.numerics.noise import MAD_FACTOR
+
+# Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise.
+TAIL, _SEPARATION = 4.0, 12.0
+# Prior counts of each component.
+_CORE_COUNT, _TAIL_COUNT, _WRONG_COUNT = 1.0, 0.5, 1.0
+_MEDIAN_RATIO, _MAX_WIDENINGS = 0.22, 6
+# Trimming point in standard deviations, variance of a normal variable trimmed there, and rounds.
+_TRIM, _TRIMMED_VARIANCE, _TRIM_ROUNDS = 2.5, 0.91125, 5
+# EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more.
+_EM_ROUNDS, _QUANTILES = 6, 300
+_BISECTIONS = 20
+
+
+@kernel(error_model="numpy")
+def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
+    """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood.
+
+    ``mixture`` (5,), updated: sigma, standard deviation of wrong residuals (prior ``spread``), fractions of
+    noise, its tail and wrong residuals.
+    """
+    n = len(residuals)
+    likelihood = 0.0
+    for last in range(rounds - 1, -1, -1):
+        sigma, wide, core, tail, wrong = mixture
+        c0, c1, c2 = core / sigma, tail / (TAIL * sigma), wrong / wide
+        i1, i2 = 0.5 / (TAIL * TAIL * sigma * sigma), 0.5 / (wide * wide)
+        n0, n1, n2, s01, s2 = 0.0, 0.0, 0.0, 0.0, 0.0
+        likelihood = 0.0
+        for k in range(n):
+            q = residuals[k] * residuals[k]
+            # The core's exponential is that of the tail to the power TAIL^2 = 16.
+            e1 = np.exp(-i1 * q)
+            e0 = e1 * e1
+            e0 *= e0
+            e0 *= e0
+            e0 *= e0
+            p0, p1, p2 = c0 * e0, c1 * e1, c2 * np.exp(-i2 * q)
+            p = p0 + p1 + p2 + 1e-300
+            if last == 0:
+                likelihood += np.log(p)
+            p = 1.0 / p
+            n0 += p0 * p
+            n1 += p1 * p
+            n2 += p2 * p
+            s01 += (p0 + p1 / (TAIL * TAIL)) * p * q
+            s2 += p2 * p * q
+        total = n + _CORE_COUNT + _TAIL_COUNT + _WRONG_COUNT
+        mixture[0] = np.sqrt(s01 / max(n0 + n1 - parameters, 1.0)) + 1e-12 * spread
+        wide = np.sqrt((s2 + _WRONG_COUNT * spread * spread) / (n2 + _WRONG_COUNT))
+        mixture[1] = max(wide, _SEPARATION * mixture[0])
+        mixture[2] = (n0 + _CORE_COUNT) / total
+        mixture[3] = (n1 + _TAIL_COUNT) / total
+        mixture[4] = (n2 + _WRONG_COUNT) / total
+    return likelihood / n
+
+
+def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
+    """Estimate the standard deviation by 1.4826 (1 + 5 / (n - p)) median |r| (Rousseeuw and Leroy 1987).
+
+    Less than half of the residuals may be wrong; p ``parameters`` were fitted to them.
+    """
+    n = len(residuals)
+    if n <= parameters or not np.isfinite(residuals).all():
+        raise ValueError(f"noise_scale needs more than {parameters} finite residuals; got {n}")
+    return float(MAD_FACTOR * (1.0 + 5.0 / (n - parameters)) * np.median(np.abs(residuals)))
+
+
+def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
+    """Return the width that contains the noise: ``threshold``, or more if the residuals continue.
+
+    Normal noise has its median at 0.22 of a width of 3 standard deviations. The width grows by steps of 1.5
+    until its median is there; if that takes more than 11 thresholds, the residuals are of wrong matches.
+    """
+    width, ordered = threshold, np.sort(residuals)
+    for _ in range(_MAX_WIDENINGS + 1):
+        n = int(np.searchsorted(ordered, width))
+        if n <= parameters:
+            return threshold
+        median = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
+        if median <= _MEDIAN_RATIO * width * np.sqrt(1.0 - parameters / n):
+            return width
+        width *= 1.5
+    return threshold
+
+
+def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
+    """Estimate the standard deviation by the root mean square of the residuals >= 0 within 2.5 of it.
+
+    Returns ``start`` if too few residuals are left.
+    """
+    sigma = start
+    for _ in range(_TRIM_ROUNDS):
+        kept = residuals[residuals <= _TRIM * sigma]
+        if len(kept) <= 2 * parameters:
+            return start
+        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / _TRIMMED_VARIANCE))
+    return sigma
+
+
+@dataclass(frozen=True)
+class NoiseMixture:
+    """Residuals as normal noise, its tail four times as wide, and wrong matches.
+
+    ``sigma`` and ``spread`` are the standard deviations of noise and wrong residuals, ``core``, ``tail`` and
+    ``wrong`` the fractions. Of two models the one with the higher mean ``log_likelihood`` is better.
+    """
+
+    sigma: float
+    spread: float
+    core: float
+    tail: float
+    wrong: float
+    log_likelihood: float
+
+    @classmethod
+    def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> NoiseMixture:
+        """Fit to residuals in ascending order by expectation-maximisation (McLachlan and Peel, 2000).
+
+        ``sigma`` is an initial value, ``spread`` the standard deviation of wrong residuals in the prior.
+        """
+        step = max(len(residuals) // _QUANTILES, 1)
+        some = residuals[step // 2 :: step]
+        share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
+        mixture = np.array([sigma, spread, 0.9 * share, 0.1 * share, 1.0 - share])
+        likelihood = _fit_mixture(some, parameters / step, spread, _EM_ROUNDS, mixture)
+        sigma, spread, core, tail, wrong = mixture.tolist()
+        return cls(sigma, spread, core, tail, wrong, float(likelihood))
+
+    @property
+    def limit(self) -> float:
+        """Residual at which noise, with its tail, and wrong matches are equally likely."""
+        low, high = self.sigma, self.spread
+        for _ in range(_BISECTIONS):
+            middle = float(np.sqrt(low * high))
+            core = self.core * np.exp(-0.5 * (middle / self.sigma) ** 2)
+            tail = self.tail / TAIL * np.exp(-0.5 * (middle / (TAIL * self.sigma)) ** 2)
+            wrong = self.wrong / self.spread * np.exp(-0.5 * (middle / self.spread) ** 2)
+            low, high = (middle, high) if core + tail > self.sigma * wrong else (low, middle)
+        return low
+
+    @property
+    def core_limit(self) -> float:
+        """Residual at which noise and its tail are equally likely."""
+        odds = max(TAIL * self.core / self.tail, 1.5)
+        return self.sigma * float(np.sqrt(2.0 * np.log(odds) / (1.0 - TAIL**-2)))
