@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
-from thesisrecon.config import PipelineConfig, SelfCalibrator, with_images
+from thesisrecon.config import PipelineConfig, with_images
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.triangulation import triangulate
@@ -136,7 +136,8 @@ def self_calibrate(
         raise ValueError(f"self_calibrate takes a projective reconstruction; got {reconstruction.stratum}")
     config = config or PipelineConfig()
     prior = prior_for(reconstruction, config.intrinsics)
-    return _method(config, images).calibrate(reconstruction, prior=prior, rng=stream(seed, "selfcalibration"))
+    method, rng = with_images(config.selfcalibration, images), stream(seed, "selfcalibration")
+    return method.calibrate(reconstruction, prior=prior, rng=rng)
 
 
 def upgrade_affine(
@@ -190,7 +191,7 @@ def upgrade_affine(
         raise ValueError(f"upgrade_affine takes a projective reconstruction; got {reconstruction.stratum}")
     if plane is None:
         config = config or PipelineConfig()
-        method = _method(config, images)
+        method = with_images(config.selfcalibration, images)
         rng = stream(seed, "selfcalibration")
         prior = prior_for(reconstruction, config.intrinsics)
         if isinstance(method, Stratified):
@@ -198,7 +199,3 @@ def upgrade_affine(
         else:
             plane = method.calibrate(reconstruction, prior=prior, rng=rng).plane_at_infinity
     return upgrade_to_affine(reconstruction, plane)
-
-
-def _method(config: PipelineConfig, images: Sequence[Image]) -> SelfCalibrator:
-    return with_images(config.selfcalibration, images) if images else config.selfcalibration

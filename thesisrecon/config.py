@@ -220,7 +220,7 @@ class ProjectiveReconstructor(Protocol):
         Parameters
         ----------
         tracks, pairs : Tracks, sequence of TwoView
-            All tracks, of which a selection is used, and the verified pairs.
+            All tracks and the verified pairs; a selection of the tracks is used.
         sizes : ndarray (V, 2) of int
             Width and height of each image.
         rng : numpy.random.Generator
@@ -257,7 +257,7 @@ def with_images(method: SelfCalibrator, images: Sequence[Image]) -> SelfCalibrat
     Parameters
     ----------
     method, images : SelfCalibrator, sequence of Image
-        Any method, and one image per view.
+        Any method, and one image per view or none.
 
     Returns
     -------
@@ -265,7 +265,7 @@ def with_images(method: SelfCalibrator, images: Sequence[Image]) -> SelfCalibrat
         The method with the images, or unchanged if it does not use them.
     """
     given = getattr(method, "with_images", None)
-    return method if given is None else cast(SelfCalibrator, given(images))
+    return method if given is None or not images else cast(SelfCalibrator, given(images))
 
 
 class MetricRefiner(Protocol):

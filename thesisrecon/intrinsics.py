@@ -107,11 +107,10 @@ class IntrinsicsOptions:
     common_prior : bool
         Images of one size come from cameras of one kind: values that are not shared scatter about a common
         mean (hierarchical prior; the scatter is estimated).
-    focal, focal_px, focal_std_rel : Mode, float, float
-        Focal length in pixels of the original images; its standard deviation is relative.
-    exif : bool
-        Read the focal length from EXIF (35 mm equivalent) if ``focal_px`` is not given. A known focal length
-        that is missing in EXIF is estimated as constant.
+    focal, focal_px, focal_std_rel, exif : Mode, float, float, bool
+        Focal length in pixels of the original images; its standard deviation is relative. ``exif``: read it
+        from EXIF (35 mm equivalent) if ``focal_px`` is not given; a known focal length that is missing there
+        is estimated as constant.
     aspect, aspect_ratio, aspect_std : Mode, float, float
         Pixel height over width, fy / fx.
     skew, skew_px, skew_std_px : Mode, float, float

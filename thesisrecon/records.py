@@ -185,10 +185,8 @@ class Tracks:
 
     Parameters
     ----------
-    view_index, point_index : ndarray (K,) of int
-        View and point of each observation; a point at most once per view.
-    xy : ndarray (K, 2)
-        Positions, px.
+    view_index, point_index, xy : ndarray (K,) of int, ndarray (K, 2)
+        View, point and position (px) of each observation; a point at most once per view.
     n_views, n_points : int
         Number of views and points.
     """

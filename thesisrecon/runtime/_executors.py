@@ -29,6 +29,18 @@ from typing import Any, ParamSpec, TypeVar
 from thesisrecon.errors import UsageError, WorkersLost, unknown_word
 from thesisrecon.runtime._signals import CODES, starting_processes
 
+P = ParamSpec("P")
+T = TypeVar("T")
+Task = tuple[Any, ...]
+Finished = Callable[[int, Any], None]
+
+NAMES = ("local", "processes", "dask://HOST:PORT")
+AHEAD = 2
+"""Submitted tasks per worker: enough to keep it busy, few in memory."""
+SIGTERM_DELAY_S = 1.0
+"""Time a worker process waits for its parent to end after SIGTERM."""
+CHECK_S = 5.0
+"""Time without results after which the workers are checked."""
 SCHEME = "dask://"
 ANSWER_S = 10.0
 """Timeout of the scheduler, and of the first worker."""
@@ -137,15 +149,6 @@ def _quiet(name: str) -> Iterator[None]:
             logger.setLevel(level)
 
 
-NAMES = ("local", "processes", "dask://HOST:PORT")
-AHEAD = 2
-"""Submitted tasks per worker: enough to keep it busy, few in memory."""
-SIGTERM_DELAY_S = 1.0
-"""Time a worker process waits for its parent to end after SIGTERM."""
-CHECK_S = 5.0
-"""Time without results after which the workers are checked."""
-
-
 @cache
 def package_key() -> str:
     """Return a digest of the code of the package, to detect workers with another version."""
@@ -155,12 +158,6 @@ def package_key() -> str:
         content.update(str(path.relative_to(package)).encode())
         content.update(path.read_bytes())
     return content.hexdigest()[:32]
-
-
-P = ParamSpec("P")
-T = TypeVar("T")
-Task = tuple[Any, ...]
-Finished = Callable[[int, Any], None]
 
 
 def available_threads() -> int:
