@@ -1,5 +1,4 @@
-"""What is unknown stays unknown: scenes that cannot be matched, or only in part, by default and as the thesis
-has it."""
+"""What is unknown stays unknown: scenes that cannot be matched, or only in part, with both presets."""
 
 from dataclasses import replace
 
@@ -19,8 +18,7 @@ def abreast(baseline, views=3):
 
 
 def shares(scene, maps):
-    """Of all pixels: known, and known but wrong by more than 5 %; of the known ones: off by more than three
-    deviations."""
+    """Shares of all pixels: known, wrong by more than 5 %; of the known ones: beyond three deviations."""
     known = wrong = beyond = total = 0
     for i, found in maps.items():
         error = np.abs(found.depth / scene.depth[i] - 1.0)[np.isfinite(found.depth)]
@@ -50,18 +48,16 @@ def observed(scene, keep):
     return replace(scene, reconstruction=replace(r, inlier=np.asarray(keep(r))))
 
 
-def fence_without(keep):
-    return lambda: observed(photograph_scene(abreast(0.4), fence()), keep)
-
-
 # The baselines are a thousandth of the depth at most: less than a fifth of a pixel.
 HOPELESS = {
     "no texture": lambda: photograph_scene(abreast(0.4), blank_wall(0.0)),
     "no baseline": lambda: photograph_scene(abreast(0.0), fence()),
     "a baseline of 0.0005": lambda: photograph_scene(abreast(5e-4), fence()),
     "a baseline of 0.005": lambda: photograph_scene(abreast(5e-3), fence()),
-    "no points": fence_without(lambda r: np.zeros_like(r.inlier)),
-    "no common points": fence_without(lambda r: r.tracks.view_index == r.tracks.point_index % 3),
+    "no points": lambda: observed(photograph_scene(abreast(0.4), fence()), lambda r: np.zeros_like(r.inlier)),
+    "no common points": lambda: observed(
+        photograph_scene(abreast(0.4), fence()), lambda r: r.tracks.view_index == r.tracks.point_index % 3
+    ),
 }
 
 
