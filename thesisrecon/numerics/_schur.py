@@ -1,8 +1,7 @@
 """The sparse linear system of bundle adjustment: points are eliminated, cameras are solved together.
 
 [[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then b = -V^-1 (h
-+ W' a). The reduced matrix has a block for every pair of views that observe a common point, and a border for
-common unknowns. Points are eliminated in chunks: the sum of their sums loses fewer digits than one long sum.
++ W' a). Points are eliminated in chunks: the sum of their sums loses fewer digits than one long sum.
 """
 
 from __future__ import annotations

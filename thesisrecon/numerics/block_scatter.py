@@ -1,8 +1,7 @@
 """Contradictions between parts of the scene after bundle adjustment, compared with the expected noise.
 
-Correlated errors, heavy tails and lenses with more coefficients than the model make gradients summed by parts
-larger than independent noise allows (the sandwich covariance of Huber 1967 and White 1980, summed by
-clusters; Liang and Zeger 1986).
+The sandwich covariance (Huber 1967, White 1980) summed by clusters (Liang and Zeger 1986): correlated errors
+and lenses beyond the model make gradients summed by parts larger than independent noise allows.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Robust losses rho(s) of a squared residual s, and their weights rho'(s).
 
-The cost of residuals r is 1/2 sum rho(|r|^2); solvers multiply residuals and Jacobians by sqrt(rho'). Each
-loss is s near 0 and turns at sqrt(s) = delta. Bundle adjustment has Huber's; an infinite delta is least
-squares.
+The cost of residuals r is 1/2 sum rho(|r|^2); solvers multiply residuals and Jacobians by sqrt(rho').
 """
 
 from __future__ import annotations

@@ -195,14 +195,12 @@ def adjust_locally(
     The other cameras that see these points are fixed and define the frame.
     """
     t, used = model.tracks, model.used
-    its = np.zeros(t.n_points, dtype=bool)
-    its[t.point_index[used & (t.view_index == view)]] = True
+    its = np.bincount(t.point_index[used & (t.view_index == view)], minlength=t.n_points) > 0
     shared = np.bincount(t.view_index[used & its[t.point_index]], minlength=t.n_views)
     free = np.zeros(t.n_views, dtype=bool)
     free[np.argsort(-shared, kind="stable")[: n_views + 1]] = True
     free &= shared > 0
-    local = np.zeros(t.n_points, dtype=bool)
-    local[t.point_index[used & free[t.view_index]]] = True
+    local = np.bincount(t.point_index[used & free[t.view_index]], minlength=t.n_points) > 0
     chosen = used & local[t.point_index]
     if chosen.sum() < 2 * 8:
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.homogeneous import whitening_transform
@@ -16,7 +17,7 @@ _SAMPLE = 6
 _BATCH, _MAX_BATCHES = 64, 12
 
 
-def resect_ransac(X: F64, xy: F64, *, threshold_px: float, rng: np.random.Generator) -> tuple[F64 | None, B8]:
+def resect_ransac(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -> tuple[F64 | None, B8]:
     """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
 
     Samples are drawn in batches until one without outliers was drawn with probability 0.999. Points X (M, 4)

@@ -76,15 +76,17 @@ def coverage_of_views(cell: I64, chosen: B8, n_views: int) -> F64:
     return np.asarray(np.sqrt(counts).sum(axis=1))
 
 
-def subset_tracks(tracks: Tracks, keep: B8) -> Tracks:
-    """Return the tracks to ``keep`` (N,), renumbered in the same order."""
+def working_tracks(tracks: Tracks, pairs: Sequence[TwoView], *, points_per_view: int) -> tuple[Tracks, B8]:
+    """Return the selected tracks with parallax, renumbered in the same order, and which (N,) they are."""
+    usable = select_tracks_with_parallax(tracks, pairs)
+    keep = select_tracks(tracks, usable, points_per_view=points_per_view)
     chosen = keep[tracks.point_index]
     point = (np.cumsum(keep) - 1)[tracks.point_index[chosen]]
-    return Tracks(tracks.view_index[chosen], point, tracks.xy[chosen], tracks.n_views, int(keep.sum()))
+    return Tracks(tracks.view_index[chosen], point, tracks.xy[chosen], tracks.n_views, int(keep.sum())), keep
 
 
 def expand_to_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B8) -> Reconstruction:
-    """Express the reconstruction of :func:`subset_tracks` in the numbers of all tracks."""
+    """Express the reconstruction of :func:`working_tracks` in the numbers of all tracks."""
     X = np.zeros((tracks.n_points, 4))
     X[keep] = reconstruction.X
     valid = np.zeros(tracks.n_points, dtype=bool)

@@ -1,8 +1,7 @@
 """Projective factorization: cameras and points of a complete table of matches at once.
 
-P. Sturm, B. Triggs, ECCV 1996 (HZ 18.4): with the right projective depths w the matrix of all w (u, v, 1) has
-rank 4, and its factors are cameras and points. Fundamental matrices give the depths; or they are iterated
-with the factors from any start (B. Triggs, CVPR 1996; J. Oliensis, R. Hartley, PAMI 29(12), 2007).
+With the right projective depths w the matrix of all w (u, v, 1) has rank 4 (P. Sturm, B. Triggs, ECCV 1996;
+HZ 18.4). Fundamental matrices give w, or iterations do (J. Oliensis, R. Hartley, PAMI 29(12), 2007).
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
@@ -20,12 +20,7 @@ from thesisrecon.geometry.two_view import epipoles, estimate_homography, homogra
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.projective._initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
 from thesisrecon.projective._model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
-from thesisrecon.projective._track_selection import (
-    expand_to_all_tracks,
-    select_tracks,
-    select_tracks_with_parallax,
-    subset_tracks,
-)
+from thesisrecon.projective._track_selection import expand_to_all_tracks, working_tracks
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
@@ -145,11 +140,9 @@ class Factorization:
 
     Parameters
     ----------
-    core_points, iterations : int
-        Views join the core while this many tracks are seen in all of it; and maximum number of depth updates,
-        0 for the published algorithm of Sturm and Triggs.
-    growth : IncrementalProjective
-        Adds the other views.
+    core_points, iterations, growth : int, int, IncrementalProjective
+        Views join the core while this many tracks are seen in all of it; maximum number of depth updates, 0
+        for the published algorithm of Sturm and Triggs; and what adds the other views.
     """
 
     core_points: int = 100
@@ -164,13 +157,7 @@ class Factorization:
             )
 
     def reconstruct(
-        self,
-        tracks: Tracks,
-        pairs: Sequence[TwoView],
-        sizes: I64,
-        *,
-        rng: np.random.Generator,
-        attempt: int = 0,
+        self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
     ) -> Reconstruction:
         """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
         ranked = rank_initial_pairs(tracks, pairs)
@@ -181,9 +168,7 @@ class Factorization:
                 f"{len(ranked)} of {counted(len(pairs), 'image pair')} accepted",
                 "take images that overlap by more than half and show texture",
             )
-        usable = select_tracks_with_parallax(tracks, pairs)
-        keep = select_tracks(tracks, usable, points_per_view=self.growth.points_per_view)
-        selected = subset_tracks(tracks, keep)
+        selected, keep = working_tracks(tracks, pairs, points_per_view=self.growth.points_per_view)
         model = self._core(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)
         return expand_to_all_tracks(to_reconstruction(model), tracks, keep)

@@ -1,9 +1,7 @@
 """Incremental projective reconstruction (chapter 6; P. Beardsley, A. Zisserman, D. Murray, IJCV 23, 1997).
 
-An initial pair, then one camera after the other: resection, triangulation, bundle adjustment, outlier
-removal. A camera is accepted if its covariance shows that it is determined: a view of a single plane fits its
-points with an arbitrary P. It is kept if it explains its points and agrees with the verified matches of its
-pairs. Other views are deferred to calibrated resection.
+A camera is accepted if its covariance shows that it is determined (a view of a single plane fits its points
+with an arbitrary P), and kept if it agrees with its points and verified matches; others are deferred.
 """
 
 from __future__ import annotations
@@ -12,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
@@ -30,13 +29,7 @@ from thesisrecon.projective._model import (
     to_reconstruction,
 )
 from thesisrecon.projective._resection import find_inconsistent_view, projection_std_px, resect_ransac
-from thesisrecon.projective._track_selection import (
-    coverage_of_views,
-    expand_to_all_tracks,
-    select_tracks,
-    select_tracks_with_parallax,
-    subset_tracks,
-)
+from thesisrecon.projective._track_selection import coverage_of_views, expand_to_all_tracks, working_tracks
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 # Required share of inliers among the points that a camera sees.
@@ -51,23 +44,21 @@ class IncrementalProjective:
 
     Parameters
     ----------
-    points_per_view : int
-        Approximate number of tracks per view, longest first; the metric stage uses all.
-    min_points : int
-        Matches needed for resection: twice the six that always agree.
+    points_per_view, min_points : int
+        Approximate number of tracks per view, longest first (the metric stage uses all), and matches needed
+        for resection: twice the six that always agree.
     outlier_sigmas, noise_floor_px : (float, float), float
         Inlier thresholds in noise sigmas of the early and late rounds, and lower bound of the noise.
     max_projection_std_rel : float, optional
         Largest 80 % quantile of the projection standard deviations over all points, as a share of the long
         side; None accepts every camera.
-    min_epipolar_inlier_ratio : float
-        Required share of verified matches on the epipolar lines of the finished model.
+    min_epipolar_inlier_ratio, max_initial_pairs : float, int
+        Required share of verified matches on the epipolar lines of the finished model, and initial pairs
+        tried in one attempt while usable views are missing.
     bundle_iterations, final_rounds : int
         Levenberg-Marquardt steps after each camera; final rounds of triangulation, adjustment and filtering.
     global_bundle_growth, local_bundle_views : float, int
         Everything is adjusted after this growth of the number of cameras, this many views with a new one.
-    max_initial_pairs : int
-        Initial pairs tried in one attempt while usable views are missing.
     """
 
     points_per_view: int = 1500
@@ -83,13 +74,7 @@ class IncrementalProjective:
     max_initial_pairs: int = 3
 
     def reconstruct(
-        self,
-        tracks: Tracks,
-        pairs: Sequence[TwoView],
-        sizes: I64,
-        *,
-        rng: np.random.Generator,
-        attempt: int = 0,
+        self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
     ) -> Reconstruction:
         """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
         ranked = rank_initial_pairs(tracks, pairs)
@@ -104,19 +89,12 @@ class IncrementalProjective:
             raise StageFailure(
                 "no other initial pair is left", f"all {len(ranked)} accepted image pairs were tried"
             )
-        usable = select_tracks_with_parallax(tracks, pairs)
-        keep = select_tracks(tracks, usable, points_per_view=self.points_per_view)
-        selected = subset_tracks(tracks, keep)
+        selected, keep = working_tracks(tracks, pairs, points_per_view=self.points_per_view)
         best = self._best_model(selected, pairs, sizes, ranked[attempt:], rng)
         return expand_to_all_tracks(to_reconstruction(best), tracks, keep)
 
     def _best_model(
-        self,
-        tracks: Tracks,
-        pairs: Sequence[TwoView],
-        sizes: I64,
-        starts: Sequence[TwoView],
-        rng: np.random.Generator,
+        self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, starts: Sequence[TwoView], rng: Generator
     ) -> ProjectiveModel:
         """Return the model with most cameras, then most inliers, over the initial pairs tried.
 
@@ -140,7 +118,7 @@ class IncrementalProjective:
         assert best is not None
         return best
 
-    def complete(self, model: ProjectiveModel, pairs: Sequence[TwoView], rng: np.random.Generator) -> None:
+    def complete(self, model: ProjectiveModel, pairs: Sequence[TwoView], rng: Generator) -> None:
         """Add views to a model of two cameras or more in place and remove those that prove wrong.
 
         Parameters
@@ -177,7 +155,7 @@ class IncrementalProjective:
             adjust_all(model, 2 * self.bundle_iterations, self.outlier_sigmas[0])
         return model
 
-    def _grow(self, model: ProjectiveModel, rng: np.random.Generator) -> None:
+    def _grow(self, model: ProjectiveModel, rng: Generator) -> None:
         """Add cameras one by one with bundle adjustment after each, then run the final rounds."""
         early, late = self.outlier_sigmas
         adjusted = int(model.registered.sum())
@@ -190,7 +168,7 @@ class IncrementalProjective:
         for round_number in range(self.final_rounds):
             adjust_all(model, 2 * self.bundle_iterations, late if round_number else early)
 
-    def add_next_camera(self, model: ProjectiveModel, rng: np.random.Generator) -> int | None:
+    def add_next_camera(self, model: ProjectiveModel, rng: Generator) -> int | None:
         """Resect the view with the best coverage by model points that passes the covariance test.
 
         Parameters
@@ -220,7 +198,7 @@ class IncrementalProjective:
                 return int(view)
         return None
 
-    def _try_camera(self, model: ProjectiveModel, view: int, rng: np.random.Generator) -> bool:
+    def _try_camera(self, model: ProjectiveModel, view: int, rng: Generator) -> bool:
         t, early = model.tracks, self.outlier_sigmas[0]
         k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
         X, xy = model.X[t.point_index[k]], t.xy[k]
@@ -236,8 +214,7 @@ class IncrementalProjective:
         model.P[view] = P
         model.registered[view] = True
         model.reasons[view] = ""
-        seen = np.zeros(t.n_points, dtype=bool)
-        seen[t.point_index[t.view_index == view]] = True
+        seen = np.bincount(t.point_index[t.view_index == view], minlength=t.n_points) > 0
         retriangulate_points(model, early, points=seen)
         return True
 

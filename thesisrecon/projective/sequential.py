@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
+from numpy.random import Generator
 
 from thesisrecon.arrays import I64
 from thesisrecon.errors import StageFailure, counted
@@ -24,29 +24,21 @@ class SequentialProjective:
 
     Parameters
     ----------
-    min_points : int
-        Matches needed for resection.
-    outlier_sigmas : float
-        Inlier threshold in noise sigmas.
+    min_points, outlier_sigmas : int, float
+        Matches needed for resection, and inlier threshold in noise sigmas.
     """
 
     min_points: int = 12
     outlier_sigmas: float = 12.0
 
     def reconstruct(
-        self,
-        tracks: Tracks,
-        pairs: Sequence[TwoView],
-        sizes: I64,
-        *,
-        rng: np.random.Generator,
-        attempt: int = 0,
+        self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
     ) -> Reconstruction:
         """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
         require_pair_with_parallax(pairs)
-        neighbours = [p for p in pairs if p.accepted and p.j == p.i + 1]
-        candidates = neighbours or [p for p in pairs if p.accepted]
-        candidates = sorted(candidates, key=lambda p: (-p.inliers, p.i, p.j))
+        accepted = [p for p in pairs if p.accepted]
+        neighbours = [p for p in accepted if p.j == p.i + 1]
+        candidates = sorted(neighbours or accepted, key=lambda p: (-p.inliers, p.i, p.j))
         if attempt >= len(candidates):
             raise StageFailure(
                 "no initial pair is left", f"{counted(len(candidates), 'image pair')} accepted"
