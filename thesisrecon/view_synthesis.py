@@ -68,12 +68,14 @@ def prepare_trilinear_views(
 
     Parameters
     ----------
-    found, config : MatchedImages, PipelineConfig
-        Result of :func:`match_images`, and the configuration (None: the default).
+    found : MatchedImages
+        Result of :func:`match_images`.
     K : array_like (3, 3) or (2, 3, 3), optional
         Intrinsics of both images, in pixels of the given images. If None, the prior of ``config.intrinsics``;
         without a focal length there, a typical one: the views are then correct up to a projective
         transformation of space.
+    config : PipelineConfig, optional
+        The default configuration if None.
 
     Returns
     -------
