@@ -5,6 +5,9 @@ the old machine code would run. Here the key is a digest of the kernel's code, i
 the same of everything that it refers to.
 """
 
+# numba's own modules have no types.
+# mypy: disable-error-code="no-untyped-call"
+
 from __future__ import annotations
 
 import contextlib
@@ -17,16 +20,19 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any, TypeVar, overload
 
 import numba
 import numpy as np
+from numba.core import cgutils, types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
+from numba.extending import lower_builtin, type_callable
+from numba.np.arrayobj import _empty_nd_impl
 
-from thesisrecon.arrays import F64, I64
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 CACHE_VARIABLE = "THESISRECON_KERNEL_CACHE"
 """Environment variable: the folder of the compiled kernels."""
@@ -43,7 +49,15 @@ if "NUMBA_OPT" not in os.environ:
     vars(numba.config)["OPT"] = type(vars(numba.config)["OPT"])(2)
 
 
-def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+@overload
+def kernel(function: Function) -> Function: ...
+
+
+@overload
+def kernel(**options: Any) -> Callable[[Function], Function]: ...
+
+
+def kernel(function: Any = None, **options: Any) -> Any:
     """Compile a function with numba on its first call and keep the machine code on disk.
 
     Parameters
@@ -63,9 +77,20 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         dispatcher: Any = numba.njit(nogil=True, **options)(function)
         if isinstance(dispatcher, Dispatcher):  # a plain function where NUMBA_DISABLE_JIT is set
             vars(dispatcher)["_cache"] = KernelCache(dispatcher)
+            vars(dispatcher)["get_call_template"] = _without_literals(dispatcher.get_call_template)
         return dispatcher
 
     return compiled if function is None else compiled(function)
+
+
+def _without_literals(template: Callable[..., Any]) -> Callable[..., Any]:
+    """Let kernels call kernels with plain types; numba would compile a version for each literal argument."""
+
+    def get_call_template(args: Any, kws: Any) -> Any:
+        plain = tuple(types.unliteral(a) for a in args)
+        return template(plain, {name: types.unliteral(a) for name, a in kws.items()})
+
+    return get_call_template
 
 
 def code_digest(*functions: Any) -> str:
@@ -251,34 +276,77 @@ def _write(path: Path, content: bytes) -> None:
     Path(file.name).replace(path)
 
 
-# Arrays of kernels. numba compiles NumPy's own functions anew for each kernel and shape, with their messages.
+
+if TYPE_CHECKING:
+    from numpy import empty as empty
+    from numpy import full as full
+    from numpy import zeros as zeros
+else:
+    # numba compiles NumPy's own functions again in each kernel and for each shape, with their error messages.
+    def empty(shape, dtype=np.float64):
+        """`numpy.empty` for kernels."""
+        return np.empty(shape, dtype)
+
+    def full(shape, value, dtype=np.float64):
+        """`numpy.full` for kernels."""
+        return np.full(shape, value, dtype)
+
+    def zeros(shape, dtype=np.float64):
+        """`numpy.zeros` for kernels."""
+        return np.zeros(shape, dtype)
+
+
+def _array_type(shape: Any, dtype: Any = types.float64) -> Any:
+    scalar = getattr(dtype, "instance_type", dtype)
+    return types.Array(scalar, len(shape) if isinstance(shape, types.BaseTuple) else 1, "C")
+
+
+@type_callable(empty)
+@type_callable(zeros)
+def _type_empty(_: Any) -> Any:
+    return lambda shape, dtype=types.float64: _array_type(shape, dtype)
+
+
+@type_callable(full)
+def _type_full(_: Any) -> Any:
+    return lambda shape, value, dtype=types.float64: _array_type(shape, dtype)  # noqa: ARG005 - the names count
+
+
+@lower_builtin(empty, types.VarArg(types.Any))
+def _lower_empty(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return _allocate(context, builder, signature, arguments)._getvalue()
+
+
+@lower_builtin(zeros, types.VarArg(types.Any))
+def _lower_zeros(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    array = _allocate(context, builder, signature, arguments)
+    size = builder.mul(array.itemsize, array.nitems)
+    cgutils.memset(builder, array.data, size, 0)
+    return array._getvalue()
+
+
+@lower_builtin(full, types.VarArg(types.Any))
+def _lower_full(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    array = _allocate(context, builder, signature, arguments)
+    value = context.cast(builder, arguments[1], signature.args[1], signature.return_type.dtype)
+    with cgutils.for_range(builder, array.nitems) as loop:
+        place = builder.gep(array.data, [loop.index])
+        context.pack_value(builder, signature.return_type.dtype, value, place)
+    return array._getvalue()
+
+
+def _allocate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    given: Any = arguments[0]
+    kind: Any = signature.args[0]
+    is_tuple = isinstance(kind, types.BaseTuple)
+    parts = cgutils.unpack_tuple(builder, given) if is_tuple else [given]
+    kinds = list(kind) if is_tuple else [kind]
+    shape = [context.cast(builder, part, of, types.intp) for part, of in zip(parts, kinds, strict=True)]
+    return _empty_nd_impl(context, builder, signature.return_type, shape)
 
 
 @kernel
-def empty_vector(n: int) -> F64:
-    """Float64 array (n,), not initialised."""
-    return np.empty(n)
-
-
-@kernel
-def empty_matrix(m: int, n: int) -> F64:
-    """Float64 array (m, n), not initialised."""
-    return np.empty((m, n))
-
-
-@kernel
-def zero_vector(n: int) -> F64:
-    """Float64 array (n,) of zeros."""
-    return np.zeros(n)
-
-
-@kernel
-def zero_matrix(m: int, n: int) -> F64:
-    """Float64 array (m, n) of zeros."""
-    return np.zeros((m, n))
-
-
-@kernel
-def empty_integers(n: int) -> I64:
-    """Int64 array (n,), not initialised."""
-    return np.empty(n, np.int64)
+def copy_to(out: Any, values: Any) -> None:
+    """Copy a vector inside kernels: ``out[:] = values`` without a check of the shapes and its message."""
+    for k in range(len(out)):
+        out[k] = values[k]

@@ -13,7 +13,7 @@ from thesisrecon.epipolar._consensus import draw_sample
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals
-from thesisrecon.numerics.levenberg_marquardt import solve_damped
+from thesisrecon.numerics.small_solvers import solve_damped
 
 seeds = st.integers(0, 2**31)
 

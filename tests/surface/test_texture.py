@@ -209,7 +209,8 @@ def test_observe_points_matches_its_twin(sphere):
     weight, color = np.zeros(400, np.float32), np.zeros((400, 3), np.float32)
     gain = np.array([1.0, 2.0, 0.5], np.float32)
     P, rgb = view.P, view.rgb
-    seen = ViewSurface(P, view.depth, view.trust, view.tolerance, rgb, gain)
+    centre, scale = -np.linalg.solve(P[:, :3], P[:, 3]), abs(np.linalg.det(P[:, :3]))
+    seen = ViewSurface(P, centre, scale, view.depth, view.trust, view.tolerance, rgb, gain)
     observe_points(points, normals, seen, weight, color)
     wanted = observed(points, normals, P, view.depth, view.trust, view.tolerance)
     np.testing.assert_allclose(weight, wanted, rtol=1e-4, atol=1e-6)

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import empty_matrix, empty_vector, kernel, zero_matrix
+from thesisrecon.kernels import copy_to, empty, kernel, zeros
+from thesisrecon.numerics.small_solvers import orthogonalize_columns, shortest_column
 
 # H is singular at a match if det J J' is below the first times its squared trace; it then has the second
 # squared distance.
@@ -51,7 +52,7 @@ def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) 
 @kernel(error_model="numpy")
 def _plane_distances(h: F64, points: F64) -> F64:
     """Squared distances (N,) of all points from a homography."""
-    squared = empty_vector(len(points))
+    squared = empty(len(points))
     for k in range(len(points)):
         squared[k] = _squared_plane_distance(h, points[k, 0], points[k, 1], points[k, 2], points[k, 3])
     return squared
@@ -63,12 +64,12 @@ def induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area:
 
     Each match gives v . x1 = b with b = (x2 x A x1) . (x2 x e2) / |x2 x e2|^2. False if nearly collinear.
     """
-    A = empty_vector(9)
+    A = empty(9)
     for j in range(3):
         A[j] = e2[1] * f[6 + j] - e2[2] * f[3 + j]
         A[3 + j] = e2[2] * f[j] - e2[0] * f[6 + j]
         A[6 + j] = e2[0] * f[3 + j] - e2[1] * f[j]
-    M, b = empty_matrix(3, 2), empty_vector(3)
+    M, b = empty((3, 2)), empty(3)
     for k in range(3):
         x1, y1, x2, y2 = points[triple[k]]
         M[k, 0], M[k, 1] = x1, y1
@@ -100,7 +101,7 @@ def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
     """
     G[:] = 0.0
     total, wide = 0.0, gate * gate
-    row = zero_matrix(2, 9)
+    row = zeros((2, 9))
     for k in range(len(points)):
         x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
         share = _squared_plane_distance(h, x1, y1, x2, y2) / wide
@@ -135,16 +136,25 @@ def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
 @kernel(error_model="numpy")
 def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
     """Fit ``h`` in place to the points within a gate by reweighted least squares; returns G."""
-    G = empty_matrix(9, 9)
+    G, turned, vectors = empty((9, 9)), empty((9, 9)), empty((9, 9))
     for _ in range(iterations):
-        h /= np.sqrt(np.sum(h * h)) + 1e-300
+        length = 1e-300
+        for i in range(9):
+            length += h[i] * h[i]
+        for i in range(9):
+            h[i] /= np.sqrt(length)
         _plane_normal_equations(h, points, gate, G)
-        vectors = np.linalg.eigh(G)[1]
-        new = vectors[:, 0].copy()
-        if np.sum(new * h) < 0.0:
-            new = -new
-        moved = np.sum((new - h) ** 2)
-        h[:] = new
+        for i in range(9):
+            for j in range(9):
+                turned[i, j] = G[i, j]
+        orthogonalize_columns(turned, vectors)
+        best, product, moved = shortest_column(turned), 0.0, 0.0
+        for i in range(9):
+            product += vectors[i, best] * h[i]
+        for i in range(9):
+            new = vectors[i, best] if product >= 0.0 else -vectors[i, best]
+            moved += (new - h[i]) ** 2
+            h[i] = new
         if moved < 1e-18:
             break
     return G
@@ -153,7 +163,7 @@ def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
 @kernel(error_model="numpy")
 def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> None:
     """Write the plane ``h`` of triples (S, 3) with the smallest sum of truncated squared distances."""
-    best, trial = float(len(points)), empty_vector(9)
+    best, trial = float(len(points)), empty(9)
     h[:] = 0.0
     wide = 1.0 / (gate * gate)
     for t in range(len(triples)):
@@ -169,13 +179,13 @@ def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: flo
                 break
         if total < best:
             best = total
-            h[:] = trial
+            copy_to(h, trial)
 
 
 @kernel(error_model="numpy")
 def count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
     """Number of points (N, 2) that each homography (S, 3, 3) maps to within ``tolerance``."""
-    counts = np.zeros(len(H), np.int64)
+    counts = zeros(len(H), np.int64)
     for s in range(len(H)):
         h = H[s]
         for k in range(len(xy1)):
@@ -238,7 +248,7 @@ def plane_covariance(h: F64, points: F64, sigma: float) -> F64:
 @kernel(error_model="numpy")
 def _parallax_lines(h: F64, points: F64) -> F64:
     """Lines (N, 3) x2 x H x1 in image 2 through a match and its position on the plane."""
-    lines = empty_matrix(len(points), 3)
+    lines = empty((len(points), 3))
     for k in range(len(points)):
         x1, y1, x2, y2 = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
         p0 = h[0] * x1 + h[1] * y1 + h[2]
@@ -255,7 +265,11 @@ def _fundamental_of_plane(h: F64, e2: F64, f: F64) -> None:
         f[j] = e2[1] * h[6 + j] - e2[2] * h[3 + j]
         f[3 + j] = e2[2] * h[j] - e2[0] * h[6 + j]
         f[6 + j] = e2[0] * h[3 + j] - e2[1] * h[j]
-    f /= np.sqrt(np.sum(f * f)) + 1e-300
+    squares = 1e-300
+    for i in range(9):
+        squares += f[i] * f[i]
+    for i in range(9):
+        f[i] /= np.sqrt(squares)
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
@@ -282,10 +296,15 @@ def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: f
     """
     columns = np.ascontiguousarray(points.T)
     lines = _parallax_lines(h, points)
-    F, agree, e2 = empty_matrix(len(pairs), 9), empty_matrix(len(pairs), len(points)), empty_vector(3)
+    F, agree, e2 = empty((len(pairs), 9)), empty((len(pairs), len(points))), empty(3)
     for s in range(len(pairs)):
         a, b = lines[pairs[s, 0]], lines[pairs[s, 1]]
         e2[0], e2[1], e2[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
         _fundamental_of_plane(h, e2, F[s])
         _inlier_mask(F[s], columns, gate, agree[s])
-    return F, agree, agree @ weights.T
+    sums = zeros((len(pairs), len(weights)))
+    for s in range(len(pairs)):
+        for m in range(len(weights)):
+            for k in range(len(points)):
+                sums[s, m] += agree[s, k] * weights[m, k]
+    return F, agree, sums

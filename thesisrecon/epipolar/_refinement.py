@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import empty_matrix, empty_vector, kernel
-from thesisrecon.numerics.levenberg_marquardt import solve_damped
+from thesisrecon.kernels import copy_to, empty, kernel
+from thesisrecon.numerics.small_solvers import orthogonalize_columns, solve_damped
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
@@ -28,7 +28,7 @@ def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delt
     Row 9 is the signed residual, row 10 the weight rho'(r) / r, 0 beyond the gate. No branches and contiguous
     rows, so that the loop vectorises.
     """
-    X = empty_matrix(4, BLOCK)
+    X = empty((4, BLOCK))
     for k in range(len(points)):
         for c in range(4):
             X[c, k] = points[k, c]
@@ -119,7 +119,7 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
     G[:] = 0.0
     h[:] = 0.0
     cost = 0.0
-    D, wd = empty_matrix(11, BLOCK), empty_vector(BLOCK)
+    D, wd = empty((11, BLOCK)), empty(BLOCK)
     for start in range(0, len(points), BLOCK):
         m = min(BLOCK, len(points) - start)
         block = points[start : start + m]
@@ -148,7 +148,7 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
 @kernel
 def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64, F64]:
     """Signed residuals (N,) of a criterion and their derivatives (N, 9) by F."""
-    r, J, D = empty_vector(len(points)), empty_matrix(len(points), 9), empty_matrix(11, BLOCK)
+    r, J, D = empty(len(points)), empty((len(points), 9)), empty((11, BLOCK))
     for start in range(0, len(points), BLOCK):
         block = points[start : start + BLOCK]
         if criterion == REPROJECTION:
@@ -208,10 +208,44 @@ def _rotate_columns(U: F64, a: F64, out: F64) -> None:
 @kernel
 def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
     """Write U and V of the nearest matrix of rank 2 and return phi."""
-    u, s, vt = np.linalg.svd(f.reshape((3, 3)))
-    U[:] = u
-    V[:] = vt.T
-    return float(np.arctan2(s[1], s[0]))
+    A, W, lengths = empty((3, 3)), empty((3, 3)), empty(3)
+    for i in range(9):
+        A[i // 3, i % 3] = f[i]
+    orthogonalize_columns(A, W)
+    for k in range(3):
+        lengths[k] = np.sqrt(A[0, k] * A[0, k] + A[1, k] * A[1, k] + A[2, k] * A[2, k])
+    last = 0 if lengths[0] <= min(lengths[1], lengths[2]) else 1 if lengths[1] <= lengths[2] else 2
+    first, second = (last + 1) % 3, (last + 2) % 3
+    if lengths[first] < lengths[second]:
+        first, second = second, first
+    for i in range(3):
+        V[i, 0], V[i, 1], V[i, 2] = W[i, first], W[i, second], W[i, last]
+        U[i, 0], U[i, 1] = A[i, first] / (lengths[first] + 1e-300), A[i, second] / (lengths[second] + 1e-300)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
+    return float(np.arctan2(lengths[second], lengths[first]))
+
+
+@kernel(error_model="numpy")
+def _project(B: F64, G: F64, h: F64, H: F64, g: F64) -> None:
+    """Write H = B' G B (7, 7) and g = B' h (7,)."""
+    GB = empty((9, 7))
+    for i in range(9):
+        for a in range(7):
+            total = 0.0
+            for j in range(9):
+                total += G[i, j] * B[j, a]
+            GB[i, a] = total
+    for a in range(7):
+        g[a] = 0.0
+        for i in range(9):
+            g[a] += B[i, a] * h[i]
+        for b in range(a, 7):
+            total = 0.0
+            for i in range(9):
+                total += B[i, a] * GB[i, b]
+            H[a, b] = H[b, a] = total
 
 
 @kernel(forceinline=True)
@@ -223,18 +257,18 @@ def refine(
     The cost is never above that of the nearest rank-2 matrix of the start. Residuals beyond ``gate`` have no
     weight; ``delta`` is the width of Huber's loss.
     """
-    U, V, Un, Vn = empty_matrix(3, 3), empty_matrix(3, 3), empty_matrix(3, 3), empty_matrix(3, 3)
+    U, V, Un, Vn = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
     phi = orthonormal_from_fundamental(f, U, V)
-    G, h, Gn, hn = empty_matrix(9, 9), empty_vector(9), empty_matrix(9, 9), empty_vector(9)
-    B, step, trial = empty_matrix(9, 7), empty_vector(7), empty_vector(9)
+    G, h, Gn, hn = empty((9, 9)), empty(9), empty((9, 9)), empty(9)
+    B, step, trial = empty((9, 7)), empty(7), empty(9)
+    H, g = empty((7, 7)), empty(7)
     fundamental_from_orthonormal(U, V, phi, f)
     cost = normal_equations(f, points, criterion, gate, delta, G, h)
     exact = 1e-26 * len(points)
     damping, steps = 1e-3, 0
     while steps < iterations and cost > exact:
         orthonormal_tangent(U, V, phi, B)
-        H = B.T @ (G @ B)
-        g = B.T @ h
+        _project(B, G, h, H, g)
         accepted = False
         while steps < iterations and not accepted:
             steps += 1
@@ -252,7 +286,7 @@ def refine(
         gain = cost - new_cost
         U, Un, V, Vn, phi = Un, U, Vn, V, phi + step[6]
         G, Gn, h, hn, cost = Gn, G, hn, h, new_cost
-        f[:] = trial
+        copy_to(f, trial)
         if gain <= 1e-6 * cost:
             break
     return cost, steps

@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._consensus import draw_sample, required_samples
 from thesisrecon.epipolar._refinement import SAMPSON, refine
-from thesisrecon.kernels import empty_integers, empty_matrix, empty_vector, kernel
+from thesisrecon.kernels import copy_to, empty, full, kernel
 
 LANES = 32
 # Rows of a solved batch: 0 and 9 the transforms to the bases (9 each), 18 the orientation of the first three
@@ -226,7 +226,7 @@ def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> floa
 @kernel(error_model="numpy")
 def sampson_distances(f: F64, points: F64) -> F64:
     """Sampson distances (N,) >= 0 of all points."""
-    r = empty_vector(len(points))
+    r = empty(len(points))
     for k in range(len(points)):
         r[k] = np.sqrt(_squared_sampson(f, points[k, 0], points[k, 1], points[k, 2], points[k, 3]))
     return r
@@ -294,7 +294,7 @@ def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
 @kernel
 def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
     """Write the samples of the rows of ``uniforms`` (B <= LANES, 7) as columns of ``X`` (28, LANES)."""
-    sample = empty_integers(7)
+    sample = empty(7, np.int64)
     for lane in range(len(uniforms)):
         draw_sample(uniforms[lane], len(points), sample)
         for m in range(7):
@@ -310,7 +310,7 @@ def _refine_best(points: F64, columns: F64, gate: float, state: F64, F: F64) -> 
     score, inliers, _ = truncated_score(f, columns, gate, state[0], (0.0, 0.0))
     if score < state[0]:
         state[0], state[1] = score, inliers / len(points)
-        F[:] = f
+        copy_to(F, f)
 
 
 @kernel
@@ -325,8 +325,8 @@ def search_fundamental(
     """
     columns = np.ascontiguousarray(points.T)
     done, least, confidence = stop
-    X, Y = np.ones((28, LANES)), empty_matrix(ROWS, LANES)
-    solutions, work = empty_matrix(3, 9), empty_vector(9)
+    X, Y = full((28, LANES), 1.0), empty((ROWS, LANES))
+    solutions, work = empty((3, 9)), empty(9)
     for start in range(0, len(uniforms), LANES):
         if done >= least and done >= required_samples(state[1], 7, confidence, LARGEST):
             break
@@ -341,7 +341,7 @@ def search_fundamental(
                 score, inliers, seen = truncated_score(solutions[k], columns, gate, state[0], evidence)
                 if score < state[0]:
                     state[0], state[1] = score, inliers / len(points)
-                    F[:] = solutions[k]
+                    copy_to(F, solutions[k])
                 else:
                     state[2] += seen
                     state[3] += inliers

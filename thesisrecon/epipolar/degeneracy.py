@@ -19,7 +19,7 @@ from thesisrecon.epipolar._planes import DominantPlane, find_dominant_plane, fun
 from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.precision import epipolar_distance_std
-from thesisrecon.kernels import empty_integers, empty_matrix, empty_vector, kernel, zero_vector
+from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
 NEIGHBOURS = 5
@@ -86,13 +86,13 @@ def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: f
     A neighbour contradicts if the parallax differs by more than the distance in image 1: two points of an
     opaque surface would change order. Points nearer than ``near`` are the same feature and do not count.
     """
-    parallax = empty_matrix(len(points), 2)
+    parallax = empty((len(points), 2))
     for k in range(len(points)):
         x1, y1 = points[k, 0], points[k, 1]
         w = h[6] * x1 + h[7] * y1 + h[8]
         parallax[k, 0] = points[k, 2] - (h[0] * x1 + h[1] * y1 + h[2]) / w
         parallax[k, 1] = points[k, 3] - (h[3] * x1 + h[4] * y1 + h[5]) / w
-    ratios, nearest, which = zero_vector(len(chosen)), empty_vector(NEIGHBOURS), empty_integers(NEIGHBOURS)
+    ratios, nearest, which = zeros(len(chosen)), empty(NEIGHBOURS), empty(NEIGHBOURS, np.int64)
     for c in range(len(chosen)):
         k, found = chosen[c], 0
         for m in range(len(points)):

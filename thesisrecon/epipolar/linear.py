@@ -9,7 +9,7 @@ from thesisrecon.epipolar._frame import MIN_PX, PairFrame, as_matches, check_mat
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import enforce_rank_two, unit_norm
-from thesisrecon.kernels import empty_matrix, empty_vector, kernel
+from thesisrecon.kernels import empty, kernel
 
 # Ratio of the eighth to the first singular value below which F is undetermined.
 UNDETERMINED_REL = 1e-12
@@ -131,7 +131,7 @@ def _null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
 
     Householder QR of A' (9, 7): the last two columns of Q.
     """
-    A = empty_matrix(7, 9)
+    A = empty((7, 9))
     for k in range(7):
         x1, y1, x2, y2 = points[sample[k]]
         A[k, 0], A[k, 1], A[k, 2] = x2 * x1, x2 * y1, x2
@@ -139,7 +139,7 @@ def _null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
         A[k, 6], A[k, 7], A[k, 8] = x1, y1, 1.0
     pencil[:] = 0.0
     pencil[0, 7] = pencil[1, 8] = 1.0
-    scales = empty_vector(7)
+    scales = empty(7)
     for k in range(7):
         norm = 0.0
         for r in range(k, 9):
@@ -226,7 +226,7 @@ def _singular_members(pencil: F64, F: F64) -> int:
     basis vector: the leading coefficient is never small and no solution is lost at infinity.
     """
     best, c, s = -1.0, 1.0, 0.0
-    trial = empty_vector(9)
+    trial = empty(9)
     for k in range(4):
         ck = (1.0, 0.0, DIAGONAL, DIAGONAL)[k]
         sk = (0.0, 1.0, DIAGONAL, -DIAGONAL)[k]
@@ -240,7 +240,7 @@ def _singular_members(pencil: F64, F: F64) -> int:
     first = c * pencil[0] + s * pencil[1]
     second = c * pencil[1] - s * pencil[0]
     lead = _det3(first)
-    roots = empty_vector(3)
+    roots = empty(3)
     count = _cubic_roots(
         _mixed_det3(first, second) / lead, _mixed_det3(second, first) / lead, _det3(second) / lead, roots
     )
@@ -269,7 +269,7 @@ def seven_point(points: F64, sample: I64, F: F64) -> int:
     int
         Number of solutions, 0 for degenerate matches.
     """
-    pencil = empty_matrix(2, 9)
+    pencil = empty((2, 9))
     if not _null_pencil(points, sample, pencil):
         return 0
     return _singular_members(pencil, F)

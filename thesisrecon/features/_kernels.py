@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, full, kernel, zeros
 
 # Sums may be reordered; assuming no NaN would break the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -22,11 +22,11 @@ def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: flo
     """
     count, height, width = channels.shape
     reach, size = derivative.size // 2, taps.size
-    out = np.zeros((height, width), np.float32)
-    ring = np.zeros((size, 3, width), np.float32)
-    slope = np.empty((2, width), np.float32)
-    column = np.empty((3, width), np.float32)
-    moment = np.empty((3, width), np.float32)
+    out = zeros((height, width), np.float32)
+    ring = zeros((size, 3, width), np.float32)
+    slope = empty((2, width), np.float32)
+    column = empty((3, width), np.float32)
+    moment = empty((3, width), np.float32)
     border = size // 2 + reach
     for y in range(reach, height - reach):
         products = ring[y % size]
@@ -101,8 +101,8 @@ def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[
     height, width = response.shape
     # Maxima do not touch: at most one in four pixels.
     most = (height // 2 + 1) * (width // 2 + 1)
-    xy = np.empty((most, 2), np.float64)
-    value = np.empty(most, np.float32)
+    xy = empty((most, 2), np.float64)
+    value = empty(most, np.float32)
     limit = np.float32(threshold)
     n = 0
     for y in range(1, height - 1):
@@ -161,7 +161,7 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
     """Squared distances (N,) to the nearest corner whose response times robustness is larger."""
     n = len(xy)
     x, y = xy[:, 0].copy(), xy[:, 1].copy()
-    out = np.full(n, np.inf, np.float32)
+    out = full(n, np.inf, np.float32)
     stronger = 0
     for i in range(n):
         while stronger < i and robustness * response[stronger] > response[i]:
@@ -179,7 +179,7 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
 def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
     """Square patches (N, side^2) of an image, clamped, rotated by ``angle`` (N,) rad, sampled bilinearly."""
     height, width = image.shape
-    out = np.empty((len(xy), side * side), np.float32)
+    out = empty((len(xy), side * side), np.float32)
     centre = 0.5 * (side - 1)
     for n in range(len(xy)):
         c, s = np.cos(angle[n]) * spacing, np.sin(angle[n]) * spacing
@@ -199,7 +199,7 @@ def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -
 @kernel
 def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
     """Of the indices ``order`` those at least ``distance`` from every corner selected before."""
-    kept = np.empty(len(order), np.int64)
+    kept = empty(len(order), np.int64)
     n = 0
     for i in order:
         free = True

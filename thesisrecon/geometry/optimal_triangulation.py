@@ -19,7 +19,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.geometry._checks import checked_unit
 from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, require_shapes
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 
 _Two = tuple[float, float]
 _Four = tuple[float, float, float, float]
@@ -72,8 +72,8 @@ def _roots_in_unit_interval(c: F64, roots: F64) -> int:
 
     The roots of each derivative divide the interval into pieces on which the next lower one is monotone.
     """
-    d = np.empty(_DEGREE + 1)
-    cuts = np.empty(_DEGREE + 2)
+    d = empty(_DEGREE + 1)
+    cuts = empty(_DEGREE + 2)
     found = 0
     for order in range(_DEGREE - 1, -1, -1):
         d[:] = 0.0
@@ -126,7 +126,7 @@ def _stationary_polynomial(cost: _PencilCost, c: F64) -> None:
 def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
     """Return the root of c of least cost in [-1, 1], or on the ``whole`` line with infinity; or NaN."""
     n0, n1, E0, E1, E2, G, kappa = pencil
-    roots, backward = np.empty(_DEGREE + 2), np.empty(_DEGREE + 1)
+    roots, backward = empty(_DEGREE + 2), empty(_DEGREE + 1)
     best, least = math.nan, math.inf
     for k in range(_roots_in_unit_interval(c, roots)):
         x = roots[k]
@@ -214,7 +214,7 @@ def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, 
 
     Matches with a NaN are skipped and have q = 0.
     """
-    c = np.empty(_DEGREE + 1)
+    c = empty(_DEGREE + 1)
     for k in range(len(xy1)):
         x1, y1, x2, y2 = xy1[k, 0], xy1[k, 1], xy2[k, 0], xy2[k, 1]
         pencil[k, 0] = pencil[k, 1] = 0.0
@@ -257,7 +257,7 @@ def _intersect_rays(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: 
     epipoles. ``back`` (4, 4) takes the point to the caller's frame. q = 0 gives a zero point.
     """
     P1, P2, L1, L2, xy1, xy2 = P[0], P[1], L[0], L[1], xy[0], xy[1]
-    plane, across1, across2, Y = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    plane, across1, across2, Y = empty(4), empty(4), empty(4), empty(4)
     for k in range(len(X)):
         q0, q1 = pencil[k, 0], pencil[k, 1]
         X[k] = 0.0

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 
 # Sums may be reordered; the flag "nnan" would remove the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -23,7 +23,7 @@ def _convolve_separable(image: F32, taps: F32) -> F32:
     height, width = image.shape
     radius = taps.size // 2
     out = np.zeros_like(image)
-    row = np.empty(width + 2 * radius, np.float32)
+    row = empty(width + 2 * radius, np.float32)
     for y in range(height):
         row[:] = np.float32(0.0)
         for k in range(taps.size):
@@ -45,8 +45,8 @@ def _convolve_separable(image: F32, taps: F32) -> F32:
 def _halve_image(image: F32) -> F32:
     """Downsample to (H // 2, W // 2) with the taps (1, 3, 3, 1) / 8, centred between the merged pixels."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
-    out = np.empty((height, width), np.float32)
-    row = np.empty(image.shape[1], np.float32)
+    out = empty((height, width), np.float32)
+    row = empty(image.shape[1], np.float32)
     one, three = np.float32(1.0 / 8.0), np.float32(3.0 / 8.0)
     for y in range(height):
         above, below = max(2 * y - 1, 0), min(2 * y + 2, image.shape[0] - 1)
@@ -76,9 +76,9 @@ def resample(image: F32, width: int, height: int) -> F32:
     ndarray (height, width) of float32
     """
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
-    out = np.empty((height, width), np.float32)
-    left = np.empty(width, np.int64)
-    fraction = np.empty(width, np.float32)
+    out = empty((height, width), np.float32)
+    left = empty(width, np.int64)
+    fraction = empty(width, np.float32)
     for x in range(width):
         u = min(max((x + 0.5) * scale_x - 0.5, 0.0), image.shape[1] - 1.0)
         left[x] = min(int(u), max(image.shape[1] - 2, 0))

@@ -16,8 +16,9 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes
 from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import copy_to, empty, kernel, zeros
 from thesisrecon.numerics.partial_bundle import minimize_reprojection
+from thesisrecon.numerics.small_solvers import orthogonalize_columns, shortest_column
 
 _PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
@@ -77,34 +78,14 @@ def _least_singular_vector(R: F64, x: F64) -> None:
 @kernel(error_model="numpy")
 def _jacobi_least(R: F64, x: F64) -> None:
     """Fill x (4,) with the unit vector of least |R x| by one-sided Jacobi rotations (Hestenes)."""
-    A, V = R.copy(), np.eye(4)
-    for i in range(1, 4):
-        A[i, :i] = 0.0
-    for _ in range(30):
-        turned = False
-        for p in range(3):
-            for q in range(p + 1, 4):
-                a = b = c = 0.0
-                for i in range(4):
-                    a, b, c = a + A[i, p] * A[i, p], b + A[i, q] * A[i, q], c + A[i, p] * A[i, q]
-                if abs(c) <= 1e-15 * math.sqrt(a * b):
-                    continue
-                turned = True
-                zeta = (b - a) / (2.0 * c)
-                t = math.copysign(1.0, zeta) / (abs(zeta) + math.sqrt(1.0 + zeta * zeta))
-                cosine = 1.0 / math.sqrt(1.0 + t * t)
-                sine = cosine * t
-                for i in range(4):
-                    A[i, p], A[i, q] = cosine * A[i, p] - sine * A[i, q], sine * A[i, p] + cosine * A[i, q]
-                    V[i, p], V[i, q] = cosine * V[i, p] - sine * V[i, q], sine * V[i, p] + cosine * V[i, q]
-        if not turned:
-            break
-    best, least = 0, math.inf
-    for p in range(4):
-        length = A[0, p] ** 2 + A[1, p] ** 2 + A[2, p] ** 2 + A[3, p] ** 2
-        if length < least:
-            best, least = p, length
-    x[:] = V[:, best]
+    A, V = empty((4, 4)), empty((4, 4))
+    for i in range(4):
+        for p in range(4):
+            A[i, p] = R[i, p] if p >= i else 0.0
+    orthogonalize_columns(A, V)
+    best = shortest_column(A)
+    for i in range(4):
+        x[i] = V[i, best]
 
 
 @kernel(error_model="numpy")
@@ -146,8 +127,8 @@ def _triangulate_each_linear(
     depth p3'X of the last pass until no depth changes by more than ``tolerance``, relative. Without
     convergence the better reprojection of the last and the linear answer is kept.
     """
-    R, row, x, y = np.zeros((4, 4)), np.empty(4), np.empty(4), np.empty(4)
-    weight = np.empty(len(xy))
+    R, row, x, y = zeros((4, 4)), empty(4), empty(4), empty(4)
+    weight = empty(len(xy))
     obs = (view, xy, weight)
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
@@ -157,18 +138,19 @@ def _triangulate_each_linear(
         for k in range(first, last):
             weight[k] = scale[view[k]]
         _least_algebraic(P, obs, first, last, R, row, x)
-        X[j] = x
-        y[:] = x
+        copy_to(X[j], x)
+        copy_to(y, x)
         rest = False
         for n in range(passes):
-            change = 0.0
+            change = total = 0.0
             for k in range(first, last):
                 p = P[view[k], 2]
                 depth = abs(p[0] * y[0] + p[1] * y[1] + p[2] * y[2] + p[3] * y[3])
                 change = max(change, abs(depth * weight[k] - 1.0))
                 weight[k] = 1.0 / depth if depth > 0.0 else math.inf
+                total += weight[k]
             rest = n > 0 and change < tolerance
-            if rest or not math.isfinite(weight[first:last].sum()):
+            if rest or not math.isfinite(total):
                 break
             _least_algebraic(P, obs, first, last, R, row, y)
         if passes > 0 and (
@@ -176,7 +158,7 @@ def _triangulate_each_linear(
             or _reprojection_cost(P, y, first, last, view, xy)
             < _reprojection_cost(P, x, first, last, view, xy)
         ):
-            X[j] = y
+            copy_to(X[j], y)
 
 
 Method = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]

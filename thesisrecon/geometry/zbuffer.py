@@ -11,7 +11,7 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 
 _SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
@@ -73,7 +73,7 @@ def _rasterize_rows(
     at the near plane (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997).
     """
     width = depth.shape[1]
-    inverse = np.empty((3, 3))
+    inverse = empty((3, 3))
     for m in range(corners.shape[0]):
         p = corners[m]
         first, last = rows

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import empty_matrix, empty_vector, kernel, zero_matrix, zero_vector
+from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.matching._prepared import (
     FAST,
     SAMPLES,
@@ -25,6 +25,7 @@ from thesisrecon.matching._prepared import (
     sample_window,
     select_matches,
 )
+from thesisrecon.numerics.small_solvers import solve_damped
 from thesisrecon.records import Matches
 
 # The kernels below are called for every window and step, so they are inlined.
@@ -71,10 +72,10 @@ def _align_windows(
     xy1, scale1, start, affine_start = matches
     iterations, affine_std, max_shift, largest_std = limits
     xy2, affine = start.copy(), affine_start.copy()
-    score = np.zeros(len(xy1), np.float32)
-    border = np.empty(WIDE * WIDE, np.float32)
-    template, window = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
-    gradient = np.empty((6 if affine_std > 0.0 else 2, SAMPLES), np.float32)
+    score = zeros(len(xy1), np.float32)
+    border = empty(WIDE * WIDE, np.float32)
+    template, window = empty(SAMPLES, np.float32), empty(SAMPLES, np.float32)
+    gradient = empty((6 if affine_std > 0.0 else 2, SAMPLES), np.float32)
     for n in range(len(xy1)):
         determinant = affine_determinant(affine[n])
         if determinant == 0.0:
@@ -117,7 +118,7 @@ def _read_template(
     """
     xy, size = place
     template, gradient = out
-    step = zero_matrix(2, 2)
+    step = zeros((2, 2))
     step[0, 0] = step[1, 1] = size
     if not sample_window(pixels, level, to_level, xy, step, WIDE, border):
         return False
@@ -166,7 +167,7 @@ def _project_out_gain_and_bias(gradient: F32, template: F32, norm: float) -> Non
 def _normal_matrix(gradient: F32) -> F64:
     """Inner products of the derivatives."""
     unknowns = len(gradient)
-    normal = zero_matrix(unknowns, unknowns)
+    normal = zeros((unknowns, unknowns))
     for g in range(unknowns):
         for h in range(g, unknowns):
             normal[g, h] = normal[h, g] = dot(gradient[g], gradient[h])
@@ -191,7 +192,7 @@ def _iterate(
     xy, a = found
     iterations, affine_std, reach, size = limits
     x, y = xy[0], xy[1]
-    moved = zero_vector(len(gradient))
+    moved = zeros(len(gradient))
     value = 0.0
     for turn in range(iterations + 1):
         if not sample_window(pixels, level, to_level, xy, a * size, SIDE, window):
@@ -219,7 +220,7 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
     moved, affine_std = prior
     unknowns = len(gradient)
     damped = normal.copy()
-    right = empty_vector(unknowns)
+    right = empty(unknowns)
     # Residual variance of a normalised sample against the prior of the affine coefficients.
     ridge = max(1.0 - value * value, 1e-4) / SAMPLES / max(HALF * HALF * affine_std * affine_std, 1e-12)
     for g in range(unknowns):
@@ -227,8 +228,10 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
         if g >= 2:
             damped[g, g] += ridge
             right[g] -= ridge * moved[g]
-    delta = empty_vector(unknowns)
-    delta[:] = np.linalg.solve(damped, right)
+    delta = zeros(unknowns)
+    if solve_damped(damped, right, 0.0, delta):
+        for g in range(unknowns):
+            delta[g] = -delta[g]
     for g in range(2, unknowns):
         moved[g] += delta[g]
     return delta
@@ -238,10 +241,11 @@ def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tu
 def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
     """Compose the map x2(x) = xy + a x with the inverse of the step of the template, in place."""
     if len(delta) == 6:
-        d = empty_matrix(2, 2)
-        d[0, 0], d[0, 1] = 1.0 + delta[2] / HALF, delta[3] / HALF
-        d[1, 0], d[1, 1] = delta[4] / HALF, 1.0 + delta[5] / HALF
-        a[:] = a @ np.linalg.inv(d)
+        p, q, r, s = 1.0 + delta[2] / HALF, delta[3] / HALF, delta[4] / HALF, 1.0 + delta[5] / HALF
+        determinant = p * s - q * r
+        for i in range(2):
+            u, v = a[i, 0], a[i, 1]
+            a[i, 0], a[i, 1] = (u * s - v * r) / determinant, (v * p - u * q) / determinant
     dx, dy = size * delta[0], size * delta[1]
     xy[0] -= a[0, 0] * dx + a[0, 1] * dy
     xy[1] -= a[1, 0] * dx + a[1, 1] * dy

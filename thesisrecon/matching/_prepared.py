@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.geometry.raster import halve, resample
-from thesisrecon.kernels import kernel, zero_matrix
+from thesisrecon.kernels import kernel, zeros
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
 # Sums may be reordered; assuming no NaN would break the bounds checks.
@@ -100,8 +100,8 @@ def dot(a: F32, b: F32) -> float:
 @kernel
 def _corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, side: int = SIDE) -> F32:
     """Normalised upright windows (N, side^2) of the corners at their scale; zero outside the image."""
-    out = np.zeros((len(xy), side * side), np.float32)
-    step = zero_matrix(2, 2)
+    out = zeros((len(xy), side * side), np.float32)
+    step = zeros((2, 2))
     for n in range(len(xy)):
         k = pyramid_level(scale[n], base, len(levels))
         step[0, 0] = step[1, 1] = scale[n]

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.matching._prepared import empty_matches
 from thesisrecon.records import Matches, Seeds
 
@@ -26,9 +26,9 @@ def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F3
     best is the same position. -1 without a second best.
     """
     rows, columns = correlation.shape
-    index = np.zeros(rows, np.int64)
-    value = np.full(rows, -1.0, np.float32)
-    second_best = np.full(rows, -1.0, np.float32)
+    index = zeros(rows, np.int64)
+    value = full(rows, -1.0, np.float32)
+    second_best = full(rows, -1.0, np.float32)
     for b in range(rows):
         row = correlation[b]
         best, top = 0, np.float32(-2.0)

@@ -10,7 +10,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.kernels import empty_integers, empty_matrix, empty_vector, kernel, zero_matrix
+from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import align_matches, strongest_distinct
 from thesisrecon.matching._prepared import (
     SAMPLES,
@@ -28,6 +28,7 @@ from thesisrecon.matching._prepared import (
     select_matches,
 )
 from thesisrecon.matching._seeds import corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.numerics.small_solvers import solve_damped
 from thesisrecon.records import Features, Image, Matches, Seeds
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
@@ -43,6 +44,20 @@ PRIOR_SHARE = 0.05
 
 
 @kernel
+def _median(values: F64, ordered: F64) -> float:
+    """Median of a few values by insertion into ``ordered``."""
+    n = len(values)
+    for k in range(n):
+        at = k
+        while at > 0 and ordered[at - 1] > values[k]:
+            ordered[at] = ordered[at - 1]
+            at -= 1
+        ordered[at] = values[k]
+    middle: float = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
+    return middle
+
+
+@kernel
 def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
     """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its neighbouring matches (N, K).
 
@@ -51,16 +66,17 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
     are collinear. Returns the map (N, 2, 2), the position in image 2 (N, 2) and its uncertainty (N,) px.
     """
     count, k = neighbours.shape
-    affine = np.empty((count, 2, 2))
-    position = empty_matrix(count, 2)
-    spread = empty_vector(count)
-    offset = empty_matrix(k, 2)
-    rest = empty_matrix(k, 2)
-    distance2 = empty_vector(k)
-    residual2 = empty_vector(k)
+    affine = empty((count, 2, 2))
+    position = empty((count, 2))
+    spread = empty(count)
+    offset = empty((k, 2))
+    rest = empty((k, 2))
+    distance2 = empty(k)
+    residual2 = empty(k)
+    ordered = empty(k)
     for n in range(count):
         mean2 = 0.0
-        a0 = zero_matrix(2, 2)
+        a0 = zeros((2, 2))
         for m in range(k):
             i = neighbours[n, m]
             dx, dy = xy1[i, 0] - xy[n, 0], xy1[i, 1] - xy[n, 1]
@@ -75,7 +91,7 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
             rest[m, 0] = xy2[i, 0] - (a0[0, 0] * dx + a0[0, 1] * dy)
             rest[m, 1] = xy2[i, 1] - (a0[1, 0] * dx + a0[1, 1] * dy)
         scale2 = np.inf
-        a, z = a0, zero_matrix(3, 2)
+        a, z = a0, zeros((3, 2))
         for _ in range(ROUNDS):
             z = _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2))
             a = a0 + z[:2].T
@@ -84,7 +100,7 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
                 ex = xy2[i, 0] - (a[0, 0] * dx + a[0, 1] * dy + z[2, 0])
                 ey = xy2[i, 1] - (a[1, 0] * dx + a[1, 1] * dy + z[2, 1])
                 residual2[m] = ex * ex + ey * ey
-            scale2 = np.median(residual2)
+            scale2 = _median(residual2, ordered)
         affine[n] = a
         position[n] = z[2]
         spread[n] = np.sqrt(scale2)
@@ -96,8 +112,8 @@ def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: t
     """Correction (3, 2) of the prior map, transposed, above the translation, by weighted least squares."""
     distance2, mean2 = near
     residual2, scale2 = misfit
-    s = zero_matrix(3, 3)
-    r = zero_matrix(3, 2)
+    s = zeros((3, 3))
+    r = zeros((2, 3))
     total = 0.0
     for m in range(len(offset)):
         w = 1.0 / (distance2[m] + mean2)
@@ -112,15 +128,18 @@ def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: t
         s[2, 2] += w
         for side in range(2):
             e = rest[m, side]
-            r[0, side] += w * dx * e
-            r[1, side] += w * dy * e
-            r[2, side] += w * e
+            r[side, 0] += w * dx * e
+            r[side, 1] += w * dy * e
+            r[side, 2] += w * e
     ridge = PRIOR_SHARE * total * mean2
     s[0, 0] += ridge
     s[1, 1] += ridge
     s[1, 0], s[2, 0], s[2, 1] = s[0, 1], s[0, 2], s[1, 2]
-    correction = empty_matrix(3, 2)
-    correction[:] = np.linalg.solve(s, r)
+    correction, step = zeros((3, 2)), empty(3)
+    for side in range(2):
+        if solve_damped(s, r[side], 0.0, step):
+            for i in range(3):
+                correction[i, side] = -step[i]
     return correction
 
 
@@ -146,13 +165,16 @@ def _match_guided(
     xy2, scale2, patches2 = corners2
     F, band, least = gate
     count = len(xy1)
-    index = np.full(count, -1, np.int64)
-    score = np.zeros(count, np.float32)
-    second_best = np.full(count, -1.0, np.float32)
-    near, seen = empty_integers(len(xy2)), np.empty(len(xy2), np.float32)
-    window = np.empty((2, SAMPLES), np.float32)
-    ready = np.zeros(2, np.bool_)
-    sizes = np.array([1.0, 2.0]) * float(np.min(scale2))
+    index = full(count, -1, np.int64)
+    score = zeros(count, np.float32)
+    second_best = full(count, -1.0, np.float32)
+    near, seen = empty(len(xy2), np.int64), empty(len(xy2), np.float32)
+    window = empty((2, SAMPLES), np.float32)
+    ready = zeros(2, np.bool_)
+    sizes = full(2, np.inf)
+    for c in range(len(scale2)):
+        sizes[0] = min(sizes[0], scale2[c])
+    sizes[1] = 2.0 * sizes[0]
     for n in range(count):
         determinant = affine_determinant(affine[n])
         if determinant == 0.0:
@@ -233,7 +255,7 @@ def _warp_windows(
     a, determinant = local
     window, ready = out
     m = np.sqrt(determinant)
-    inverse = empty_matrix(2, 2)
+    inverse = empty((2, 2))
     inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
     inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
     for t in range(len(sizes)):

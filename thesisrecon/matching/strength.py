@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import empty_integers, empty_vector, kernel
+from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import align_matches
 from thesisrecon.matching._prepared import (
     SIDE,
@@ -62,9 +62,9 @@ def _strength_of_match(
     ``tolerance`` of the relative difference, 0: product of figure 4.4.
     """
     xy1, xy2 = xy
-    index = np.full(len(xy1), -1, np.int64)
-    strength = np.zeros(len(xy1), np.float32)
-    held = empty_integers(search[1])
+    index = full(len(xy1), -1, np.int64)
+    strength = zeros(len(xy1), np.float32)
+    held = empty(search[1], np.int64)
     for u in range(len(xy1)):
         count = _best_candidates(correlation[u], xy1[u], xy2, search, held)
         for k in range(count):
@@ -110,7 +110,7 @@ def _neighbours_agree(
     xy1, xy2 = xy
     u, v = pair
     radius, tolerance = rule
-    moved, other = empty_vector(2), empty_vector(2)
+    moved, other = empty(2), empty(2)
     moved[0], moved[1] = xy2[v, 0] - xy1[u, 0], xy2[v, 1] - xy1[u, 1]
     total = 0.0
     for m in near[0]:

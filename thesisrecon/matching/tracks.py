@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import empty_integers, empty_matrix, kernel
+from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.numerics.observations import morton_pair_order
@@ -26,7 +26,7 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
     count = len(view_of)
     parent = np.arange(count)
     # Sets are lists linked through ``following``; the smaller one joins the larger.
-    following, last, size = np.full(count, -1, np.int64), np.arange(count), np.ones(count, np.int64)
+    following, last, size = full(count, -1, np.int64), np.arange(count), full(count, 1, np.int64)
     # Views of the set of a root: root times views plus view.
     has = {np.int64(-1)}
     for n in range(count):
@@ -57,8 +57,8 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
         following[last[a]] = b
         last[a] = last[b]
         size[a] += size[b]
-    first = np.full(count, -1, np.int64)
-    root = empty_integers(count)
+    first = full(count, -1, np.int64)
+    root = empty(count, np.int64)
     for n in range(count):
         a = n
         while parent[a] != a:
@@ -77,28 +77,27 @@ def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle:
     view of every observation and the map (K, 2, 2) to it; an unreachable observation keeps its own corner.
     """
     count = len(xy)
-    position, maps = xy.copy(), np.zeros((count, 2, 2))
+    position, maps = xy.copy(), zeros((count, 2, 2))
     maps[:, 0, 0] = 1.0
     maps[:, 1, 1] = 1.0
-    start = np.zeros(count + 1, np.int64)
+    start = zeros(count + 1, np.int64)
     for e in range(len(edges)):
         start[edges[e, 0] + 1] += 1
         start[edges[e, 1] + 1] += 1
     start = np.cumsum(start)
     fill = start[:-1].copy()
-    incident = empty_integers(2 * len(edges))
+    incident = empty(2 * len(edges), np.int64)
     for e in range(len(edges)):
         for side in range(2):
             incident[fill[edges[e, side]]] = e
             fill[edges[e, side]] += 1
-    reached = np.zeros(count, np.bool_)
-    queue = empty_integers(count)
+    reached = zeros(count, np.bool_)
+    queue = empty(count, np.int64)
     head, tail = 0, 0
     for t in range(len(middle)):
         queue[tail] = middle[t]
         reached[middle[t]] = True
         tail += 1
-    inverse = empty_matrix(2, 2)
     while head < tail:
         k = queue[head]
         head += 1
@@ -108,18 +107,20 @@ def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle:
             other = edges[e, 1] if forward else edges[e, 0]
             if reached[other]:
                 continue
-            a = affine[e]
-            if forward:
-                position[other] = xy2[e] + a @ (position[k] - xy1[e])
-                maps[other] = a @ maps[k]
-            else:
-                determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+            a, b, c, d = affine[e, 0, 0], affine[e, 0, 1], affine[e, 1, 0], affine[e, 1, 1]
+            here, there = xy1[e], xy2[e]
+            if not forward:
+                determinant = a * d - b * c
                 if abs(determinant) < 1e-6:
                     continue
-                inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
-                inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
-                position[other] = xy1[e] + inverse @ (position[k] - xy2[e])
-                maps[other] = inverse @ maps[k]
+                a, b, c, d = d / determinant, -b / determinant, -c / determinant, a / determinant
+                here, there = there, here
+            dx, dy = position[k, 0] - here[0], position[k, 1] - here[1]
+            position[other, 0] = there[0] + (a * dx + b * dy)
+            position[other, 1] = there[1] + (c * dx + d * dy)
+            for side in range(2):
+                u, v = maps[k, 0, side], maps[k, 1, side]
+                maps[other, 0, side], maps[other, 1, side] = a * u + b * v, c * u + d * v
             reached[other] = True
             queue[tail] = other
             tail += 1

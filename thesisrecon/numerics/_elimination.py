@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, full, kernel
 from thesisrecon.numerics._kernels import invert_cholesky_3x3, multiply_transposed_3x3
 from thesisrecon.numerics._observations import Jacobians
 
@@ -75,7 +75,7 @@ def eliminate_points(
     """Add the eliminated points to the sums; a point whose block is not positive does not move."""
     k = index.start[first]
     n = index.start[last] - k
-    left = _Elimination(k, np.empty((n, 2, 3)), np.empty((n, 2)), np.empty((last - first, 3)))
+    left = _Elimination(k, empty((n, 2, 3)), empty((n, 2)), empty((last - first, 3)))
     _sum_points(first, last, damping, J, index, points, left)
     _add_views(first, last, J, index, sums, left)
     if len(sums.corner) > 0:
@@ -96,7 +96,7 @@ def _sum_points(
     left: _Elimination,
 ) -> None:
     """Compute J'J and J'r of each point, its inverse, B~ and the residuals after its own step."""
-    M, more = np.empty((3, 3)), 1.0 + damping
+    M, more = empty((3, 3)), 1.0 + damping
     for j in range(first, last):
         v00 = v01 = v02 = v11 = v12 = v22 = h0 = h1 = h2 = 0.0
         s, e = index.start[j], index.start[j + 1]
@@ -182,8 +182,8 @@ def _add_common(
     for j in range(first, last):
         most = max(most, index.start[j + 1] - index.start[j])
     wide = min(len(sums.corner), most * index.common.shape[1])
-    E, T, p = np.empty((most, 2, wide)), np.empty((2, wide)), np.empty((3, wide))
-    column, slot = np.empty(wide, np.int64), np.full(len(sums.corner), -1)
+    E, T, p = empty((most, 2, wide)), empty((2, wide)), empty((3, wide))
+    column, slot = empty(wide, np.int64), full(len(sums.corner), -1, np.int64)
     edge = C * sums.border.shape[0]
     ends = (sums.corner, sums.rhs[edge:], sums.diagonal[edge:], sums.gradient[edge:])
     for j in range(first, last):
@@ -297,7 +297,7 @@ def substitute_points(
 @kernel
 def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
     """Fill the share (K, 2) of each coordinate's variance that its point's unknowns absorb, B V^-1 B'."""
-    M = np.empty((3, 3))
+    M = empty((3, 3))
     for j in range(len(start) - 1):
         v00 = v01 = v02 = v11 = v12 = v22 = 0.0
         for k in range(start[j], start[j + 1]):

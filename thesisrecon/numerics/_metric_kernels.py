@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._kernels import away_from_zero, loss_curvature, loss_value, loss_weight
 from thesisrecon.numerics._observations import Jacobians, Weighting
 from thesisrecon.numerics.observations import Observations
@@ -54,7 +54,7 @@ def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
 @kernel
 def project_metric(model: MetricModel, obs: Observations) -> F64:
     """Return residuals (K, 2), projection minus observation, px."""
-    residual = np.empty((len(obs.xy), 2))
+    residual = empty((len(obs.xy), 2))
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
         x0, x1, x2 = _in_camera(model.R[v], model.t[v], x)
@@ -108,7 +108,7 @@ def linearize_metric(
     among (log f, aspect, skew, cx, cy, k1, k2, k3); ``common`` are those in the columns of E.
     """
     cost = 0.0
-    D = np.empty((2, 10))
+    D = empty((2, 10))
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
         r, q = model.R[v], model.intrinsics[model.group[v]]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._kernels import away_from_zero, loss_value, loss_weight
 from thesisrecon.numerics._observations import Jacobians, Weighting
 from thesisrecon.numerics.observations import Observations
@@ -68,7 +68,7 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
 @kernel
 def project_projective(P: F64, X: F64, obs: Observations) -> F64:
     """Return residuals (K, 2), projection minus observation; P (V, 3, 4), X (N, 4)."""
-    residual = np.empty((len(obs.xy), 2))
+    residual = empty((len(obs.xy), 2))
     for k in range(len(obs.xy)):
         p, x = P[obs.view_index[k]], X[obs.point_index[k]]
         z0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]

@@ -9,7 +9,6 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import kernel
 from thesisrecon.numerics._kernels import floored_diagonal, solve_positive
 
 State = TypeVar("State")
@@ -130,51 +129,6 @@ class DenseSystem:
             return None
         return step, 0.5 * float(step @ (diagonal * step - self.gradient))
 
-
-@kernel
-def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
-    """Solve (H + damping diag H) step = -g by Cholesky factorisation, inside kernels.
-
-    Parameters
-    ----------
-    H, g, damping, step : ndarray (n, n), ndarray (n,), float, ndarray (n,)
-        J'J, J'r and Levenberg-Marquardt damping; and the output.
-
-    Returns
-    -------
-    bool
-        False if the damped matrix is not positive definite.
-    """
-    n = len(g)
-    L = np.zeros((n, n))
-    floor = 0.0
-    for i in range(n):
-        floor = max(floor, H[i, i])
-    floor = 1e-14 * floor + 1e-300
-    for i in range(n):
-        for j in range(i + 1):
-            total = H[i, j]
-            if i == j:
-                total += damping * max(H[i, i], floor)
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 1e-3 * damping * floor:
-                    return False
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    for i in range(n):
-        total = -g[i]
-        for k in range(i):
-            total -= L[i, k] * step[k]
-        step[i] = total / L[i, i]
-    for i in range(n - 1, -1, -1):
-        total = step[i]
-        for k in range(i + 1, n):
-            total -= L[k, i] * step[k]
-        step[i] = total / L[i, i]
-    return True
 
 
 def invert_information(information: F64) -> F64:

@@ -9,7 +9,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._kernels import away_from_zero, invert_positive_3x3, loss_value, loss_weight
 from thesisrecon.numerics._metric_kernels import (
     MetricModel,
@@ -78,8 +78,8 @@ def _linearize_point(
     v, beta = tangent
     H[:] = 0.0
     g[:] = 0.0
-    J = np.empty((2, 4))
-    r = np.empty(2)
+    J = empty((2, 4))
+    r = empty(2)
     for k in range(len(xy)):
         p = P[view_index[k]]
         u0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
@@ -106,9 +106,9 @@ def _linearize_point(
 @kernel
 def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, options: _PointOptions) -> None:
     """Refine every unit point of X (N, 4) in place by Levenberg-Marquardt in its tangent space."""
-    H, M, Mi, root = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    g, step = np.empty(3), np.empty((1, 3))
-    v, beta, moved = np.empty((1, 4)), np.empty(1), np.empty((1, 4))
+    H, M, Mi, root = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
+    g, step = empty(3), empty((1, 3))
+    v, beta, moved = empty((1, 4)), empty(1), empty((1, 4))
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
         if last - first < 2:

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.numerics.partial_bundle import refine_points
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
@@ -26,7 +26,7 @@ _POINT_ITERATIONS = 4
 @kernel
 def project_observations(P: F64, X: F64, view: I64, point: I64, xy: F64, chosen: B8) -> tuple[F64, F64]:
     """Return depths (K,), 0 if not chosen, and distances (K,) px, inf if not chosen or in the focal plane."""
-    depth, distance = np.zeros(len(xy)), np.full(len(xy), np.inf)
+    depth, distance = zeros(len(xy)), full(len(xy), np.inf)
     for k in range(len(xy)):
         if not chosen[k]:
             continue

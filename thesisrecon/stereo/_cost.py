@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.arrays import F32, I16, I32, U8, U16
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 
 LEVELS = 4
 """Integer steps of one grey level: resampled images have fractional levels."""
@@ -155,13 +155,13 @@ def _compare(centre: I16, other: I16, bits: I32) -> None:
 def census(grey: I16, bits: I32) -> None:
     """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre."""
     height, width = grey.shape
-    padded = np.empty((2 * REACH + 1, width + 2 * REACH), np.int16)
+    padded = empty((2 * REACH + 1, width + 2 * REACH), np.int16)
     bits[:] = 0
     for y in range(height):
         for dy in range(-REACH, REACH + 1):
             row = padded[dy + REACH]
             source = grey[min(max(y + dy, 0), height - 1)]
-            row[REACH : REACH + width] = source
+            copy_to(row[REACH : REACH + width], source)
             row[:REACH] = source[0]
             row[REACH + width :] = source[width - 1]
         for dy in range(2 * REACH + 1):
@@ -214,8 +214,8 @@ def _row_costs(
     bits_l, a, valid_l = left
     bits_r, b, valid_r = right
     width = bits_l.shape[1]
-    total, differing = np.empty(width, np.int16), np.empty(width, np.int16)
-    known = np.empty(width, np.uint8)
+    total, differing = empty(width, np.int16), empty(width, np.int16)
+    known = empty(width, np.uint8)
     for q in range(len(out)):
         d = first + q
         lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
@@ -260,7 +260,7 @@ def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> N
             for y in range(max(-dy, 0), min(height, height - dy)):
                 mask = masks[arm, s, y, lo:hi]
                 if s == 0:
-                    mask[:] = valid[y + dy, lo + dx : hi + dx]
+                    copy_to(mask, valid[y + dy, lo + dx : hi + dx])
                 else:
                     _both(masks[arm, s - 1, y, lo:hi], valid[y + dy, lo + dx : hi + dx], mask)
                 for k in range(len(channels)):
@@ -354,9 +354,9 @@ def cost_volume(
             _row_costs(y, left, right, first, weights, outside, volume[y])
         return
     span = 2 * ARM + 1
-    ring, counts = np.zeros((n, span, width), np.uint16), np.zeros((span, width), np.uint16)
-    costs, ones = np.zeros((n, width + 2 * ARM), np.uint8), np.ones(width + 2 * ARM, np.uint8)
-    share, wide = np.empty(width, np.float32), np.empty((2 * ARM, width), np.uint16)
+    ring, counts = zeros((n, span, width), np.uint16), zeros((span, width), np.uint16)
+    costs, ones = zeros((n, width + 2 * ARM), np.uint8), full(width + 2 * ARM, 1, np.uint8)
+    share, wide = empty(width, np.float32), empty((2 * ARM, width), np.uint16)
     summed = 0
     for y in range(height):
         while summed < min(y + ARM + 1, height):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import I16, U8, U64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 
 Word8 = tuple[np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64]
 
@@ -140,8 +140,8 @@ def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> Non
     ``P2`` (N, W) is the penalty between a pixel and the one above it.
     """
     rows, n, width = costs.shape
-    unreachable = np.full(width, np.uint8(255 - P1), np.uint8)
-    least, p2 = np.empty((2, width), np.uint8), np.empty(width, np.uint8)
+    unreachable = full(width, np.uint8(255 - P1), np.uint8)
+    least, p2 = empty((2, width), np.uint8), empty(width, np.uint8)
     _start_row(costs[0], total[0], least[0])
     for y in range(1, rows):
         # The sum still holds the path from above only, from which the next row continues.
@@ -149,7 +149,7 @@ def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> Non
         settings = (P1, shift, unreachable)
         old, new = least[(y - 1) & 1], least[y & 1]
         _extend_row(costs[y], total[y - 1], old, p2, settings, total[y], new)
-    paths = np.empty((2, n, width), np.uint8)
+    paths = empty((2, n, width), np.uint8)
     _start_row(costs[rows - 1], paths[(rows - 1) & 1], least[(rows - 1) & 1])
     for y in range(rows - 1, -1, -1):
         path = paths[y & 1]
@@ -210,7 +210,7 @@ def _transpose_rows(source: U8, out: U8) -> None:
     """
     rows, n, width = source.shape
     words = out.view(np.uint64)
-    tile = np.zeros((BLOCK, TILE // 8 + 1), np.uint64)
+    tile = zeros((BLOCK, TILE // 8 + 1), np.uint64)
     bytes_of = tile.view(np.uint8)
     for q in range(n):
         plane = words[:, q]
@@ -228,7 +228,7 @@ def _transpose_back(source: U8, out: U8) -> None:
     """Inverse of :func:`_transpose_rows`."""
     rows, n, width = out.shape
     words = source.view(np.uint64)
-    tile = np.zeros((BLOCK, TILE // 8 + 1), np.uint64)
+    tile = zeros((BLOCK, TILE // 8 + 1), np.uint64)
     bytes_of = tile.view(np.uint8)
     for q in range(n):
         plane = words[:, q]
@@ -261,8 +261,9 @@ def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
         transposed = scratch[0, : wide * n * high].reshape((wide, n, high))
         summed = scratch[1, : wide * n * high].reshape((wide, n, high))
         _transpose_rows(costs[start : start + rows], transposed)
-        p2 = np.zeros((width, high), np.uint8)
-        p2[:, :rows] = P2[0, start : start + rows].T
+        p2 = zeros((width, high), np.uint8)
+        for y in range(rows):
+            copy_to(p2[:, y], P2[0, start + y])
         _sum_opposite(transposed[:width], p2, P1, 0, summed[:width])
         _transpose_back(summed, total[0, start : start + rows])
     _sum_opposite(costs, P2[1], P1, 0, total[1])

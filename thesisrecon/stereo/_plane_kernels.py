@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64, U8, U32
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 
 UNKNOWN = 4.0
 """Cost of a pixel without a plane; the largest cost of a plane is 2."""
@@ -316,8 +316,8 @@ def sweep_planes(
     """
     gray, H, e, offsets = views.gray, views.H, views.e, window.offsets
     height, width = gray.shape
-    samples, warp = np.empty((2, offsets.shape[1]), np.float32), np.empty(8)
-    plane, trial = np.empty(3), np.empty(3)
+    samples, warp = empty((2, offsets.shape[1]), np.float32), empty(8)
+    plane, trial = empty(3), empty(3)
     reach = -float(offsets[0, 0])
     back = -1 if backward else 1
     for row in range(height):
@@ -369,7 +369,7 @@ def rate_planes(
     gray, squares, layout, H, e = views
     offsets = window.offsets
     height, width = gray.shape
-    samples, warp, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
+    samples, warp, plane = empty((2, offsets.shape[1]), np.float32), empty(8), empty(3)
     for v in range(height):
         for u in range(width):
             least[v, u], support[v, u], slope[v, u] = UNKNOWN, 0, 0.0
@@ -396,7 +396,7 @@ def begin_planes(views: PatchViews, window: PatchWindow, planes: F32, cost: F32)
     """Compute the cost (H, W) of planes (H, W, 3), ``UNKNOWN`` without one."""
     gray, offsets = views.gray, window.offsets
     height, width = gray.shape
-    samples, warp, plane = np.empty((2, offsets.shape[1]), np.float32), np.empty(8), np.empty(3)
+    samples, warp, plane = empty((2, offsets.shape[1]), np.float32), empty(8), empty(3)
     for v in range(height):
         for u in range(width):
             cost[v, u] = UNKNOWN

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, I16, U8, U16
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 from thesisrecon.stereo._cost import LEVELS, StereoImage, add_squares
 
 UNREACHED = np.uint16(65535)
@@ -87,9 +87,9 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
     """
     pairs, _, n, width = sums.shape
     left, right, confidence = out
-    total = np.empty((n, width), np.uint16)
-    best, index, second = np.empty(width, np.uint16), np.empty(width, np.int16), np.empty(width, np.uint16)
-    best_r, index_r = np.empty(width, np.uint16), np.empty(width, np.int16)
+    total = empty((n, width), np.uint16)
+    best, index, second = empty(width, np.uint16), empty(width, np.int16), empty(width, np.uint16)
+    best_r, index_r = empty(width, np.uint16), empty(width, np.int16)
     for y in range(len(left)):
         for q in range(n):
             _set_sum(sums[0, start + y, q], sums[1, start + y, q], total[q])
@@ -149,7 +149,7 @@ def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F
 def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
     """Mean of (I(x + 1) - I(x - 1))^2 over channels and a square window, (H, W); zeros outside the image."""
     n, height, width = channels.shape
-    columns = np.zeros(width, np.int32)
+    columns = zeros(width, np.int32)
     share = np.float32(1.0) / np.float32(n * (2 * radius + 1) ** 2)
     for y in range(-radius, height):
         # Running sum: one row enters the window, another leaves it.
@@ -178,14 +178,14 @@ def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: in
     height, width = disparity.shape
     # Padding with unknown pixels gives every pixel four neighbours; one column serves both sides.
     line = width + 1
-    flat = np.full((height + 2) * line, np.float32(np.nan), np.float32)
-    counted = np.zeros((height + 2) * line, np.bool_)
+    flat = full((height + 2) * line, np.float32(np.nan), np.float32)
+    counted = zeros((height + 2) * line, np.bool_)
     for y in range(height):
         start = (y + 1) * line
-        flat[start : start + width] = disparity[y]
-        counted[start : start + width] = textured[y]
+        copy_to(flat[start : start + width], disparity[y])
+        copy_to(counted[start : start + width], textured[y])
     open_ = ~np.isnan(flat)
-    queue = np.empty(height * width, np.int32)
+    queue = empty(height * width, np.int32)
     for seed in range(line, (height + 1) * line):
         if not open_[seed]:
             continue
@@ -216,9 +216,9 @@ def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: in
 def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
     """Fill unknown pixels that have ``least`` known ones among 8 neighbours with their median, (H, W)."""
     height, width = disparity.shape
-    around = np.empty(8, np.float32)
-    out[:] = disparity
+    around = empty(8, np.float32)
     for y in range(height):
+        copy_to(out[y], disparity[y])
         for x in range(width):
             if not np.isnan(disparity[y, x]):
                 continue
@@ -256,7 +256,7 @@ def _gather_similar(centre: F32, other: F32, step: np.float32, total: F32, count
 def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32) -> None:
     """Mean of the disparities in a square window that differ from the centre by at most ``step``, (H, W)."""
     height, width = disparity.shape
-    total, count = np.empty(width, np.float32), np.empty(width, np.float32)
+    total, count = empty(width, np.float32), empty(width, np.float32)
     for y in range(height):
         total[:], count[:] = 0.0, 0.0
         for b in range(max(y - radius, 0), min(y + radius + 1, height)):

@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64
 from thesisrecon.geometry.raster import cubic_weights
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 
 MAX_TAPS = 24
 """Limit of the filter width: reductions by more than 6 alias."""
@@ -68,8 +68,8 @@ def _sample_image(image: F32, xy: F64, out: F32) -> None:
     pixels are left out.
     """
     height, width, channels = image.shape
-    wx, wy = np.empty(MAX_TAPS), np.empty(MAX_TAPS)
-    total = np.empty(channels)
+    wx, wy = empty(MAX_TAPS), empty(MAX_TAPS)
+    total = empty(channels)
     for i in range(out.shape[0]):
         for j in range(xy.shape[1]):
             out[i, j] = np.nan

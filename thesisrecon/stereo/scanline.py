@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import (
     LEVELS,
@@ -162,8 +162,8 @@ def _solve_row(
     """
     n, width = costs.shape
     occluded, border, along, across = penalties
-    keys = np.full((2, 3, n), INFINITE, np.int64)
-    states = np.zeros((width + 1, n), np.uint8)
+    keys = full((2, 3, n), INFINITE, np.int64)
+    states = zeros((width + 1, n), np.uint8)
     best, last = INFINITE, (0, 0, MATCHED)
     left[:], right[:] = OCCLUDED, OCCLUDED
     for i in range(width + 1):
@@ -243,9 +243,9 @@ def _solve_rows(
     radius, scale, penalties = model[0], model[1], (model[2], model[3], model[4], model[5])
     height, width = left[1].shape
     n, span = last - first + 1, 2 * radius + 1
-    ring, total = np.empty((span, n, width), np.int32), np.empty(width, np.int32)
-    costs = np.empty((n, width), np.int32)
-    found = np.full((2, 2, width), OCCLUDED, np.int32)
+    ring, total = empty((span, n, width), np.int32), empty(width, np.int32)
+    costs = empty((n, width), np.int32)
+    found = full((2, 2, width), OCCLUDED, np.int32)
     done = 0
     for y in range(height):
         while done < min(y + radius + 1, height):

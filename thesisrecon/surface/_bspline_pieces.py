@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, full, kernel
 from thesisrecon.numerics.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._depth_grid import GRAZING_DEG, max_depth_slope, same_surface
@@ -53,7 +53,7 @@ def _number_coefficients(first: I64, columns: int, start: I64, linked: I64, coef
     """
     rows = (len(first) - 1) // columns
     parent = np.arange(len(coefficient))
-    own = np.full(len(coefficient), -1, dtype=np.int64)
+    own = full(len(coefficient), -1, np.int64)
     count = 0
     for a in range(rows + 3):
         for b in range(columns + 3):
@@ -96,7 +96,7 @@ def sum_squares(
 ) -> None:
     """Accumulate the upper triangles (N, 16, 16) and right sides (N, 16) of the normal equations."""
     height, width = piece.shape
-    b = np.empty(16)
+    b = empty(16)
     for y in range(height):
         for x in range(width):
             k = piece[y, x]

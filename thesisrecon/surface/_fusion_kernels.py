@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64, U8
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel, zeros
 
 SIDE = 8
 """Voxels per side of a block."""
@@ -154,7 +154,7 @@ def place_vertices(blocks: I64, place: I64, value: F32, weight: F32, vertex: I64
     the cell edges. Returns the number of vertices.
     """
     count = 0
-    corner = np.empty(8)
+    corner = empty(8)
     for b in range(blocks.shape[0]):
         for i in range(SIDE):
             for j in range(SIDE):
@@ -211,8 +211,8 @@ def join_vertices(
     ``faces`` (M, 3) receives the first M faces; the shorter diagonal is used. Returns the number of faces.
     """
     count = 0
-    step = np.zeros(3, np.int64)
-    ring = np.empty(4, np.int64)
+    step = zeros(3, np.int64)
+    ring = empty(4, np.int64)
     for b in range(blocks.shape[0]):
         for i in range(SIDE):
             for j in range(SIDE):

@@ -147,7 +147,10 @@ def _prepared(mesh: TexturedMesh, view: PinholeView) -> ViewSurface:
     # Bilinear interpolation must not use missing pixels.
     trust[scipy.ndimage.minimum_filter(view.seen, 3) == 0] = 0.0
     tolerance = DEPTH_TOLERANCE_PX / focal
-    return ViewSurface(view.P, depth, trust.astype(np.float32), tolerance, view.rgb, np.ones(3, np.float32))
+    M, gain = view.P[:, :3], np.ones(3, np.float32)
+    centre = np.asarray(-np.linalg.solve(M, view.P[:, 3]), np.float64)
+    scale = abs(float(np.linalg.det(M)))
+    return ViewSurface(view.P, centre, scale, depth, trust.astype(np.float32), tolerance, view.rgb, gain)
 
 
 def _equalizing_gains(weight: F32, color: F32) -> F32:

@@ -8,18 +8,22 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.geometry.raster import weighted_median
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel, zeros
 
 
 class ViewSurface(NamedTuple):
     """A surface seen by one view.
 
+    With (u, v, 1) z = M X + p, the pixels per area are ``scale`` = det M times the distance of ``centre`` to
+    the tangent plane over z^3.
     ``depth`` (H, W): nearest depth, inf without a surface; ``trust`` (H, W): weight of each pixel in 0 .. 1;
     ``tolerance``: relative depth by which visible points may lie behind ``depth``; ``gain`` (3,): of the
     brightness.
     """
 
     P: F64
+    centre: F64
+    scale: float
     depth: F32
     trust: F32
     tolerance: float
@@ -55,12 +59,8 @@ def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, co
     A point is visible if it is at most ``view.tolerance`` of its depth behind the farthest of the four pixels
     around.
     """
-    P, depth, trust, tolerance, rgb, gain = view
+    P, centre, scale, depth, trust, tolerance, rgb, gain = view
     height, width = depth.shape
-    M = np.ascontiguousarray(P[:, :3])
-    # (u, v, 1) z = M X + p: pixels per area are det M times the distance to the tangent plane over z^3.
-    centre = -np.linalg.solve(M, np.ascontiguousarray(P[:, 3]))
-    scale = abs(np.linalg.det(M))
     for n in range(points.shape[0]):
         weight[n] = 0.0
         X, Y, Z = points[n]
@@ -116,9 +116,9 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
     distance d from the weighted median colour.
     """
     views = weight.shape[0]
-    relative = np.empty(views)
-    order = np.empty(views, np.int64)
-    middle = np.empty(3)
+    relative = empty(views)
+    order = empty(views, np.int64)
+    middle = empty(3)
     for n in range(weight.shape[1]):
         best = np.float32(0.0)
         for v in range(views):
@@ -131,7 +131,7 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
             count, sum_of_weights = _sort_weighted(color[:, n, k], relative, order)
             middle[k] = weighted_median(color[:, n, k], relative, order[:count], 0.5 * sum_of_weights)
         total = 0.0
-        mean = np.zeros(3)
+        mean = zeros(3)
         for v in range(views):
             if relative[v] <= 0.0:
                 continue
@@ -152,7 +152,7 @@ def grow_colors(texture: U8, drawn: B8) -> None:
     """Extend the drawn texels by the mean of their neighbours."""
     height, width = drawn.shape
     before = drawn.copy()
-    total = np.zeros(3)
+    total = zeros(3)
     for y in range(height):
         for x in range(width):
             if before[y, x]:

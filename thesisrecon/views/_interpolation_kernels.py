@@ -6,7 +6,7 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64
 from thesisrecon.geometry.raster import weighted_median
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 
 ONE_SURFACE_PX = 1.0
 """Neighbouring disparities that differ by more belong to different surfaces."""
@@ -63,7 +63,7 @@ def filter_extrapolated_by_colour(
     ``limits``: colour difference at which weights fall to 1 / e; weight of guesses relative to known values.
     """
     height, width = disparity.shape
-    values, weights = np.empty(WINDOW * WINDOW, np.float32), np.empty(WINDOW * WINDOW)
+    values, weights = empty(WINDOW * WINDOW, np.float32), empty(WINDOW * WINDOW)
     for y in range(rows[0], rows[1]):
         for x in range(width):
             out[y, x] = disparity[y, x]
@@ -95,7 +95,7 @@ def filter_extrapolated_by_colour(
 def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
     """Replace disparities of confidence 0 by the median of their neighbours."""
     height, width = disparity.shape
-    values = np.empty((2 * NEAR + 1) ** 2, np.float32)
+    values = empty((2 * NEAR + 1) ** 2, np.float32)
     for y in range(rows[0], rows[1]):
         for x in range(width):
             out[y, x] = disparity[y, x]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import F32, F64, I16, I32
 from thesisrecon.geometry.raster import cubic_weights
 from thesisrecon.geometry.zbuffer import run_in_strips
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
@@ -100,7 +100,7 @@ def _draw_footprint(
     """Draw what a pixel covers, half a pixel to each side, moved as its neighbours are."""
     target, inverse_depth = surface
     source, front = picture
-    across, down = np.empty(3), np.empty(3)
+    across, down = empty(3), empty(3)
     n_across = _slope(target, inverse_depth, at, (0, 1), limits, across)
     n_down = _slope(target, inverse_depth, at, (1, 0), limits, down)
     if n_across == 2 and n_down == 2:
@@ -194,7 +194,7 @@ def _draw_surface(
 def _sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
     """Sample rows of an image by cubic convolution; bilinear beside the border, NaN beside NaN."""
     height, width, channels = image.shape
-    wx, wy = np.empty(4, np.float32), np.empty(4, np.float32)
+    wx, wy = empty(4, np.float32), empty(4, np.float32)
     for y in range(rows[0], rows[1]):
         for x in range(source.shape[1]):
             u, v = source[y, x, 0], source[y, x, 1]
@@ -260,7 +260,7 @@ def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
 @kernel
 def _fill_from_behind(rgb: F32, inverse_depth: F32, steps: I32, distance: I16, step: float, out: F32) -> None:
     """Fill holes with the background around, see :func:`fill_holes`."""
-    colors = np.empty(rgb.shape[2])
+    colors = empty(rgb.shape[2])
     for y in range(rgb.shape[0]):
         for x in range(rgb.shape[1]):
             if not np.isnan(inverse_depth[y, x]):

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import Raster, rasterize, run_in_strips, sample_texture
-from thesisrecon.kernels import kernel
+from thesisrecon.kernels import empty, kernel
 from thesisrecon.records import RenderedView, TexturedMesh
 
 STRIP = 16
@@ -30,7 +30,7 @@ def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lamps: F64, a
 
     ``lamps`` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
     """
-    light = np.empty(3)
+    light = empty(3)
     for p in range(color.shape[0]):
         px, py, pz = points[p, 0], points[p, 1], points[p, 2]
         nx, ny, nz = _unit(normals[p, 0], normals[p, 1], normals[p, 2])
@@ -52,7 +52,7 @@ def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lamps: F64, a
 @kernel
 def _average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: U8) -> None:
     """Average blocks of ``samples`` x ``samples`` pixels; those with negative ``drawn`` are background."""
-    total = np.empty(3, dtype=np.float32)
+    total = empty(3, np.float32)
     share = np.float32(1.0 / (samples * samples))
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
