@@ -32,7 +32,7 @@ from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
 from validation.metrics.pictures import picture_metrics, psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.scenes.courtyard import build_courtyard
-from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_photograph
+from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_image
 from validation.scenes.nine_views import dissolved
 from validation.scenes.raycast import Rays, World, trace
 from validation.scenes.real import load_real_scene
@@ -89,7 +89,7 @@ class CourtyardTruth:
 
 def courtyard_image(world: World, pose: Pose) -> U8:
     """Render an image with the exposure of the pose and without white balance."""
-    with PIL.Image.open(io.BytesIO(render_photograph(world, pose, 0)[0])) as image:
+    with PIL.Image.open(io.BytesIO(render_image(world, pose, 0)[0])) as image:
         return np.asarray(image.convert("RGB"))
 
 
