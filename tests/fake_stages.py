@@ -12,25 +12,11 @@ import numpy as np
 import PIL.Image
 
 from tests.synthetic import reconstruction_of
+from thesisrecon import records
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import compose_camera, project
-from thesisrecon.records import (
-    DepthMap,
-    Features,
-    FundamentalFit,
-    Image,
-    IntrinsicInterval,
-    Matches,
-    MetricResult,
-    PinholeView,
-    SelfCalibration,
-    Tracks,
-    TwoView,
-    Upgrade,
-)
-from thesisrecon.stereo._neighbours import SparsePoints
-from thesisrecon.stereo.depth import MultiViewScene
+from thesisrecon.stereo.depth import MultiViewScene, SparsePoints
 
 CALLS = []
 WIDTH, HEIGHT, POINTS = 96, 80, 30
@@ -44,7 +30,7 @@ def photographs(n):
     for i in range(n):
         coarse = PIL.Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8))
         rgb = np.array(coarse.resize((WIDTH, HEIGHT), PIL.Image.Resampling.BICUBIC))
-        pictures.append(Image(f"{i:02d}.png", rgb, (WIDTH, HEIGHT)))
+        pictures.append(records.Image(f"{i:02d}.png", rgb, (WIDTH, HEIGHT)))
     return pictures
 
 
@@ -72,7 +58,7 @@ class FakeDetector:
     def detect(self, image):
         CALLS.append(f"detect {image.name}")
         xy = project(scene_camera(view_of(image)), scene_points())
-        return Features(xy, np.ones(POINTS, np.float32), np.ones(POINTS, np.float32))
+        return records.Features(xy, np.ones(POINTS, np.float32), np.ones(POINTS, np.float32))
 
 
 @dataclass(frozen=True)
@@ -93,7 +79,7 @@ class FakeMatcher:
         every = np.arange(POINTS)
         affine = np.broadcast_to(np.eye(2), (POINTS, 2, 2)).copy()
         score = np.ones(POINTS, np.float32)
-        return Matches(pair[0], pair[1], every, every, xy1, view2.xy.copy(), score, affine)
+        return records.Matches(pair[0], pair[1], every, every, xy1, view2.xy.copy(), score, affine)
 
 
 @dataclass(frozen=True)
@@ -102,7 +88,7 @@ class FakeEstimator:
         assert xy1.shape == xy2.shape
         rng.standard_normal()
         F = np.eye(3) / np.sqrt(3.0)
-        return FundamentalFit(F, np.ones(len(xy1), np.bool_), 0.1, np.eye(9))
+        return records.FundamentalFit(F, np.ones(len(xy1), np.bool_), 0.1, np.eye(9))
 
 
 @dataclass(frozen=True)
@@ -110,7 +96,7 @@ class FakeVerifier:
     accept: bool = True
 
     def verify(self, matches, fit, rng):
-        return TwoView(
+        return records.TwoView(
             i=matches.i,
             j=matches.j,
             F=fit.F,
@@ -134,7 +120,7 @@ class FakeTracks:
         views = len(prepared)
         point, view = (a.ravel() for a in np.meshgrid(np.arange(POINTS), np.arange(views), indexing="ij"))
         xy = np.stack([prepared[i].xy for i in range(views)], axis=1).reshape(-1, 2)
-        return Tracks(view, point, xy + 0.01 * rng.standard_normal(xy.shape), views, POINTS)
+        return records.Tracks(view, point, xy + 0.01 * rng.standard_normal(xy.shape), views, POINTS)
 
 
 @dataclass(frozen=True)
@@ -159,9 +145,9 @@ class FakeCalibrator:
         CALLS.append(f"calibrate prior={prior.focal_known.any()}")
         Ks = np.broadcast_to(K, (len(prior.mean), 3, 3)).copy()
         Ks[:, 0, 1] = self.skew_px
-        upgrade = Upgrade(np.eye(4), Ks, 0.0, "fake")
+        upgrade = records.Upgrade(np.eye(4), Ks, 0.0, "fake")
         why = () if self.identifiable else ("the camera only rotates",)
-        return SelfCalibration(np.eye(4), Ks, np.zeros_like(Ks), self.identifiable, why, (upgrade,))
+        return records.SelfCalibration(np.eye(4), Ks, np.zeros_like(Ks), self.identifiable, why, (upgrade,))
 
 
 @dataclass(frozen=True)
@@ -174,14 +160,14 @@ class FakeMetric:
         CALLS.append(f"metric {attempt}")
         views = len(prior.mean)
         intervals = {
-            "focal_px": IntrinsicInterval(100.0, 1.0, "fake"),
-            "principal_x_px": IntrinsicInterval(47.0, 0.5, "fake"),
-            "principal_y_px": IntrinsicInterval(40.0, 0.5, "fake"),
-            "k1": IntrinsicInterval(0.0, 0.0, "fake"),
+            "focal_px": records.IntrinsicInterval(100.0, 1.0, "fake"),
+            "principal_x_px": records.IntrinsicInterval(47.0, 0.5, "fake"),
+            "principal_y_px": records.IntrinsicInterval(40.0, 0.5, "fake"),
+            "k1": records.IntrinsicInterval(0.0, 0.0, "fake"),
         }
         metric = replace(reconstruction, stratum="metric", K=calibration.K, distortion=np.zeros((views, 3)))
         trusted = attempt >= self.trusted_from
-        return MetricResult(
+        return records.MetricResult(
             metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else self.failed_checks
         )
 
@@ -196,7 +182,7 @@ class FakeDense:
         CALLS.append("prepare dense")
         P = reconstruction.P
         views = {
-            i: PinholeView(i, P[i], image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
+            i: records.PinholeView(i, P[i], image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
             for i, image in enumerate(images)
             if reconstruction.registered[i]
         }
@@ -212,7 +198,7 @@ class FakeDense:
         y, x = np.indices(shape)
         rays = np.stack([x, y, np.ones(shape)], axis=-1) @ np.linalg.inv(P[:, :3]).T
         depth = ((8.0 + np.linalg.solve(P[:, :3], P[:, 3])[2]) / rays[..., 2]).astype(np.float32)
-        return DepthMap(view, P, depth, np.full_like(depth, 0.01), np.ones(shape, dtype=np.uint8))
+        return records.DepthMap(view, P, depth, np.full_like(depth, 0.01), np.ones(shape, dtype=np.uint8))
 
     def confirm(self, scene, depth_maps, view):
         depth = depth_maps[view].depth

@@ -17,7 +17,7 @@ from thesisrecon.cli import common
 from thesisrecon.cli import runs as cli
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.runs import _duration, _intrinsic_lines
-from thesisrecon.io import demo
+from thesisrecon.io import _images
 from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
 
 ROOT = Path(__file__).parents[2]
@@ -267,7 +267,7 @@ def test_help_and_version(capsys):
 
 
 def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(demo, "files", lambda _: tmp_path / "thesisrecon")
+    monkeypatch.setattr(_images, "files", lambda _: tmp_path / "thesisrecon")
     assert run_command(["demo", "-o", str(tmp_path / "out")]) == 2
     assert str(tmp_path / "thesisrecon" / "courtyard") in capsys.readouterr().err
 

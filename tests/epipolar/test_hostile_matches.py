@@ -9,10 +9,10 @@ from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.configuration import classify_configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
-from thesisrecon.epipolar.precision import epipolar_distance_interval, epipoles_of
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
 from thesisrecon.epipolar.refinement import refine_by_rows, refine_fundamental
 from thesisrecon.errors import StageFailure
+from validation.metrics.fundamental_precision import epipolar_distance_interval, epipoles_of
 
 PAIR = make_pair(60, np.random.default_rng(0))
 GOOD1, GOOD2, _ = spoil(PAIR, np.random.default_rng(1), sigma=0.4, outliers=0.0)

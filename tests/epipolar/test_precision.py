@@ -6,17 +6,17 @@ from scipy import stats
 
 from tests.epipolar.pairs import make_pair
 from thesisrecon.epipolar.configuration import Configuration
-from thesisrecon.epipolar.precision import (
-    _degrees_of_freedom,
-    _ellipse_95,
-    _student_95,
-    epipolar_distance_std,
-    epipoles_of,
-    fundamental_bound,
-)
+from thesisrecon.epipolar.precision import epipolar_distance_std
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
 from thesisrecon.records import FundamentalFit
+from validation.metrics.fundamental_precision import (
+    _degrees_of_freedom,
+    _ellipse_95,
+    _student_95,
+    epipoles_of,
+    fundamental_bound,
+)
 from validation.scenes.two_views import make_two_views
 from validation.studies.epipolar_synthetic import DEFAULT, GOLD, check_precision
 

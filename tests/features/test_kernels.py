@@ -3,13 +3,7 @@ import pytest
 from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordinates, maximum_filter
 
 from tests.synthetic import texture
-from thesisrecon.features._kernels import (
-    corner_response,
-    enforce_spacing,
-    fit_maxima,
-    sample_patches,
-    squared_suppression_radii,
-)
+from thesisrecon.features import _kernels as kernels
 from thesisrecon.geometry.raster import gaussian_taps
 
 
@@ -29,7 +23,7 @@ def moments_twin(channels, derivative, taps):
 def test_corner_response_equals_its_numpy_twin(trace_weight, derivative, count):
     channels = np.stack([texture(60, 83, seed).astype(np.float32) for seed in range(count)])
     taps, along = gaussian_taps(1.5), np.array(derivative, np.float32)
-    found = corner_response(channels, along, taps, trace_weight)
+    found = kernels.corner_response(channels, along, taps, trace_weight)
     a, m, c = moments_twin(channels, along, taps)
     noble = (a * c - m * m) / (a + c + 1e-6)
     twin = a * c - m * m - trace_weight * (a + c) ** 2 if trace_weight else noble
@@ -45,7 +39,7 @@ def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there():
     response = (
         gaussian_filter(np.random.default_rng(2).normal(size=(50, 70)), 1.5).astype(np.float32) * 500 + 130
     )
-    xy, value = fit_maxima(response, 130.0)
+    xy, value = kernels.fit_maxima(response, 130.0)
     top = (maximum_filter(response, 3) == response) & (response > 130.0)
     top[0] = top[-1] = top[:, 0] = top[:, -1] = False
     assert len(xy) == top.sum()
@@ -68,7 +62,7 @@ def test_suppression_radii_equal_their_numpy_twin():
     distance2 = ((xy[:, None] - xy[None]) ** 2).sum(-1)
     stronger = np.float32(0.9) * response[None] > response[:, None]
     twin = np.where(stronger, distance2, np.inf).min(axis=1)
-    assert np.allclose(squared_suppression_radii(xy, response, 0.9), twin, rtol=1e-5)
+    assert np.allclose(kernels.squared_suppression_radii(xy, response, 0.9), twin, rtol=1e-5)
 
 
 def test_patches_equal_their_numpy_twin():
@@ -76,7 +70,7 @@ def test_patches_equal_their_numpy_twin():
     xy = np.array([[40.3, 35.7], [3.0, 4.0], [86.5, 77.0]])
     angle = np.array([0.0, 0.7, -2.0], np.float32)
     b, a = np.mgrid[0:8, 0:8] - 3.5
-    for n, patch in enumerate(sample_patches(image, xy, angle, 8, 4.0)):
+    for n, patch in enumerate(kernels.sample_patches(image, xy, angle, 8, 4.0)):
         c, s = 4.0 * np.cos(angle[n]), 4.0 * np.sin(angle[n])
         u = np.clip(xy[n, 0] + c * a - s * b, 0, 88.999)
         v = np.clip(xy[n, 1] + s * a + c * b, 0, 78.999)
@@ -86,7 +80,7 @@ def test_patches_equal_their_numpy_twin():
 
 def test_selected_corners_are_apart_and_none_is_dropped_without_reason():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
-    kept = enforce_spacing(xy, np.arange(400), 6.0)
+    kept = kernels.enforce_spacing(xy, np.arange(400), 6.0)
     distance = np.linalg.norm(xy[:, None] - xy[kept][None], axis=2)
     assert (np.sort(distance[kept], axis=1)[:, 1] >= 6.0).all()
     for dropped in np.setdiff1d(np.arange(400), kept):

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from tests.geometry.properties import (
-    gap,
-    holds_for_every,
-    incidence_residual,
-    incidence_sine,
-    random_camera,
-)
+from tests.geometry import properties
 from thesisrecon.geometry.conics import (
     ABSOLUTE_CONIC,
     ABSOLUTE_DUAL_QUADRIC,
@@ -36,7 +30,7 @@ def _round(rng, d, n):
     return transform(T, np.diag([1.0] * (d - 1) + [-1.0]), "conics"), x
 
 
-@holds_for_every()
+@properties.holds_for_every()
 def test_3_2_absolute_conic_has_no_real_points(rng):
     x = rng.normal(size=(20, 3))
     assert (bilinear_form(ABSOLUTE_CONIC, x, x) > 0.0).all()
@@ -44,22 +38,22 @@ def test_3_2_absolute_conic_has_no_real_points(rng):
     assert imaginary @ ABSOLUTE_CONIC @ imaginary == 0.0
 
 
-@holds_for_every(dimensions)
+@properties.holds_for_every(dimensions)
 def test_3_4_and_3_10_tangents_belong_to_the_inverse(rng, d):
     C, x = _round(rng, d, 6)
-    assert gap(dual(C), np.linalg.inv(C)) < 1e-9
-    assert incidence_residual(dual(C), x @ C).max() < 1e-12
-    assert incidence_residual(dual(C), rng.normal(size=(6, d))).max() > 1e-6
-    assert gap(dual(dual(C)), C) < 1e-9
+    assert properties.gap(dual(C), np.linalg.inv(C)) < 1e-9
+    assert properties.incidence_residual(dual(C), x @ C).max() < 1e-12
+    assert properties.incidence_residual(dual(C), rng.normal(size=(6, d))).max() > 1e-6
+    assert properties.gap(dual(dual(C)), C) < 1e-9
 
 
 def test_3_4_the_dual_of_two_lines_is_their_point():
     l, m = np.array([1.0, 0.0, -2.0]), np.array([0.0, 1.0, 3.0])
     meet = np.cross(l, m)
-    assert gap(dual(np.outer(l, m) + np.outer(m, l)), np.outer(meet, meet)) < 1e-12
+    assert properties.gap(dual(np.outer(l, m) + np.outer(m, l)), np.outer(meet, meet)) < 1e-12
 
 
-@holds_for_every(dimensions)
+@properties.holds_for_every(dimensions)
 def test_3_5_and_3_6_lines_meet_in_two_points_or_touch_or_miss(rng, d):
     C, x = _round(rng, d, 2)
     inside, away = np.ones(d), rng.normal(size=d - 1)
@@ -69,26 +63,26 @@ def test_3_5_and_3_6_lines_meet_in_two_points_or_touch_or_miss(rng, d):
     other[:-1] += np.linalg.svd(far[None, :-1])[2][1]
     found = intersect_line(C, inside, far)
     assert found.shape == (2, d)
-    assert incidence_residual(C, found).max() < 1e-10
+    assert properties.incidence_residual(C, found).max() < 1e-10
     assert intersect_line(C, far, other).shape == (0, d)
     through_both = intersect_line(C, x[0], x[1])
-    assert min(gap(through_both[0], x[0]), gap(through_both[0], x[1])) < 1e-7
+    assert min(properties.gap(through_both[0], x[0]), properties.gap(through_both[0], x[1])) < 1e-7
 
 
-@holds_for_every(dimensions)
+@properties.holds_for_every(dimensions)
 def test_3_7_the_tangent_touches_in_its_point_alone(rng, d):
     C, x = _round(rng, d, 1)
     t = C @ x[0]
-    assert incidence_sine(t, x[0]) < 1e-12
+    assert properties.incidence_sine(t, x[0]) < 1e-12
     along = np.cross(t, rng.normal(size=3)) if d == 3 else np.linalg.svd(t[None])[2][1]
     touching = intersect_line(C, x[0], along)
     assert len(touching) >= 1
-    assert max(gap(point, x[0]) for point in touching) < 1e-5
+    assert max(properties.gap(point, x[0]) for point in touching) < 1e-5
 
 
-@holds_for_every()
+@properties.holds_for_every()
 def test_3_11_infinity_is_imaged_without_regard_to_the_centre(rng):
-    P, K, R, _ = random_camera(rng)
+    P, K, R, _ = properties.random_camera(rng)
     np.testing.assert_allclose(P[:, :3], K @ R)
     G = np.eye(4)
     G[:3, 3] = rng.normal(size=3)
@@ -97,15 +91,15 @@ def test_3_11_infinity_is_imaged_without_regard_to_the_centre(rng):
     np.testing.assert_allclose(P @ np.append(x, 0.0), P[:, :3] @ x, rtol=1e-9)
 
 
-@holds_for_every()
+@properties.holds_for_every()
 def test_3_12_to_3_15_images_of_the_absolute_conic_are_those_of_the_calibration(rng):
-    P, K, _, _ = random_camera(rng)
+    P, K, _, _ = properties.random_camera(rng)
     H, image, dual_image = P[:, :3], image_of_absolute_conic(K), image_of_absolute_conic(K, is_dual=True)
     scale = rng.choice([-3.0, 3.0])
-    assert gap(transform(H, ABSOLUTE_CONIC, "conics"), image) < 1e-7
-    assert gap(transform(H, ABSOLUTE_CONIC, "dual conics"), dual_image) < 1e-12
-    assert gap(P @ ABSOLUTE_DUAL_QUADRIC @ P.T, dual_image) < 1e-12
-    assert gap(np.linalg.inv(image), dual_image) < 1e-7
+    assert properties.gap(transform(H, ABSOLUTE_CONIC, "conics"), image) < 1e-7
+    assert properties.gap(transform(H, ABSOLUTE_CONIC, "dual conics"), dual_image) < 1e-12
+    assert properties.gap(P @ ABSOLUTE_DUAL_QUADRIC @ P.T, dual_image) < 1e-12
+    assert properties.gap(np.linalg.inv(image), dual_image) < 1e-7
     np.testing.assert_allclose(calibration_from_image(scale * dual_image, is_dual=True), K, atol=1e-6)
     np.testing.assert_allclose(calibration_from_image(scale * image), K, atol=1e-3)
 
@@ -117,7 +111,7 @@ def test_3_14_conics_of_no_camera_are_refused():
                 calibration_from_image(wrong, is_dual=is_dual)
 
 
-@holds_for_every()
+@properties.holds_for_every()
 def test_3_9_the_plane_at_infinity_is_the_null_vector_of_the_absolute_dual_quadric(rng):
     G = random_transform("projective", rng)
     Q = transform(G, ABSOLUTE_DUAL_QUADRIC, "dual conics")
@@ -126,7 +120,7 @@ def test_3_9_the_plane_at_infinity_is_the_null_vector_of_the_absolute_dual_quadr
     assert np.linalg.matrix_rank(Q) == 3
 
 
-@holds_for_every(dimensions)
+@properties.holds_for_every(dimensions)
 def test_3_4_2_intersection_and_tangency_of_surfaces_are_kept_by_projective_transforms(rng, d):
     C, x = _round(rng, d, 3)
     # A shear of the last row keeps the surface finite, which a general transform need not.
@@ -138,11 +132,11 @@ def test_3_4_2_intersection_and_tangency_of_surfaces_are_kept_by_projective_tran
     moved, moved_touching = transform(G, C, "conics"), transform(G, touching, "conics")
     y = x @ G.T
     # The two surfaces share x[0] with its tangent plane, before and after.
-    assert gap(moved @ y[0], transform(G, plane, "planes")) < 1e-9
-    assert gap(moved_touching @ y[0], transform(G, plane, "planes")) < 1e-9
-    assert incidence_residual(dual(moved), moved @ y[0]) < 1e-9
+    assert properties.gap(moved @ y[0], transform(G, plane, "planes")) < 1e-9
+    assert properties.gap(moved_touching @ y[0], transform(G, plane, "planes")) < 1e-9
+    assert properties.incidence_residual(dual(moved), moved @ y[0]) < 1e-9
     # A line through two points of the surface meets it in their images, one that misses it still does.
-    assert incidence_residual(moved, y[1]) < 1e-9
+    assert properties.incidence_residual(moved, y[1]) < 1e-9
     for start, end in ((x[1], x[2]), rng.normal(size=(2, d))):
         assert len(intersect_line(C, start, end)) == len(intersect_line(moved, G @ start, G @ end))
 

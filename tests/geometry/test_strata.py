@@ -12,23 +12,14 @@ from tests.geometry.properties import (
     random_camera,
     random_points,
 )
+from thesisrecon.geometry import strata
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.conics import ABSOLUTE_CONIC, ABSOLUTE_DUAL_QUADRIC, curvature_sign, dual
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.strata import (
-    DEGREES_OF_FREEDOM,
-    PLANE_AT_INFINITY,
-    affine_from_projective,
-    cross_ratio,
-    group_of,
-    metric_from_affine,
-    metric_from_projective,
-    transform,
-)
 from validation.scenes.transforms import random_transform
 
-groups = st.sampled_from(list(DEGREES_OF_FREEDOM))
-ORDER = list(DEGREES_OF_FREEDOM)
+groups = st.sampled_from(list(strata.DEGREES_OF_FREEDOM))
+ORDER = list(strata.DEGREES_OF_FREEDOM)
 
 
 def length(X, Y):
@@ -44,18 +35,18 @@ def volume(X):
 @holds_for_every(groups)
 def test_table_3_3_images_do_not_change(rng, group):
     G, (P, *_), X = random_transform(group, rng), random_camera(rng), random_points(rng, 6)
-    moved = transform(G, X, "points") @ transform(G, P, "cameras").T
+    moved = strata.transform(G, X, "points") @ strata.transform(G, P, "cameras").T
     np.testing.assert_allclose(moved, X @ P.T, rtol=1e-9, atol=1e-9 * np.abs(P).max())
-    centre = camera_centre(transform(G, P, "cameras"))
-    assert gap(centre, transform(G, camera_centre(P), "points")) < 1e-7
+    centre = camera_centre(strata.transform(G, P, "cameras"))
+    assert gap(centre, strata.transform(G, camera_centre(P), "points")) < 1e-7
 
 
 @holds_for_every(groups)
 def test_table_3_3_planes_and_lines_keep_their_points(rng, group):
     G, X = random_transform(group, rng), random_points(rng, 3)
     plane = camera_centre(X)
-    Y = transform(G, X, "points")
-    assert incidence_sine(transform(G, plane, "planes"), Y).max() < 1e-12
+    Y = strata.transform(G, X, "points")
+    assert incidence_sine(strata.transform(G, plane, "planes"), Y).max() < 1e-12
 
 
 @holds_for_every(st.sampled_from([3, 4]))
@@ -64,33 +55,33 @@ def test_table_3_3_conics_quadrics_and_their_duals(rng, d):
     G = np.eye(d) + 0.4 * A / np.linalg.norm(A)
     # A sphere-like conic or quadric, moved anywhere, and points on it.
     T = np.eye(d) + 0.3 * rng.normal(size=(d, d)) / d
-    C = transform(T, np.diag([1.0] * (d - 1) + [-1.0]), "conics")
+    C = strata.transform(T, np.diag([1.0] * (d - 1) + [-1.0]), "conics")
     unit = rng.normal(size=(5, d - 1))
     x = np.column_stack([unit / np.linalg.norm(unit, axis=1, keepdims=True), np.ones(5)]) @ T.T
     tangents = x @ C
     assert incidence_residual(C, x).max() < 1e-12
-    moved_x, moved_tangents = transform(G, x, "points"), transform(G, tangents, "planes")
-    assert incidence_residual(transform(G, C, "conics"), moved_x).max() < 1e-12
-    assert incidence_residual(transform(G, dual(C), "dual conics"), moved_tangents).max() < 1e-12
-    assert gap(transform(G, dual(C), "dual conics"), dual(transform(G, C, "conics"))) < 1e-7
-    assert gap(moved_x @ transform(G, C, "conics"), moved_tangents) < 1e-7
+    moved_x, moved_tangents = strata.transform(G, x, "points"), strata.transform(G, tangents, "planes")
+    assert incidence_residual(strata.transform(G, C, "conics"), moved_x).max() < 1e-12
+    assert incidence_residual(strata.transform(G, dual(C), "dual conics"), moved_tangents).max() < 1e-12
+    assert gap(strata.transform(G, dual(C), "dual conics"), dual(strata.transform(G, C, "conics"))) < 1e-7
+    assert gap(moved_x @ strata.transform(G, C, "conics"), moved_tangents) < 1e-7
 
 
 @holds_for_every(groups)
 def test_3_4_each_group_holds_its_members_and_is_closed(rng, group):
     G, H = random_transform(group, rng), random_transform(group, rng)
-    assert group_of(G) == group
-    assert group_of(-3.0 * G) == group
-    assert ORDER.index(group_of(G @ H)) >= ORDER.index(group)
-    assert ORDER.index(group_of(np.linalg.inv(G))) >= ORDER.index(group)
+    assert strata.group_of(G) == group
+    assert strata.group_of(-3.0 * G) == group
+    assert ORDER.index(strata.group_of(G @ H)) >= ORDER.index(group)
+    assert ORDER.index(strata.group_of(np.linalg.inv(G))) >= ORDER.index(group)
 
 
 def test_3_4_a_reflection_is_affine_only_and_wrong_matrices_are_refused():
-    assert group_of(np.diag([1.0, 1.0, -1.0, 1.0])) == "affine"
-    assert group_of(np.eye(4)) == "euclidean"
+    assert strata.group_of(np.diag([1.0, 1.0, -1.0, 1.0])) == "affine"
+    assert strata.group_of(np.eye(4)) == "euclidean"
     for wrong in (np.eye(3), np.full((4, 4), np.nan), np.diag([1.0, 1.0, 1.0, 0.0])):
         with pytest.raises(ValueError, match="group_of"):
-            group_of(wrong)
+            strata.group_of(wrong)
 
 
 def _tangent_vectors(group, rng):
@@ -110,9 +101,9 @@ def _tangent_vectors(group, rng):
 @pytest.mark.parametrize("group", ORDER)
 def test_3_4_degrees_of_freedom(group):
     moves = _tangent_vectors(group, np.random.default_rng(0))
-    assert np.linalg.matrix_rank(moves) == DEGREES_OF_FREEDOM[group]
+    assert np.linalg.matrix_rank(moves) == strata.DEGREES_OF_FREEDOM[group]
     for move in moves[:5]:
-        stepped = group_of(np.eye(4) + 1e-5 * move.reshape(4, 4), tolerance=1e-8)
+        stepped = strata.group_of(np.eye(4) + 1e-5 * move.reshape(4, 4), tolerance=1e-8)
         assert ORDER.index(stepped) >= ORDER.index(group)
 
 
@@ -122,10 +113,10 @@ def test_3_4_2_projective_invariants_are_kept_by_all(rng, group):
     base, direction = random_points(rng, 2)
     x = base + np.array([-1.0, 0.2, 1.1, 2.7])[:, None] * direction
     true = (-1.0 - 1.1) * (0.2 - 2.7) / ((-1.0 - 2.7) * (0.2 - 1.1))
-    assert cross_ratio(x) == pytest.approx(true, rel=1e-6)
-    assert cross_ratio(transform(G, x, "points")) == pytest.approx(true, rel=1e-6)
+    assert strata.cross_ratio(x) == pytest.approx(true, rel=1e-6)
+    assert strata.cross_ratio(strata.transform(G, x, "points")) == pytest.approx(true, rel=1e-6)
     P, *_ = random_camera(rng)
-    assert cross_ratio(x @ P.T / 1000.0) == pytest.approx(true, rel=1e-4)
+    assert strata.cross_ratio(x @ P.T / 1000.0) == pytest.approx(true, rel=1e-4)
     for signature, sign in (
         ([1, 1, 1, -1], 1),
         ([1, 1, -1, -1], -1),
@@ -133,38 +124,38 @@ def test_3_4_2_projective_invariants_are_kept_by_all(rng, group):
         ([1, 1, 0, -1], 0),
     ):
         Q = np.diag(np.array(signature, dtype=float))
-        assert curvature_sign(transform(G, Q, "conics")) == sign
+        assert curvature_sign(strata.transform(G, Q, "conics")) == sign
 
 
 def test_3_4_2_cross_ratio_at_the_base_point_and_where_it_does_not_exist():
     base, direction = np.array([0.0, 1.0, 2.0, 1.0]), np.array([1.0, 0.0, 0.5, 0.0])
     x = base + np.array([0.0, 1.0, 3.0, 0.0])[:, None] * direction
     x[3] = direction
-    assert cross_ratio(x) == pytest.approx(3.0 / 2.0)
-    assert cross_ratio(x[[0, 1, 2, 0]]) == np.inf
+    assert strata.cross_ratio(x) == pytest.approx(3.0 / 2.0)
+    assert strata.cross_ratio(x[[0, 1, 2, 0]]) == np.inf
     with pytest.raises(ValueError, match="three of the four"):
-        cross_ratio(x[[0, 0, 0, 1]])
+        strata.cross_ratio(x[[0, 0, 0, 1]])
     with pytest.raises(ValueError, match="collinear"):
-        cross_ratio(np.eye(4))
+        strata.cross_ratio(np.eye(4))
     with pytest.raises(ValueError, match="four finite points"):
-        cross_ratio(np.eye(3))
+        strata.cross_ratio(np.eye(3))
 
 
 @holds_for_every(groups)
 def test_3_4_3_affine_invariants_are_kept_by_affine_transforms_only(rng, group):
     G, X = random_transform(group, rng), random_points(rng, 8)
-    Y = transform(G, X, "points")
+    Y = strata.transform(G, X, "points")
     plane = rng.normal(size=4)
-    parallel = transform(G, np.stack([plane, plane + 1.7 * PLANE_AT_INFINITY]), "planes")
+    parallel = strata.transform(G, np.stack([plane, plane + 1.7 * strata.PLANE_AT_INFINITY]), "planes")
     x, y = X[0] / X[0, 3], X[1] / X[1, 3]
-    on_line = transform(G, np.stack([x, y, x + 0.3 * (y - x)]), "points")
+    on_line = strata.transform(G, np.stack([x, y, x + 0.3 * (y - x)]), "points")
     centroid, moved_centroid = (homogenize(dehomogenize(Z).mean(axis=0)) for Z in (X, Y))
     changes = [
         gap(*parallel[:, :3]),
         abs(volume(Y[:4]) / volume(Y[4:]) / (volume(X[:4]) / volume(X[4:])) - 1.0),
         abs(length(on_line[0], on_line[2]) / length(on_line[0], on_line[1]) - 0.3),
-        gap(transform(G, centroid, "points"), moved_centroid),
-        gap(transform(G, PLANE_AT_INFINITY, "planes"), PLANE_AT_INFINITY),
+        gap(strata.transform(G, centroid, "points"), moved_centroid),
+        gap(strata.transform(G, strata.PLANE_AT_INFINITY, "planes"), strata.PLANE_AT_INFINITY),
     ]
     if group == "projective":
         assert min(changes) > 1e-6
@@ -175,56 +166,56 @@ def test_3_4_3_affine_invariants_are_kept_by_affine_transforms_only(rng, group):
 @holds_for_every(groups)
 def test_3_4_4_metric_invariants_are_kept_by_metric_transforms_only(rng, group):
     G, X = random_transform(group, rng), random_points(rng, 3)
-    Y = transform(G, X, "points")
+    Y = strata.transform(G, X, "points")
     ratios = length(*Y[:2]) / length(*Y[1:]) / (length(*X[:2]) / length(*X[1:])) - 1.0
-    quadric = gap(transform(G, ABSOLUTE_DUAL_QUADRIC, "dual conics"), ABSOLUTE_DUAL_QUADRIC)
+    quadric = gap(strata.transform(G, ABSOLUTE_DUAL_QUADRIC, "dual conics"), ABSOLUTE_DUAL_QUADRIC)
     if group in ("projective", "affine"):
         assert abs(ratios) > 1e-7
         assert quadric > 1e-4
     else:
         assert abs(ratios) < 1e-9
         assert quadric < 1e-12
-        conic = transform(G[:3, :3], ABSOLUTE_CONIC, "conics")
+        conic = strata.transform(G[:3, :3], ABSOLUTE_CONIC, "conics")
         assert gap(conic, ABSOLUTE_CONIC) < 1e-12
 
 
 @holds_for_every(groups)
 def test_3_4_5_lengths_are_kept_by_euclidean_transforms_only(rng, group):
     G, (X, Y) = random_transform(group, rng), random_points(rng, 2)
-    change = float(length(transform(G, X, "points"), transform(G, Y, "points")) / length(X, Y))
+    change = float(length(strata.transform(G, X, "points"), strata.transform(G, Y, "points")) / length(X, Y))
     assert (abs(change - 1.0) < 1e-9) == (group == "euclidean")
 
 
 @holds_for_every()
 def test_3_4_3_projective_to_affine(rng):
     plane = rng.normal(size=4)
-    G = affine_from_projective(plane)
-    assert gap(transform(G, plane, "planes"), PLANE_AT_INFINITY) < 1e-9
+    G = strata.affine_from_projective(plane)
+    assert gap(strata.transform(G, plane, "planes"), strata.PLANE_AT_INFINITY) < 1e-9
     np.testing.assert_allclose(G[3], plane / plane[3])
 
 
 @pytest.mark.parametrize("plane", [[1.0, 2.0, -1.0, 0.0], [0.0, 0.0, 2.0, 1e-9], [0.0, 0.0, 0.0, -4.0]])
 def test_3_4_3_planes_through_the_origin_have_an_upgrade_too(plane):
-    G = affine_from_projective(np.array(plane))
+    G = strata.affine_from_projective(np.array(plane))
     assert np.linalg.cond(G) < 1.001
-    assert gap(transform(G, np.array(plane), "planes"), PLANE_AT_INFINITY) < 1e-12
+    assert gap(strata.transform(G, np.array(plane), "planes"), strata.PLANE_AT_INFINITY) < 1e-12
     with pytest.raises(ValueError, match="not zero"):
-        affine_from_projective(np.zeros(4))
+        strata.affine_from_projective(np.zeros(4))
 
 
 @holds_for_every()
 def test_3_4_1_stratified_and_direct_upgrades_restore_ratios_of_lengths(rng):
     truth = random_points(rng, 6)
     G = random_transform("projective", rng)
-    X = transform(G, truth, "points")
-    quadric = transform(G, ABSOLUTE_DUAL_QUADRIC, "dual conics") * rng.choice([-2.0, 2.0])
-    direct = metric_from_projective(quadric)
+    X = strata.transform(G, truth, "points")
+    quadric = strata.transform(G, ABSOLUTE_DUAL_QUADRIC, "dual conics") * rng.choice([-2.0, 2.0])
+    direct = strata.metric_from_projective(quadric)
     assert np.linalg.det(direct) > 0.0
-    to_affine = affine_from_projective(np.linalg.svd(quadric)[2][3])
-    affine_quadric = transform(to_affine, quadric, "dual conics")
-    to_metric = metric_from_affine(np.linalg.inv(affine_quadric[:3, :3]))
+    to_affine = strata.affine_from_projective(np.linalg.svd(quadric)[2][3])
+    affine_quadric = strata.transform(to_affine, quadric, "dual conics")
+    to_metric = strata.metric_from_affine(np.linalg.inv(affine_quadric[:3, :3]))
     for upgrade in (direct, to_metric @ to_affine):
-        Y = transform(upgrade, X, "points")
+        Y = strata.transform(upgrade, X, "points")
         scale = length(Y[0], Y[1]) / length(truth[0], truth[1])
         np.testing.assert_allclose(length(Y[2:4], Y[4:6]), scale * length(truth[2:4], truth[4:6]), rtol=1e-6)
         assert np.isfinite(dehomogenize(Y)).all()
@@ -232,6 +223,6 @@ def test_3_4_1_stratified_and_direct_upgrades_restore_ratios_of_lengths(rng):
 
 def test_3_4_4_conics_of_no_metric_frame_are_refused():
     with pytest.raises(ValueError, match="definite"):
-        metric_from_affine(np.diag([1.0, 1.0, -1.0]))
+        strata.metric_from_affine(np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(ValueError, match="semi-definite"):
-        metric_from_projective(np.diag([1.0, 1.0, -1.0, 0.0]))
+        strata.metric_from_projective(np.diag([1.0, 1.0, -1.0, 0.0]))

@@ -11,21 +11,8 @@ import pytest
 
 from tests.io.test_colmap import export, scene
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
+from thesisrecon.io import _files as files
 from thesisrecon.io._exports import read_cameras
-from thesisrecon.io._files import (
-    is_partial,
-    link,
-    printable,
-    read_bytes,
-    read_json,
-    read_pairs,
-    read_text,
-    shorten_middle,
-    shortened,
-    write_atomically,
-    write_json,
-    write_text,
-)
 from validation.studies.robustness import disk_ends, remount, small_disk
 
 
@@ -36,10 +23,10 @@ def entries(folder):
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
 def test_a_failed_write_leaves_the_old_file(tmp_path, number):
     path = tmp_path / "a.json"
-    write_json(path, {"a": 1})
+    files.write_json(path, {"a": 1})
     before = entries(tmp_path)
     with disk_ends(1, number), pytest.raises(OutputError) as refused:
-        write_json(path, {"a": 2})
+        files.write_json(path, {"a": 2})
     assert entries(tmp_path) == before
     assert str(refused.value) == f"{path} cannot be written: {os.strerror(number)}; {REMEDIES[number]}"
     assert isinstance(refused.value, UsageError)
@@ -54,19 +41,19 @@ def test_each_file_of_a_model_is_whole_or_absent(tmp_path):
 def test_a_disk_that_is_full_or_read_only(tmp_path):
     try:
         with small_disk(tmp_path / "disk", "64k") as disk:
-            write_json(disk / "a.json", [1])
+            files.write_json(disk / "a.json", [1])
             for name in ("a.json", "b.json"):
                 with pytest.raises(OutputError, match="No space left on device; free space there"):
-                    write_text(disk / name, "x" * 100_000)
+                    files.write_text(disk / name, "x" * 100_000)
             assert list(entries(disk)) == ["a.json"]
-            assert read_json(disk / "a.json") == [1]
+            assert files.read_json(disk / "a.json") == [1]
             remount(disk, "size=1m")
-            write_text(disk / "b.json", "x" * 100_000)
+            files.write_text(disk / "b.json", "x" * 100_000)
             remount(disk, "ro")
             with pytest.raises(OutputError, match="Read-only file system; make the place writable"):
-                write_text(disk / "c.json", "")
+                files.write_text(disk / "c.json", "")
             with pytest.raises(OutputError, match="Read-only file system"):
-                link(disk / "a.json", disk / "deep" / "a.json")
+                files.link(disk / "a.json", disk / "deep" / "a.json")
     except PermissionError as error:
         pytest.skip(str(error))
 
@@ -76,9 +63,9 @@ def test_a_file_stands_where_a_folder_belongs(tmp_path):
     (tmp_path / "folder").mkdir()
     for path in (tmp_path / "file" / "x", tmp_path / "file" / "deep" / "x"):
         with pytest.raises(OutputError, match="move away the file that stands where a folder belongs"):
-            write_atomically(path, b"")
+            files.write_atomically(path, b"")
     with pytest.raises(OutputError, match="move away the folder that stands where a file belongs"):
-        write_atomically(tmp_path / "folder", b"")
+        files.write_atomically(tmp_path / "folder", b"")
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder"]
 
 
@@ -91,13 +78,13 @@ def test_the_sentence_survives_the_way_from_a_worker():
 
 
 def test_json_has_no_nan(tmp_path):
-    write_json(
+    files.write_json(
         tmp_path / "a.json",
         {"a": float("nan"), "b": [np.float64(1.5), np.int64(2)], "c": np.array([np.inf, 1])},
     )
-    assert read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, 2], "c": [None, 1.0]}
-    assert read_json(tmp_path / "b.json") is None
-    assert [is_partial(name) for name in (".points.ply.partial", "points.ply.partial", ".lock")] == [
+    assert files.read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, 2], "c": [None, 1.0]}
+    assert files.read_json(tmp_path / "b.json") is None
+    assert [files.is_partial(name) for name in (".points.ply.partial", "points.ply.partial", ".lock")] == [
         True,
         False,
         False,
@@ -118,37 +105,37 @@ def test_json_has_no_nan(tmp_path):
     ],
 )
 def test_names_are_shown_in_one_line_and_in_their_order(name, shown):
-    assert printable(name) == shown
+    assert files.printable(name) == shown
     shown.encode("utf-8")
 
 
 def test_a_long_sentence_keeps_its_beginning_and_its_end():
     said = f"'--seed': '{'9' * 50}' is no integer"
-    assert shorten_middle(said, len(said)) == said
-    assert shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
-    assert len(shorten_middle(said, 60)) == 60
-    assert shortened("x" * 60) == "x" * 60
-    assert shortened("x" * 61) == "x" * 57 + "..."
+    assert files.shorten_middle(said, len(said)) == said
+    assert files.shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
+    assert len(files.shorten_middle(said, 60)) == 60
+    assert files.shortened("x" * 60) == "x" * 60
+    assert files.shortened("x" * 61) == "x" * 57 + "..."
 
 
 def test_only_regular_files_of_a_size_are_read(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"\xef\xbb\xbfgr\xc3\xb6\xc3\x9fe")
-    assert read_text(path) == "größe"
-    assert len(read_bytes(path, largest=11)) == 10
+    assert files.read_text(path) == "größe"
+    assert len(files.read_bytes(path, largest=11)) == 10
     with pytest.raises(OSError, match=r"larger than 0 MiB"):
-        read_bytes(path, largest=9)
+        files.read_bytes(path, largest=9)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UsageError, match="pipe cannot be read: it is a pipe, a device or a socket"):
-        read_text(tmp_path / "pipe")
+        files.read_text(tmp_path / "pipe")
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UsageError, match="not a UTF-8 text"):
-        read_pairs(tmp_path / "binary")
+        files.read_pairs(tmp_path / "binary")
     with pytest.raises(UsageError, match="cannot be read: No such file"):
-        read_text(tmp_path / "nowhere")
+        files.read_text(tmp_path / "nowhere")
     # Files of the system say that they are empty.
     if Path("/proc/self/status").exists():
-        assert b"Pid:" in read_bytes(Path("/proc/self/status"))
+        assert b"Pid:" in files.read_bytes(Path("/proc/self/status"))
 
 
 def test_names_with_and_without_blanks(tmp_path):
@@ -158,7 +145,7 @@ def test_names_with_and_without_blanks(tmp_path):
         b'\xef\xbb\xbf# a list\n\na.jpg b.jpg\r\n"my a.jpg"  "my b.jpg"\nc d.jpg\te.jpg\r\n"f.jpg"\t"g.jpg"\n'
     )
     pairs = [("a.jpg", "b.jpg"), ("my a.jpg", "my b.jpg"), ("c d.jpg", "e.jpg"), ("f.jpg", "g.jpg")]
-    assert read_pairs(path) == pairs
+    assert files.read_pairs(path) == pairs
 
 
 @pytest.mark.parametrize("line", ["a.jpg", "a.jpg b.jpg c.jpg", 'a.jpg "b.jpg', "a\tb\tc"])
@@ -166,7 +153,7 @@ def test_a_line_that_is_not_a_pair_is_named(tmp_path, line):
     path = tmp_path / "pairs.txt"
     path.write_text(f"a.jpg b.jpg\n{line}\n", encoding="utf-8")
     with pytest.raises(UsageError, match=r"line 2 of .* must hold two file names"):
-        read_pairs(path)
+        files.read_pairs(path)
 
 
 ONE = {

@@ -9,15 +9,9 @@ import PIL.Image
 import pytest
 
 from thesisrecon.errors import UsageError
+from thesisrecon.io import _pixels as pixels
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io._images import MAX_DECODED_BYTES, list_images, read_images, scene_name
-from thesisrecon.io._pixels import (
-    EXIF_TRANSFORMS,
-    MemoryBudget,
-    StoredImage,
-    decoding_bytes,
-    resized_to,
-)
 
 
 def picture(seed=0, size=(96, 80)):
@@ -219,7 +213,7 @@ def at_once(picture, size, max_size_px):
     return np.asarray(picture.resize(size, PIL.Image.Resampling.LANCZOS, box=box, reducing_gap=3.0))
 
 
-@pytest.mark.parametrize("transform", [None, *EXIF_TRANSFORMS.values()])
+@pytest.mark.parametrize("transform", [None, *pixels.EXIF_TRANSFORMS.values()])
 @pytest.mark.parametrize(("width", "height"), [(1000, 667), (600, 1100)])
 def test_stripes_give_the_pixels_of_the_whole_image(transform, width, height):
     upright = coloured(width, height)
@@ -228,11 +222,11 @@ def test_stripes_give_the_pixels_of_the_whole_image(transform, width, height):
         stored = upright.rotate(back, expand=True)
     else:
         stored = upright if transform is None else upright.transpose(transform)
-    picture = StoredImage(stored, transform)
+    picture = pixels.StoredImage(stored, transform)
     assert picture.size == (width, height)
-    np.testing.assert_array_equal(resized_to(picture, 1600), np.asarray(upright))
+    np.testing.assert_array_equal(pixels.resized_to(picture, 1600), np.asarray(upright))
     for most in (900, 300, 130, 64):
-        found = resized_to(picture, most)
+        found = pixels.resized_to(picture, most)
         assert max(found.shape[:2]) == most
         np.testing.assert_array_equal(found, at_once(upright, found.shape[1::-1], most))
 
@@ -240,7 +234,7 @@ def test_stripes_give_the_pixels_of_the_whole_image(transform, width, height):
 @pytest.mark.parametrize("mode", ["L", "1", "P", "CMYK", "YCbCr", "LAB"])
 def test_colours_are_converted_alike_in_stripes(mode):
     stored = coloured(500, 700, mode)
-    found = resized_to(StoredImage(stored), 200)
+    found = pixels.resized_to(pixels.StoredImage(stored), 200)
     np.testing.assert_array_equal(found, at_once(stored.convert("RGB"), (142, 200), 200))
 
 
@@ -248,13 +242,13 @@ def test_every_stripe_of_a_deep_picture_has_the_range_of_all():
     """The bright end stands below the first stripe."""
     values = np.repeat(np.arange(900, dtype=np.uint16)[:, None] * 4, 80, axis=1)
     for array in (values, values.astype(np.float32), values.astype(np.int32)):
-        found = resized_to(StoredImage(PIL.Image.fromarray(array)), 1600)
+        found = pixels.resized_to(pixels.StoredImage(PIL.Image.fromarray(array)), 1600)
         top = 3596 if array.dtype == np.float32 else 4095
         assert np.abs(found[..., 1] - values * (255.0 / top)).max() <= 0.51
 
 
 def test_threads_take_no_more_room_together_than_there_is():
-    room, held, most = MemoryBudget(100), [0], [0]
+    room, held, most = pixels.MemoryBudget(100), [0], [0]
 
     def use(amount):
         with room.reserve(amount):
@@ -286,10 +280,10 @@ def opened(kind, image, **options):
 
 def test_memory_for_decoding_depends_on_the_format():
     image = coloured(90, 90)
-    assert decoding_bytes(opened("PNG", image)) == 4 * 8100
-    assert decoding_bytes(opened("JPEG", image)) == 4 * 8100
-    assert decoding_bytes(opened("JPEG", image, progressive=True)) == 10 * 8100
-    assert decoding_bytes(opened("WEBP", image)) == 16 * 8100
+    assert pixels.decoding_bytes(opened("PNG", image)) == 4 * 8100
+    assert pixels.decoding_bytes(opened("JPEG", image)) == 4 * 8100
+    assert pixels.decoding_bytes(opened("JPEG", image, progressive=True)) == 10 * 8100
+    assert pixels.decoding_bytes(opened("WEBP", image)) == 16 * 8100
     # The largest sensors are read in every kind of JPEG.
     assert MAX_DECODED_BYTES > 10 * 14204 * 10652
 

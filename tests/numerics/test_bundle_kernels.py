@@ -8,31 +8,23 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics import _projective_kernels as kernels
+from thesisrecon.numerics import _reduced_solvers as solvers
 from thesisrecon.numerics import _schur
 from thesisrecon.numerics._elimination import ReducedSums, sum_leverages
-from thesisrecon.numerics._kernels import floored_diagonal
-from thesisrecon.numerics._metric_kernels import MetricModel, linearize_metric, metric_cost, move_poses
-from thesisrecon.numerics._observations import Jacobians, Weighting, sort_observations
-from thesisrecon.numerics._projective_kernels import (
-    UnitState,
-    linearize_projective,
-    projective_cost,
-    tangent_step,
-)
-from thesisrecon.numerics._reduced_solvers import (
-    BandedCholesky,
-    ReducedSystem,
-    add_diagonal,
-    choose_solver,
-    fill_band,
-    solve_dense,
-)
 from thesisrecon.numerics._schur import BundleSystem, build_layout
 from thesisrecon.numerics.block_scatter import block_scatter
-from thesisrecon.numerics.losses import huber
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import MetricCameras
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics.metric_cameras import (
+    MetricCameras,
+    MetricModel,
+    linearize_metric,
+    metric_cost,
+    move_poses,
+)
+from thesisrecon.numerics.noise import huber
+from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
+from thesisrecon.numerics.small_solvers import floored_diagonal
 
 
 def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):
@@ -109,18 +101,18 @@ def test_projective_jacobians_match_finite_differences():
     X /= np.linalg.norm(X, axis=1, keepdims=True)
     view, point = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(7)))
     xy = rng.normal(size=(21, 2))
-    J, state = Jacobians.empty(21, 11, 0), UnitState.at(P, X)
+    J, state = Jacobians.empty(21, 11, 0), kernels.UnitState.at(P, X)
     seen, weighting = Observations(view, point, xy), Weighting(1.0, np.inf)
-    cost = linearize_projective(state, seen, weighting, J)
-    assert projective_cost(state, seen, weighting) == pytest.approx(cost, rel=1e-12)
+    cost = kernels.linearize_projective(state, seen, weighting, J)
+    assert kernels.projective_cost(state, seen, weighting) == pytest.approx(cost, rel=1e-12)
     z = np.einsum("kab,kb->ka", P.reshape(3, 3, 4)[view], X[point])
     np.testing.assert_allclose(J.residual, z[:, :2] / z[:, 2:] - xy, rtol=1e-12)
     assert cost == pytest.approx(0.5 * np.sum(J.residual**2))
 
     def residual(sP, sX):
         moved_P, moved_X = np.empty_like(P), np.empty_like(X)
-        tangent_step(P, state.vP, state.bP, sP, moved_P)
-        tangent_step(X, state.vX, state.bX, sX, moved_X)
+        kernels.tangent_step(P, state.vP, state.bP, sP, moved_P)
+        kernels.tangent_step(X, state.vX, state.bX, sX, moved_X)
         u = np.einsum("kab,kb->ka", moved_P.reshape(3, 3, 4)[view], moved_X[point])
         return u[:, :2] / u[:, 2:]
 
@@ -180,7 +172,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     layout = build_layout(o, np.arange(6) - 1, width=7, common=columns, border=9)
     assert layout.solver is None
     if solver == "banded":
-        layout = replace(layout, solver=BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
+        layout = replace(layout, solver=solvers.BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
     J = layout.jacobians()
     model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     cost = linearize_metric(model, o.seen, Weighting(1.0, np.inf), own, common, J)
@@ -225,16 +217,16 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
         dense[2 * row[i] : 2 * row[i] + 2, 2 * column[i] : 2 * column[i] + 2] = blocks[i]
     dense[:8, 8:], dense[8:, 8:] = border.reshape(8, 3), corner
     full = np.triu(dense) + np.triu(dense, 1).T
-    system = ReducedSystem(row, column, ReducedSums(blocks, border, corner, *np.zeros((3, 11))))
+    system = solvers.ReducedSystem(row, column, ReducedSums(blocks, border, corner, *np.zeros((3, 11))))
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
     more, pair = np.arange(11.0), np.full((4, 4), -1)
     pair[row, column] = np.arange(6)
-    add_diagonal(blocks, pair, corner, more)
+    solvers.add_diagonal(blocks, pair, corner, more)
     full += np.diag(more)
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
     place = np.array([1, 3, 0, 2])
     band = np.zeros((8, 6))
-    fill_band(blocks, row, column, place, band)
+    solvers.fill_band(blocks, row, column, place, band)
     order = (2 * np.argsort(place)[:, None] + np.arange(2)).ravel()
     moved = full[np.ix_(order, order)]
     for i in range(8):
@@ -242,7 +234,7 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
             assert band[i, j - i] == moved[j, i]
 
 
-@pytest.mark.parametrize("solve", [solve_dense, BandedCholesky(np.arange(3), 2).solve])
+@pytest.mark.parametrize("solve", [solvers.solve_dense, solvers.BandedCholesky(np.arange(3), 2).solve])
 @pytest.mark.parametrize("spoiled", ["views", "corner", "rhs"])
 @pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
 def test_every_solver_detects_an_indefinite_system(solve, spoiled, value):
@@ -250,7 +242,7 @@ def test_every_solver_detects_an_indefinite_system(solve, spoiled, value):
     blocks, border, corner = np.zeros((5, 2, 2)), np.full((3, 2, 1), 0.1), np.eye(1)
     blocks[row == column] = np.eye(2)
     sums = ReducedSums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
-    system = ReducedSystem(row, column, sums)
+    system = solvers.ReducedSystem(row, column, sums)
     full = np.triu(system.dense()) + np.triu(system.dense(), 1).T
     np.testing.assert_allclose(full @ solve(system), 1.0)
     what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
@@ -262,7 +254,7 @@ def test_every_solver_detects_an_indefinite_system(solve, spoiled, value):
 def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
     def chosen(n, pairs):
         i, j = (np.array(a) for a in zip(*sorted(pairs), strict=True))
-        return choose_solver(i, j, n, 6, 4)
+        return solvers.choose_solver(i, j, n, 6, 4)
 
     near = {(i, j) for i in range(400) for j in range(i, min(i + 8, 400))}
     ring = near | {(j, i + 400) for i in range(-8, 0) for j in range(i + 8)}
@@ -270,7 +262,7 @@ def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
     wild = {tuple(sorted(rng.integers(0, 2000, 2))) for _ in range(20000)} | {(i, i) for i in range(2000)}
     every = {(i, j) for i in range(150) for j in range(i, 150)}
     assert chosen(400, near).reach == 7
-    assert isinstance(chosen(400, ring), BandedCholesky)
+    assert isinstance(chosen(400, ring), solvers.BandedCholesky)
     assert chosen(2000, wild) is None
     assert chosen(150, every) is None
 

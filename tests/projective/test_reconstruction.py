@@ -11,16 +11,20 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project, project_camera
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate
-from thesisrecon.projective._initial_pair import initial_cameras, rank_initial_pairs
 from thesisrecon.projective._model import ProjectiveModel, consistent_observations, retriangulate_points
-from thesisrecon.projective._resection import (
+from thesisrecon.projective._track_selection import (
+    initial_cameras,
+    rank_initial_pairs,
+    select_tracks,
+    select_tracks_with_parallax,
+)
+from thesisrecon.projective.factorization import Factorization
+from thesisrecon.projective.incremental import (
+    IncrementalProjective,
     find_inconsistent_view,
     projection_std_px,
     resect_ransac,
 )
-from thesisrecon.projective._track_selection import select_tracks, select_tracks_with_parallax
-from thesisrecon.projective.factorization import Factorization
-from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.projective.sequential import SequentialProjective
 from thesisrecon.records import DegeneracyReport, Tracks
 

@@ -17,7 +17,7 @@ from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
 from thesisrecon.report._data import ReportData
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.simplification import simplify_mesh
+from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 SIZE = (480, 320)

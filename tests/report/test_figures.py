@@ -11,34 +11,15 @@ from PIL import Image as PillowImage
 
 from tests.report.synthetic import SIZE, made_up_cameras, made_up_run
 from thesisrecon.records import HeldOut
+from thesisrecon.report import _drawing as drawing
+from thesisrecon.report import _figures as figures
 from thesisrecon.report import _figures as figures_module
-from thesisrecon.report._drawing import (
-    DIFFERENCE_LIMIT,
-    HUES,
-    SCALE,
-    UNKNOWN,
-    _clip_line,
-    _paint_scale,
-    _spread_matches,
-    depth_side,
-    draw_depth,
-    draw_held_out,
-    draw_pair,
-    thumbnail,
-)
-from thesisrecon.report._figures import (
-    _histogram_path,
-    build_scene,
-    pair_matrix_figure,
-    scene_figure,
-    upright_rotation,
-)
 
 
 def test_the_scene_is_valid_json_with_escaped_names():
     data = made_up_run(names=["<b>one</b>.jpg", "two&.jpg", "three.jpg"], points=200)
-    scene = build_scene(data.metric.reconstruction)
-    figure = scene_figure(scene, [p.name for p in data.images], data.colors)
+    scene = figures.build_scene(data.metric.reconstruction)
+    figure = figures.scene_figure(scene, [p.name for p in data.images], data.colors)
     json.dumps(figure, allow_nan=False)
     points, lines, marks = figure["data"]
     assert len(points["x"]) == len(points["marker"]["color"]) == len(scene.points)
@@ -48,7 +29,7 @@ def test_the_scene_is_valid_json_with_escaped_names():
 
 def test_the_matrix_is_symmetric_and_marks_rejected_pairs():
     data = made_up_run(points=300)
-    figure = pair_matrix_figure(data.pairs, [p.name for p in data.images])
+    figure = figures.pair_matrix_figure(data.pairs, [p.name for p in data.images])
     json.dumps(figure, allow_nan=False)
     accepted, refused = figure["data"]
     pair, bad = data.pairs[0], next(p for p in data.pairs if not p.accepted)
@@ -62,7 +43,7 @@ def test_the_matrix_is_symmetric_and_marks_rejected_pairs():
 def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch):
     data = made_up_run(points=300)
     monkeypatch.setattr(figures_module, "MAX_MATRIX", 3)
-    figure = pair_matrix_figure(data.pairs, [p.name for p in data.images])
+    figure = figures.pair_matrix_figure(data.pairs, [p.name for p in data.images])
     accepted = figure["data"][0]
     assert accepted["x"] == ["views 1–3", "views 4–6", "views 7–9"]
     inside = max(p.inliers for p in data.pairs if p.j < 3)
@@ -72,12 +53,12 @@ def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch):
 def test_a_pair_without_matches_has_a_colour():
     data = made_up_run(points=100)
     empty = dataclasses.replace(data.pairs[0], xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
-    figure = pair_matrix_figure([empty], ["a", "b"])
+    figure = figures.pair_matrix_figure([empty], ["a", "b"])
     assert figure["data"][0]["z"][0][1] == 0.0
 
 
 def test_histogram_bars_stand_on_the_ground():
-    path = _histogram_path(np.array([0.5, 0.0, 1.0, 0.25]), 1.0, 40, 10)
+    path = figures._histogram_path(np.array([0.5, 0.0, 1.0, 0.25]), 1.0, 40, 10)
     assert path.count("M") == 3
     assert path.startswith("M0.0 10.0v-5.0")
     assert "M20.0 10.0v-10.0" in path
@@ -91,7 +72,7 @@ def opened(uri):
 
 def test_a_thumbnail_keeps_the_aspect_and_shrinks_when_there_are_many():
     image = made_up_run(points=50).images[0]
-    few, many = thumbnail(image, 10), thumbnail(image, 2000)
+    few, many = drawing.thumbnail(image, 10), drawing.thumbnail(image, 2000)
     assert opened(few.uri).size == (few.width, few.height) == (360, 240)
     assert many.width < few.width / 3
 
@@ -103,10 +84,10 @@ def test_the_lines_pass_through_the_numbered_matches():
     first, second = (
         dataclasses.replace(data.images[v], rgb=rgb) for v, rgb in zip((pair.i, pair.j), flat, strict=True)
     )
-    drawn = draw_pair(pair, first, second)
+    drawn = drawing.draw_pair(pair, first, second)
     pixels = np.asarray(opened(drawn.uri)).astype(int)
     s = 640 / max(SIZE)
-    chosen = _spread_matches(pair.xy1, len(HUES))
+    chosen = drawing._spread_matches(pair.xy1, len(drawing.HUES))
     for x, y in (pair.xy1[chosen] + 0.5) * s - 0.5:
         # A dot of the colour of its line: bright and coloured or at least far from the grey ground.
         spot = pixels[round(y), round(x)]
@@ -120,34 +101,34 @@ def test_a_pair_without_matches_is_no_error():
     data = made_up_run(points=100)
     pair = data.pairs[0]
     empty = dataclasses.replace(pair, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
-    drawn = draw_pair(empty, data.images[0], data.images[1])
+    drawn = drawing.draw_pair(empty, data.images[0], data.images[1])
     assert opened(drawn.uri).size == (drawn.width, drawn.height)
     assert min(drawn.width, drawn.height) > 100
 
 
 def test_lines_are_cut_at_the_edges_of_the_photograph():
-    level = _clip_line(np.array([0.0, 1.0, -10.0]), 100, 50)
+    level = drawing._clip_line(np.array([0.0, 1.0, -10.0]), 100, 50)
     assert level == ((-0.5, 10.0), (99.5, 10.0))
-    upright = _clip_line(np.array([1.0, 0.0, -10.0]), 100, 50)
+    upright = drawing._clip_line(np.array([1.0, 0.0, -10.0]), 100, 50)
     assert upright == ((10.0, -0.5), (10.0, 49.5))
-    assert _clip_line(np.array([0.0, 1.0, 20.0]), 100, 50) is None
-    assert _clip_line(np.zeros(3), 100, 50) is None
+    assert drawing._clip_line(np.array([0.0, 1.0, 20.0]), 100, 50) is None
+    assert drawing._clip_line(np.zeros(3), 100, 50) is None
 
 
 def test_spread_matches_are_different_and_far_apart():
     xy = np.random.default_rng(0).uniform(0, 100, (500, 2))
-    chosen = _spread_matches(xy, 12)
+    chosen = drawing._spread_matches(xy, 12)
     assert len(set(chosen.tolist())) == 12
     gaps = np.linalg.norm(xy[chosen][:, None] - xy[chosen][None], axis=2) + np.eye(12) * 1e9
     assert gaps.min() > 20
-    assert len(_spread_matches(xy[:5], 12)) == 5
-    assert len(_spread_matches(np.zeros((0, 2)), 12)) == 0
+    assert len(drawing._spread_matches(xy[:5], 12)) == 5
+    assert len(drawing._spread_matches(np.zeros((0, 2)), 12)) == 0
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
 def test_odd_pictures_have_thumbnails(shape):
     image = dataclasses.replace(made_up_run(points=50).images[0], rgb=np.zeros(shape, dtype=np.uint8))
-    drawn = thumbnail(image, 3)
+    drawn = drawing.thumbnail(image, 3)
     assert opened(drawn.uri).size == (drawn.width, drawn.height)
     assert drawn.width >= drawn.height >= 1
 
@@ -160,19 +141,24 @@ def lightness(rgb):
 
 
 def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness():
-    steps = np.diff(lightness(_paint_scale(np.linspace(0, 1, 33)).astype(float)))
+    steps = np.diff(lightness(drawing._paint_scale(np.linspace(0, 1, 33)).astype(float)))
     assert steps.min() > 1.8
     assert steps.max() < 1.6 * steps.min()
-    ends = _paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
-    assert ["#" + bytes(c).hex() for c in ends[:4]] == [SCALE[0], SCALE[0], SCALE[-1], SCALE[-1]]
-    assert tuple(ends[4]) == UNKNOWN
+    ends = drawing._paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
+    assert ["#" + bytes(c).hex() for c in ends[:4]] == [
+        drawing.SCALE[0],
+        drawing.SCALE[0],
+        drawing.SCALE[-1],
+        drawing.SCALE[-1],
+    ]
+    assert tuple(ends[4]) == drawing.UNKNOWN
 
 
 def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
     depth = np.tile(np.linspace(2.0, 6.0, 300, dtype=np.float32), (200, 1))
     depth[:, 200:250] = np.nan
     depth[0, 0] = 1e4  # a stray takes none of the scale
-    drawn = draw_depth(depth, side=360)
+    drawn = drawing.draw_depth(depth, side=360)
     assert (drawn.picture.width, drawn.picture.height) == (300, 200)
     assert drawn.near == pytest.approx(2.0, abs=0.06)
     assert drawn.far == pytest.approx(6.0, abs=0.06)
@@ -183,12 +169,12 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
     assert light[190] < 55
     assert light[290] < 20
     assert (np.diff(light[5:190:20]) < -2).all()
-    assert np.abs(pixels[100, 210:240] - UNKNOWN).max() < 8
+    assert np.abs(pixels[100, 210:240] - drawing.UNKNOWN).max() < 8
 
 
 @pytest.mark.parametrize("value", [np.nan, 3.0])
 def test_depth_maps_without_depth_or_relief_are_accepted(value):
-    drawn = draw_depth(np.full((30, 40), value, dtype=np.float32), side=360)
+    drawn = drawing.draw_depth(np.full((30, 40), value, dtype=np.float32), side=360)
     assert drawn.share == float(np.isfinite(value))
     np.testing.assert_equal((drawn.near, drawn.far), (value, value))
 
@@ -196,25 +182,27 @@ def test_depth_maps_without_depth_or_relief_are_accepted(value):
 def test_depth_pictures_shrink_when_there_are_many():
     rng = np.random.default_rng(1)
     noise = rng.uniform(1, 5, (480, 640)).astype(np.float32)  # the hardest picture for a JPEG
-    assert draw_depth(noise, side=depth_side(10)).picture.width == 360
-    assert 300 * len(draw_depth(noise, side=depth_side(300)).picture.uri) < 4_000_000
+    assert drawing.draw_depth(noise, side=drawing.depth_side(10)).picture.width == 360
+    assert 300 * len(drawing.draw_depth(noise, side=drawing.depth_side(300)).picture.uri) < 4_000_000
 
 
 def test_the_comparison_shows_the_differences():
     real = np.full((300, 400, 3), 120, dtype=np.uint8)
     rendered, compared = real.copy(), np.ones((300, 400), dtype=bool)
-    rendered[:, 200:] += np.uint8(DIFFERENCE_LIMIT)
+    rendered[:, 200:] += np.uint8(drawing.DIFFERENCE_LIMIT)
     compared[200:] = False
-    pictures = draw_held_out(HeldOut(0, real, rendered, compared, 20.0, 0.9))
+    pictures = drawing.draw_held_out(HeldOut(0, real, rendered, compared, 20.0, 0.9))
     photo, model, apart = (np.asarray(opened(p.uri)).astype(float) for p in pictures)
     assert np.abs(photo - 120).max() < 4
     assert np.abs(model[:190, 210:] - 184).max() < 4
     for picture in (model, apart):
-        assert np.abs(picture[210:] - UNKNOWN).max() < 8
+        assert np.abs(picture[210:] - drawing.UNKNOWN).max() < 8
     assert lightness(apart[100, 100]) < 20
     assert lightness(apart[100, 300]) > 90
     large = [np.zeros((900, 1200, 3), dtype=np.uint8)] * 2
-    assert draw_held_out(HeldOut(0, *large, np.ones((900, 1200), dtype=bool), 0.0, 0.0))[2].width == 640
+    assert (
+        drawing.draw_held_out(HeldOut(0, *large, np.ones((900, 1200), dtype=bool), 0.0, 0.0))[2].width == 640
+    )
 
 
 def rotation(axis, angle):
@@ -227,7 +215,7 @@ def rotation(axis, angle):
 def test_up_is_found_in_any_frame():
     rotations, _ = made_up_cameras(7)
     turn = rotation(np.array([0.3, -1.0, 0.7]), 2.1)
-    upright = upright_rotation(rotations @ turn.T)
+    upright = figures.upright_rotation(rotations @ turn.T)
     assert np.allclose(upright @ upright.T, np.eye(3))
     assert np.isclose(np.linalg.det(upright), 1)
     # In the made-up world y points down and the wall is along +z.
@@ -238,13 +226,13 @@ def test_up_is_found_in_any_frame():
 def test_up_of_a_ring_of_cameras_is_its_axis():
     level = [rotation(np.array([0.0, 1.0, 0.0]), angle) for angle in np.linspace(0, 2 * np.pi, 9)[:-1]]
     tilted = np.stack([rotation(np.array([1.0, 0.0, 0.0]), -0.4) @ R for R in level])
-    assert (upright_rotation(tilted) @ [0, -1, 0])[2] > 0.999
+    assert (figures.upright_rotation(tilted) @ [0, -1, 0])[2] > 0.999
 
 
 def test_parallel_cameras_and_cameras_that_look_down_have_an_up():
     ahead = np.tile(np.eye(3), (4, 1, 1))
-    assert (upright_rotation(ahead) @ [0, -1, 0])[2] > 0.999
-    single = upright_rotation(np.eye(3)[None])
+    assert (figures.upright_rotation(ahead) @ [0, -1, 0])[2] > 0.999
+    single = figures.upright_rotation(np.eye(3)[None])
     assert (single @ [0, 0, 1])[1] > 0.999
 
 
@@ -253,7 +241,7 @@ def test_strays_are_left_out_and_many_points_are_thinned():
     before = data.metric.reconstruction
     X = before.X.copy()
     X[5, :3] = 1e5
-    scene = build_scene(dataclasses.replace(before, X=X), max_points=200)
+    scene = figures.build_scene(dataclasses.replace(before, X=X), max_points=200)
     assert 150 <= len(scene.points) <= 200
     assert 5 not in scene.index
     assert (scene.high - scene.low).max() < 20
@@ -261,7 +249,7 @@ def test_strays_are_left_out_and_many_points_are_thinned():
 
 def test_the_pyramids_point_at_the_scene():
     data = made_up_run(points=300)
-    scene = build_scene(data.metric.reconstruction)
+    scene = figures.build_scene(data.metric.reconstruction)
     assert scene.views.tolist() == list(range(8))
     gaze = scene.corners.mean(axis=1) - scene.centres
     towards = scene.points.mean(axis=0) - scene.centres
@@ -274,12 +262,12 @@ def test_the_pyramids_point_at_the_scene():
 def test_nothing_registered_gives_no_scene():
     data = made_up_run(points=50)
     nothing = np.zeros_like(data.metric.reconstruction.registered)
-    assert build_scene(dataclasses.replace(data.metric.reconstruction, registered=nothing)) is None
+    assert figures.build_scene(dataclasses.replace(data.metric.reconstruction, registered=nothing)) is None
 
 
 def test_a_scene_without_points_still_shows_its_cameras():
     data = made_up_run(points=50)
     nothing = np.zeros_like(data.metric.reconstruction.valid)
-    scene = build_scene(dataclasses.replace(data.metric.reconstruction, valid=nothing))
+    scene = figures.build_scene(dataclasses.replace(data.metric.reconstruction, valid=nothing))
     assert len(scene.points) == 0
     assert len(scene.centres) == 8

@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from tests.report.synthetic import (
-    NOISE_PX,
-    SPHERE_NAMES,
-    Structure,
-    Witness,
-    made_up_run,
-    projective_run,
-    sphere_run,
-)
+from tests.report import synthetic
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.records import Image, IntrinsicInterval, TexturedMesh
@@ -34,18 +26,18 @@ from thesisrecon.report._page import render_report, strip_page
 
 @pytest.fixture(scope="module")
 def page():
-    return render_report(made_up_run())
+    return render_report(synthetic.made_up_run())
 
 
 def test_the_page_fetches_nothing_and_is_small(page):
-    structure = Structure(page)
+    structure = synthetic.Structure(page)
     assert all(address.startswith(("data:", "#")) for address in structure.addresses)
     assert len(page.encode()) < 10_000_000
     assert page.count("plotly.js v") == 1
 
 
 def test_the_page_holds_every_section_and_its_links_lead_somewhere(page):
-    structure = Structure(page)
+    structure = synthetic.Structure(page)
     wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
     assert wanted == {"main", "view", "images", "pairs", "stages", "warnings", "config"}
     assert wanted <= set(structure.ids)
@@ -62,15 +54,15 @@ def test_the_page_holds_every_section_and_its_links_lead_somewhere(page):
 
 
 def test_the_same_data_gives_the_same_page(page):
-    assert render_report(made_up_run()) == page
+    assert render_report(synthetic.made_up_run()) == page
 
 
 def test_runs_that_stopped_early_say_how_far_they_got():
-    early = projective_run()
+    early = synthetic.projective_run()
     page = render_report(early)
     assert "Stopped early" in page
     assert 'id="scene-figure"' not in page
-    assert Structure(page).count("svg") == 8
+    assert synthetic.Structure(page).count("svg") == 8
     only_features = dataclasses.replace(early, reconstruction=None, pairs=(), until="features")
     page = render_report(only_features)
     assert "corners were detected" in page
@@ -78,14 +70,14 @@ def test_runs_that_stopped_early_say_how_far_they_got():
 
 
 def test_a_projective_camera_is_not_called_registered(page):
-    projective = render_report(projective_run())
+    projective = render_report(synthetic.projective_run())
     assert projective.count('<span class="state open">projective camera</span>') == 8
     assert ">registered<" not in projective
     assert page.count('<span class="state good">registered</span>') == 8
 
 
 def test_the_caption_states_omitted_points():
-    data = made_up_run(points=200)
+    data = synthetic.made_up_run(points=200)
     assert "All 200 points are shown." in render_report(data)
     X = data.metric.reconstruction.X.copy()
     X[0, :3] = 1e6
@@ -105,7 +97,7 @@ def test_a_failed_run_without_anything_has_a_page():
 
 
 def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
-    data = dataclasses.replace(projective_run(), reconstruction=None, until="matches")
+    data = dataclasses.replace(synthetic.projective_run(), reconstruction=None, until="matches")
     nothing = dataclasses.replace(
         data.pairs[0],
         F=np.zeros((3, 3)),
@@ -119,11 +111,11 @@ def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
     page = render_report(dataclasses.replace(data, pairs=[nothing]))
     assert "too few matches for an F" in page
     assert "<td>–</td><td>–</td>" in page
-    assert Structure(page).count("figure") == 1  # the matrix
+    assert synthetic.Structure(page).count("figure") == 1  # the matrix
 
 
 def test_warnings_of_the_run_stand_beside_those_of_its_stages():
-    data = projective_run()
+    data = synthetic.projective_run()
     stage_warning = data.reports[1].warnings[0]
     summary = {"warnings": [stage_warning, "2 initial pairs were tried"]}
     page = render_report(dataclasses.replace(data, summary=summary))
@@ -133,7 +125,7 @@ def test_warnings_of_the_run_stand_beside_those_of_its_stages():
 
 
 def test_a_name_that_is_not_unicode_can_be_written(tmp_path):
-    page = render_report(made_up_run(names=["a\udcff.jpg", "b.jpg", "c.jpg"], points=60))
+    page = render_report(synthetic.made_up_run(names=["a\udcff.jpg", "b.jpg", "c.jpg"], points=60))
     write_text(tmp_path / "report.html", page)
     assert "a?.jpg" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
@@ -142,7 +134,7 @@ def test_three_hundred_photographs_stay_under_the_limit():
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
     images = tuple(Image(f"{n}.jpg", noise, (240, 160)) for n in range(300))
-    template = made_up_run(points=100).pairs[0]
+    template = synthetic.made_up_run(points=100).pairs[0]
     pairs = [dataclasses.replace(template, i=i, j=j) for i in range(300) for j in range(i + 1, 300)]
     data = ReportData("many", images, (), "", {}, "0.1.0", pairs=pairs)
     assert len(render_report(data).encode()) < 10_000_000
@@ -150,15 +142,15 @@ def test_three_hundred_photographs_stay_under_the_limit():
 
 def test_the_affine_stratum_is_drawn_where_there_is_one(page):
     assert 'id="affine-figure"' in page
-    data = made_up_run()
+    data = synthetic.made_up_run()
     without = render_report(dataclasses.replace(data, affine=None))
     assert 'id="affine-figure"' not in without
 
 
 def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
-    data = sphere_run()
+    data = synthetic.sphere_run()
     page = render_report(data)
-    structure = Structure(page)
+    structure = synthetic.Structure(page)
     assert {"model", "depth", "held-out", "model-data", "model-figure"} <= set(structure.ids)
     assert len(structure.ids) == len(set(structure.ids))
     wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
@@ -168,14 +160,14 @@ def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
     assert structure.count("img") == 8 + 7 + 3
     assert structure.count("option") == 8 + 1
     texels = f"{data.model.texture.shape[1]} × {data.model.texture.shape[0]} texels"
-    for text in (texels, "27.3 dB", "0.912", html.escape(SPHERE_NAMES[2])):
+    for text in (texels, "27.3 dB", "0.912", html.escape(synthetic.SPHERE_NAMES[2])):
         assert text in page
     assert "<b>.jpg" not in page
-    assert render_report(sphere_run()) == page
+    assert render_report(synthetic.sphere_run()) == page
 
 
 def test_only_the_scripts_of_the_page_may_run():
-    for data, scripts in ((sphere_run(), 3), (made_up_run(points=50), 2)):
+    for data, scripts in ((synthetic.sphere_run(), 3), (synthetic.made_up_run(points=50), 2)):
         page = render_report(data)
         policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
         assert policy is not None
@@ -184,7 +176,7 @@ def test_only_the_scripts_of_the_page_may_run():
         digests = [hashlib.sha256(body.encode()).digest() for body in bodies]
         assert len(allowed) == len(bodies) == scripts
         assert sorted(allowed) == sorted("sha256-" + base64.b64encode(d).decode() for d in digests)
-    nothing = render_report(dataclasses.replace(projective_run(), reconstruction=None, pairs=()))
+    nothing = render_report(dataclasses.replace(synthetic.projective_run(), reconstruction=None, pairs=()))
     assert "script-src 'none'" in html.unescape(nothing)
     assert "<script" not in nothing
 
@@ -192,8 +184,10 @@ def test_only_the_scripts_of_the_page_may_run():
 def test_without_a_model_nothing_of_it_is_on_the_page(page):
     for trace in ('id="model', 'id="depth"', 'id="held-out"', "model.glb", "WebGL 2"):
         assert trace not in page
-    empty = dataclasses.replace(sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
-    bare = render_report(dataclasses.replace(sphere_run(), model=empty, held_out=None, depth_maps={}))
+    empty = dataclasses.replace(synthetic.sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
+    bare = render_report(
+        dataclasses.replace(synthetic.sphere_run(), model=empty, held_out=None, depth_maps={})
+    )
     for trace in ("model-data", 'id="model"', 'id="depth"', 'id="held-out"'):
         assert trace not in bare
 
@@ -209,7 +203,7 @@ def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page():
     coarse = rng.integers(0, 255, (512, 512, 3), dtype=np.uint8)  # as busy as a photograph at its finest
     texture = np.asarray(PillowImage.fromarray(coarse).resize((2048, 2048), PillowImage.Resampling.BICUBIC))
     uv = rng.uniform(0, 2047, (len(vertices), 2))[faces]
-    data = sphere_run()
+    data = synthetic.sphere_run()
     large = TexturedMesh(vertices, faces, uv=uv, texture=texture)
     assert 149_000 < len(faces) <= 151_000
     grown = len(render_report(dataclasses.replace(data, model=large)))
@@ -217,7 +211,7 @@ def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page():
 
 
 def test_the_table_of_cameras_has_a_column_for_every_estimate():
-    data = made_up_run()
+    data = synthetic.made_up_run()
     square = {
         "aspect": IntrinsicInterval(1.0, 0.0, "assumed"),
         "skew_px": IntrinsicInterval(0.0, 0.0, "assumed"),
@@ -255,7 +249,7 @@ def test_a_strip_has_its_notes_and_at_least_one_frame():
 def test_one_turns_through_the_pictures(browser, tmp_path):
     path = tmp_path / "strip.html"
     path.write_text(strip(), encoding="utf-8")
-    seen = Witness(browser, path, 900, drawn=())
+    seen = synthetic.Witness(browser, path, 900, drawn=())
     assert abs(int(seen.pixels("#shown")[30, 40, 0]) - LEVELS[0]) < 4
     seen.page.locator("#place").press("ArrowRight")
     assert seen.page.inner_text("#caption") == "picture <1>"
@@ -271,7 +265,7 @@ def test_one_turns_through_the_pictures(browser, tmp_path):
 
 
 def test_intrinsics_are_reported_in_pixels_of_the_file():
-    data = made_up_run(points=100)  # worked at a quarter of the size
+    data = synthetic.made_up_run(points=100)  # worked at a quarter of the size
     working, original = data.metric.intrinsics[0], data.original_intrinsics[0]
     assert original["focal_px"].value == pytest.approx(4 * working["focal_px"].value)
     assert original["focal_px"].std == pytest.approx(4 * working["focal_px"].std)
@@ -285,19 +279,19 @@ def test_intrinsics_are_reported_in_pixels_of_the_file():
 
 
 def test_the_residuals_are_the_noise_that_was_added():
-    data = made_up_run(points=1500)
+    data = synthetic.made_up_run(points=1500)
     reconstruction = data.metric.reconstruction
     distances = reprojection_distances(reconstruction)
     assert len(distances[-1]) == 0  # the last view is not registered
     assert sum(map(len, distances)) == len(used_observations(reconstruction))
     summary = summarize_distances(np.concatenate(distances))
     # Two independent coordinates make a Rayleigh distribution: RMS sqrt(2) sigma, median sigma sqrt(2 ln 2).
-    assert summary.rms_px == pytest.approx(np.sqrt(2) * NOISE_PX, rel=0.03)
-    assert summary.median_px == pytest.approx(np.sqrt(2 * np.log(2)) * NOISE_PX, rel=0.03)
+    assert summary.rms_px == pytest.approx(np.sqrt(2) * synthetic.NOISE_PX, rel=0.03)
+    assert summary.median_px == pytest.approx(np.sqrt(2 * np.log(2)) * synthetic.NOISE_PX, rel=0.03)
 
 
 def test_only_inliers_of_registered_views_and_valid_points_count():
-    data = made_up_run(points=200)
+    data = synthetic.made_up_run(points=200)
     before = data.metric.reconstruction
     after = dataclasses.replace(before, valid=np.arange(200) < 100)
     used = used_observations(after)
@@ -308,10 +302,10 @@ def test_only_inliers_of_registered_views_and_valid_points_count():
 
 
 def test_without_distortion_the_projective_residuals_grow_by_what_it_moved():
-    reconstruction = projective_run().reconstruction
+    reconstruction = synthetic.projective_run().reconstruction
     assert reconstruction is not None
     summary = summarize_distances(np.concatenate(reprojection_distances(reconstruction)))
-    assert summary.rms_px > 2 * NOISE_PX
+    assert summary.rms_px > 2 * synthetic.NOISE_PX
 
 
 def test_histogram_holds_every_distance():

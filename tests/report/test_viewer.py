@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from tests.report.synthetic import (
-    SPHERE_NAMES,
-    SPHERE_SIZE,
-    Witness,
-    made_up_run,
-    sphere_model,
-    sphere_reconstruction,
-    sphere_run,
-)
+from tests.report import synthetic
 from tests.surface.sphere import SHAPE, K, photograph, ring_of
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
@@ -33,12 +25,12 @@ def unpacked(text, kind, columns):
 
 
 def upright():
-    P = sphere_reconstruction().P
+    P = synthetic.sphere_reconstruction().P
     return upright_rotation(np.stack([decompose_camera(p)[1] for p in P]))
 
 
 def data_of(mesh):
-    return viewer_data(mesh, sphere_reconstruction(), SPHERE_NAMES)
+    return viewer_data(mesh, synthetic.sphere_reconstruction(), synthetic.SPHERE_NAMES)
 
 
 def corners(data):
@@ -49,7 +41,7 @@ def corners(data):
 
 
 def test_every_triangle_arrives_where_it_is_with_its_texture():
-    mesh = sphere_model()
+    mesh = synthetic.sphere_model()
     assert mesh.uv is not None
     data = json.loads(json.dumps(data_of(mesh), allow_nan=False))
     step = max(np.array(data["high"]) - data["low"]) / LEVELS
@@ -64,14 +56,14 @@ def test_every_triangle_arrives_where_it_is_with_its_texture():
 
 
 def test_corners_that_agree_are_sent_once():
-    mesh = sphere_model()
+    mesh = synthetic.sphere_model()
     assert mesh.uv is not None
     sent = len(unpacked(data_of(mesh)["positions"], "<u2", 3))
     assert len(mesh.vertices) < sent < 0.6 * 3 * len(mesh.faces)
 
 
 def test_a_model_with_colours_or_none_needs_no_texture():
-    mesh = sphere_model()
+    mesh = synthetic.sphere_model()
     colors = np.random.default_rng(0).integers(0, 255, mesh.vertices.shape, dtype=np.uint8)
     bare = replace(mesh, uv=None, texture=None, untextured=None)
     coloured = data_of(replace(bare, colors=colors))
@@ -83,33 +75,37 @@ def test_a_model_with_colours_or_none_needs_no_texture():
 
 
 def test_the_viewer_stands_where_photographs_were_taken():
-    data = data_of(sphere_model())
-    names = [f"{k + 1} · {name}" for k, name in enumerate(SPHERE_NAMES)]
+    data = data_of(synthetic.sphere_model())
+    names = [f"{k + 1} · {name}" for k, name in enumerate(synthetic.SPHERE_NAMES)]
     assert [stand["name"] for stand in data["viewpoints"]] == names
     turn = upright()
-    for stand, P in zip(data["viewpoints"], sphere_reconstruction().P, strict=True):
+    for stand, P in zip(data["viewpoints"], synthetic.sphere_reconstruction().P, strict=True):
         R, t = decompose_camera(P)[1:]
         np.testing.assert_allclose(stand["eye"], turn @ (-R.T @ t), atol=1e-9)
         ahead = np.array(stand["target"]) - stand["eye"]
         np.testing.assert_allclose(ahead / np.linalg.norm(ahead), turn @ R[2], atol=1e-9)
         # Looking at the sphere from 3.8 away, the middle depth lies between its front and its back.
         assert 2.5 < np.linalg.norm(ahead) < 4.9
-        np.testing.assert_allclose(stand["field"], (SPHERE_SIZE[0] / 300.0, SPHERE_SIZE[1] / 300.0))
-    assert 0 <= data["start"] < len(SPHERE_NAMES)
+        np.testing.assert_allclose(
+            stand["field"], (synthetic.SPHERE_SIZE[0] / 300.0, synthetic.SPHERE_SIZE[1] / 300.0)
+        )
+    assert 0 <= data["start"] < len(synthetic.SPHERE_NAMES)
 
 
 def test_views_without_a_camera_are_not_viewpoints():
-    reconstruction = sphere_reconstruction()
+    reconstruction = synthetic.sphere_reconstruction()
     registered = reconstruction.registered.copy()
     registered[3] = False
     P = reconstruction.P * registered[:, None, None]
-    data = viewer_data(sphere_model(), replace(reconstruction, registered=registered, P=P), SPHERE_NAMES)
+    data = viewer_data(
+        synthetic.sphere_model(), replace(reconstruction, registered=registered, P=P), synthetic.SPHERE_NAMES
+    )
     assert [stand["name"][0] for stand in data["viewpoints"]] == list("1235678")
 
 
 def test_a_texture_beyond_the_limit_is_reduced(monkeypatch):
     monkeypatch.setattr(_viewer, "MAX_TEXELS", 100 * 100)
-    data = data_of(sphere_model())
+    data = data_of(synthetic.sphere_model())
     picture = PillowImage.open(io.BytesIO(base64.b64decode(data["texture"].split(",")[1])))
     assert 0.9 * 100 * 100 < picture.width * picture.height <= 100 * 100
 
@@ -122,7 +118,7 @@ def test_a_flat_model_has_a_box():
 
 
 def test_a_stray_does_not_take_the_resolution_of_the_rest():
-    mesh = sphere_model()
+    mesh = synthetic.sphere_model()
     far = np.array([[500.0, 0, 0], [501, 0, 0], [500, 1, 0]])
     n = len(mesh.vertices)
     spoiled = replace(
@@ -150,14 +146,14 @@ EVIL = [
 def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "report.html"
     title = "<img src=x onerror=alert(9)>"
-    run = dataclasses.replace(made_up_run(names=EVIL, points=3000), title=title)
+    run = dataclasses.replace(synthetic.made_up_run(names=EVIL, points=3000), title=title)
     path.write_text(render_report(run), "utf-8")
     return path
 
 
 @pytest.fixture(scope="module", params=[1400, 420], ids=["desktop", "narrow"])
 def witness(request, browser, report):
-    opened = Witness(browser, report, request.param, drawn=("matrix-figure", "scene-figure"))
+    opened = synthetic.Witness(browser, report, request.param, drawn=("matrix-figure", "scene-figure"))
     yield opened
     opened.context.close()
 
@@ -232,13 +228,13 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 @pytest.fixture(scope="module")
 def model_report(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "report.html"
-    path.write_text(render_report(sphere_run()), "utf-8")
+    path.write_text(render_report(synthetic.sphere_run()), "utf-8")
     return path
 
 
 @pytest.fixture(scope="module", params=[1400, 420], ids=["desktop", "narrow"])
 def opened(request, browser, model_report):
-    model_page = Witness(
+    model_page = synthetic.Witness(
         browser, model_report, request.param, drawn=("model-figure",), reduced_motion="reduce"
     )
     yield model_page
@@ -415,7 +411,7 @@ def test_pictures_of_depth_and_comparison_are_shown(model_page):
 def test_a_fine_screen_gets_at_most_twice_the_pixels_and_the_eye_glides(browser, model_report):
     drawn = ("model-figure", "scene-figure")
     screen = {"device_scale_factor": 3, "has_touch": True}
-    model_page = Witness(browser, model_report, 420, drawn=drawn, script=RECORD_VIEWS, **screen)
+    model_page = synthetic.Witness(browser, model_report, 420, drawn=drawn, script=RECORD_VIEWS, **screen)
     canvas = model_page.page.locator(CANVAS)
     assert canvas.evaluate("c => c.width") == 2 * canvas.evaluate("c => c.clientWidth")
     ways = []
@@ -449,7 +445,7 @@ def spread_fingers(model_page):
 
 @pytest.mark.browser
 def test_missing_webgl_is_reported(browser, model_report):
-    model_page = Witness(browser, model_report, 1000, drawn=(), script=WITHOUT_WEBGL)
+    model_page = synthetic.Witness(browser, model_report, 1000, drawn=(), script=WITHOUT_WEBGL)
     text = model_page.page.locator("#model-figure").inner_text()
     assert "no WebGL 2" in text
     assert "model.glb" in text

@@ -11,19 +11,11 @@ import numpy as np
 import pytest
 
 from tests.fake_stages import fake_config, photographs
+from thesisrecon import records
 from thesisrecon.cli.main import run_command
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import read_json, write_atomically
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import (
-    Features,
-    IntrinsicInterval,
-    MetricResult,
-    Reconstruction,
-    Seeds,
-    StageReport,
-    Tracks,
-)
 from thesisrecon.runtime._run_folder import (
     ChangedRecord,
     RunDirectory,
@@ -34,26 +26,21 @@ from thesisrecon.runtime._run_folder import (
     key_of,
     read_record,
 )
-from validation.studies.robustness import (
-    SmallRuns,
-    different,
-    disk_ends,
-    filled,
-    outputs,
-    refused_at,
-)
+from validation.studies.robustness import SmallRuns, different, disk_ends, filled, outputs, refused_at
 
 
 def some_features(value=1.0):
-    seeds = Seeds(
+    seeds = records.Seeds(
         np.full((2, 2), value), np.ones(2, np.float32), np.zeros(2, np.float32), np.eye(2, dtype=np.float32)
     )
-    return Features(np.arange(6.0).reshape(3, 2), np.ones(3, np.float32), np.zeros(3, np.float32), seeds)
+    return records.Features(
+        np.arange(6.0).reshape(3, 2), np.ones(3, np.float32), np.zeros(3, np.float32), seeds
+    )
 
 
 def some_metric():
-    tracks = Tracks(np.zeros(1, np.int64), np.zeros(1, np.int64), np.ones((1, 2)), 2, 1)
-    reconstruction = Reconstruction(
+    tracks = records.Tracks(np.zeros(1, np.int64), np.zeros(1, np.int64), np.ones((1, 2)), 2, 1)
+    reconstruction = records.Reconstruction(
         stratum="metric",
         P=np.ones((2, 3, 4)),
         X=np.ones((1, 4)),
@@ -65,8 +52,8 @@ def some_metric():
         sigma_px=0.5,
         reasons=("", "ünsüitable"),
     )
-    intervals = ({"focal_px": IntrinsicInterval(100.0, 1.0, "data")}, {})
-    return MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
+    intervals = ({"focal_px": records.IntrinsicInterval(100.0, 1.0, "data")}, {})
+    return records.MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
 
 
 def test_records_survive_the_disk(tmp_path):
@@ -78,7 +65,7 @@ def test_records_survive_the_disk(tmp_path):
     assert features.seeds.patches.dtype == np.float32
     assert metric.reconstruction.reasons == ("", "ünsüitable")
     assert metric.reconstruction.K is None
-    assert metric.intrinsics[0]["focal_px"] == IntrinsicInterval(100.0, 1.0, "data")
+    assert metric.intrinsics[0]["focal_px"] == records.IntrinsicInterval(100.0, 1.0, "data")
     assert metric.failed_checks == ("a doubt",)
     assert metric.reconstruction.registered.dtype == np.bool_
 
@@ -110,7 +97,7 @@ def test_the_manifest_ends_a_stage_and_removes_stale_files(tmp_path):
     folder = StageFolder(tmp_path)
     folder.save("old", "1", some_features())
     folder.save("new", "2", some_features())
-    report = StageReport("features", 1.5, {"images": 1}, {"x": 0.5}, ("a warning",))
+    report = records.StageReport("features", 1.5, {"images": 1}, {"x": 0.5}, ("a warning",))
     folder.finish(report, {"kind": "k"}, {"new": "2"})
     assert not (tmp_path / "old.npz").exists()
     assert folder.finished({"new": "2"}) == report
@@ -306,7 +293,7 @@ def test_nothing_is_unpacked(tmp_path):
     assert refused(path)
 
 
-TRACKS = Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3)
+TRACKS = records.Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3)
 CHANGES = [
     ("beyond the views", lambda parts: parts["array0"].__setitem__(1, 10**9)),
     ("below zero", lambda parts: parts["array1"].__setitem__(1, -1)),

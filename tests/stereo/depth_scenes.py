@@ -7,13 +7,7 @@ from scipy.ndimage import map_coordinates
 
 from tests.synthetic import photograph, reconstruction_of, texture
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import (
-    camera_from_centre,
-    decompose_camera,
-    distort,
-    project,
-    undistort,
-)
+from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Image, Reconstruction, Tracks
 
@@ -51,7 +45,7 @@ def on_arc(angles_deg, *, distance=6.0):
         z = -centre / np.linalg.norm(centre)
         x = np.cross([0.0, 1.0, 0.0], z)
         x /= np.linalg.norm(x)
-        cameras.append(camera_from_centre(K, np.array([x, np.cross(z, x), z]), centre))
+        cameras.append(matrix.camera_from_centre(K, np.array([x, np.cross(z, x), z]), centre))
     return np.array(cameras)
 
 
@@ -69,8 +63,10 @@ def photograph_scene(P, rectangles, *, sizes=None, noise=1.0, points=400, seed=0
     for view, (camera, size) in enumerate(zip(P, sizes or [(200, 150)] * len(P), strict=True)):
         shape = size[::-1]
         xy = np.indices(shape)[::-1].reshape(2, -1).T.astype(float)
-        K = decompose_camera(camera)[0]
-        straight = undistort((xy - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, lens) @ K[:2, :2].T + K[:2, 2]
+        K = matrix.decompose_camera(camera)[0]
+        straight = (
+            matrix.undistort((xy - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, lens) @ K[:2, :2].T + K[:2, 2]
+        )
         gray = trace(camera, rectangles, straight)[1].reshape(shape)
         images.append(photograph(gray + noise * rng.normal(size=shape), f"{view}.png"))
         depth, _, textured = trace(camera, rectangles, xy)
@@ -105,12 +101,12 @@ def trace(P, rectangles, xy):
 
 def observed_points(P, depths, X, lens):
     """A metric reconstruction of points X (N, 3), observed by every view whose depth map shows them."""
-    K = np.stack([decompose_camera(camera)[0] for camera in P])
+    K = np.stack([matrix.decompose_camera(camera)[0] for camera in P])
     views, points, seen_at = [], [], []
     for k, (camera, depth) in enumerate(zip(P, depths, strict=True)):
         z = X @ camera[2, :3] + camera[2, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            xy = project(camera, X)
+            xy = matrix.project(camera, X)
         limit = np.array(depth.shape[::-1]) - 1.0
         inside = (z > 0) & np.all((xy >= 0) & (xy <= limit), axis=1)
         at = np.where(inside[:, None], np.rint(xy), 0).astype(np.int64)
@@ -118,7 +114,7 @@ def observed_points(P, depths, X, lens):
         views.append(np.full(len(n), k))
         points.append(n)
         normalized = (xy[n] - K[k, :2, 2]) @ np.linalg.inv(K[k, :2, :2]).T
-        seen_at.append(distort(normalized, lens) @ K[k, :2, :2].T + K[k, :2, 2])
+        seen_at.append(matrix.distort(normalized, lens) @ K[k, :2, :2].T + K[k, :2, 2])
     view, point = np.concatenate(views), np.concatenate(points)
     order = np.lexsort((view, point))
     tracks = Tracks(view[order], point[order], np.concatenate(seen_at)[order], len(P), len(X))

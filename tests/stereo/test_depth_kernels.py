@@ -3,14 +3,7 @@
 import numpy as np
 
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.stereo._depth_kernels import (
-    count_agreement,
-    fuse_inverse_depths,
-    inverse_depths,
-    splat_depths,
-    surface_continuation,
-    update_kalman,
-)
+from thesisrecon.stereo import _depth_kernels as kernels
 from thesisrecon.stereo._plane_kernels import fit_planes
 
 SHAPE = (23, 31)
@@ -37,7 +30,7 @@ def test_inverse_depths_equal_least_squares_on_the_line():
     xy = (q[..., :2] / q[..., 2:] + rng.normal(0.0, 0.1, (*SHAPE, 2))).astype(np.float32)
     sigma = holes(rng, np.full(SHAPE, 0.3))
     rho, std = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
-    inverse_depths(xy, sigma, H, e, rho, std)
+    kernels.inverse_depths(xy, sigma, H, e, rho, std)
     h = homogenize(pixels()) @ H.T
     a, b = e[:2] - xy * e[2], xy * h[..., 2:] - h[..., :2]
     wanted = (a * b).sum(-1) / (a * a).sum(-1)
@@ -58,7 +51,7 @@ def test_fusion_is_the_weighted_mean_of_the_largest_party():
     rho = holes(rng, rho)
     out, out_std = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
     support, rivals = np.empty(SHAPE, np.uint8), np.empty(SHAPE, np.uint8)
-    fuse_inverse_depths(rho, std, 3.0, out, out_std, support, rivals)
+    kernels.fuse_inverse_depths(rho, std, 3.0, out, out_std, support, rivals)
     apart = np.abs(rho[:, None].astype(float) - rho[None])
     agree = apart <= 3.0 * np.hypot(std[:, None].astype(float), std[None])
     weight = 1.0 / std.astype(float) ** 2
@@ -83,7 +76,7 @@ def test_the_filter_ends_at_the_first_outlier():
     new, new_std = holes(rng, rng.uniform(0.8, 1.3, SHAPE)), np.full(SHAPE, 0.03, np.float32)
     alive, support = (rng.random(SHAPE) < 0.8).astype(np.uint8), np.ones(SHAPE, np.uint8)
     before, was = rho.copy(), alive.copy()
-    update_kalman(rho, std, new, new_std, 3.0, alive, support)
+    kernels.update_kalman(rho, std, new, new_std, 3.0, alive, support)
     inside = np.abs(new - before) <= 3.0 * np.hypot(0.05, 0.03)
     first, measured = np.isnan(before), np.isfinite(new)
     taken = (was == 1) & measured & (first | inside)
@@ -105,7 +98,7 @@ def test_agreement_counts_consistent_and_contradicted_depths():
     std = np.full(SHAPE, 1e-3, np.float32)
     agree, contradict = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, np.uint8)
     limits = np.array([1.0, 0.01, 2.0])
-    count_agreement((depth, std), to, (other, std), back, limits, agree, contradict)
+    kernels.count_agreement((depth, std), to, (other, std), back, limits, agree, contradict)
     v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
     x, y = u + 3.0 / depth, v + 1.0 / depth
     inside = (x > -0.5) & (x < SHAPE[1] - 0.5) & (y > -0.5) & (y < SHAPE[0] - 0.5)
@@ -125,7 +118,7 @@ def test_depths_land_on_the_nearest_pixels_of_another_view_the_nearer_before_the
     out = np.full((19, 25), np.nan, np.float32)
     out[4, 5], out[6, 7] = 0.1, 9.0
     wanted = out.copy()
-    splat_depths(depth, to, out)
+    kernels.splat_depths(depth, to, out)
     z = depth.astype(float)
     w = 1.1 * z + 0.2
     p, q = (
@@ -164,7 +157,7 @@ def test_continued_surfaces_lie_on_the_plane_of_certain_pixels():
     sure[np.isnan(rho)] = 0
     std = np.full(SHAPE, 4e-4, np.float32)
     joins = np.empty(SHAPE, np.uint8)
-    surface_continuation(rho, std, sure, 3, 0.05, 2.0, joins)
+    kernels.surface_continuation(rho, std, sure, 3, 0.05, 2.0, joins)
     wanted = np.zeros(SHAPE, bool)
     for v, u in np.argwhere((sure == 0) & np.isfinite(rho)):
         near = (np.abs(x - u) <= 3) & (np.abs(y - v) <= 3) & (sure > 0)

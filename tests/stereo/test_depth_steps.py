@@ -11,11 +11,18 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import DepthMap, DisparityMap
 from thesisrecon.stereo._depth_fusion import _concatenated, _measured
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
-from thesisrecon.stereo._neighbours import pinhole_view, select_neighbours, shared_projections, sparse_points
 from thesisrecon.stereo._planar import common_orientation
 from thesisrecon.stereo._polar import polar
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
-from thesisrecon.stereo.depth import _complete_depths, _confirm_depths, _region_sizes
+from thesisrecon.stereo.depth import (
+    _complete_depths,
+    _confirm_depths,
+    _region_sizes,
+    pinhole_view,
+    select_neighbours,
+    shared_projections,
+    sparse_points,
+)
 
 
 @pytest.fixture(scope="module")

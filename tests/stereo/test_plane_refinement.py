@@ -6,14 +6,7 @@ from scipy.ndimage import map_coordinates
 
 from tests.stereo.twins import Setting, squares
 from tests.synthetic import texture
-from thesisrecon.stereo._plane_kernels import (
-    PatchViews,
-    PatchWindow,
-    begin_planes,
-    pack_squares,
-    rate_planes,
-    sweep_planes,
-)
+from thesisrecon.stereo import _plane_kernels as kernels
 
 SHAPE = (13, 17)
 PLANE = np.array([1.0, 6e-3, -4e-3])
@@ -25,13 +18,15 @@ def arguments(setting, others):
     words, layout, start = [], [], 0
     for other in others:
         word = np.empty(other.shape, np.uint32)
-        pack_squares(other, word)
+        kernels.pack_squares(other, word)
         words.append(word.ravel())
         layout.append((start, *other.shape[::-1]))
         start += other.size
     packed = np.concatenate(words)
     gray, H, e = setting.gray, setting.H, setting.e
-    return PatchViews(gray, packed, np.array(layout), H, e), PatchWindow(setting.offsets, setting.likeness)
+    return kernels.PatchViews(gray, packed, np.array(layout), H, e), kernels.PatchWindow(
+        setting.offsets, setting.likeness
+    )
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +66,7 @@ def test_squares_are_the_four_levels_of_an_interpolation(scene):
     gray = scene[0].gray.copy()
     gray[5, 7] = 300.0
     packed = np.empty(SHAPE, np.uint32)
-    pack_squares(gray, packed)
+    kernels.pack_squares(gray, packed)
     wanted = squares(gray)
     for k in range(4):
         assert ((packed >> (8 * k)) & 255 == wanted[..., k]).all()
@@ -85,11 +80,11 @@ def test_costs_equal_weighted_correlations(scene, spread):
     setting, given, places = scene
     planes = planes_about(places, spread)
     cost = np.empty(SHAPE, np.float32)
-    begin_planes(*given, planes, cost)
+    kernels.begin_planes(*given, planes, cost)
     np.testing.assert_allclose(cost, setting.begin(planes), atol=2e-4)
     least, slope = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
     support = np.empty(SHAPE, np.uint8)
-    rate_planes(*given, planes, 0.4, least, support, slope)
+    kernels.rate_planes(*given, planes, 0.4, least, support, slope)
     wanted = setting.rate(planes, 0.4)
     np.testing.assert_allclose(least, wanted[0], atol=2e-4)
     assert (support == wanted[1]).all()
@@ -102,10 +97,10 @@ def test_a_pass_equals_that_of_plain_numpy(scene, backward):
     setting, given, places = scene
     planes = planes_about(places, 0.5)
     cost = np.empty(SHAPE, np.float32)
-    begin_planes(*given, planes, cost)
+    kernels.begin_planes(*given, planes, cost)
     wanted, wanted_cost = planes.copy(), cost.copy()
     setting.sweep(wanted, wanted_cost, step_px=0.4, converged_cost=0.02, backward=backward)
-    sweep_planes(*given, 0.4, 0.02, backward, planes, cost)
+    kernels.sweep_planes(*given, 0.4, 0.02, backward, planes, cost)
     # Sums in single precision may turn a choice between planes of one cost.
     assert np.mean(np.isclose(cost, wanted_cost, atol=5e-4)) > 0.97
     same = np.isclose(planes, wanted, atol=1e-4, equal_nan=True).all(axis=-1)

@@ -9,21 +9,15 @@ from tests.stereo.rectification_scenes import MOTIONS, PLANAR, SIZE, make_pair
 from tests.synthetic import texture
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
+from thesisrecon.stereo import _planar as planar
 from thesisrecon.stereo import rectification
 from thesisrecon.stereo._distortion import jacobians, matches_in_frame, measure_quality
 from thesisrecon.stereo._epipolar_pair import MAX_GROWTH, MAX_SHRINK, pair_of_cameras, pair_of_fundamental
-from thesisrecon.stereo._planar import (
-    PlanarRectification,
-    common_orientation,
-    hartley,
-    loop_zhang,
-    minimum_distortion,
-)
 from thesisrecon.stereo._polar import PolarRectification, polar
 from thesisrecon.stereo._resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
 from thesisrecon.stereo.rectification import disparity_range, rectify, rectify_cameras, rectify_pair
 
-PLANAR_METHODS = (hartley, loop_zhang, minimum_distortion, common_orientation)
+PLANAR_METHODS = (planar.hartley, planar.loop_zhang, planar.minimum_distortion, planar.common_orientation)
 CASES = [(method, motion) for method in PLANAR_METHODS for motion in PLANAR]
 CASES += [(polar, motion) for motion in MOTIONS]
 
@@ -50,7 +44,7 @@ def matched(rectified, pair):
 def test_exact_matches_share_their_row_and_nearer_ones_are_farther_left_on_the_right(method, motion):
     scene = make_pair(motion, np.random.default_rng(0))
     for pair in both_pairs(scene):
-        if pair.cameras is None and method is common_orientation:
+        if pair.cameras is None and method is planar.common_orientation:
             continue
         rectified = method(pair)
         left = rectified.rectified_from_original(0, scene.xy1)
@@ -97,7 +91,9 @@ def test_the_maps_are_inverse_to_each_other(rng, case):
         assert np.abs(rectified.original_from_rectified(side, there) - coverage).max(initial=0.0) < 1e-9
 
 
-@pytest.mark.parametrize(("method", "motion"), [(loop_zhang, "toed in"), (polar, "forward")], ids=named)
+@pytest.mark.parametrize(
+    ("method", "motion"), [(planar.loop_zhang, "toed in"), (polar, "forward")], ids=named
+)
 def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
     rectified = method(both_pairs(make_pair(motion, np.random.default_rng(2)))[0])
     rows = range(37, 42)
@@ -110,19 +106,19 @@ def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
 
 def test_a_parallel_pair_stays_as_it_is():
     scene = make_pair("parallel", np.random.default_rng(3))
-    for method in (loop_zhang, minimum_distortion, common_orientation):
+    for method in (planar.loop_zhang, planar.minimum_distortion, planar.common_orientation):
         for H in method(both_pairs(scene)[1]).H:
             expected = np.eye(3)
             expected[:2, 2] = (H / H[2, 2])[:2, 2]
             # The disparities of any scene slope a little; a shear takes part of that.
-            atol = 0.1 if method is minimum_distortion else 1e-6
+            atol = 0.1 if method is planar.minimum_distortion else 1e-6
             np.testing.assert_allclose(H / H[2, 2], expected, atol=atol)
 
 
 def test_disparities_of_a_common_orientation_are_inverse_depths():
     scene = make_pair("toed in", np.random.default_rng(4))
     pair = both_pairs(scene)[1]
-    rectified = common_orientation(pair)
+    rectified = planar.common_orientation(pair)
     left, right = (rectified.rectified_from_original(k, xy) for k, xy in enumerate(pair.matches))
     d = (left - right)[:, 0]
     # The third coordinate of the new orientation is that of H1 M1 over its scale.
@@ -138,7 +134,7 @@ def test_hartley_leaves_the_second_photograph_rigid_about_its_centre_and_makes_t
     scene = make_pair("beside", np.random.default_rng(5))
     pair = both_pairs(scene)[0]
     centre = (np.array(scene.sizes[1]) - 1.0) / 2.0
-    J = jacobians(hartley(pair), 1, centre[None])[0]
+    J = jacobians(planar.hartley(pair), 1, centre[None])[0]
     s = np.linalg.svd(J, compute_uv=False)
     assert s[0] / s[1] == pytest.approx(1.0, abs=1e-5)
     spread = [np.ptp(np.quantile(matched(m(pair), pair)[:, 0], [0.01, 0.99])) for m in PLANAR_METHODS[:3]]
@@ -149,11 +145,11 @@ def test_loop_and_zhang_keep_angles_and_ratios_and_the_least_distorted_is_not_be
     for motion in ("beside", "toed in", "rolled", "behind"):
         pair = both_pairs(make_pair(motion, np.random.default_rng(6), noise_px=0.1))[0]
         found = {m: measure_quality(m(pair), pair) for m in PLANAR_METHODS[:3]}
-        assert np.abs(np.array(found[loop_zhang].orthogonality_deg) - 90.0).max() < 5.0
-        assert np.abs(np.array(found[loop_zhang].aspect) - 1.0).max() < 0.1
+        assert np.abs(np.array(found[planar.loop_zhang].orthogonality_deg) - 90.0).max() < 5.0
+        assert np.abs(np.array(found[planar.loop_zhang].aspect) - 1.0).max() < 0.1
         least = min(quality.distortion for quality in found.values())
         # The crop, which the measure heeds, depends on the result.
-        assert found[minimum_distortion].distortion < least + 0.01
+        assert found[planar.minimum_distortion].distortion < least + 0.01
 
 
 @pytest.mark.parametrize("motion", ["forward", "diagonal", "half forward"])
@@ -177,15 +173,15 @@ def test_epipoles_inside_are_for_polar_frames_alone(motion):
 def test_the_best_is_planar_for_neighbours_and_polar_where_planar_frames_stretch(monkeypatch):
     scene = make_pair("beside", np.random.default_rng(9))
     best = rectify_pair(scene.F, scene.xy1, scene.xy2, *scene.sizes)
-    assert isinstance(best, PlanarRectification)
+    assert isinstance(best, planar.PlanarRectification)
     wide = both_pairs(make_pair("toed in", np.random.default_rng(9)))[0]
     monkeypatch.setattr(rectification, "BENDING", -1.0)
-    assert isinstance(rectify(wide, (minimum_distortion, polar)), PolarRectification)
+    assert isinstance(rectify(wide, (planar.minimum_distortion, polar)), PolarRectification)
 
 
 def test_matches_bound_the_disparities_and_a_few_wrong_ones_do_not():
     scene = make_pair("beside", np.random.default_rng(10))
-    rectified = common_orientation(pair_of_cameras(*scene.P, *scene.sizes))
+    rectified = planar.common_orientation(pair_of_cameras(*scene.P, *scene.sizes))
     low, high = disparity_range(rectified, scene.xy1, scene.xy2)
     left = rectified.rectified_from_original(0, scene.xy1)
     d = left[:, 0] - rectified.rectified_from_original(1, scene.xy2)[:, 0]
@@ -258,7 +254,7 @@ def test_wrong_calls_are_value_errors(change):
 
 def planar_frame(H, size):
     """Both images mapped by one homography."""
-    return PlanarRectification(np.stack([H, H]), size)
+    return planar.PlanarRectification(np.stack([H, H]), size)
 
 
 def cubic(x):

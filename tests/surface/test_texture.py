@@ -9,18 +9,10 @@ from tests.surface.sphere import looking_at_origin, paint, photograph, points_of
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.surface import _texture_blending
-from thesisrecon.surface._mesh import face_neighbours, vertex_normals
-from thesisrecon.surface._texture_blending import _equalizing_gains, blend_colors, prepare_views
-from thesisrecon.surface._texture_kernels import (
-    ViewSurface,
-    combine_colors,
-    continue_faces,
-    diffuse,
-    grow_colors,
-    observe_points,
-)
-from thesisrecon.surface._texture_views import choose_views, face_quality, label_charts
+from thesisrecon.surface import _texture_blending as blending
+from thesisrecon.surface import _texture_kernels as kernels
 from thesisrecon.surface.fusion import VolumetricFusion
+from thesisrecon.surface.mesh import face_neighbours, vertex_normals
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas, _pack_rectangles
 from thesisrecon.views.render import render
@@ -52,7 +44,7 @@ def test_a_new_view_shows_the_painted_sphere(sphere):
 
 def test_hidden_and_cut_off_points_are_not_visible(sphere):
     view = photograph(ring_of()[0])
-    quality = face_quality(sphere, [view])[:, 0]
+    quality = blending.face_quality(sphere, [view])[:, 0]
     middle = sphere.vertices[sphere.faces].mean(axis=1)
     centre = -np.linalg.solve(view.P[:, :3], view.P[:, 3])
     towards = (middle * (centre - middle)).sum(1) / np.linalg.norm(centre - middle, axis=1)
@@ -61,20 +53,20 @@ def test_hidden_and_cut_off_points_are_not_visible(sphere):
     half = replace(view, seen=np.arange(160)[None, :].repeat(120, axis=0) < 80)
     xy = middle @ view.P[:, :3].T + view.P[:, 3]
     right = xy[:, 0] / xy[:, 2] > 82
-    assert face_quality(sphere, [half])[right, 0].max() == 0.0
+    assert blending.face_quality(sphere, [half])[right, 0].max() == 0.0
 
 
 def test_charts_are_large_and_use_views_that_see_them(sphere):
     views = [photograph(m) for m in ring_of()]
-    quality = face_quality(sphere, views)
+    quality = blending.face_quality(sphere, views)
     neighbours = face_neighbours(sphere.faces)
-    label = choose_views(quality, neighbours)
+    label = blending.choose_views(quality, neighbours)
     seen = quality.max(axis=1) > 0.0
     np.testing.assert_array_equal(label >= 0, seen)
     assert (quality[seen, label[seen]] > 0.0).all()
     assert np.median(quality[seen, label[seen]] / quality[seen].max(axis=1)) > 0.8
     patchwork = np.where(seen, quality.argmax(axis=1), -1)
-    charts, before = (len(np.unique(label_charts(x, neighbours)[seen])) for x in (label, patchwork))
+    charts, before = (len(np.unique(blending.label_charts(x, neighbours)[seen])) for x in (label, patchwork))
     assert charts < 0.5 * before
     assert charts < 40
 
@@ -126,7 +118,7 @@ def test_a_surface_outside_all_views_is_rejected(sphere):
 
 def test_gains_are_found(sphere):
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
-    found = [view.gain for view in prepare_views(sphere, views)]
+    found = [view.gain for view in blending.prepare_views(sphere, views)]
     wanted = np.exp(np.log(GAINS).mean()) / np.array(GAINS)
     np.testing.assert_allclose(found, np.repeat(wanted[:, None], 3, axis=1), atol=0.025)
 
@@ -135,7 +127,9 @@ def test_gains_of_views_that_share_nothing_stay():
     weight = np.array([[1, 1, 1, 0, 0], [1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], dtype=np.float32)
     color = np.full((3, 5, 3), 100, dtype=np.float32)
     color[1] = 144.0
-    np.testing.assert_allclose(_equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4)
+    np.testing.assert_allclose(
+        blending._equalizing_gains(weight, color)[:, 0], [1.2, 1 / 1.2, 1.0], rtol=1e-4
+    )
 
 
 def test_depths_that_one_image_contradicts_are_removed(sphere, monkeypatch):
@@ -147,10 +141,10 @@ def test_depths_that_one_image_contradicts_are_removed(sphere, monkeypatch):
     x, y = (towards[:, :2] / towards[:, 2:]).T
     facing = (sphere.vertices @ np.linalg.solve(views[0].P[:, :3], views[0].P[:, 3])) < 0
     hit = facing & (np.abs(x - 80) < 15) & (np.abs(y - 60) < 15)
-    prepared, error = prepare_views(sphere, views), []
+    prepared, error = blending.prepare_views(sphere, views), []
     for scatter in (1e6, 20.0):
         monkeypatch.setattr(_texture_blending, "SCATTER", scatter)
-        color = blend_colors(prepared, sphere.vertices, vertex_normals(sphere))[0]
+        color = blending.blend_colors(prepared, sphere.vertices, vertex_normals(sphere))[0]
         error.append(float(np.sqrt(np.mean((color - paint(sphere.vertices))[hit] ** 2))))
     assert error[0] > 12.0
     assert error[1] < 0.3 * error[0]
@@ -174,7 +168,7 @@ def test_spread_shares_matches_its_twin(sphere):
     share[rng.random(share.shape) < 0.3] = 0.0
     spread = rng.random(share.shape).astype(np.float32)
     out = np.empty_like(share)
-    diffuse(share, neighbours, 0.1, spread, out)
+    kernels.diffuse(share, neighbours, 0.1, spread, out)
     around = np.where(neighbours[..., None] >= 0, spread[neighbours], 0.0).sum(axis=1)
     count = np.maximum((neighbours >= 0).sum(axis=1, keepdims=True), 1)
     np.testing.assert_allclose(out, np.where(share > 0, 0.1 * share + 0.9 * around / count, 0.0), rtol=1e-5)
@@ -201,7 +195,7 @@ def observed(points, normals, P, depth, trust, tolerance):
 
 
 def test_observe_points_matches_its_twin(sphere):
-    view = prepare_views(sphere, [photograph(ring_of()[2])])[0]
+    view = blending.prepare_views(sphere, [photograph(ring_of()[2])])[0]
     rng = np.random.default_rng(1)
     points = rng.normal(size=(400, 3))
     points *= 1.01 / np.linalg.norm(points, axis=1, keepdims=True)
@@ -210,8 +204,8 @@ def test_observe_points_matches_its_twin(sphere):
     gain = np.array([1.0, 2.0, 0.5], np.float32)
     P, rgb = view.P, view.rgb
     centre, scale = -np.linalg.solve(P[:, :3], P[:, 3]), abs(np.linalg.det(P[:, :3]))
-    seen = ViewSurface(P, centre, scale, view.depth, view.trust, view.tolerance, rgb, gain)
-    observe_points(points, normals, seen, weight, color)
+    seen = kernels.ViewSurface(P, centre, scale, view.depth, view.trust, view.tolerance, rgb, gain)
+    kernels.observe_points(points, normals, seen, weight, color)
     wanted = observed(points, normals, P, view.depth, view.trust, view.tolerance)
     np.testing.assert_allclose(weight, wanted, rtol=1e-4, atol=1e-6)
     assert 50 < (weight > 0).sum() < 350
@@ -229,7 +223,7 @@ def test_combine_colors_matches_its_twin():
     weight[:, 0] = 0.0
     color = (255 * rng.random((5, 60, 3))).astype(np.float32)
     out = np.full((60, 3), 7.0, np.float32)
-    combine_colors(weight, color, 2.0, 30.0, out)
+    kernels.combine_colors(weight, color, 2.0, 30.0, out)
     np.testing.assert_array_equal(out[0], 7.0)
     for n in np.flatnonzero(weight.any(axis=0)):
         w, c = weight[:, n].astype(float), color[:, n].astype(float)
@@ -247,7 +241,7 @@ def test_grow_colors_matches_its_twin():
     texture = rng.integers(0, 256, (12, 15, 3)).astype(np.uint8)
     drawn = rng.random((12, 15)) < 0.1
     before, was = texture.astype(float), drawn.copy()
-    grow_colors(texture, drawn)
+    kernels.grow_colors(texture, drawn)
     padded = np.pad(was, 1)
     sums = np.pad(np.where(was[..., None], before, 0.0), ((1, 1), (1, 1), (0, 0)))
     shifts = [(j, i) for j in range(3) for i in range(3)]
@@ -264,7 +258,7 @@ def test_faces_are_continued_by_a_texel():
     face = np.full((12, 12), -1)
     face[3:5, 3:6] = 0
     weights = np.zeros((12, 12, 2), np.float32)
-    continue_faces(corners, 4.0, face, weights)
+    kernels.continue_faces(corners, 4.0, face, weights)
     wanted = np.full((12, 12), -1)
     wanted[3:5, 2:7] = 0
     wanted[2:6, 3:6] = 0
@@ -275,5 +269,5 @@ def test_faces_are_continued_by_a_texel():
             np.testing.assert_allclose(weights[y, x], found[1:], atol=1e-6)
     face = np.full((12, 12), -1)
     face[3, 3] = 0
-    continue_faces(corners, 0.1, face, weights)
+    kernels.continue_faces(corners, 0.1, face, weights)
     assert (face >= 0).sum() < 5

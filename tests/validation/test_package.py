@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from thesisrecon.io.demo import DEMO_IMAGES, demo_images
+from thesisrecon.io._images import DEMO_IMAGES, demo_images
 from validation.scenes.real import ROOT
 from validation.studies.package.built import NEEDED, wheel_faults
 from validation.studies.package.environments import (

@@ -9,17 +9,7 @@ from tests.synthetic import texture
 from thesisrecon.geometry.camera_matrix import compose_camera, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import DisparityMap
-from thesisrecon.views._interpolation_kernels import (
-    NEAR,
-    ONE_SURFACE_PX,
-    REACH,
-    SPARSE,
-    blend,
-    disparity_from_rectified,
-    filter_extrapolated_by_colour,
-    filter_extrapolated_by_median,
-    intermediate_positions,
-)
+from thesisrecon.views import _interpolation_kernels as kernels
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
     _with_all_rows,
@@ -307,7 +297,7 @@ def test_disparities_are_taken_back_by_interpolation():
     H = np.array([[1.1, 0.05, -2.0], [-0.03, 0.9, 1.2], [1e-3, -2e-3, 1.0]])
     shape = (16, 20)
     places, d, conf = np.empty((*shape, 2)), np.empty(shape, np.float32), np.empty(shape, np.float32)
-    disparity_from_rectified((whole, sure), H, (0, 16), places, d, conf)
+    kernels.disparity_from_rectified((whole, sure), H, (0, 16), places, d, conf)
     y, x = np.mgrid[0:16, 0:20].astype(float)
     xh = np.stack([x, y, np.ones(shape)], axis=-1) @ H.T
     at = xh[..., :2] / xh[..., 2:]
@@ -318,13 +308,13 @@ def test_disparities_are_taken_back_by_interpolation():
     s, t = u - x0, v - y0
     smooth = (1 - t) * ((1 - s) * four[0] + s * four[1]) + t * ((1 - s) * four[2] + s * four[3])
     nearest = np.rint(v).astype(int), np.rint(u).astype(int)
-    plain = np.where(np.ptp(four, axis=0) <= ONE_SURFACE_PX, smooth, whole[nearest])
+    plain = np.where(np.ptp(four, axis=0) <= kernels.ONE_SURFACE_PX, smooth, whole[nearest])
     np.testing.assert_allclose(d, plain, atol=1e-5)
     inside = (at > -0.5).all(axis=-1) & (at[..., 0] < 22.5) & (at[..., 1] < 13.5)
     np.testing.assert_array_equal(conf, np.where(inside, sure[nearest], 0.0))
     assert 0.2 < inside.mean() < 1.0
     H[2] = [-0.1, 0.0, 1.0]
-    disparity_from_rectified((whole, sure), H, (0, 16), places, d, conf)
+    kernels.disparity_from_rectified((whole, sure), H, (0, 16), places, d, conf)
     assert np.isnan(places[:, 10:]).all()
     assert np.isnan(d[:, 10:]).all()
     assert np.isfinite(d[:, :10]).all()
@@ -335,7 +325,7 @@ def test_pixels_are_sampled_as_the_homography_maps_them():
     places, d = rng.uniform(0, 30, (5, 7, 2)), field(3, (5, 7))
     G = np.array([[0.9, 0.1, 3.0], [-0.1, 1.1, -2.0], [4e-3, -0.05, 1.0]])
     target = np.empty((5, 7, 2))
-    intermediate_positions(places, d, 0.3, G, (0, 5), target)
+    kernels.intermediate_positions(places, d, 0.3, G, (0, 5), target)
     moved = places - 0.3 * np.stack([d, 0 * d], axis=-1).astype(float)
     xh = np.concatenate([moved, np.ones((5, 7, 1))], axis=-1) @ G.T
     plain = np.where(xh[..., 2:] > 0, xh[..., :2] / xh[..., 2:], np.nan)
@@ -353,21 +343,25 @@ def test_guesses_become_medians_of_pixels_of_their_colour():
     levels = np.where(np.arange(31) < 18, 60.0, 200.0)[None, :, None] + rng.uniform(0, 40, (*shape, 3))
     levels = levels.astype(np.float32)
     out = np.empty_like(d)
-    filter_extrapolated_by_colour(levels, d, sure, (0, 9), (30.0, 0.5), out)
-    filter_extrapolated_by_colour(levels, d, sure, (9, 20), (30.0, 0.5), out)
+    kernels.filter_extrapolated_by_colour(levels, d, sure, (0, 9), (30.0, 0.5), out)
+    kernels.filter_extrapolated_by_colour(levels, d, sure, (9, 20), (30.0, 0.5), out)
     for y, x in np.ndindex(shape):
         if sure[y, x] > 0.0 or np.isnan(d[y, x]):
             np.testing.assert_array_equal(out[y, x], d[y, x])
             continue
-        rows = [v for v in range(y - REACH, y + REACH + 1, SPARSE) if 0 <= v < shape[0]]
-        columns = [u for u in range(x - REACH, x + REACH + 1, SPARSE) if 0 <= u < shape[1]]
+        rows = [
+            v for v in range(y - kernels.REACH, y + kernels.REACH + 1, kernels.SPARSE) if 0 <= v < shape[0]
+        ]
+        columns = [
+            u for u in range(x - kernels.REACH, x + kernels.REACH + 1, kernels.SPARSE) if 0 <= u < shape[1]
+        ]
         part = np.ix_(rows, columns)
         apart = np.abs(levels[part] - levels[y, x]).sum(axis=-1)
         weight = np.exp(-apart / 30.0) * np.where(sure[part] > 0.0, 1.0, 0.5)
         values, weight = d[part].ravel(), weight.ravel()
         kept = np.isfinite(values)
         values, weight = values[kept], weight[kept]
-        if np.ptp(np.append(values, d[y, x])) <= ONE_SURFACE_PX:
+        if np.ptp(np.append(values, d[y, x])) <= kernels.ONE_SURFACE_PX:
             assert out[y, x] == d[y, x]
             continue
         order = np.argsort(values)
@@ -385,12 +379,14 @@ def test_a_guess_alone_goes_with_those_around():
     sure = rng.choice([0.0, 0.0, 1.0], d.shape).astype(np.float32)
     out = np.empty_like(d)
     for rows in ((0, 5), (5, 14)):
-        filter_extrapolated_by_median(d, sure, rows, out)
+        kernels.filter_extrapolated_by_median(d, sure, rows, out)
     for y, x in np.ndindex(d.shape):
-        around = d[max(y - NEAR, 0) : y + NEAR + 1, max(x - NEAR, 0) : x + NEAR + 1].ravel()
+        around = d[
+            max(y - kernels.NEAR, 0) : y + kernels.NEAR + 1, max(x - kernels.NEAR, 0) : x + kernels.NEAR + 1
+        ].ravel()
         around = np.sort(around[np.isfinite(around)])
         expected = d[y, x]
-        if sure[y, x] == 0.0 and np.isfinite(expected) and np.ptp(around) > ONE_SURFACE_PX:
+        if sure[y, x] == 0.0 and np.isfinite(expected) and np.ptp(around) > kernels.ONE_SURFACE_PX:
             expected = around[len(around) // 2]
         np.testing.assert_array_equal(out[y, x], expected)
     assert (out != d).sum() > 20
@@ -404,7 +400,7 @@ def test_two_pictures_become_one_by_the_rules():
     weights = tuple(rng.choice([0.01, 0.4, 1.0], (9, 9)).astype(np.float32) for _ in range(2))
     sources = tuple(rng.uniform(-0.5, 8.5, (*shape, 2)).astype(np.float32) for _ in range(2))
     out = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
-    blend(colors, fronts, sources, weights, (0.5, 0.015, s), out)
+    kernels.blend(colors, fronts, sources, weights, (0.5, 0.015, s), out)
     for y, x in np.ndindex(shape):
         n, w, c = ([float(f[y, x]) for f in fronts], [], [color[y, x].astype(float) for color in colors])
         for k in (0, 1):

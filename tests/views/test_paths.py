@@ -12,14 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.surface.sphere import K, looking_at_origin
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
-from thesisrecon.views.paths import (
-    _fit_to_size,
-    _geometric_median,
-    estimate_up,
-    interpolate_cameras,
-    orbit,
-    sample_surface,
-)
+from thesisrecon.views import paths
 
 SIZE = (160, 120)
 UP = np.array([0.0, -1.0, 0.0])  # of cameras whose y axis points down
@@ -52,7 +45,7 @@ def project(camera, X):
 
 def test_all_round_the_scene_the_orbit_is_a_circle_at_constant_speed():
     cameras = ring(np.linspace(0, 2 * np.pi, 10)[:-1])
-    path = orbit(cameras, ball(), 40)
+    path = paths.orbit(cameras, ball(), 40)
     centres = centres_of(path)
     np.testing.assert_allclose(centres[:, 1], centres[0, 1])
     steps = np.linalg.norm(np.roll(centres, -1, axis=0) - centres, axis=1)
@@ -69,21 +62,21 @@ def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed):
     cameras = ring(np.sort(rng.uniform(0, arc, 8)), rng.uniform(-1.2, 0.5), rng.uniform(3.0, 5.0))
     turn = Rotation.random(random_state=seed).as_matrix()
     shift, X = rng.normal(size=3), ball(800, seed)
-    path = orbit(moved(cameras, turn, shift), X @ turn.T + shift, 12)
-    middle, up = _geometric_median(X @ turn.T + shift), turn @ UP
+    path = paths.orbit(moved(cameras, turn, shift), X @ turn.T + shift, 12)
+    middle, up = paths._geometric_median(X @ turn.T + shift), turn @ UP
     for camera in path:
         np.testing.assert_allclose(project(camera, middle), [79.5, 59.5], atol=1e-6)
         assert abs(camera.R[0] @ up) < 0.06
         assert -camera.R[1] @ up > 0.1
         assert np.linalg.norm(camera.centre - shift) > 1.2
     # A swing has no first camera to start from, but what it passes is the same.
-    same = orbit(cameras, X, 12)
+    same = paths.orbit(cameras, X, 12)
     np.testing.assert_allclose((centres_of(path) - shift) @ turn, centres_of(same), atol=1e-6)
 
 
 def test_an_orbit_of_one_side_stays_on_that_side_and_closes():
     angles = np.radians([-50.0, -20.0, 5.0, 45.0])
-    path = orbit(ring(angles), ball(), 61)
+    path = paths.orbit(ring(angles), ball(), 61)
     centres = centres_of(path)
     seen = np.degrees(np.arctan2(centres[:, 0], -centres[:, 2]))
     assert seen.min() == pytest.approx(-50.0, abs=2.0)
@@ -96,7 +89,7 @@ def test_an_orbit_avoids_obstacles_and_shows_the_model():
     """A long wall: at its ends the cameras' median distance would lead through it."""
     wall = np.random.default_rng(0).uniform([-6, -1, -0.2], [6, 1, 0.2], (3000, 3))
     cameras = ring(np.radians(np.arange(0, 360, 30.0)), -0.5, 5.0)
-    for camera in orbit(cameras, wall, 36):
+    for camera in paths.orbit(cameras, wall, 36):
         assert cKDTree(wall).query(camera.centre)[0] > 0.5
         inside = np.array([project(camera, X) for X in wall[::50]])
         front = (camera.R @ wall[::50].T + camera.t[:, None])[2] > 0
@@ -106,14 +99,14 @@ def test_an_orbit_avoids_obstacles_and_shows_the_model():
 
 def test_far_points_and_points_without_a_number_do_not_move_the_middle():
     X = np.vstack([ball(), np.full((300, 3), 500.0), np.full((5, 3), np.nan)])
-    path = orbit(ring(np.linspace(0, 6, 9)), X, 5)
+    path = paths.orbit(ring(np.linspace(0, 6, 9)), X, 5)
     assert max(np.abs(project(camera, np.zeros(3)) - [79.5, 59.5]).max() for camera in path) < 25
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7])
 def test_one_camera_swings_a_little(frames):
     (camera,) = ring(np.array([0.4]))
-    path = orbit([camera], ball(), frames)
+    path = paths.orbit([camera], ball(), frames)
     assert len(path) == frames
     np.testing.assert_allclose(path[0].centre, camera.centre, atol=0.1)
     if frames == 7:
@@ -125,14 +118,14 @@ def test_cameras_in_the_middle_that_look_away_see_their_surroundings():
     """Photographs from the middle of a room, outwards."""
     room = 5.0 * ball()
     away = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 5, 7), 0.0)]
-    for camera in orbit(away, room, 10):
+    for camera in paths.orbit(away, room, 10):
         assert 0.1 < np.linalg.norm(camera.centre) < 2.5
         assert abs(camera.R[0] @ UP) < 1e-6
     behind = [
         Camera(c.K, np.diag([-1.0, 1, -1]) @ c.R, np.diag([-1.0, 1, -1]) @ c.t, SIZE)
         for c in ring(np.zeros(3))
     ]
-    for camera in orbit(behind, ball(), 4):
+    for camera in paths.orbit(behind, ball(), 4):
         np.testing.assert_allclose(
             camera.R @ np.zeros(3) + camera.t, [0, 0, 1] @ np.diag([0, 0, np.linalg.norm(camera.t)]), atol=0.2
         )
@@ -144,9 +137,9 @@ def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled():
     for camera in ring(np.linspace(-1, 1, 12), -6.0):
         roll = Rotation.from_rotvec([0, 0, rng.normal(0.0, 0.06)]).as_matrix()
         cameras.append(Camera(K, roll @ camera.R, roll @ camera.t, SIZE))
-    assert np.degrees(np.arccos(estimate_up(cameras) @ UP)) < 4.0
+    assert np.degrees(np.arccos(paths.estimate_up(cameras) @ UP)) < 4.0
     (one,) = ring(np.array([0.7]))
-    np.testing.assert_allclose(estimate_up([one]), -one.R[1], atol=1e-9)
+    np.testing.assert_allclose(paths.estimate_up([one]), -one.R[1], atol=1e-9)
 
 
 def test_of_cameras_that_look_straight_down_up_is_behind_them():
@@ -155,14 +148,14 @@ def test_of_cameras_that_look_straight_down_up_is_behind_them():
         a = 2 * np.pi * k / 8
         R = np.array([[np.cos(a), 0, np.sin(a)], [np.sin(a), 0, -np.cos(a)], [0, 1.0, 0]])
         down.append(Camera(K, R, -R @ np.array([0.5 * np.cos(a), -4.0, 0.5 * np.sin(a)]), SIZE))
-    np.testing.assert_allclose(estimate_up(down), UP, atol=1e-9)
-    assert all(camera.centre[1] < -3.0 for camera in orbit(down, ball(), 6))
+    np.testing.assert_allclose(paths.estimate_up(down), UP, atol=1e-9)
+    assert all(camera.centre[1] < -3.0 for camera in paths.orbit(down, ball(), 6))
 
 
 def test_interpolation_ends_at_the_real_cameras_and_passes_all():
     cameras = ring(np.array([0.0, 0.3, 0.5, 1.1, 1.3]), -1.0)
     cameras[2] = Camera(1.2 * K * [[1], [1], [1 / 1.2]], cameras[2].R, cameras[2].t, SIZE)
-    path = interpolate_cameras(cameras, 400)
+    path = paths.interpolate_cameras(cameras, 400)
     for real, frame in ((cameras[0], path[0]), (cameras[-1], path[-1])):
         np.testing.assert_allclose(frame.P, real.P)
     centres = centres_of(path)
@@ -177,7 +170,7 @@ def test_interpolation_ends_at_the_real_cameras_and_passes_all():
 @given(seed=st.integers(0, 10_000))
 def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed):
     angles = np.cumsum(np.random.default_rng(seed).uniform(0.02, 0.8, 6))
-    for camera in interpolate_cameras(ring(angles, 0.0), 30):
+    for camera in paths.interpolate_cameras(ring(angles, 0.0), 30):
         np.testing.assert_allclose(camera.R[1], -UP, atol=1e-9)
         np.testing.assert_allclose(camera.centre[1], 0.0, atol=1e-9)
         assert np.linalg.det(camera.R) == pytest.approx(1.0)
@@ -185,12 +178,12 @@ def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed):
 
 def test_turning_on_the_spot_takes_its_time():
     still = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
-    path = interpolate_cameras(still, 31)
+    path = paths.interpolate_cameras(still, 31)
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
     np.testing.assert_allclose(turns, 1.0 / 30, rtol=1e-6)
     # Half a turn at one place of a way: no frame jumps.
     far = [Camera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
-    path = interpolate_cameras(
+    path = paths.interpolate_cameras(
         [*far[:2], Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]], 100
     )
     turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
@@ -200,19 +193,19 @@ def test_turning_on_the_spot_takes_its_time():
 def test_coincident_cameras_and_one_camera_stand_still():
     camera = ring(np.array([0.3]))[0]
     for cameras in ([camera], [camera] * 3):
-        path = interpolate_cameras(cameras, 5)
+        path = paths.interpolate_cameras(cameras, 5)
         assert len(path) == 5
         for frame in path:
             np.testing.assert_allclose(frame.P, camera.P, atol=1e-12)
     moving = ring(np.array([0.0, 0.0, 0.5, 0.5, 1.0]))
-    steps = np.linalg.norm(np.diff(centres_of(interpolate_cameras(moving, 50)), axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(centres_of(paths.interpolate_cameras(moving, 50)), axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=0.05)
 
 
 def test_other_shapes_of_pictures_show_all_that_the_camera_saw():
     camera = ring(np.array([0.3]))[0]
     for size in ((320, 240), (400, 100), (30, 90)):
-        other = _fit_to_size(camera, size)
+        other = paths._fit_to_size(camera, size)
         rays = np.linalg.inv(camera.K) @ np.array(
             [[-0.5, 159.5, -0.5, 159.5], [-0.5, -0.5, 119.5, 119.5], [1, 1, 1, 1]]
         )
@@ -222,29 +215,29 @@ def test_other_shapes_of_pictures_show_all_that_the_camera_saw():
         assert min(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) <= 1.0 + 1e-9
         assert max(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) == pytest.approx(1.0)
     turned = Camera(K, camera.R, camera.t, (120, 160))
-    assert {frame.size for frame in interpolate_cameras([camera, turned], 5)} == {SIZE}
-    assert {frame.size for frame in orbit([camera, turned], ball(), 5, size=(70, 50))} == {(70, 50)}
+    assert {frame.size for frame in paths.interpolate_cameras([camera, turned], 5)} == {SIZE}
+    assert {frame.size for frame in paths.orbit([camera, turned], ball(), 5, size=(70, 50))} == {(70, 50)}
 
 
 def test_points_lie_on_the_surface_by_its_area():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [5, 3, 0], [8, 0, 0]])
     mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [3, 4, 5], [0, 0, 1]]))
-    X = sample_surface(mesh, 1000)
+    X = paths.sample_surface(mesh, 1000)
     small = X[:, 0] < 2
     assert small.mean() == pytest.approx(0.1, abs=0.005)
     assert (X[small, :2].sum(axis=1) <= 1.0 + 1e-12).all()
     np.testing.assert_allclose(X[small].mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.02)
-    assert len(sample_surface(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
+    assert len(paths.sample_surface(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
 
 
 def test_wrong_calls_are_refused():
     cameras = ring(np.array([0.0]))
-    for path in (lambda c, n: orbit(c, ball(), n), interpolate_cameras):
+    for path in (lambda c, n: paths.orbit(c, ball(), n), paths.interpolate_cameras):
         with pytest.raises(ValueError, match="at least one camera"):
             path([], 5)
         with pytest.raises(ValueError, match="at least one frame; got 0"):
             path(cameras, 0)
     with pytest.raises(ValueError, match="none that is finite"):
-        orbit(cameras, np.full((4, 3), np.nan), 5)
+        paths.orbit(cameras, np.full((4, 3), np.nan), 5)
     with pytest.raises(ValueError, match="all points and cameras are in one place"):
-        orbit(cameras, np.tile(cameras[0].centre, (4, 1)), 5)
+        paths.orbit(cameras, np.tile(cameras[0].centre, (4, 1)), 5)

@@ -89,7 +89,7 @@ def reconstruct(
 def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0) -> None:
     """Reconstruct the courtyard images that come with the package."""
     cap_threads(threads)
-    from thesisrecon.io.demo import demo_images
+    from thesisrecon.io._images import demo_images
 
     # The folder may hold a demo of an older version with other settings.
     options = {"threads": threads or None, "overwrite": True}

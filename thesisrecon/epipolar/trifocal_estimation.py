@@ -27,7 +27,7 @@ from thesisrecon.numerics.levenberg_marquardt import (
     minimize_residuals,
     run_levenberg_marquardt,
 )
-from thesisrecon.numerics.losses import huber
+from thesisrecon.numerics.noise import huber
 
 # Largest relative standard deviation of T. Planes, rotations and random matches give 0.5 to 1.5 at any noise;
 # scenes with depth and noise of a hundredth of the parallax below 0.1.

@@ -8,6 +8,24 @@ from numpy.typing import ArrayLike, NDArray
 from thesisrecon.arrays import F64
 
 
+def checked_inverse(G: F64, caller: str) -> F64:
+    """Invert matrices (..., d, d) that are finite and not singular."""
+    require_finite(caller, G)
+    try:
+        return np.asarray(np.linalg.inv(G), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(f"{caller} needs an invertible matrix; got a singular one of {G.shape}") from error
+
+
+def checked_unit(array: F64, caller: str) -> F64:
+    """Scale an array that is finite and not zero to unit Frobenius norm."""
+    require_finite(caller, array)
+    norm = float(np.linalg.norm(array))
+    if not norm > 0.0:
+        raise ValueError(f"{caller} needs numbers that are not all zero")
+    return array / norm
+
+
 def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]]) -> None:
     """Raise ``ValueError`` if an array has a wrong shape.
 

@@ -17,8 +17,7 @@ import math
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._checks import checked_unit
-from thesisrecon.geometry.homogeneous import cross_matrix, require_finite, require_shapes
+from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite, require_shapes
 from thesisrecon.kernels import empty, kernel
 
 _Two = tuple[float, float]

@@ -10,8 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._checks import checked_unit
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, require_finite
+from thesisrecon.geometry.homogeneous import (
+    checked_unit,
+    cross_matrix,
+    dehomogenize,
+    homogenize,
+    require_finite,
+)
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import unit_norm
 

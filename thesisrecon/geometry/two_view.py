@@ -9,9 +9,9 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._checks import checked_unit
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import (
+    checked_unit,
     cross_matrix,
     dehomogenize,
     homogenize,

@@ -21,8 +21,6 @@ from thesisrecon.numerics._elimination import (
     mark_pairs,
     substitute_points,
 )
-from thesisrecon.numerics._kernels import floored_diagonal
-from thesisrecon.numerics._observations import Jacobians, SortedObservations
 from thesisrecon.numerics._reduced_solvers import (
     BandedCholesky,
     ReducedSystem,
@@ -30,7 +28,8 @@ from thesisrecon.numerics._reduced_solvers import (
     choose_solver,
     solve_dense,
 )
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics.observations import Jacobians, Observations, SortedObservations
+from thesisrecon.numerics.small_solvers import floored_diagonal
 
 CHUNK = 16384
 # Every chunk has its own sums: few chunks if these are large.

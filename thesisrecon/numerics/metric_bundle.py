@@ -17,19 +17,24 @@ from thesisrecon.numerics._intrinsic_unknowns import (
     assign_columns,
     number_unknowns,
 )
-from thesisrecon.numerics._metric_kernels import (
+from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
+from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
+from thesisrecon.numerics.metric_cameras import (
     POSE_DOF,
+    MetricCameras,
     MetricModel,
     linearize_metric,
     metric_cost,
     move_poses,
     project_metric,
 )
-from thesisrecon.numerics._observations import Jacobians, SortedObservations, Weighting, sort_observations
-from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
-from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
-from thesisrecon.numerics.metric_cameras import MetricCameras
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics.observations import (
+    Jacobians,
+    Observations,
+    SortedObservations,
+    Weighting,
+    sort_observations,
+)
 
 # Below a relative gain of NEWTON_GAIN, MIN_CURVATURE of the curvature along a residual is kept if its loss
 # bends: reweighting is safe far from the minimum, Newton's method is faster near it.

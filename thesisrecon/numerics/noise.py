@@ -1,10 +1,46 @@
-"""Standard deviation of the noise, and Huber's loss for it, from residuals at a minimum."""
+"""Robust losses rho(s) of squared residuals, and the standard deviation of the noise from residuals."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from thesisrecon.arrays import F64
+
+
+def huber(s: F64, delta: float) -> tuple[F64, F64]:
+    """Compute rho = s below delta^2, 2 delta sqrt(s) - delta^2 above (Huber 1964); convex.
+
+    Parameters
+    ----------
+    s, delta : ndarray, float
+        Squared residuals, and turning point.
+
+    Returns
+    -------
+    rho, weight : ndarray
+        Loss and its derivative.
+    """
+    root = np.sqrt(np.maximum(s, delta**2))
+    inside = s <= delta**2
+    return np.where(inside, s, 2.0 * delta * root - delta**2), np.where(inside, 1.0, delta / root)
+
+
+def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
+    """Compute rho = 2 delta^2 (sqrt(1 + s / delta^2) - 1), the smooth relative of Huber's loss; convex.
+
+    Parameters
+    ----------
+    s, delta : ndarray, float
+        As in :func:`huber`.
+
+    Returns
+    -------
+    rho, weight : ndarray
+        Loss and its derivative.
+    """
+    root = np.sqrt(1.0 + s / delta**2)
+    return 2.0 * delta**2 * (root - 1.0), 1.0 / root
+
 
 # 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75), which is not consistent.
 MAD_FACTOR = 1.4826022185056018

@@ -2,12 +2,78 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+
+
+@dataclass(frozen=True)
+class SortedObservations:
+    """Observations sorted by (point, view).
+
+    ``start`` (N + 1,) is the first observation of each point, ``order`` (K,) the caller's position of each.
+    """
+
+    seen: Observations
+    start: I64
+    order: I64
+
+    def unsort(self, values: F64) -> F64:
+        """Return values (K, ...) of observations in the caller's order."""
+        out = np.empty_like(values)
+        out[self.order] = values
+        return out
+
+
+def sort_observations(observations: Observations, n_views: int, n_points: int) -> SortedObservations:
+    """Check and sort observations; raise ``ValueError`` for wrong shapes, indices or pixels."""
+    view = np.ascontiguousarray(observations.view_index, dtype=np.int64)
+    point = np.ascontiguousarray(observations.point_index, dtype=np.int64)
+    xy = np.ascontiguousarray(observations.xy, dtype=np.float64)
+    require_shapes("observations", view_index=(view, ("K",)), point_index=(point, ("K",)), xy=(xy, ("K", 2)))
+    require_finite("observations", xy)
+    if len(view) and (view.min() < 0 or view.max() >= n_views or point.min() < 0 or point.max() >= n_points):
+        raise ValueError(f"observation indices are beyond the {n_views} views or {n_points} points")
+    key = point * max(n_views, 1) + view
+    order = np.arange(len(key))
+    if np.any(key[1:] < key[:-1]):
+        order = np.argsort(key, kind="stable")
+        view, point, xy = view[order], point[order], xy[order]
+    start = np.zeros(n_points + 1, dtype=np.int64)
+    np.cumsum(np.bincount(point, minlength=n_points), out=start[1:])
+    return SortedObservations(Observations(view, point, xy), start, order)
+
+
+class Jacobians(NamedTuple):
+    """Weighted ``residual`` (K, 2) and Jacobians ``A`` (K, 2, C), ``E`` (K, 2, F), ``B`` (K, 2, 3)."""
+
+    residual: F64
+    A: F64
+    E: F64
+    B: F64
+
+    @classmethod
+    def empty(cls, n: int, own: int, common: int) -> Jacobians:
+        """Allocate buffers of n observations with ``own`` columns in A and ``common`` ones in E."""
+        return cls(*(np.empty((n, *shape)) for shape in [(2,), (2, own), (2, common), (2, 3)]))
+
+
+class Weighting(NamedTuple):
+    """Weighting of residuals: in units of ``sigma``, under Huber's loss that turns at ``delta``.
+
+    ``min_curvature`` is the least fraction of the curvature along a residual that is kept if its loss bends
+    (Triggs et al., Bundle Adjustment, 1999, equation 11): 1 is plain reweighting.
+    """
+
+    sigma: float
+    delta: float
+    min_curvature: float = 1.0
+
 
 _MORTON_BITS = 31
 

@@ -12,7 +12,6 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
 from thesisrecon.numerics._elimination import revert_crossing_points
-from thesisrecon.numerics._observations import Jacobians, Weighting, sort_observations
 from thesisrecon.numerics._projective_kernels import (
     UnitState,
     linearize_projective,
@@ -22,7 +21,7 @@ from thesisrecon.numerics._projective_kernels import (
 )
 from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
 
 _VIEW_DOF = 11
 

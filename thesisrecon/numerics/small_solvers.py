@@ -1,13 +1,100 @@
-"""Linear algebra of small matrices in kernels; it compiles in a fraction of the time of LAPACK's wrappers."""
+"""Linear algebra of small matrices: kernels that compile in a fraction of the time of LAPACK's wrappers."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.kernels import kernel, zeros
+
+TINY = 1e-12
+
+
+@kernel(inline="always")
+def loss_value(s: float, delta: float) -> float:
+    """Evaluate Huber's rho(s); least squares if delta is infinite."""
+    d2 = delta * delta
+    return s if s <= d2 else 2.0 * delta * math.sqrt(s) - d2
+
+
+@kernel(inline="always")
+def loss_weight(s: float, delta: float) -> float:
+    """Evaluate rho'(s)."""
+    return 1.0 if s <= delta * delta else delta / math.sqrt(s)
+
+
+@kernel(inline="always")
+def loss_curvature(s: float, delta: float) -> float:
+    """Evaluate 1 + 2 s rho'' / rho', the fraction of the curvature along a residual that its loss leaves."""
+    return 1.0 if s / (delta * delta) <= 1.0 else 0.0
+
+
+@kernel(inline="always")
+def away_from_zero(w: float) -> float:
+    """Move a projective depth off 0, so that a point in the focal plane gets a huge residual."""
+    if w >= 0.0:
+        return max(w, TINY)
+    return min(w, -TINY)
+
+
+@kernel
+def invert_cholesky_3x3(
+    m00: float, m10: float, m20: float, m11: float, m21: float, m22: float, out: F64
+) -> bool:
+    """Fill ``out`` with L^-1 of a symmetric matrix L L' given by its lower triangle."""
+    out[:] = 0.0
+    if not m00 > 0.0:
+        return False
+    l00 = np.sqrt(m00)
+    l10, l20 = m10 / l00, m20 / l00
+    p1 = m11 - l10 * l10
+    if not p1 > 0.0:
+        return False
+    l11 = np.sqrt(p1)
+    l21 = (m21 - l20 * l10) / l11
+    p2 = m22 - l20 * l20 - l21 * l21
+    if not p2 > 0.0:
+        return False
+    out[0, 0], out[1, 1], out[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / np.sqrt(p2)
+    out[1, 0] = -l10 * out[0, 0] * out[1, 1]
+    out[2, 1] = -l21 * out[1, 1] * out[2, 2]
+    out[2, 0] = -(l20 * out[0, 0] + l21 * out[1, 0]) * out[2, 2]
+    return True
+
+
+@kernel
+def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
+    """Invert a symmetric positive matrix by Cholesky factorisation."""
+    positive: bool = invert_cholesky_3x3(M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2], root)
+    multiply_transposed_3x3(root, out)
+    return positive
+
+
+@kernel(inline="always")
+def multiply_transposed_3x3(L: F64, out: F64) -> None:
+    """Fill ``out`` with L' L."""
+    for a in range(3):
+        for b in range(3):
+            out[a, b] = L[0, a] * L[0, b] + L[1, a] * L[1, b] + L[2, a] * L[2, b]
+
+
+def floored_diagonal(diagonal: F64) -> F64:
+    """Floor the diagonal (D,) of J'J away from 0, so that the damped matrix is positive."""
+    largest = float(diagonal.max(initial=0.0))
+    return np.maximum(diagonal, 1e-12 * largest if largest > 0.0 else 1.0)
+
+
+def solve_positive(A: F64, b: F64) -> F64 | None:
+    """Solve A x = b, b (D,) or (D, M), by Cholesky factorisation; None if A is not positive."""
+    if not (np.isfinite(A).all() and np.isfinite(b).all()):
+        return None
+    if len(b) == 0:
+        return np.zeros_like(b)
+    _, x, info = scipy.linalg.lapack.dposv(A, b, lower=1)
+    return None if info != 0 or not np.isfinite(x).all() else np.asarray(x).reshape(b.shape)
 
 
 @kernel

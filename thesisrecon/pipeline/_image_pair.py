@@ -46,7 +46,7 @@ def match_pair(
     --------
     >>> from thesisrecon import PipelineConfig, match_pair
     >>> from thesisrecon.config import ImageOptions
-    >>> from thesisrecon.io.demo import demo_images
+    >>> from thesisrecon.io._images import demo_images
     >>> first, second = demo_images()[:2]
     >>> pair = match_pair(first, second, config=PipelineConfig(images=ImageOptions(max_size_px=640)))
     >>> pair.F.shape, len(pair.xy1) > 60

@@ -18,9 +18,14 @@ from thesisrecon.geometry.camera_matrix import orient_signs
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_sampson_residuals
 from thesisrecon.numerics.noise import noise_from_distances
-from thesisrecon.projective._initial_pair import NO_PARALLAX, rank_initial_pairs, require_pair_with_parallax
 from thesisrecon.projective._model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
-from thesisrecon.projective._track_selection import expand_to_all_tracks, working_tracks
+from thesisrecon.projective._track_selection import (
+    NO_PARALLAX,
+    expand_to_all_tracks,
+    rank_initial_pairs,
+    require_pair_with_parallax,
+    working_tracks,
+)
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 

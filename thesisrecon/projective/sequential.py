@@ -9,8 +9,8 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.projective._initial_pair import require_pair_with_parallax
 from thesisrecon.projective._model import adjust_all, to_reconstruction
+from thesisrecon.projective._track_selection import require_pair_with_parallax
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 

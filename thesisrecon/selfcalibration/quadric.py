@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics.losses import huber
+from thesisrecon.numerics.noise import huber
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
     FOCAL_LIMITS,

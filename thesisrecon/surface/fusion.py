@@ -18,7 +18,6 @@ from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import decompose_camera, project
 from thesisrecon.records import DepthMap, TexturedMesh
-from thesisrecon.surface._depth_grid import GRAZING_DEG, max_depth_slope, triangulate_grid
 from thesisrecon.surface._fusion_kernels import (
     SIDE,
     MapSamples,
@@ -27,8 +26,8 @@ from thesisrecon.surface._fusion_kernels import (
     place_vertices,
     touched_blocks,
 )
-from thesisrecon.surface._mesh import remove_small_parts, remove_unused_vertices, select_faces
-from thesisrecon.surface.linear import surface_from_depth
+from thesisrecon.surface.linear import GRAZING_DEG, max_depth_slope, surface_from_depth, triangulate_grid
+from thesisrecon.surface.mesh import remove_small_parts, remove_unused_vertices, select_faces
 
 MIN_COSINE = 0.1
 """Lower limit of the incidence cosine."""

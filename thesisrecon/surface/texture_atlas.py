@@ -15,15 +15,15 @@ from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.raster import resample, smooth
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface._mesh import face_neighbours
-from thesisrecon.surface._texture_blending import paint_texture
-from thesisrecon.surface._texture_views import (
+from thesisrecon.surface._texture_blending import (
     choose_views,
     face_quality,
     label_charts,
+    paint_texture,
     project_to_view,
     view_camera,
 )
+from thesisrecon.surface.mesh import face_neighbours
 
 CHART_MARGIN = 2
 """Pixels around each chart, so that reduced textures do not mix charts."""

@@ -39,7 +39,7 @@ def pages(tmp_path_factory):
     failed = Outcome(out, EVIL)
     judged = {("toy", "yard"): (judgement, {"ours": Outcome(out), "crashing": failed})}
     gates = {"toy/yard/wheels-lost": Gate("toy/yard/wheels-lost", 1.0, True, EVIL)}
-    write_pages(options, STAGES, judged, collect(options, judged, gates), None)
+    write_pages(options, STAGES, judged, collect(options, judged, gates))
     return out
 
 

@@ -85,7 +85,7 @@ def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(s
     # Nobody waits for one that is known to hang.
     assert {name: o.failure for name, o in outcomes.items()} == refused
     results = collect(options, judged, {})
-    page = write_pages(options, STAGES, judged, results, None).read_text(encoding="utf-8")
+    page = write_pages(options, STAGES, judged, results).read_text(encoding="utf-8")
     assert page.count("pycolmap did not answer a small question within 12 s") == 2
     assert "Not used: OpenCV crashed" in results.environment[PACKAGES["cv2"]]
 
