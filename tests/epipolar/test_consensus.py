@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare, norm
 
-from thesisrecon.epipolar._consensus import SampleConsensus, draw_sample, required_samples
 from thesisrecon.epipolar._noise import (
     TAIL,
     NoiseMixture,
@@ -18,6 +17,8 @@ from thesisrecon.epipolar._noise import (
     noise_width,
     trimmed_noise_scale,
 )
+from thesisrecon.epipolar._sampling import draw_sample, required_samples
+from thesisrecon.epipolar.ransac import _SampleConsensus
 
 
 @settings(max_examples=100, deadline=None)
@@ -90,7 +91,7 @@ class Line:
 
 def search_line(x, y, rng, *args, **options):
     line = Line(x, y)
-    return SampleConsensus(*args, **options).search(line.solve, line.residuals, 2, len(x), rng)
+    return _SampleConsensus(*args, **options).search(line.solve, line.residuals, 2, len(x), rng)
 
 
 def test_consensus_finds_the_line_among_outliers():

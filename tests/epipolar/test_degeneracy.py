@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from tests.epipolar.facade import FacadeMaker
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar._chance import log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._frame import PairFrame
+from thesisrecon.epipolar._noise import log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._planes import (
     _plane_distances,
     _plane_normal_equations,
@@ -28,7 +29,6 @@ from thesisrecon.geometry.two_view import (
     unit_norm,
 )
 from thesisrecon.records import FundamentalFit
-from validation.scenes.facade import FacadeMaker
 
 
 def judged(xy1, xy2, seed=0):

@@ -9,7 +9,6 @@ from tests.epipolar.pairs import make_pair, oriented
 from thesisrecon.epipolar import _refinement as rank2
 from thesisrecon.epipolar import _sampling as kernels
 from thesisrecon.epipolar import linear
-from thesisrecon.epipolar._consensus import draw_sample
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals
@@ -268,7 +267,7 @@ def batch_of(points, rng):
     kernels.solve_seven_point_batch(X, Y)
     samples = np.empty((kernels.LANES, 7), dtype=np.int64)
     for u, sample in zip(uniforms, samples, strict=True):
-        draw_sample(u, len(points), sample)
+        kernels.draw_sample(u, len(points), sample)
     return samples, Y
 
 

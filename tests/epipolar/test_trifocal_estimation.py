@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.epipolar._tensor_equations import TensorEquations, tensor_equations
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
     _minimize_algebraic_error,
     _minimize_reprojection_error,
     _ReprojectionProblem,
+    _tensor_equations,
+    _TensorEquations,
     estimate_trifocal,
 )
 from thesisrecon.errors import StageFailure
@@ -83,7 +84,7 @@ def test_exact_matches_give_the_tensor_of_their_cameras(n, m):
 
 
 @dataclass(frozen=True)
-class FickleEquations(TensorEquations):
+class FickleEquations(_TensorEquations):
     """Equations whose solution has the other sign each time, as a singular vector may have."""
 
     calls: list[int] = field(default_factory=list)
@@ -95,7 +96,7 @@ class FickleEquations(TensorEquations):
 
 def test_the_least_error_does_not_hang_on_the_signs_of_singular_vectors():
     rng = np.random.default_rng(3)
-    equations = tensor_equations(*matches(three_cameras(rng), rng, 30, 0, 0.5))
+    equations = _tensor_equations(*matches(three_cameras(rng), rng, 30, 0, 0.5))
     start = equations.solve()
     expected = _minimize_algebraic_error(equations, start)
     fickle = FickleEquations(equations.A, equations.noise, equations.transforms)
@@ -115,7 +116,7 @@ def test_each_step_approaches_the_truth_and_reports_the_noise(n, m):
         P = three_cameras(rng)
         points, segments = matches(P, rng, n, m, 0.5)
         exact, _ = matches(P, rng, 100, 0, 0.0)
-        equations = tensor_equations(points, segments)
+        equations = _tensor_equations(points, segments)
         algebraic = _minimize_algebraic_error(equations, equations.solve())
         np.testing.assert_allclose(
             abs(np.sum(algebraic * tensor_from_cameras(*cameras_from_tensor(algebraic)))), 1.0, atol=1e-9
@@ -188,7 +189,7 @@ def test_noisy_matches_that_cannot_work_are_named(kind, sigma):
 def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():
     rng = np.random.default_rng(3)
     points, segments = matches(three_cameras(rng), rng, 9, 8, 1.0)
-    equations = tensor_equations(points, segments)
+    equations = _tensor_equations(points, segments)
     linear, best = equations.solve(), _minimize_algebraic_error(equations, equations.solve())
     from_linear, from_best = (
         _ReprojectionProblem(T, points, segments, equations.transforms, 1.0) for T in (linear, best)

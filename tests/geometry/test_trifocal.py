@@ -5,8 +5,8 @@ import pytest
 from hypothesis import strategies as st
 
 from tests.geometry.properties import gap, holds_for_every, random_camera
-from thesisrecon.epipolar._tensor_equations import check_triplets, tensor_equations
-from thesisrecon.geometry import three_view as view
+from thesisrecon.epipolar.trifocal_estimation import _check_triplets, _tensor_equations
+from thesisrecon.geometry import three_view
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.strata import transform
@@ -17,7 +17,7 @@ NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 
 
 def estimate_tensor_linear(points, segments):
-    equations = tensor_equations(points, segments)
+    equations = _tensor_equations(points, segments)
     return equations.in_pixels(equations.solve())
 
 
@@ -49,7 +49,7 @@ def test_tensor_of_canonical_cameras(rng):
     P2, P3 = rng.normal(size=(2, 3, 4))
     T = np.einsum("ji,k->ijk", P2[:, :3], P3[:, 3]) - np.einsum("j,ki->ijk", P2[:, 3], P3[:, :3])
     np.testing.assert_allclose(
-        view.tensor_from_cameras(np.eye(3, 4), P2, P3), T / np.linalg.norm(T), atol=1e-12
+        three_view.tensor_from_cameras(np.eye(3, 4), P2, P3), T / np.linalg.norm(T), atol=1e-12
     )
 
 
@@ -58,14 +58,9 @@ def test_tensor_is_the_same_in_every_projective_frame(rng):
     P = three_cameras(rng)
     G = random_transform("projective", rng)
     scales = rng.uniform(0.5, 2.0, 3) * rng.choice([-1.0, 1.0], 3)
-    assert (
-        gap(
-            view.tensor_from_cameras(*(scales[:, None, None] * transform(G, P, "cameras"))),
-            view.tensor_from_cameras(*P),
-        )
-        < 1e-6
-    )
-    assert not view.unit_tensor(np.zeros((3, 3, 3))).any()
+    moved = scales[:, None, None] * transform(G, P, "cameras")
+    assert gap(three_view.tensor_from_cameras(*moved), three_view.tensor_from_cameras(*P)) < 1e-6
+    assert not three_view.unit_tensor(np.zeros((3, 3, 3))).any()
 
 
 @holds_for_every()
@@ -74,11 +69,11 @@ def test_trifocal_constraint_of_points(rng):
     X = homogenize(rng.uniform(-1.5, 1.5, (6, 3)))
     x = np.einsum("vab,nb->vna", P, X)
     x /= np.linalg.norm(x, axis=2, keepdims=True)
-    T = view.tensor_from_cameras(*P)
+    T = three_view.tensor_from_cameras(*P)
     # Two lines through each point span all others: four independent equations.
     l2, l3 = (np.linalg.svd(x[v][:, None])[2][:, 1:] for v in (1, 2))
     right, wrong = (
-        np.abs(view.trifocal_residuals(T, x[0][:, None, None], l2[:, :, None], lines[:, None])).max()
+        np.abs(three_view.trifocal_residuals(T, x[0][:, None, None], l2[:, :, None], lines[:, None])).max()
         for lines in (l3, np.roll(l3, 1, axis=0))
     )
     assert right < 1e-9
@@ -90,10 +85,10 @@ def test_trifocal_constraint_of_lines(rng):
     P = three_cameras(rng)
     l = lines_of(seen_segments(P, rng, 6))
     l /= np.linalg.norm(l, axis=2, keepdims=True)
-    T = view.tensor_from_cameras(*P)
+    T = three_view.tensor_from_cameras(*P)
     on_first = np.linalg.svd(l[0][:, None])[2][:, 1:]
     right, wrong = (
-        np.abs(view.trifocal_residuals(T, on_first, l[1][:, None], lines[:, None])).max()
+        np.abs(three_view.trifocal_residuals(T, on_first, l[1][:, None], lines[:, None])).max()
         for lines in (l[2], np.roll(l[2], 1, axis=0))
     )
     assert right < 1e-9
@@ -104,10 +99,10 @@ def test_trifocal_constraint_of_lines(rng):
 def test_figure_3_14_points_are_transferred_to_the_third_view(rng):
     P = three_cameras(rng)
     xy = seen_points(P, rng, 12)
-    T = view.tensor_from_cameras(*P)
-    assert np.abs(view.transfer_points(T, xy[0], xy[1]) - xy[2]).max() < 1e-3
+    T = three_view.tensor_from_cameras(*P)
+    assert np.abs(three_view.transfer_points(T, xy[0], xy[1]) - xy[2]).max() < 1e-3
     F31, F32 = fundamental_from_cameras(P[0], P[2]), fundamental_from_cameras(P[1], P[2])
-    assert np.median(np.abs(view.transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2])) < 1e-5
+    assert np.median(np.abs(three_view.transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2])) < 1e-5
 
 
 @holds_for_every()
@@ -118,10 +113,9 @@ def test_figure_3_14_the_tensor_serves_the_trifocal_plane_where_epipolar_lines_d
     xy = np.stack([project(camera, X) for camera in P])
     F31, F32 = fundamental_from_cameras(P[0], P[2]), fundamental_from_cameras(P[1], P[2])
     size = np.abs(xy).max(axis=(0, 2))
-    by_tensor = (
-        np.abs(view.transfer_points(view.tensor_from_cameras(*P), xy[0], xy[1]) - xy[2]).max(axis=1) / size
-    )
-    by_lines = np.abs(view.transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2]).max(axis=1) / size
+    T = three_view.tensor_from_cameras(*P)
+    by_tensor = np.abs(three_view.transfer_points(T, xy[0], xy[1]) - xy[2]).max(axis=1) / size
+    by_lines = np.abs(three_view.transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2]).max(axis=1) / size
     assert np.median(by_tensor) < 1e-6
     assert np.nanmedian(by_lines) > 1e-4
 
@@ -130,29 +124,29 @@ def test_figure_3_14_the_tensor_serves_the_trifocal_plane_where_epipolar_lines_d
 def test_figure_3_15_lines_are_transferred_to_the_third_view(rng):
     P = three_cameras(rng)
     l = lines_of(seen_segments(P, rng, 6))
-    found = unit_normals(view.transfer_lines(view.tensor_from_cameras(*P), l[0], l[1]))
+    found = unit_normals(three_view.transfer_lines(three_view.tensor_from_cameras(*P), l[0], l[1]))
     assert max(gap(a, b) for a, b in zip(found, l[2], strict=True)) < 1e-5
 
 
 @holds_for_every()
 def test_epipoles_and_fundamental_matrices_from_the_tensor(rng):
     P = three_cameras(rng)
-    T, xy = view.tensor_from_cameras(*P), seen_points(P, rng, 10)
+    T, xy = three_view.tensor_from_cameras(*P), seen_points(P, rng, 10)
     centre = camera_centre(P[0])
-    e2, e3 = view.tensor_epipoles(T)
+    e2, e3 = three_view.tensor_epipoles(T)
     assert gap(e2, P[1] @ centre) < 1e-6
     assert gap(e3, P[2] @ centre) < 1e-6
-    F21, F31 = view.fundamentals_from_tensor(T)
+    F21, F31 = three_view.fundamentals_from_tensor(T)
     assert symmetric_residuals(F21, xy[0], xy[1]).max() < 1e-3
     assert symmetric_residuals(F31, xy[0], xy[2]).max() < 1e-3
 
 
 @holds_for_every()
 def test_cameras_from_the_tensor_have_the_tensor(rng):
-    T = view.tensor_from_cameras(*three_cameras(rng))
-    P = view.cameras_from_tensor(T)
+    T = three_view.tensor_from_cameras(*three_cameras(rng))
+    P = three_view.cameras_from_tensor(T)
     np.testing.assert_array_equal(P[0], np.eye(3, 4))
-    assert gap(view.tensor_from_cameras(*P), T) < 1e-6
+    assert gap(three_view.tensor_from_cameras(*P), T) < 1e-6
 
 
 @holds_for_every(st.sampled_from([(7, 0), (0, 13), (4, 5), (20, 0), (0, 30), (10, 10)]))
@@ -160,18 +154,18 @@ def test_linear_estimate_is_exact_on_exact_points_and_lines(rng, counts):
     P = three_cameras(rng)
     points, segments = seen_points(P, rng, counts[0]), seen_segments(P, rng, counts[1])
     T = estimate_tensor_linear(points, segments)
-    assert gap(T, view.tensor_from_cameras(*P)) < 1e-5
+    assert gap(T, three_view.tensor_from_cameras(*P)) < 1e-5
 
 
 @holds_for_every(examples=10)
 def test_given_epipoles_the_constrained_solution_is_the_tensor_of_the_cameras(rng):
     P = three_cameras(rng)
-    equations = tensor_equations(seen_points(P, rng, 10), NO_SEGMENTS)
-    e2, e3 = view.tensor_epipoles(equations.solve())
+    equations = _tensor_equations(seen_points(P, rng, 10), NO_SEGMENTS)
+    e2, e3 = three_view.tensor_epipoles(equations.solve())
     T = equations.solve_with_epipoles(e2, e3)
-    assert gap(equations.in_pixels(T), view.tensor_from_cameras(*P)) < 1e-6
+    assert gap(equations.in_pixels(T), three_view.tensor_from_cameras(*P)) < 1e-6
     noisy = equations.solve_with_epipoles(*np.linalg.qr(rng.normal(size=(3, 3)))[0][:2])
-    conditioned = view.tensor_from_cameras(*view.cameras_from_tensor(noisy))
+    conditioned = three_view.tensor_from_cameras(*three_view.cameras_from_tensor(noisy))
     assert gap(conditioned, noisy) < 1e-6
 
 
@@ -180,14 +174,14 @@ def test_wrong_triplets_are_refused():
     P = three_cameras(rng)
     points, segments = seen_points(P, rng, 6), seen_segments(P, rng, 3)
     with pytest.raises(ValueError, match="needs points"):
-        check_triplets(points[:2], segments)
+        _check_triplets(points[:2], segments)
     with pytest.raises(ValueError, match="needs points"):
-        check_triplets(points, segments[:, :, 0])
+        _check_triplets(points, segments[:, :, 0])
     with pytest.raises(ValueError, match="finite"):
-        check_triplets(np.where(points > points[0, 0, 0], np.nan, points), segments)
+        _check_triplets(np.where(points > points[0, 0, 0], np.nan, points), segments)
     segments[1, 0, 1] = segments[1, 0, 0]
     with pytest.raises(ValueError, match="no length"):
-        check_triplets(points, segments)
+        _check_triplets(points, segments)
 
 
 def test_coplanar_and_equal_points_are_refused():

@@ -1,10 +1,11 @@
-"""Section 5.4: standard deviation of the noise from residuals that contain wrong matches."""
+"""Section 5.4: the noise among wrong residuals, and how many matches agree with a wrong model by chance."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.kernels import kernel
@@ -20,6 +21,8 @@ _TRIM, _TRIMMED_VARIANCE, _TRIM_ROUNDS = 2.5, 0.91125, 5
 # EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more.
 _EM_ROUNDS, _QUANTILES = 6, 300
 _BISECTIONS = 20
+# Matches within a cell of this size, px, count as one place.
+_SAME_PX = 2.0
 
 
 @kernel(error_model="numpy")
@@ -154,3 +157,47 @@ class NoiseMixture:
         """Residual at which noise and its tail are equally likely."""
         odds = max(TAIL * self.core / self.tail, 1.5)
         return self.sigma * float(np.sqrt(2.0 * np.log(odds) / (1.0 - TAIL**-2)))
+
+
+def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
+    """Weight (N,) of each match, one over the number of matches at its position.
+
+    At most one of the matches at one position (within 2 px in either image) is right, and all of them agree
+    with every F whose epipole lies there: together they count once.
+    """
+    return 1.0 / np.maximum(_matches_per_cell(xy1), _matches_per_cell(xy2))
+
+
+def _matches_per_cell(xy: F64) -> F64:
+    cell = np.floor(xy / _SAME_PX).astype(np.int64)
+    _, place, count = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True, return_counts=True)
+    return np.asarray(count[place], dtype=np.float64)
+
+
+def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: int) -> float:
+    """log10 of the expected number of models with as many inliers among wrong matches.
+
+    A-contrario bound (tried - free) C(tried, free) P(Binomial >= agreeing - free): the model passes through
+    ``free`` matches and each of the rest agrees with probability ``chance`` (Moisan and Stival, IJCV 57,
+    2004). ``agreeing`` and ``tried`` are sums of weights.
+    """
+    rest, hits = tried - free, agreeing - free
+    if hits <= 0.0 or rest <= 0.0:
+        return 0.0
+    tail = float(scipy.special.betainc(hits, max(rest - hits, 0.0) + 1.0, min(chance, 1.0)))
+    ways = (
+        scipy.special.gammaln(tried + 1.0)
+        - scipy.special.gammaln(free + 1.0)
+        - scipy.special.gammaln(rest + 1.0)
+        + np.log(max(rest, 1.0))
+    )
+    return float((ways + np.log(max(tail, 1e-300))) / np.log(10.0))
+
+
+def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
+    """Probability that a wrong match lies within a Sampson distance of any F.
+
+    Area of a band of width 2 sqrt(2) band_px across the bounding box of the matches, relative to the box.
+    """
+    narrow = min(float(np.ptp(xy)) for xy in (*xy1.T, *xy2.T))
+    return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))

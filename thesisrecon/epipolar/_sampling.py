@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.arrays import F64
-from thesisrecon.epipolar._consensus import draw_sample, required_samples
+from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.kernels import copy_to, empty, full, kernel
 
@@ -289,6 +288,35 @@ def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
     if not right > 1.5 * wrong:
         return 0.0, 0.0
     return np.log(wrong / right), np.log((1.0 - wrong) / (1.0 - right))
+
+
+@kernel
+def draw_sample(uniforms: F64, n: int, out: I64) -> None:
+    """Turn uniform numbers (s,) into distinct sorted indices below n; every subset is equally likely."""
+    for k in range(len(out)):
+        index = min(int(uniforms[k] * (n - k)), n - k - 1)
+        place = 0
+        while place < k and out[place] <= index:
+            index += 1
+            place += 1
+        for m in range(k, place, -1):
+            out[m] = out[m - 1]
+        out[place] = index
+
+
+@kernel
+def required_samples(inlier_ratio: float, sample_size: int, confidence: float, largest: int) -> int:
+    """Return the number of samples of which one is free of outliers with probability ``confidence``.
+
+    N = log(1 - confidence) / log(1 - ratio^size) (Fischler and Bolles 1981), at most ``largest``.
+    """
+    good = inlier_ratio**sample_size
+    if good <= 1e-12:
+        return largest
+    if good >= 1.0:
+        return 1
+    needed = np.log(1.0 - confidence) / np.log1p(-good)
+    return int(min(float(largest), np.ceil(needed)))
 
 
 @kernel

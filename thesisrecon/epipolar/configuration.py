@@ -16,9 +16,14 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.epipolar._chance import chance_of_agreement, log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar._noise import noise_scale, trimmed_noise_scale
+from thesisrecon.epipolar._noise import (
+    chance_of_agreement,
+    log10_false_alarms,
+    multiplicity_weights,
+    noise_scale,
+    trimmed_noise_scale,
+)
 from thesisrecon.epipolar._planes import (
     find_dominant_plane,
     fundamentals_of_plane,

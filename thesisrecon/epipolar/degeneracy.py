@@ -13,8 +13,8 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar._chance import chance_of_agreement, log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._frame import PairFrame, check_matches
+from thesisrecon.epipolar._noise import chance_of_agreement, log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._planes import DominantPlane, find_dominant_plane, fundamentals_of_plane
 from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.epipolar._sampling import sampson_distances

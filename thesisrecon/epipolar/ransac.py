@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar._consensus import SampleConsensus
 from thesisrecon.epipolar._frame import PairFrame, as_matches, check_matches
 from thesisrecon.epipolar._noise import noise_scale
-from thesisrecon.epipolar._sampling import sampson_distances
+from thesisrecon.epipolar._sampling import draw_sample, sampson_distances
 from thesisrecon.epipolar.linear import seven_point
 from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.epipolar.refinement import Criterion, refine_fundamental
@@ -96,6 +95,57 @@ def discard_outliers(
     return sigma, inliers if inliers.sum() >= MINIMUM else residuals <= limit
 
 
+_Model = TypeVar("_Model")
+
+
+@dataclass(frozen=True)
+class _SampleConsensus:
+    """Algorithm 2: the model with the most data within a threshold.
+
+    Of two models with equally many inliers the one with the lower standard deviation wins (Fischler and
+    Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
+    n! / s!). ``stop_inlier_ratio`` ends the search; ``least_median`` ranks models by the median of their
+    residuals instead (Rousseeuw, 1984).
+    """
+
+    threshold: float
+    max_samples: int = 1000
+    stop_inlier_ratio: float = 1.0
+    least_median: bool = False
+
+    def search(
+        self,
+        solve: Callable[[I64], list[_Model]],
+        residuals: Callable[[_Model], F64],
+        sample_size: int,
+        n: int,
+        rng: np.random.Generator,
+    ) -> tuple[_Model, B8, int] | None:
+        """Return the best model of n data, its inliers (n,) and the number of samples; None without a model.
+
+        ``solve`` gives the models of some data by their indices, ``residuals`` the distances (n,) of a model.
+        """
+        best: tuple[_Model, B8] | None = None
+        best_rank, drawn = (-np.inf, 0.0), 0
+        sample = np.empty(sample_size, dtype=np.int64)
+        while drawn < self.max_samples and best_rank[0] <= self.stop_inlier_ratio * n:
+            draw_sample(rng.random(sample_size), n, sample)
+            drawn += 1
+            for model in solve(sample):
+                rank, inliers = self._rank(residuals(model))
+                if rank > best_rank:
+                    best, best_rank = (model, inliers), rank
+        return None if best is None else (*best, drawn)
+
+    def _rank(self, residuals: F64) -> tuple[tuple[float, float], B8]:
+        if self.least_median:
+            median = float(np.partition(residuals, len(residuals) // 2)[len(residuals) // 2])
+            return (-median, 0.0), residuals <= median
+        inliers = np.abs(residuals) < self.threshold
+        rms = float(np.sqrt(np.mean(residuals[inliers] ** 2))) if inliers.any() else 0.0
+        return (int(inliers.sum()), -rms), inliers
+
+
 @dataclass(frozen=True)
 class ThesisRansac:
     """RANSAC as in section 5.4 of the thesis, with its errors corrected.
@@ -143,7 +193,7 @@ class ThesisRansac:
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""
         gate_px = INLIER_TESTS[self.inlier_test].ratio * self.threshold_px
-        search = SampleConsensus(gate_px, self.samples, self.stop_inlier_ratio)
+        search = _SampleConsensus(gate_px, self.samples, self.stop_inlier_ratio)
         criterion: Criterion = "epipolar-distance" if self.epipolar_distance else "sampson"
         limit_px, test = self.threshold_px, self.inlier_test
         return _search_and_refine(xy1, xy2, rng, search, self.rounds, limit_px, test, criterion)
@@ -174,7 +224,7 @@ class LeastMedianOfSquares:
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""
-        search = SampleConsensus(np.inf, self.samples, least_median=True)
+        search = _SampleConsensus(np.inf, self.samples, least_median=True)
         return _search_and_refine(xy1, xy2, rng, search, self.rounds)
 
 
@@ -182,7 +232,7 @@ def _search_and_refine(
     xy1: F64,
     xy2: F64,
     rng: Generator,
-    search: SampleConsensus,
+    search: _SampleConsensus,
     rounds: int,
     limit_px: float | None = None,
     test: InlierTest = "sampson",

@@ -21,11 +21,11 @@ from thesisrecon.arrays import F64
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
 from thesisrecon.epipolar.refinement import Criterion, refine_by_rows, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import symmetric_residuals
+from validation.metrics.fundamental_precision import fundamental_bound
 from validation.metrics.record import Metric
 from validation.references.fundamental import OURS, SOLVERS, opencv_eight_point
 from validation.references.libraries import one_thread

@@ -11,16 +11,16 @@ from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
-from thesisrecon.epipolar.precision import (
-    epipolar_distance_interval,
-    epipoles_of,
-    fundamental_bound,
-    fundamental_covariance,
-)
+from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import epipolar_lines, epipoles, sampson_residuals, symmetric_residuals
 from thesisrecon.records import FundamentalFit
+from validation.metrics.fundamental_precision import (
+    epipolar_distance_interval,
+    epipoles_of,
+    fundamental_bound,
+)
 from validation.metrics.record import Metric
 from validation.scenes.two_views import make_two_views
 from validation.studies.runner import Part

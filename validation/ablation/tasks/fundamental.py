@@ -11,10 +11,10 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.epipolar.precision import fundamental_bound
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
 from validation.ablation.study import Measure, Place, Task
+from validation.metrics.fundamental_precision import fundamental_bound
 from validation.scenes.cube import CubePair, cube_pairs, make_cube
 from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHOLD_PX
 
