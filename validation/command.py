@@ -18,7 +18,7 @@ from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
 from validation.harness.process import own_cores
 from validation.harness.records import ReportOptions
-from validation.harness.results import Results, collect, compare, read_results, write_results
+from validation.harness.results import Results, collect, write_results
 from validation.harness.scenes import load_images
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
@@ -34,7 +34,6 @@ def main(arguments: list[str] | None = None) -> int:
         return ablation.run_command(parsed)
     try:
         options = _report_options(parsed)
-        other = read_results(parsed.against) if getattr(parsed, "against", None) else None
         gates = read_gates()
         for name in options.folders:
             load_images(name, options)
@@ -51,8 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
             return 2
     results = collect(options, judged, gates)
     write_results(options.out, results)
-    changes = None if other is None else compare(other, results)
-    page = write_pages(options, STAGES, judged, results, changes)
+    page = write_pages(options, STAGES, judged, results)
     if parsed.command == "check":
         _print_gates(results)
     broken = counted(len(results.broken) + len(results.missing), "gate")
@@ -85,8 +83,6 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps (default: small)"
         )
-        if name == "report":
-            command.add_argument("--against", type=Path, help="folder of another report to compare with")
     ablation.add_parser(commands)
     commands.add_parser("study", help="Run one study; --list shows them.", add_help=False)
     return parser

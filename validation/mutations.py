@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from thesisrecon.errors import counted
 from thesisrecon.runtime._signals import install_signal_handlers
 from validation.harness.gates import Gate, read_gates
-from validation.harness.planting import CopiedTree
 from validation.harness.process import last_words, own_cores, run_process
 from validation.harness.records import slug
 from validation.harness.results import Results, read_results
@@ -29,6 +31,7 @@ from validation.scenes.real import ROOT, data_root
 MUTATIONS_FILE = Path(__file__).with_suffix(".toml")
 FIELDS = ("name", "file", "old", "new", "check")
 TASK_LIMIT_S = 900
+COPIED = ("thesisrecon", "validation", "fixtures", "pyproject.toml")
 
 
 @dataclass(frozen=True)
@@ -45,12 +48,10 @@ class Mutation:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Return the stages of ``check``."""
         return tuple(dict.fromkeys(where.split("/")[0] for where in self.check))
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Return the scenes of ``check``."""
         return tuple(dict.fromkeys(where.split("/")[1] for where in self.check))
 
     def apply(self, root: Path) -> str:
@@ -83,7 +84,6 @@ class Fate:
 
     @property
     def survived(self) -> bool:
-        """Return whether no gate caught the fault."""
         return not (self.caught or self.skipped)
 
 
@@ -110,8 +110,44 @@ def read_mutations(path: Path = MUTATIONS_FILE) -> list[Mutation]:
 
 
 @dataclass(frozen=True)
-class Bench(CopiedTree):
-    """The copied tree and its checks."""
+class Bench:
+    """A copy of the tree in ``out``, in which one fault at a time is planted, and its checks."""
+
+    out: Path
+
+    @property
+    def tree(self) -> Path:
+        return self.out / "tree"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Environment of a process that imports the copy; its kernels outlive the copy."""
+        return {"PYTHONPATH": str(self.tree), "THESISRECON_KERNEL_CACHE": str(self.out / "kernels")}
+
+    def set_up(self) -> None:
+        shutil.rmtree(self.tree, ignore_errors=True)
+        self.tree.mkdir(parents=True)
+        for name in COPIED:
+            source, target = ROOT / name, self.tree / name
+            if source.is_dir():
+                shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy2(source, target)
+
+    @contextmanager
+    def planted(self, file: str, text: str) -> Iterator[None]:
+        """Replace ``file`` by the faulty ``text`` for a while.
+
+        Kernels are cached by the code they are made from, bytecode by the time of the file.
+        """
+        path = self.tree / file
+        sound, before = path.read_text(encoding="utf-8"), path.stat().st_mtime
+        path.write_text(text, encoding="utf-8")
+        try:
+            yield
+        finally:
+            path.write_text(sound, encoding="utf-8")
+            os.utime(path, (before, before))
 
     def check(self, name: str, wanted: Sequence[Mutation], resume: str = "") -> Checked:
         """Run ``python -m validation check`` in the tree for these faults.

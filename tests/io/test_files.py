@@ -13,7 +13,7 @@ from tests.io.test_colmap import export, scene
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
 from thesisrecon.io import _files as files
 from thesisrecon.io._exports import read_cameras
-from validation.studies.robustness import disk_ends, remount, small_disk
+from validation.studies.robustness import disk_ends
 
 
 def entries(folder):
@@ -36,26 +36,6 @@ def test_each_file_of_a_model_is_whole_or_absent(tmp_path):
     with disk_ends(3, errno.ENOSPC), pytest.raises(OutputError, match=r"frames\.bin cannot be written"):
         export(tmp_path / "0", scene())
     assert sorted(entries(tmp_path / "0")) == ["cameras.bin", "rigs.bin"]
-
-
-def test_a_disk_that_is_full_or_read_only(tmp_path):
-    try:
-        with small_disk(tmp_path / "disk", "64k") as disk:
-            files.write_json(disk / "a.json", [1])
-            for name in ("a.json", "b.json"):
-                with pytest.raises(OutputError, match="No space left on device; free space there"):
-                    files.write_text(disk / name, "x" * 100_000)
-            assert list(entries(disk)) == ["a.json"]
-            assert files.read_json(disk / "a.json") == [1]
-            remount(disk, "size=1m")
-            files.write_text(disk / "b.json", "x" * 100_000)
-            remount(disk, "ro")
-            with pytest.raises(OutputError, match="Read-only file system; make the place writable"):
-                files.write_text(disk / "c.json", "")
-            with pytest.raises(OutputError, match="Read-only file system"):
-                files.link(disk / "a.json", disk / "deep" / "a.json")
-    except PermissionError as error:
-        pytest.skip(str(error))
 
 
 def test_a_file_stands_where_a_folder_belongs(tmp_path):

@@ -1,29 +1,15 @@
-"""The study of self-calibration: its scenes are what they say, its bound behaves as one, its tables count."""
+"""The scenes of the self-calibration task are what they say, and its bound behaves as one."""
 
-import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from thesisrecon.geometry.camera_matrix import project
+from validation.ablation.tasks.calibration import Cell, assumptions, make_rig
 from validation.metrics.focal_bound import focal_bound
-from validation.metrics.record import markdown_table
 from validation.scenes.cloud import make_cloud
 from validation.scenes.rigs import cube_rig, noisy_tracks, projective_from_truth
-from validation.studies.selfcalibration import (
-    BOUND,
-    WITH_BUNDLE,
-    Cell,
-    Trial,
-    assumptions,
-    cells,
-    make_rig,
-    read_trials,
-    report,
-    run_cell,
-    targets,
-)
 
 
 @pytest.mark.parametrize("scene", ["cube", "cloud"])
@@ -64,46 +50,3 @@ def test_the_bound_grows_with_noise_and_shrinks_with_cameras_and_priors():
     assert focal_bound(rig, 1.0, zooming=False, principal_std_px=0.1)[0] <= std[0]
     scaled = replace(rig, X=3.0 * rig.X, C=3.0 * rig.C)
     np.testing.assert_allclose(focal_bound(scaled, 1.0, zooming=False, principal_std_px=15.0), std, rtol=1e-4)
-
-
-def test_a_cell_measures_every_method_on_the_same_draws(tmp_path):
-    cell = Cell("cloud", "constant", 0.0, 5)
-    trials = run_cell(cell, ("nonlinear-quadric", "kruppa-equations", BOUND), range(2))
-    assert [t.method for t in trials] == ["nonlinear-quadric", "kruppa-equations", BOUND] * 2
-    assert all(t.median_pct < 3.0 for t in trials)
-    text = report(trials)
-    assert "| nonlinear-quadric |" in text
-    assert "| cloud, constant | 5 cameras, 0 px |" in text
-    assert "| draws of the others | 2 |" in text
-    file = tmp_path / "trials.jsonl"
-    file.write_text("".join(json.dumps(asdict(t)) + "\n" for t in [*trials, *trials]), encoding="utf-8")
-    assert len(read_trials([file])) == len(trials)
-
-
-def test_refusals_count_as_failures_and_targets_are_judged():
-    def trial(seed, mode, median, worst):
-        return Trial("cube", mode, 1.0, 27, seed, WITH_BUNDLE, median, worst, True, 1.0)
-
-    some = [
-        trial(0, "constant", 0.05, 0.05),
-        trial(1, "constant", np.nan, np.nan),
-        trial(2, "constant", 0.04, 0.04),
-    ]
-    assert "0.05 (67)" in report(some)
-    text = markdown_table(targets([*some, trial(0, "zooming", 0.1, 4.0), trial(1, "zooming", 0.1, 6.0)]))
-    assert "missed" in text
-    assert "worst camera within 5 %, % of trials | 50 | >= 90 | missed" in text
-
-
-def test_cells_cross_at_one_pixel_and_the_most_cameras():
-    places = cells(["cube"], ["constant"], (0.5, 1.0, 2.0), (3, 27))
-    assert [(c.sigma_px, c.views) for c in places] == [(0.5, 27), (1.0, 27), (2.0, 27), (1.0, 3)]
-
-
-def test_the_report_crosses_at_one_pixel():
-    places = [(1.0, 3), (1.0, 27), (0.5, 27), (2.0, 27)]
-    text = report(
-        [Trial("cloud", "zooming", s, v, 0, "linear-quadric", 0.2, 6.0, True, 1.0) for s, v in places]
-    )
-    assert "| 3 cameras, 1 px | 27 cameras, 1 px | 27 cameras, 0.5 px | 27 cameras, 2 px |" in text
-    assert "0.2 (100, 0)" in text

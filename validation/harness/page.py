@@ -16,7 +16,7 @@ from thesisrecon.errors import counted
 from thesisrecon.io._files import write_text
 from thesisrecon.report._page import plotly_script, render_page
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, key_of, slug
-from validation.harness.results import Change, Results, Row
+from validation.harness.results import Results, Row
 
 HERE = Path(__file__).parent
 WIDEST_PX = 1400
@@ -37,7 +37,6 @@ def write_pages(
     stages: Mapping[str, Stage],
     judged: Judged,
     results: Results,
-    changes: Sequence[Change] | None,
 ) -> Path:
     """Write all pages and return the path of the first."""
     scenes = [s for s in options.scenes if any(scene == s for _, scene in judged)]
@@ -55,7 +54,7 @@ def write_pages(
         rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         failures = [(k, why) for k, why in results.failures.items() if k.split("/")[1] == scene]
         missing = [k for k in results.missing if k.split("/")[1] == scene]
-        page = _page(scene, links, _verdict(rows, missing), sections, failures, None, None)
+        page = _page(scene, links, _verdict(rows, missing), sections, failures, None)
         write_text(options.out / f"scene-{slug(scene)}.html", page)
     whole = [_section(stages[name], results, names) for name in options.stages]
     page = _page(
@@ -65,7 +64,6 @@ def write_pages(
         [section for section in whole if section["rows"]],
         list(results.failures.items()),
         list(results.environment.items()),
-        changes,
     )
     write_text(options.out / "index.html", page)
     return options.out / "index.html"
@@ -78,7 +76,6 @@ def _page(
     sections: Sequence[Mapping[str, Any]],
     failures: Sequence[tuple[str, str]],
     environment: Sequence[tuple[str, Any]] | None,
-    changes: Sequence[Change] | None,
 ) -> str:
     figures = {plot["id"]: plot["figure"] for section in sections for plot in section["plots"]}
     scripts = [plotly_script(), (HERE / "page.js").read_text(encoding="utf-8")] if figures else []
@@ -93,7 +90,6 @@ def _page(
         several=environment is not None,
         failures=failures,
         environment=environment,
-        changes=changes,
         figures=figures,
         version=__version__,
     )

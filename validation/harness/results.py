@@ -1,4 +1,4 @@
-"""``results.json`` and the tables as CSV: numbers with limits and references; comparison of runs."""
+"""``results.json`` and the tables as CSV: numbers with limits and references."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ from validation.metrics.record import Metric
 from validation.references.libraries import PACKAGES
 
 OWN_PACKAGES = ("thesisrecon", "numpy", "scipy", "numba")
-TIME_UNITS = ("s", "s processor", "s / s", "us", "ms", "MB")
-"""Units of numbers that vary between runs."""
 
 
 @dataclass(frozen=True)
@@ -152,36 +150,7 @@ def read_results(out: Path) -> Results:
             record["options"],
         )
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{out} holds no report to compare with (results.json): {error}") from None
-
-
-@dataclass(frozen=True)
-class Change:
-    """A number that differs between two runs; None if missing in one."""
-
-    key: str
-    unit: str
-    before: float | None
-    now: float | None
-    verdicts: tuple[str, str]
-
-    @property
-    def is_time(self) -> bool:
-        return self.unit in TIME_UNITS
-
-
-def compare(before: Results, now: Results) -> list[Change]:
-    """Return all changed numbers of ours and verdicts, with times and memory."""
-    old, new = ({row.key: row for row in r.rows} for r in (before, now))
-    changes = []
-    for key in dict.fromkeys([*old, *new]):
-        rows = [row for row in (old.get(key), new.get(key)) if row is not None]
-        values = [None if (row := found.get(key)) is None else row.value for found in (old, new)]
-        verdicts = ["absent" if (row := found.get(key)) is None else row.verdict for found in (old, new)]
-        if values[0] != values[1] or verdicts[0] != verdicts[1]:
-            change = (verdicts[0], verdicts[1])
-            changes.append(Change(key, rows[-1].unit, values[0], values[1], change))
-    return changes
+        raise ValueError(f"{out} holds no results.json of a report: {error}") from None
 
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:

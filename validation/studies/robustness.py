@@ -5,10 +5,9 @@ every output must have the bytes of an undisturbed run, times aside.
 ``stop-anywhere``: runs and all their processes get SIGINT or SIGTERM, as from a terminal. Each must end
 within two seconds with the exit code of the signal, one sentence on how to continue and no process left
 behind; resumed, it must give the same bytes.
-``full-disk``: for every file that a small run writes, the disk is full or read-only from that file on; more
-runs use real file systems that are too small or become read-only, if file systems can be mounted. Each must
-end with exit code 2 and one sentence with place, cause and advice, leave no foreign file, and resume to the
-same bytes.
+``full-disk``: for every file that a small run writes, the disk is full or read-only from that file on.
+Each must end with exit code 2 and one sentence with place, cause and advice, leave no foreign file, and
+resume to the same bytes.
 """
 
 from __future__ import annotations
@@ -290,7 +289,6 @@ def stop_table(rows: Sequence[Stop], asked: signal.Signals) -> str:
 # ---------------------------------------------------------------- full and read-only disks
 
 REFUSED = 2
-ROOM = "64m"
 SMALL_MODEL = ["--set", "dense.max_side=160", "--set", "dense.match_side=160"]
 """Coarse depth maps: every stage writes its files quickly."""
 
@@ -383,65 +381,13 @@ def _strange(there: dict[str, bytes], wanted: dict[str, bytes]) -> tuple[str, ..
     return tuple(name for name, content in there.items() if wanted.get(name) != content)
 
 
-@contextlib.contextmanager
-def small_disk(place: Path, size: str) -> Iterator[Path]:
-    """Mount a file system of this size in memory; ``PermissionError`` if that is not allowed."""
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
-    try:
-        mounted = subprocess.run(command, check=False, capture_output=True).returncode == 0
-    except OSError:
-        mounted = False
-    if not mounted:
-        raise PermissionError("file systems cannot be mounted here")
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", "--lazy", str(place)], check=True)
-
-
-def remount(place: Path, options: str) -> None:
-    """Change a file system of :func:`small_disk`: ``size=64m`` for more room, ``ro`` for read-only."""
-    subprocess.run(["mount", "-o", f"remount,{options}", str(place)], check=True)
-
-
-def filled(runs: SmallRuns, share: float, wanted: dict[str, bytes]) -> Refusal:
-    """Run on a disk with room for this share of the files, then resume with more."""
-    size = int(share * sum(map(len, wanted.values())))
-    with small_disk(runs.place / f"disk-{size}", f"{size}") as disk:
-        ended = runs.run(disk / "out")
-        strange = _strange(outputs(disk / "out"), wanted)
-        remount(disk, f"size={ROOM}")
-        again = runs.whole(disk / "out")
-    return Refusal(f"a disk of {size // 1024} KiB", *ended, strange, different(again, wanted))
-
-
-def locked(runs: SmallRuns, write: int, wanted: dict[str, bytes]) -> Refusal:
-    """Run on a disk that becomes read-only before the ``write``-th file, then resume."""
-    with small_disk(runs.place / f"locked-{write}", ROOM) as disk:
-        with disk_ends(write, errno.EIO):
-            runs.run(disk / "out")
-        remount(disk, "ro")
-        ended = runs.run(disk / "out")
-        strange = _strange(outputs(disk / "out"), wanted)
-        remount(disk, "rw")
-        again = runs.whole(disk / "out")
-    return Refusal(f"read-only at file {write}", *ended, strange, different(again, wanted))
-
-
-def refuse_runs(runs: SmallRuns, every: int, disks: int) -> Iterator[Refusal]:
-    """Run undisturbed, then with every n-th file unwritable and on small disks."""
+def refuse_runs(runs: SmallRuns, every: int) -> Iterator[Refusal]:
+    """Run undisturbed, then with every n-th file unwritable."""
     runs.whole(runs.place / "first")
     with disk_ends(0, 0) as written:
         wanted = runs.whole(runs.place / "whole")
     for k, write in enumerate(range(1, written[0] + 1, every)):
         yield refused_at(runs, write, errno.ENOSPC if k % 2 == 0 else errno.EROFS, wanted)
-    try:
-        for k in range(disks):
-            yield filled(runs, (k + 0.5) / disks, wanted)
-            yield locked(runs, 2 + k * (written[0] - 2) // disks, wanted)
-    except PermissionError as error:
-        print(f"left out: {error}", file=sys.stderr, flush=True)
 
 
 def refusal_table(rows: Sequence[Refusal]) -> str:
@@ -499,11 +445,11 @@ def stop_anywhere_study(
 
 
 def full_disk_study(
-    every: int = 1, disks: int = 10, views: int = 3, max_size: int = 320, until: str = "model"
+    every: int = 1, views: int = 3, max_size: int = 320, until: str = "model"
 ) -> Iterator[Part]:
     """Fill the disk or make it read-only at every file; each run must say so and resume."""
     with TemporaryDirectory() as place:
         runs = SmallRuns(Path(place), views, max_size, until)
-        rows = _printed(refuse_runs(runs, every, disks))
+        rows = _printed(refuse_runs(runs, every))
     yield refusal_table(rows)
     yield _count("runs without room", "runs with faults", sum(bool(r.wrong) for r in rows), len(rows))

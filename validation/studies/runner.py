@@ -33,6 +33,7 @@ MODULES = {
     "benchmark-table": "timing",
     "calibration-coverage": "coverage",
     "calibration-real": "calibration_real",
+    "compile-time": "compile_time",
     "critical-motions": "critical_motions",
     "dinosaur": "projective",
     "epipolar": "epipolar_synthetic",
@@ -75,6 +76,7 @@ HELP = {
     "executor": "executor of the runs",
     "first": "number of the first draw",
     "gaps": "gaps of the pairs (i, i + gap)",
+    "functions": "rows of the tables",
     "images": "folder of images",
     "kills": "runs killed (SIGKILL) at moments spread over their time",
     "kinds": "words; kinds of sets that contain one of them are taken",
@@ -130,7 +132,7 @@ def run_studies(arguments: Sequence[str]) -> int:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("name", nargs="?", choices=list(MODULES), metavar="NAME", help="name of the study")
     parser.add_argument("--list", action="store_true", help="list the studies and exit")
-    options = parser.parse_args(list(arguments[:1]))
+    options = parser.parse_args([name.replace("_", "-") for name in arguments[:1]])
     if options.list:
         for name in MODULES:
             print(f"{name:22} {_summary(load_study(name))}")

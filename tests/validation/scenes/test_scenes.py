@@ -9,12 +9,10 @@ from PIL import Image
 from PIL import Image as PillowImage
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project
-from thesisrecon.geometry.two_view import estimate_homography, homography_residuals, sampson_residuals
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.crops import Crop, make_crops, make_separate_crops, shared_area
 from validation.scenes.cube import SIZE as CUBE_SIZE
 from validation.scenes.cube import make_cube
-from validation.scenes.facade import FacadeMaker
 from validation.scenes.fixtures import SIZE, courtyard_poses, encode_depth, render_image, versions, write_cube
 from validation.scenes.materials import Material, over, smooth
 from validation.scenes.procedural import courses, fractal
@@ -179,26 +177,6 @@ def test_six_cameras_see_a_single_plane_and_every_point_is_seen_often():
     cube = make_cube()
     assert np.bincount(cube.faces_seen()).tolist() == [0, 6, 15, 6]
     assert cube.visible.sum(axis=0).min() >= 10
-
-
-def test_exact_matches_agree_with_f_and_the_others_do_not():
-    facade = FacadeMaker(sigma_px=0.5).make(np.random.default_rng(0))
-    assert len(facade.xy1) == len(facade.right) > 100
-    assert len(facade.exact1) == facade.right.sum()
-    assert np.abs(sampson_residuals(facade.F, facade.exact1, facade.exact2)).max() < 1e-6
-    noise = sampson_residuals(facade.F, facade.xy1[facade.right], facade.xy2[facade.right])
-    assert np.std(noise) == pytest.approx(0.5, rel=0.2)
-    wrong = np.abs(sampson_residuals(facade.F, facade.xy1[~facade.right], facade.xy2[~facade.right]))
-    assert np.median(wrong) > 2.0
-
-
-def test_a_flat_facade_is_reported_as_a_plane():
-    flat = FacadeMaker(relief=0.0, off_plane=0.0).make(np.random.default_rng(1))
-    assert flat.off_plane == 0
-    H = estimate_homography(flat.exact1, flat.exact2)
-    assert homography_residuals(H, flat.exact1, flat.exact2).max() < 1e-6
-    deep = FacadeMaker(relief=0.03, off_plane=0.1).make(np.random.default_rng(1))
-    assert deep.off_plane > 10
 
 
 IMAGES = load_fixture_scene().image_paths[:3]

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from thesisrecon.io.demo import DEMO_IMAGES
+from thesisrecon.io._images import DEMO_IMAGES
 from validation.scenes.real import ROOT
 from validation.studies.package.environments import clean_environment, install, make_environment
 

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from thesisrecon.io.demo import DEMO_IMAGES, demo_images
+from thesisrecon.io._images import DEMO_IMAGES, demo_images
 from validation.studies.package.built import build, check_built, find_built
 from validation.studies.package.environments import (
     clean_environment,
