@@ -1,4 +1,4 @@
-"""Compile time of the kernels in a run on the demo's images with an empty cache, by module and by function."""
+"""Compile time of the kernels in a run on the demo images with an empty cache, by module and function."""
 
 from __future__ import annotations
 
