@@ -29,8 +29,7 @@ def test_every_kind_is_named_at_every_noise(kind, sigma):
         scene = make_two_views(kind, 100, rng)
         xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (scene.xy1, scene.xy2))
         found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
-        right += found.kind is kind
-        assert found.sigma_px == pytest.approx(sigma, rel=0.35)
+        right += found is kind
     assert right >= 24
 
 
@@ -46,7 +45,7 @@ def test_every_kind_is_named_with_wrong_matches_too(kind, sigma):
         xy2[wrong] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(wrong.sum()), 2))
         fit = estimate_fundamental(xy1, xy2, threshold_px=max(1.0, 2.0 * sigma))
         found = classify_configuration(fit.F, xy1, xy2, inliers=fit.inliers)
-        right += found.kind is kind
+        right += found is kind
     assert right >= 14
 
 
@@ -57,8 +56,7 @@ def test_relief_of_the_size_of_the_noise_is_seen_in_many_matches():
     X = flat.X + np.c_[np.zeros((800, 2)), rng.normal(0.0, 0.025, 800)]
     xy1, xy2 = (project(P, X) + rng.normal(0.0, 0.7, (800, 2)) for P in (flat.P1, flat.P2))
     found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
-    assert found.kind is Configuration.GENERAL
-    assert found.off_homography < 0.1
+    assert found is Configuration.GENERAL
 
 
 def test_wrong_matches_that_f_fits_do_not_hide_a_plane():
@@ -69,8 +67,7 @@ def test_wrong_matches_that_f_fits_do_not_hide_a_plane():
     xy2[wrong] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(wrong.sum()), 2))
     fit = estimate_fundamental(xy1, xy2)
     found = classify_configuration(fit.F, xy1[fit.inliers], xy2[fit.inliers])
-    assert found.kind is Configuration.PLANE
-    assert found.off_homography < 0.04
+    assert found is Configuration.PLANE
 
 
 def test_a_tenth_of_the_matches_off_a_plane_make_the_scene_general():
@@ -78,26 +75,15 @@ def test_a_tenth_of_the_matches_off_a_plane_make_the_scene_general():
     flat = make_two_views(Configuration.PLANE, 180, np.random.default_rng(5))
     X = np.r_[flat.X, rng.uniform((-1.2, -1.2, 3.8), (1.2, 1.2, 6.2), (20, 3))]
     xy1, xy2 = (project(P, X) + rng.normal(0.0, 0.3, (200, 2)) for P in (flat.P1, flat.P2))
-    assert classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2).kind is Configuration.GENERAL
+    assert classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2) is Configuration.GENERAL
 
 
-def test_a_camera_that_did_not_move_turned_by_nothing():
+def test_a_camera_that_did_not_move_is_a_rotation():
     rng = np.random.default_rng(2)
     xy1 = rng.uniform((0.0, 0.0), (1280.0, 960.0), (80, 2))
     xy2 = xy1 + rng.normal(0.0, 0.5, xy1.shape)
     found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
-    assert found.kind is Configuration.ROTATION
-    assert found.rotation_deg < 1.0
-
-
-def test_the_angle_of_a_rotation_is_found_without_the_camera():
-    rng = np.random.default_rng(3)
-    scene = make_two_views(Configuration.ROTATION, 300, rng)
-    R = np.linalg.inv(scene.P1[:, :3]) @ scene.P2[:, :3]
-    xy1, xy2 = (xy + rng.normal(0.0, 0.2, xy.shape) for xy in (scene.xy1, scene.xy2))
-    found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
-    angle = np.degrees(np.arccos((np.trace(R) - 1.0) / 2.0))
-    assert found.rotation_deg == pytest.approx(angle, abs=0.5)
+    assert found is Configuration.ROTATION
 
 
 @pytest.mark.parametrize("focal", [0.8, 3.0])
@@ -132,7 +118,7 @@ def test_homography_distances_are_half_the_transfer_of_a_similarity():
 
 def test_exact_and_wrong_calls():
     pair = make_pair(40, np.random.default_rng(0))
-    assert classify_configuration(pair.F, pair.xy1, pair.xy2).kind is Configuration.GENERAL
+    assert classify_configuration(pair.F, pair.xy1, pair.xy2) is Configuration.GENERAL
     xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.3, outliers=0.0)
     with pytest.raises(StageFailure, match="needed at least 12"):
         classify_configuration(pair.F, xy1[:11], xy2[:11])

@@ -336,13 +336,14 @@ def test_matches_amid_those_of_the_plane_are_a_reason():
 
 def test_relief_of_a_plane_of_few_matches_is_that_of_noise():
     """The parameters that F and the homography take from the residuals are allowed for."""
-    errors = []
+    planes = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
         scene = make_two_views(Configuration.PLANE, 24, rng)
         xy1, xy2 = (xy + rng.normal(0.0, 0.5, xy.shape) for xy in (scene.xy1, scene.xy2))
-        errors.append(classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2).homography_errors)
-    assert 0.0 < np.median(errors) < 2.1
+        found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
+        planes += found is Configuration.PLANE
+    assert planes >= 38
 
 
 def test_the_translation_is_where_no_other_epipole_has_less_error():

@@ -120,33 +120,7 @@ class Configuration(Enum):
     TRANSLATION = "pure translation"
 
 
-@dataclass(frozen=True)
-class ConfigurationReport:
-    """The configuration of a pair and its evidence.
-
-    Parameters
-    ----------
-    kind : Configuration
-        The result.
-    sigma_px : float
-        Standard deviation of one coordinate from the residuals of the general F, or of the homography.
-    homography_errors : float
-        Log ratio of the squared parallax of matches within 3.3 sigma of the homography to their squared
-        distances from F, in standard errors; above 4 it shows relief.
-    off_homography : float
-        Fraction of the inliers more than 4 sigma off the homography.
-    rotation_deg : float
-        Rotation angle; NaN if the eigenvalues of the homography exclude a rotation.
-    """
-
-    kind: Configuration
-    sigma_px: float
-    homography_errors: float
-    off_homography: float
-    rotation_deg: float
-
-
-def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None) -> ConfigurationReport:
+def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None) -> Configuration:
     """Determine which model explains the inliers of F.
 
     The matches with their outliers show how many agree by chance. Both images are assumed to share their
@@ -164,8 +138,8 @@ def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = N
 
     Returns
     -------
-    ConfigurationReport
-        The configuration, GENERAL if relief and baseline exceed the noise, and its evidence.
+    Configuration
+        GENERAL if relief and baseline exceed the noise.
 
     Raises
     ------
@@ -181,7 +155,7 @@ def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = N
     >>> rng = np.random.default_rng(0)
     >>> xy1 = rng.uniform(0, 500, (60, 2))
     >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1)) + rng.normal(0, 0.3, (60, 2))
-    >>> classify_configuration(estimate_fundamental(xy1, xy2).F, xy1, xy2).kind.value
+    >>> classify_configuration(estimate_fundamental(xy1, xy2).F, xy1, xy2).value
     'pure translation'
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
@@ -198,8 +172,7 @@ def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = N
     sigma = _scale(f, points[inliers])
     agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
     chance = chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
-    case = _InlierData(f, points, agree, multiplicity_weights(xy1, xy2), sigma, chance)
-    return _classify(case, frame.scale)
+    return _classify(_InlierData(f, points, agree, multiplicity_weights(xy1, xy2), sigma, chance))
 
 
 @dataclass(frozen=True)
@@ -226,31 +199,27 @@ def _scale(f: F64, points: F64) -> float:
     return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
 
 
-def _classify(case: _InlierData, scale: float) -> ConfigurationReport:
-    sigma, errors, off, chance, angle = case.sigma, np.inf, 1.0, -np.inf, np.nan
-    kind = Configuration.GENERAL
-    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=sigma, rng=np.random.default_rng(0))
+def _classify(case: _InlierData) -> Configuration:
+    rng = np.random.default_rng(0)
+    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=case.sigma, rng=rng)
     if plane is not None:
-        squared = plane.squared * sigma**2
+        squared = plane.squared * case.sigma**2
         noise = _plane_noise(squared[case.agree])
         near, far = squared < NEAR * noise**2, squared > FAR * noise**2
         errors = _excess_errors(case, near, float(squared[near].sum()))
-        off, chance = float(np.mean(far[case.agree])), case.false_alarms(far, EPIPOLE)
-        # Least squares of all of them, for which the covariance holds.
-        refine_plane(plane.h, case.points[near], 1e6 * noise, 4)
-        H = plane.h.reshape(3, 3)
-        rotation_errors, angle = _rotation_evidence(H, plane_covariance(plane.h, case.points[near], noise))
-        if errors < STANDARD_ERRORS and chance > MAX_CHANCE:
-            # F fits the noise of a plane, the homography does not: use the noise of the homography.
-            sigma, kind = noise, Configuration.PLANE
-            xy1, xy2 = case.points[near, :2], case.points[near, 2:]
+        if errors < STANDARD_ERRORS and case.false_alarms(far, EPIPOLE) > MAX_CHANCE:
+            inliers = case.points[near]
+            # Least squares of all of them, for which the covariance holds.
+            refine_plane(plane.h, inliers, 1e6 * noise, 4)
+            H = plane.h.reshape(3, 3)
             # Student's limit, since the noise is estimated.
-            limit = float(scipy.special.stdtrit(int(near.sum()) - 7, 1.0 - ROTATION_RISK))
-            if rotation_errors < limit and np.isfinite(angle) and _rotation_test(H, xy1, xy2) <= 1.0:
-                kind = Configuration.ROTATION
-    if kind is Configuration.GENERAL and _translation_ratio(case) <= 1.0:
-        kind = Configuration.TRANSLATION
-    return ConfigurationReport(kind, sigma / scale, errors, off, angle)
+            limit = float(scipy.special.stdtrit(len(inliers) - 7, 1.0 - ROTATION_RISK))
+            rotation = (
+                _eigenvalue_errors(H, plane_covariance(plane.h, inliers, noise)) < limit
+                and _rotation_test(H, inliers[:, :2], inliers[:, 2:]) <= 1.0
+            )
+            return Configuration.ROTATION if rotation else Configuration.PLANE
+    return Configuration.TRANSLATION if _translation_ratio(case) <= 1.0 else Configuration.GENERAL
 
 
 def _plane_noise(squared: F64) -> float:
@@ -279,14 +248,14 @@ def _excess_errors(case: _InlierData, near: B8, rss_plane: float) -> float:
     return float(np.log(ratio) / np.sqrt(2.0 / (k - 1) + 2.0 / (k - 7)))
 
 
-def _rotation_evidence(H: F64, covariance: F64) -> tuple[float, float]:
-    """Return abs(trace H - trace H^-1) in standard errors, and the angle in degrees.
+def _eigenvalue_errors(H: F64, covariance: F64) -> float:
+    """abs(trace H - trace H^-1) in standard errors; infinite if the eigenvalues exclude a rotation.
 
     H of a rotation has eigenvalues 1, exp(+-i angle) for every camera (HZ 13.2; Hartley 1994).
     """
     determinant = float(np.cbrt(np.linalg.det(H)))
     if not abs(determinant) > 1e-4 * float(np.linalg.norm(H)):
-        return np.inf, np.nan
+        return float("inf")
     # Unit determinant; the covariance along H itself is 0.
     M, back = H / determinant, np.linalg.inv(H / determinant)
     covariance = covariance / determinant**2
@@ -299,10 +268,7 @@ def _rotation_evidence(H: F64, covariance: F64) -> tuple[float, float]:
     mean, error = 0.5 * (t + t_back), float(np.sqrt(max(float(slope @ covariance @ slope), 1e-300)))
     still = bool(np.linalg.norm(M - np.eye(3)) ** 2 < 16.0 * np.trace(covariance) + 1e-18)
     turned = -1.0 <= mean < 3.0 - 3.0 * error
-    angle = (
-        float(np.degrees(np.arccos(np.clip(0.5 * (mean - 1.0), -1.0, 1.0)))) if turned or still else np.nan
-    )
-    return abs(t - t_back) / gap, angle
+    return abs(t - t_back) / gap if turned or still else float("inf")
 
 
 def _translation_ratio(case: _InlierData) -> float:

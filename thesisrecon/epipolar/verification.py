@@ -98,14 +98,14 @@ def _assess_pair(
     if fit.inliers.sum() < MINIMUM:
         return "", None
     try:
-        found = classify_configuration(fit.F, matches.xy1, matches.xy2, inliers=fit.inliers)
+        kind = classify_configuration(fit.F, matches.xy1, matches.xy2, inliers=fit.inliers)
         degeneracy = assess_degeneracy(fit, matches.xy1, matches.xy2, rng=rng)
     except StageFailure:
         return "", None
-    if found.kind in (Configuration.PLANE, Configuration.ROTATION):
-        reason = f"one homography explains the matches ({found.kind.value})"
+    if kind in (Configuration.PLANE, Configuration.ROTATION):
+        reason = f"one homography explains the matches ({kind.value})"
         degeneracy = replace(degeneracy, determined=False, reasons=(reason, *degeneracy.reasons))
-    return found.kind.value, degeneracy
+    return kind.value, degeneracy
 
 
 def homography_inlier_ratio(
