@@ -97,20 +97,11 @@ class FakeVerifier:
 
     def verify(self, matches, fit, rng):
         return records.TwoView(
-            i=matches.i,
-            j=matches.j,
-            F=fit.F,
-            sigma_px=fit.sigma_px,
-            index1=matches.index1,
-            index2=matches.index2,
-            xy1=matches.xy1,
-            xy2=matches.xy2,
-            affine=matches.affine,
-            candidates=len(matches.xy1),
-            homography_inlier_ratio=0.1,
-            accepted=self.accept,
+            i=matches.i, j=matches.j, F=fit.F, sigma_px=fit.sigma_px, index1=matches.index1,
+            index2=matches.index2, xy1=matches.xy1, xy2=matches.xy2, affine=matches.affine,
+            candidates=len(matches.xy1), homography_inlier_ratio=0.1, accepted=self.accept,
             reason="" if self.accept else "too few verified matches",
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -208,16 +199,10 @@ class FakeDense:
 def fake_config(**changes):
     """A pipeline of fakes."""
     config = PipelineConfig(
-        features=FakeDetector(),
-        matching=FakeMatcher(),
-        epipolar=FakeEstimator(),
-        verification=FakeVerifier(),
-        tracks=FakeTracks(),
-        projective=FakeProjective(),
-        selfcalibration=FakeCalibrator(),
-        metric=FakeMetric(),
-        dense=FakeDense(),
-    )
+        features=FakeDetector(), matching=FakeMatcher(), epipolar=FakeEstimator(),
+        verification=FakeVerifier(), tracks=FakeTracks(), projective=FakeProjective(),
+        selfcalibration=FakeCalibrator(), metric=FakeMetric(), dense=FakeDense(),
+    )  # fmt: skip
     return replace(config, **changes)
 
 

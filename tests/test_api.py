@@ -26,15 +26,10 @@ def small_reconstruction():
     view, point = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
     xy = np.array([[1.0, 2.0], [3.2, 0.4], [0.0, 0.0], [90.0, 90.0]])
     return reconstruction_of(
-        np.stack([fakes.scene_camera(0), fakes.scene_camera(1)]),
-        [[96, 80], [48, 40]],
-        X=fakes.scene_points()[:3],
-        tracks=Tracks(view, point, xy, 2, 3),
-        stratum="projective",
-        sigma_px=1.0,
-        valid=np.array([True, True, False]),
-        inlier=np.array([True, True, True, False]),
-    )
+        np.stack([fakes.scene_camera(0), fakes.scene_camera(1)]), [[96, 80], [48, 40]],
+        X=fakes.scene_points()[:3], tracks=Tracks(view, point, xy, 2, 3), stratum="projective",
+        sigma_px=1.0, valid=np.array([True, True, False]), inlier=np.array([True, True, True, False]),
+    )  # fmt: skip
 
 
 def test_two_photographs_give_verified_matches_and_f():

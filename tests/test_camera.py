@@ -15,12 +15,9 @@ K = np.array([[800.0, 2.0, 310.0], [0.0, 790.0, 245.0], [0.0, 0.0, 1.0]])
 @pytest.fixture
 def camera():
     return Camera(
-        K,
-        Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(),
-        np.array([0.2, -0.1, 0.5]),
-        (640, 480),
+        K, Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.2, -0.1, 0.5]), (640, 480),
         np.array([-0.1, 0.02]),
-    )
+    )  # fmt: skip
 
 
 def test_unprojection_inverts_projection(camera):
@@ -71,20 +68,14 @@ def test_lists_are_converted():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"K": K[:2]}, r"needs K \(3, 3\)"),
-        ({"t": np.zeros((3, 1))}, r"got .*\(3, 1\)"),
-        ({"R": np.full((3, 3), np.nan)}, "finite"),
-        ({"distortion": np.array([np.inf])}, "finite"),
-        ({"K": K.T}, "upper triangular"),
-        ({"K": -K}, "positive focal lengths"),
-        ({"K": 2.0 * K}, "K33 = 1"),
-        ({"R": 1.001 * np.eye(3)}, r"needs a rotation R; .* 0\.002"),
-        ({"R": np.zeros((3, 3))}, "needs a rotation R"),
-        ({"size": (640.0, 480.0)}, "whole numbers"),
-        ({"size": (640,)}, "whole numbers"),
-        ({"size": (640, 0)}, "at least 1 x 1"),
+        ({"K": K[:2]}, r"needs K \(3, 3\)"), ({"t": np.zeros((3, 1))}, r"got .*\(3, 1\)"),
+        ({"R": np.full((3, 3), np.nan)}, "finite"), ({"distortion": np.array([np.inf])}, "finite"),
+        ({"K": K.T}, "upper triangular"), ({"K": -K}, "positive focal lengths"),
+        ({"K": 2.0 * K}, "K33 = 1"), ({"R": 1.001 * np.eye(3)}, r"needs a rotation R; .* 0\.002"),
+        ({"R": np.zeros((3, 3))}, "needs a rotation R"), ({"size": (640.0, 480.0)}, "whole numbers"),
+        ({"size": (640,)}, "whole numbers"), ({"size": (640, 0)}, "at least 1 x 1"),
     ],
-)
+)  # fmt: skip
 def test_impossible_cameras_are_refused(camera, change, words):
     with pytest.raises(ValueError, match=words):
         replace(camera, **change)

@@ -40,19 +40,15 @@ def test_a_preset_survives_toml(name):
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("features.spread=false", False),
-        ("features.levels=3", 3),
+        ("features.spread=false", False), ("features.levels=3", 3),
         ("features.measure.formula=harris", "harris"),
         ("features.measure.derivative_taps=[-1, 0, 1]", (-1.0, 0.0, 1.0)),
-        ("features.measure.colour=true", True),
-        ("matching.growth=false", False),
-        ("matching.coarse_first=false", False),
-        ("matching.rematch=false", False),
-        ("matching.align=false", False),
-        ("matching.support=never", "never"),
+        ("features.measure.colour=true", True), ("matching.growth=false", False),
+        ("matching.coarse_first=false", False), ("matching.rematch=false", False),
+        ("matching.align=false", False), ("matching.support=never", "never"),
         ("matching.orientation=upright", "upright"),
     ],
-)
+)  # fmt: skip
 def test_the_steps_of_the_front_end_are_switched_by_settings(setting, value):
     config = apply_settings(setting)
     found = config
@@ -122,19 +118,14 @@ def test_a_nested_field_of_several_kinds_takes_a_word_or_a_table():
         ("images.max_size=900", "did you mean images.max_size_px"),
         ("images.max_size_px=large", "takes a whole number"),
         ("images.max_size_px=900.5", "takes a whole number"),
-        ("images.max_size_px=true", "takes a whole number"),
-        ("images.max_size_px=3", "at least 64"),
+        ("images.max_size_px=true", "takes a whole number"), ("images.max_size_px=3", "at least 64"),
         ("intrinsics.cameras=each", "unknown value of intrinsics.cameras"),
         ("intrinsics.focal_px=1000", "needs focal_std_rel"),
-        ("intrinsics.exif=true", "needs focal_std_rel"),
-        ("selfcalibration.focal_range=[1]", "list of 2"),
-        ("selfcalibration.search=7", "takes a table"),
-        ("images", "stage.field=value"),
-        ("=3", "stage.field=value"),
-        ("images.=3", "stage.field=value"),
-        ("images=3", "stage.field=value"),
+        ("intrinsics.exif=true", "needs focal_std_rel"), ("selfcalibration.focal_range=[1]", "list of 2"),
+        ("selfcalibration.search=7", "takes a table"), ("images", "stage.field=value"),
+        ("=3", "stage.field=value"), ("images.=3", "stage.field=value"), ("images=3", "stage.field=value"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_setting_gets_a_sentence(setting, words):
     with pytest.raises(UsageError, match=words.replace(".", r"\.")):
         apply_settings(setting)
@@ -291,15 +282,12 @@ def test_presets_survive_their_own_text(name):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"focal_px": 100.0}, "needs focal_std_rel"),
-        ({"focal": "known"}, "needs its value"),
+        ({"focal_px": 100.0}, "needs focal_std_rel"), ({"focal": "known"}, "needs its value"),
         ({"focal_px": -1.0, "focal_std_rel": 0.1}, "focal_px must be above 0"),
         ({"focal_px": np.inf, "focal_std_rel": 0.1}, "focal_px must be above 0"),
-        ({"aspect_ratio": 0.0}, "aspect_ratio must be above 0"),
-        ({"k1_std": 0.0}, "mode known"),
+        ({"aspect_ratio": 0.0}, "aspect_ratio must be above 0"), ({"k1_std": 0.0}, "mode known"),
         ({"aspect_std": -0.1}, "aspect_std must be above 0"),
-        ({"skew_px": np.inf}, "skew_px must be finite"),
-        ({"k1_value": np.nan}, "k1_value must be finite"),
+        ({"skew_px": np.inf}, "skew_px must be finite"), ({"k1_value": np.nan}, "k1_value must be finite"),
         ({"principal_point_px": (np.inf, 0.0)}, "principal_point_px must be finite"),
         ({"k1_std": np.inf}, "k1_std must be finite"),
         ({"focal_std_rel": 0.1}, "has no effect without a focal length"),
@@ -309,7 +297,7 @@ def test_presets_survive_their_own_text(name):
         ({"principal_point": "known", "principal_point_std_rel": 0.1}, "with principal_point = known"),
         ({"k1": "known", "k1_std": 0.1}, "has no effect with k1 = known"),
     ],
-)
+)  # fmt: skip
 def test_contradictory_options_are_rejected(options, words):
     with pytest.raises(ValueError, match=words):
         IntrinsicsOptions(**options)

@@ -71,13 +71,9 @@ HOPELESS = {
     "no points": without_points,
 }
 PARTLY = {
-    "forward": ahead,
-    "tiny baseline": lambda: abreast(0.05),
-    "a fence": lambda: abreast(0.4),
-    "a view of elsewhere": of_elsewhere,
-    "a small photograph": far_smaller,
-    "burnt out": burnt_out,
-}
+    "forward": ahead, "tiny baseline": lambda: abreast(0.05), "a fence": lambda: abreast(0.4),
+    "a view of elsewhere": of_elsewhere, "a small photograph": far_smaller, "burnt out": burnt_out,
+}  # fmt: skip
 MADE = {}
 
 

@@ -35,7 +35,7 @@ print(value, sum(caller.outer.stats.cache_hits.values()))
 
 
 def run_in(folder, code=RUN, **variables):
-    environment = {**os.environ, "THESISRECON_KERNEL_CACHE": str(folder / "cache"), **variables}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), **variables}
     environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(Path(__file__).parent.parent)])
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -78,7 +78,7 @@ def test_an_edit_of_a_comment_or_a_moved_function_recompiles_nothing(package):
 
 def test_a_damaged_entry_is_compiled_again(package):
     run_in(package)
-    for entry in (package / "cache").iterdir():
+    for entry in (package / "cache" / "thesisrecon").iterdir():
         entry.write_bytes(entry.read_bytes()[:-7])
     assert run_in(package) == ["8.0", "0"]
     assert run_in(package) == ["8.0", "1"]
@@ -86,7 +86,10 @@ def test_a_damaged_entry_is_compiled_again(package):
 
 def test_a_folder_that_cannot_be_written_costs_only_the_cache(package):
     (package / "cache").write_text("a file in the place of the folder", encoding="utf-8")
-    assert run_in(package) == ["8.0", "0"]
+    warned = "import logging; logging.basicConfig(format='%(message)s', stream=__import__('sys').stdout)" + RUN
+    words = run_in(package, warned)
+    assert words[-2:] == ["8.0", "0"]
+    assert " ".join(words).count("set the variable NUMBA_CACHE_DIR to a writable folder") == 1
 
 
 def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(package):

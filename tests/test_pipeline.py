@@ -46,11 +46,8 @@ def read(path):
 def kept_bytes(out):
     """Every result file of a run and its hash."""
     files = [
-        *out.glob("0*/*.npz"),
-        *(out / "sparse" / "0").iterdir(),
-        out / "points.ply",
-        out / "cameras.json",
-    ]
+        *out.glob("0*/*.npz"), *(out / "sparse" / "0").iterdir(), out / "points.ply", out / "cameras.json",
+    ]  # fmt: skip
     return {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
 
 
@@ -73,14 +70,8 @@ def test_a_run_writes_all_documented_files(tmp_path):
     assert summary["cameras"][0]["focal_px"] == {"value": 100.0, "std": 1.0, "source": "fake"}
     assert summary["failure"] is None
     assert set(summary["seconds"]) >= {
-        "images",
-        "features",
-        "matches",
-        "tracks",
-        "metric",
-        "outputs",
-        "total",
-    }
+        "images", "features", "matches", "tracks", "metric", "outputs", "total",
+    }  # fmt: skip
     manifest = read(out / "02-matches" / "manifest.json")
     assert set(manifest["keys"]) == {f"{i:05d}-{j:05d}" for i in range(4) for j in range(i + 1, 4)}
     assert manifest["report"]["counts"]["accepted"] == 6
@@ -419,14 +410,11 @@ class NamelessDetector(fakes.FakeDetector):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"until": "surface"}, "unknown stage"),
-        ({"until": "metrik"}, "did you mean metric"),
-        ({"threads": -1}, "at least 1"),
-        ({"executor": "dask://there"}, "dask://HOST:PORT"),
-        ({"executor": "proceses"}, "did you mean processes"),
-        ({"seed": -1}, "at least 0"),
+        ({"until": "surface"}, "unknown stage"), ({"until": "metrik"}, "did you mean metric"),
+        ({"threads": -1}, "at least 1"), ({"executor": "dask://there"}, "dask://HOST:PORT"),
+        ({"executor": "proceses"}, "did you mean processes"), ({"seed": -1}, "at least 0"),
     ],
-)
+)  # fmt: skip
 def test_wrong_options_are_rejected_before_any_output(tmp_path, options, words):
     with pytest.raises(UsageError, match=words):
         run(tmp_path / "out", **options)

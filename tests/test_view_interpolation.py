@@ -162,12 +162,8 @@ def test_a_film_of_two_goes_from_one_to_the_other(still):
 def test_a_film_of_three_crosses_the_triangle(still):
     film = interpolated_sequence([even("a", 100), even("b", 200), even("c", 50)], 5)
     assert [place["weights"] for place in film.frame_metadata] == [
-        [1.0, 0.0, 0.0],
-        [0.75, 0.25, 0.0],
-        [0.5, 0.5, 0.0],
-        [0.25, 0.25, 0.5],
-        [0.0, 0.0, 1.0],
-    ]
+        [1.0, 0.0, 0.0], [0.75, 0.25, 0.0], [0.5, 0.5, 0.0], [0.25, 0.25, 0.5], [0.0, 0.0, 1.0],
+    ]  # fmt: skip
     assert still == [("a", "b"), ("the interpolated view", "c")]
     levels = [float(film.draw(k, 1).mean()) for k in range(5)]
     assert levels[0] == 100.0

@@ -190,14 +190,11 @@ def test_the_strongest_of_each_size_where_corners_are_not_spread():
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("derivative_taps", (-1.0, 1.0)),
-        ("derivative_taps", (1.0, 1.0, 1.0)),
-        ("derivative_taps", (0.5, 0.0, -0.5)),
-        ("harris_k", 0.3),
-        ("integration_taps", 4),
+        ("derivative_taps", (-1.0, 1.0)), ("derivative_taps", (1.0, 1.0, 1.0)),
+        ("derivative_taps", (0.5, 0.0, -0.5)), ("harris_k", 0.3), ("integration_taps", 4),
         ("integration_sigma_px", 0.0),
     ],
-)
+)  # fmt: skip
 def test_a_measure_that_cannot_be_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
         CornerMeasure(**{field: value})
@@ -206,15 +203,12 @@ def test_a_measure_that_cannot_be_is_refused(field, value):
 @pytest.mark.parametrize(
     ("kind", "field", "value"),
     [
-        (HarrisCorners, "max_corners", 0),
-        (HarrisCorners, "threshold_rel", 2.0),
-        (HarrisCorners, "threshold_rel", np.nan),
-        (HarrisCorners, "spacing_rel", -0.1),
-        (MultiScaleCorners, "seeds_per_level", -5),
-        (MultiScaleCorners, "full_corners", -1),
+        (HarrisCorners, "max_corners", 0), (HarrisCorners, "threshold_rel", 2.0),
+        (HarrisCorners, "threshold_rel", np.nan), (HarrisCorners, "spacing_rel", -0.1),
+        (MultiScaleCorners, "seeds_per_level", -5), (MultiScaleCorners, "full_corners", -1),
         (MultiScaleCorners, "levels", 0),
     ],
-)
+)  # fmt: skip
 def test_a_detector_that_cannot_be_is_refused(kind, field, value):
     with pytest.raises(ValueError, match=field):
         kind(**{field: value})

@@ -41,23 +41,19 @@ def test_numbers_that_are_not_finite_are_rejected():
     for v in (np.nan, np.inf):
         calls = [
             (camera_matrix.decompose_camera, spoilt(P, v)),
-            (two_view.fundamental_from_cameras, P, spoilt(OTHER, v)),
-            (two_view.epipoles, spoilt(F, v)),
-            (two_view.enforce_rank_two, spoilt(F, v)),
-            (two_view.estimate_homography, spoilt(XY, v), XY),
-            (normalizing_transform, spoilt(XY, v)),
-            (two_view.infinite_homography, P, spoilt(OTHER, v)),
+            (two_view.fundamental_from_cameras, P, spoilt(OTHER, v)), (two_view.epipoles, spoilt(F, v)),
+            (two_view.enforce_rank_two, spoilt(F, v)), (two_view.estimate_homography, spoilt(XY, v), XY),
+            (normalizing_transform, spoilt(XY, v)), (two_view.infinite_homography, P, spoilt(OTHER, v)),
             (two_view.plane_homography, P, OTHER, spoilt(np.ones(4), v)),
             (correct_matches, F, spoilt(XY, v), XY),
             (resect_linear, RNG.normal(size=(8, 4)), spoilt(XY, v)),
             (three_view.tensor_from_cameras, P, spoilt(OTHER, v), P),
             (three_view.fundamentals_from_tensor, spoilt(T, v)),
-            (three_view.transfer_lines, T, LINE, spoilt(LINE, v)),
-            (conics.dual, spoilt(CONIC, v)),
+            (three_view.transfer_lines, T, LINE, spoilt(LINE, v)), (conics.dual, spoilt(CONIC, v)),
             (estimate_similarity, spoilt(RNG.normal(size=(5, 3)), v), RNG.normal(size=(5, 3))),
             (strata.transform, spoilt(np.eye(4), v), P, "cameras"),
             (conics.image_of_absolute_conic, spoilt(np.eye(3), v)),
-        ]
+        ]  # fmt: skip
         assert accepted(calls, "needs finite") == []
 
 
@@ -70,13 +66,10 @@ def test_singular_and_empty_arrays_are_rejected():
         (two_view.plane_homography, np.ones((3, 4)), P, np.ones(4)),
         (two_view.plane_homography, P, OTHER, np.zeros(4)),
         (three_view.tensor_from_cameras, P, np.zeros((3, 4)), P),
-        (correct_matches, np.zeros((3, 3)), XY, XY),
-        (strata.transform, np.ones((4, 4)), P, "cameras"),
+        (correct_matches, np.zeros((3, 3)), XY, XY), (strata.transform, np.ones((4, 4)), P, "cameras"),
         (strata.transform, np.zeros((4, 4)), np.eye(4), "conics"),
         (conics.image_of_absolute_conic, np.ones((3, 3))),
-        (conics.intersect_line, CONIC, np.zeros(3), LINE),
-        (conics.curvature_sign, np.zeros((4, 4))),
-        (two_view.epipoles, np.eye(4)),
-        (two_view.canonical_cameras, np.zeros((2, 3))),
-    ]
+        (conics.intersect_line, CONIC, np.zeros(3), LINE), (conics.curvature_sign, np.zeros((4, 4))),
+        (two_view.epipoles, np.eye(4)), (two_view.canonical_cameras, np.zeros((2, 3))),
+    ]  # fmt: skip
     assert accepted(calls, r"needs .*(invertible|zero|finite camera|\(3, 3\))") == []

@@ -30,16 +30,9 @@ from thesisrecon.numerics.partial_bundle import minimize_reprojection
 METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]
 
 KINDS = [
-    "general",
-    "forward",
-    "rectified",
-    "epipole at infinity",
-    "near the epipoles",
-    "far points",
-    "points at infinity",
-    "short baseline",
-    "projective frame",
-]
+    "general", "forward", "rectified", "epipole at infinity", "near the epipoles", "far points",
+    "points at infinity", "short baseline", "projective frame",
+]  # fmt: skip
 
 K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 480.0], [0.0, 0.0, 1.0]])
 

@@ -59,10 +59,8 @@ def test_impossible_options_are_rejected(arguments, make, words, tmp_path, run_c
 
 
 CONFIGS = [
-    ("features = 3", "takes a table"),
-    ("features = [1, 2]", "takes a table"),
-    ("[[features]]\nlevels = 1", "takes a table"),
-    ("[features]\nkind = 3", "unknown kind of features 3"),
+    ("features = 3", "takes a table"), ("features = [1, 2]", "takes a table"),
+    ("[[features]]\nlevels = 1", "takes a table"), ("[features]\nkind = 3", "unknown kind of features 3"),
     ("[features]\nkind = ['a']", "unknown kind of features ['a']"),
     ("[features]\nlevels = 'many'", "takes a whole number; got 'many'"),
     ("[features]\nlevels = 1.5", "takes a whole number; got 1.5"),
@@ -78,13 +76,10 @@ CONFIGS = [
     ("[intrinsics]\ncameras = ['shared']", "unknown value of intrinsics.cameras"),
     ("[dense]\npairs = 3", "pairs"),
     ("[dense.pairs]\nmatcher = {kind = []}", "unknown kind of dense.pairs.matcher []"),
-    ("preset = 3", "unknown preset 3"),
-    ("preset = ['default']", "unknown preset ['default']"),
-    (f"a = {'[' * 50_000}", "too deep"),
-    (b"\xff\xfe\0a", "is not a UTF-8 text"),
-    ("\0", "is not TOML"),
+    ("preset = 3", "unknown preset 3"), ("preset = ['default']", "unknown preset ['default']"),
+    (f"a = {'[' * 50_000}", "too deep"), (b"\xff\xfe\0a", "is not a UTF-8 text"), ("\0", "is not TOML"),
     ("x" * 100_000 + " = 1", "unknown stage"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "words"), CONFIGS, ids=[str(k) for k in range(len(CONFIGS))])
@@ -98,15 +93,11 @@ def test_settings_of_wrong_types(text, words, tmp_path, run_cli):
 
 
 PAIRS = [
-    ("line 1 of", b"\0\0\0"),
-    ("not a UTF-8 text", b"\xff\xfe\0"),
-    ("line 1 of", "a.png " * 100_000),
-    ("line 2 of", 'a.png b.png\n"a.png\n'),
-    ("names 'c\\x1b[31m.png'", "a.png c\x1b[31m.png"),
-    ("names '<b>.png'", "a.png <b>.png"),
-    ("leaves no pair", "# nothing\n"),
+    ("line 1 of", b"\0\0\0"), ("not a UTF-8 text", b"\xff\xfe\0"), ("line 1 of", "a.png " * 100_000),
+    ("line 2 of", 'a.png b.png\n"a.png\n'), ("names 'c\\x1b[31m.png'", "a.png c\x1b[31m.png"),
+    ("names '<b>.png'", "a.png <b>.png"), ("leaves no pair", "# nothing\n"),
     ("pairs 'a.png' with itself", "a.png a.png\n"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "text"), PAIRS, ids=[str(k) for k in range(len(PAIRS))])

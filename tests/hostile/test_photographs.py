@@ -101,26 +101,22 @@ PROFILE = PIL.ImageCms.ImageCmsProfile(PIL.ImageCms.createProfile("LAB")).tobyte
 
 # Unusual images that are valid.
 PHOTOGRAPHS = [
-    ("sixteen bits.png", sixteen_bits()),
-    ("cmyk.jpg", files.encoded("JPEG", picture().convert("CMYK"))),
+    ("sixteen bits.png", sixteen_bits()), ("cmyk.jpg", files.encoded("JPEG", picture().convert("CMYK"))),
     ("palette.png", files.encoded("PNG", picture().convert("P"))),
     ("alpha.png", files.encoded("PNG", picture().convert("RGBA"))),
     ("grey and alpha.png", files.encoded("PNG", picture().convert("LA"))),
-    ("one bit.png", files.encoded("PNG", picture().convert("1"))),
-    ("animated.gif", animated()),
-    ("nan.tif", with_nan()),
-    ("packed.tif", files.encoded("TIFF", compression="tiff_lzw")),
+    ("one bit.png", files.encoded("PNG", picture().convert("1"))), ("animated.gif", animated()),
+    ("nan.tif", with_nan()), ("packed.tif", files.encoded("TIFF", compression="tiff_lzw")),
     ("exif of noise.jpg", with_exif(bytes(range(256)) * 4)),
     ("exif cut.jpg", with_exif(b"II*\0\x08\0\0\0\xff\xff")),
     ("exif in a circle.jpg", with_exif(b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x08\0\0\0\x08")),
-    ("focal of words.jpg", wrong_focal("wide")),
-    ("focal below zero.jpg", wrong_focal(0)),
+    ("focal of words.jpg", wrong_focal("wide")), ("focal below zero.jpg", wrong_focal(0)),
     ("profile of another space.jpg", files.encoded("JPEG", icc_profile=PROFILE)),
     ("profile of noise.png", files.encoded("PNG", icc_profile=bytes(range(256)) * 9)),
     ("profile of noise.jpg", files.encoded("JPEG", icc_profile=os.urandom(70_000))),
     ("jpeg called.png", files.encoded("JPEG")),
     ("more after its end.jpg", files.encoded("JPEG") + os.urandom(5000)),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "content"), PHOTOGRAPHS, ids=[name for name, _ in PHOTOGRAPHS])
@@ -179,23 +175,12 @@ def test_a_file_that_vanishes_while_others_are_read(tmp_path, run_cli, monkeypat
 
 
 NAMES = [
-    "<img src=x onerror=alert(1)>.png",
-    "\"'><script>alert(2)<\u2215script>.png",
-    "{{ 7 * 7 }} %s %n $(id) `id` ;&|.png",
-    "line\nend\r\t\x1b[31m.png",
-    "\u202egnp.exe turned.png",
-    "a" * 251 + ".png",
-    "\U0001f4f7 写真 größe e\u0301.png",
-    "-o.png",
-    "--help.png",
-    "a\\x0ab.png",
-    "a\nb.png",
-    os.fsdecode(b"latin \xff.png"),
-    os.fsdecode(b"latin \xfe.png"),
-    "latin \\xff.png",
-    "NaN.png",
-    "null.png",
-]
+    "<img src=x onerror=alert(1)>.png", "\"'><script>alert(2)<\u2215script>.png",
+    "{{ 7 * 7 }} %s %n $(id) `id` ;&|.png", "line\nend\r\t\x1b[31m.png", "\u202egnp.exe turned.png",
+    "a" * 251 + ".png", "\U0001f4f7 写真 größe e\u0301.png", "-o.png", "--help.png", "a\\x0ab.png",
+    "a\nb.png", os.fsdecode(b"latin \xff.png"), os.fsdecode(b"latin \xfe.png"), "latin \\xff.png",
+    "NaN.png", "null.png",
+]  # fmt: skip
 
 
 def test_names_are_distinguished_and_shown_in_one_line(tmp_path, run_cli):

@@ -39,17 +39,11 @@ def packed_bomb(path):
 
 
 RECORDS = [
-    ("pickle", pickled),
-    ("packed", packed_bomb),
-    ("empty", writes(b"")),
-    ("text", writes("dear reader")),
-    ("zip of nothing", writes(b"PK\x05\x06" + bytes(18))),
-    ("pipe", pipe),
-    ("device", links("/dev/zero")),
-    ("round", links("{here}/00000.npz")),
-    ("folder", lambda path: path.mkdir()),
+    ("pickle", pickled), ("packed", packed_bomb), ("empty", writes(b"")), ("text", writes("dear reader")),
+    ("zip of nothing", writes(b"PK\x05\x06" + bytes(18))), ("pipe", pipe), ("device", links("/dev/zero")),
+    ("round", links("{here}/00000.npz")), ("folder", lambda path: path.mkdir()),
     ("10 TiB", sparse(10**13, b"PK\x03\x04")),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("make", [make for _, make in RECORDS], ids=[name for name, _ in RECORDS])
@@ -79,15 +73,12 @@ def manifest(report):
 
 GOOD_REPORT = {"stage": "features", "seconds": 1.0, "counts": {}, "metrics": {}, "warnings": []}
 MANIFESTS = [
-    ("deep", writes(files.deep_json())),
-    ("list", writes("[]")),
-    ("no report", manifest(None)),
-    ("words", manifest("soup")),
-    ("seconds in words", manifest({**GOOD_REPORT, "seconds": "soup"})),
+    ("deep", writes(files.deep_json())), ("list", writes("[]")), ("no report", manifest(None)),
+    ("words", manifest("soup")), ("seconds in words", manifest({**GOOD_REPORT, "seconds": "soup"})),
     ("counts in words", manifest({**GOOD_REPORT, "counts": "soup"})),
     ("counts of tables", manifest({**GOOD_REPORT, "counts": {"images": {}}})),
     ("a number as warning", manifest({**GOOD_REPORT, "warnings": [3]})),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("make", [make for _, make in MANIFESTS], ids=[name for name, _ in MANIFESTS])
@@ -213,14 +204,11 @@ def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):
     for name in ("summary.json", "model.glb", "cameras.json", "run.json"):
         (folder / name).symlink_to("/dev/zero")
     done = subprocess.run(
-        [sys.executable, "-m", "thesisrecon", *arguments],
-        cwd=tmp_path,
+        [sys.executable, "-m", "thesisrecon", *arguments], cwd=tmp_path,
         env={**os.environ, "PYTHONIOENCODING": "latin-1", "PYTHONPATH": str(Path(__file__).parents[2])},
-        capture_output=True,
-        timeout=120,
-        check=False,
+        capture_output=True, timeout=120, check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30)),
-    )
+    )  # fmt: skip
     assert done.returncode == code, done.stderr
     assert done.stdout == b""
     files.require_sentence(done.stderr.decode("latin-1"))

@@ -32,31 +32,22 @@ def scene(*, k=(0.0, 0.0, 0.0), aspect=1.0, noise_px=0.3):
     )
     X[~valid] = 0
     return Reconstruction(
-        stratum="metric",
-        P=np.where(registered[:, None, None], compose_camera(K, R, t), 0.0),
-        X=X,
-        registered=registered,
-        valid=valid,
-        inlier=rng.random(V * N) > 0.15,
+        stratum="metric", P=np.where(registered[:, None, None], compose_camera(K, R, t), 0.0), X=X,
+        registered=registered, valid=valid, inlier=rng.random(V * N) > 0.15,
         tracks=Tracks(view, point, xy + rng.normal(0, noise_px, xy.shape), V, N),
-        sizes=np.tile(SIZE, (V, 1)),
-        sigma_px=noise_px,
+        sizes=np.tile(SIZE, (V, 1)), sigma_px=noise_px,
         reasons=tuple("" if known else "too few points" for known in registered),
-        K=np.where(registered[:, None, None], K, 0.0),
-        distortion=np.tile(k, (V, 1)),
-    )
+        K=np.where(registered[:, None, None], K, 0.0), distortion=np.tile(k, (V, 1)),
+    )  # fmt: skip
 
 
 def export(folder, reconstruction, *, scale=1.0, names=NAMES):
     return write_colmap_model(
-        folder,
-        reconstruction,
-        names,
+        folder, reconstruction, names,
         colors=np.random.default_rng(0).integers(0, 256, (N, 3), dtype=np.uint8),
-        groups=np.zeros(V, dtype=np.int64),
-        scales=np.full(V, scale),
+        groups=np.zeros(V, dtype=np.int64), scales=np.full(V, scale),
         original_sizes=np.tile((1537, 1155), (V, 1)),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

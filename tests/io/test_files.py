@@ -76,14 +76,11 @@ def test_json_has_no_nan(tmp_path):
     [
         ("größe 写真 \U0001f4f7 e\u0301.jpg", "größe 写真 \U0001f4f7 e\u0301.jpg"),
         ("a\nb\t\x1b[31m\x7f\x85", "a\\x0ab\\x09\\x1b[31m\\x7f\\x85"),
-        ("a\u2028b\u2029c", "a\\u2028b\\u2029c"),
-        ("\u202egpj.exe\u2066", "\\u202egpj.exe\\u2066"),
-        (os.fsdecode(b"gr\xfc\xdfe"), "gr\\xfc\\xdfe"),
-        ("half \ud800", "half \\ud800"),
-        ("both \ud800\udcff", "both \\ud800\\udcff"),
-        ("<b>&\"'", "<b>&\"'"),
+        ("a\u2028b\u2029c", "a\\u2028b\\u2029c"), ("\u202egpj.exe\u2066", "\\u202egpj.exe\\u2066"),
+        (os.fsdecode(b"gr\xfc\xdfe"), "gr\\xfc\\xdfe"), ("half \ud800", "half \\ud800"),
+        ("both \ud800\udcff", "both \\ud800\\udcff"), ("<b>&\"'", "<b>&\"'"),
     ],
-)
+)  # fmt: skip
 def test_names_are_shown_in_one_line_and_in_their_order(name, shown):
     assert files.printable(name) == shown
     shown.encode("utf-8")
@@ -137,15 +134,10 @@ def test_a_line_that_is_not_a_pair_is_named(tmp_path, line):
 
 
 ONE = {
-    "name": "a.jpg",
-    "width": 160,
-    "height": 120,
-    "K": [[150.0, 0, 79.5], [0, 151.0, 59.5], [0, 0, 1]],
-    "distortion": [-0.05, 0, 0],
-    "R": np.eye(3).tolist(),
-    "t": [0.1, 0.2, 3.0],
+    "name": "a.jpg", "width": 160, "height": 120, "K": [[150.0, 0, 79.5], [0, 151.0, 59.5], [0, 0, 1]],
+    "distortion": [-0.05, 0, 0], "R": np.eye(3).tolist(), "t": [0.1, 0.2, 3.0],
     "centre": [-0.1, -0.2, -3.0],
-}
+}  # fmt: skip
 
 
 def written(folder, content):

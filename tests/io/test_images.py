@@ -82,15 +82,9 @@ def test_exif_rotation_is_applied(tmp_path, orientation):
     # The stored pixels are those that the orientation turns back into the upright picture.
     turns = PIL.Image.Transpose
     stored = {
-        1: None,
-        2: turns.FLIP_LEFT_RIGHT,
-        3: turns.ROTATE_180,
-        4: turns.FLIP_TOP_BOTTOM,
-        5: turns.TRANSPOSE,
-        6: turns.ROTATE_90,
-        7: turns.TRANSVERSE,
-        8: turns.ROTATE_270,
-    }[orientation]
+        1: None, 2: turns.FLIP_LEFT_RIGHT, 3: turns.ROTATE_180, 4: turns.FLIP_TOP_BOTTOM,
+        5: turns.TRANSPOSE, 6: turns.ROTATE_90, 7: turns.TRANSVERSE, 8: turns.ROTATE_270,
+    }[orientation]  # fmt: skip
     exif = PIL.Image.Exif()
     exif[0x0112] = orientation
     (upright if stored is None else upright.transpose(stored)).save(tmp_path / "a.png", exif=exif)
@@ -151,13 +145,9 @@ def test_unreadable_images_are_rejected_and_the_others_are_used(tmp_path):
     photographs = read_images(tmp_path, max_size_px=1600)
     assert [image.name for image in photographs.images] == ["good one ü.jpg"]
     expected = {
-        "text.jpg": "not an image",
-        "cut.jpg": "truncated",
-        "empty.png": "not an image",
-        "raw.heic": "",
-        "tiny.png": "only 20 x 10 pixels",
-        "blank.png": "blank",
-    }
+        "text.jpg": "not an image", "cut.jpg": "truncated", "empty.png": "not an image", "raw.heic": "",
+        "tiny.png": "only 20 x 10 pixels", "blank.png": "blank",
+    }  # fmt: skip
     assert set(photographs.refused) == set(expected)
     for name, words in expected.items():
         assert words in photographs.refused[name]

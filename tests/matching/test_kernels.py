@@ -105,13 +105,9 @@ def test_growth_equals_its_numpy_twin():
     affine, radius = np.tile(np.eye(2), (len(xy1), 1, 1)), np.full(len(xy1), 12.0)
     place = xy1 - (14.0, 0.0)
     index, score, second_best = _match_guided(
-        one.pyramid,
-        (xy1, one.features.scale),
-        (affine, place, radius),
-        (xy2, two.features.scale, two.patches),
-        two.cells,
-        (F, 1.5, 0.7),
-    )
+        one.pyramid, (xy1, one.features.scale), (affine, place, radius),
+        (xy2, two.features.scale, two.patches), two.cells, (F, 1.5, 0.7),
+    )  # fmt: skip
     correlation = one.patches @ two.patches.T
     allowed = np.linalg.norm(place[:, None] - xy2[None], axis=2) <= 12.0
     allowed &= np.abs(xy1[:, None, 1] - xy2[None, :, 1]) <= 1.5

@@ -12,22 +12,14 @@ from thesisrecon.records import Image, Matches
 
 VARIANTS = [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())]
 SWITCHED = [
-    SeedsAndGrowth(),
-    SeedsAndGrowth(orientation="upright"),
-    SeedsAndGrowth(orientation="rotated"),
-    SeedsAndGrowth(support="always"),
-    SeedsAndGrowth(support="never"),
-    SeedsAndGrowth(growth=False),
-    SeedsAndGrowth(coarse_first=False),
-    SeedsAndGrowth(rematch=False),
-    SeedsAndGrowth(neighbours=1),
-    SeedsAndGrowth(coarse_first=False, rematch=False),
-    SeedsAndGrowth(align=False),
+    SeedsAndGrowth(), SeedsAndGrowth(orientation="upright"), SeedsAndGrowth(orientation="rotated"),
+    SeedsAndGrowth(support="always"), SeedsAndGrowth(support="never"), SeedsAndGrowth(growth=False),
+    SeedsAndGrowth(coarse_first=False), SeedsAndGrowth(rematch=False), SeedsAndGrowth(neighbours=1),
+    SeedsAndGrowth(coarse_first=False, rematch=False), SeedsAndGrowth(align=False),
     SeedsAndGrowth(growth=False, align=False),
     StrengthOfMatch(weight="relative-difference", min_correlation=0.7, min_strength=0.15),
-    StrengthOfMatch(window=11, colour=True),
-    StrengthOfMatch(align=True),
-]
+    StrengthOfMatch(window=11, colour=True), StrengthOfMatch(align=True),
+]  # fmt: skip
 BOTH = pytest.mark.parametrize(("detector", "variant"), VARIANTS, ids=["seeds", "strength"])
 
 

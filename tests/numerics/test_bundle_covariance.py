@@ -41,13 +41,9 @@ def test_the_banded_way_gives_the_covariances_of_the_dense_one(monkeypatch, popu
 
     def fit():
         return refine_metric_bundle(
-            cameras,
-            block.X,
-            Observations(block.view, block.point, xy),
-            free=FREE,
-            prior=prior,
+            cameras, block.X, Observations(block.view, block.point, xy), free=FREE, prior=prior,
             options=BundleOptions(covariance=True),
-        )
+        )  # fmt: skip
 
     dense = fit()
     monkeypatch.setattr(bundle_covariance, "MAX_DENSE", 0)

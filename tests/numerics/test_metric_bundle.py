@@ -168,13 +168,9 @@ def test_a_std_of_zero_holds_one_camera_at_its_mean_while_others_move():
     std = np.full_like(mean, np.inf)
     std[2, 0], mean[2, 0] = 0.0, 1234.0
     fit = _refine(
-        block.cameras,
-        block.X,
-        _seen(block),
-        free=FOCAL,
-        prior=IntrinsicsPrior.unshared(mean, std),
+        block.cameras, block.X, _seen(block), free=FOCAL, prior=IntrinsicsPrior.unshared(mean, std),
         covariance=True,
-    )
+    )  # fmt: skip
     assert fit.cameras.intrinsics[2, 0] == pytest.approx(1234.0, rel=1e-12)
     assert not fit.intrinsics_covariance[2].any()
     others = np.delete(np.arange(6), 2)

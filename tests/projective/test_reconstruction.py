@@ -202,13 +202,10 @@ def observe(scene, R, t):
     xy = np.concatenate([old.xy, new_xy + rng.normal(0, NOISE_PX, new_xy.shape)])
     order = np.lexsort((view, point))
     return replace(
-        scene,
-        K=np.concatenate([scene.K, np.tile(scene.K[0], (m, 1, 1))]),
-        R=np.concatenate([scene.R, R]),
-        t=np.concatenate([scene.t, t]),
-        sizes=np.tile(scene.sizes[0], (n + m, 1)),
+        scene, K=np.concatenate([scene.K, np.tile(scene.K[0], (m, 1, 1))]), R=np.concatenate([scene.R, R]),
+        t=np.concatenate([scene.t, t]), sizes=np.tile(scene.sizes[0], (n + m, 1)),
         tracks=Tracks(view[order], point[order], xy[order], n + m, old.n_points),
-    )
+    )  # fmt: skip
 
 
 def reconstruct(scene, pairs, seed=0, **changes):
@@ -304,11 +301,8 @@ def test_a_beginning_in_a_corner_gives_way_to_one_that_reaches_more():
     t, s = big.tracks, small.tracks
     tracks = Tracks(
         np.concatenate([t.view_index, 6 + s.view_index]),
-        np.concatenate([t.point_index, 300 + s.point_index]),
-        np.concatenate([t.xy, s.xy]),
-        9,
-        1200,
-    )
+        np.concatenate([t.point_index, 300 + s.point_index]), np.concatenate([t.xy, s.xy]), 9, 1200,
+    )  # fmt: skip
     pairs = true_pairs(big) + [replace(p, i=p.i + 6, j=p.j + 6) for p in true_pairs(small)]
     assert rank_initial_pairs(tracks, pairs)[0].i >= 6
     both = replace(big, tracks=tracks, sizes=np.tile(big.sizes[0], (9, 1)))

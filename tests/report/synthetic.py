@@ -75,20 +75,11 @@ def made_up_pair(i, j, cameras, xy, seen):
     both = both[: max(8, len(both) // (1 + abs(i - j)))]
     accepted = abs(i - j) < 5
     return TwoView(
-        i=i,
-        j=j,
-        F=F / np.linalg.norm(F),
-        sigma_px=0.2,
-        index1=both,
-        index2=both,
-        xy1=xy[i][both],
-        xy2=xy[j][both],
-        affine=np.tile(np.eye(2), (len(both), 1, 1)),
-        candidates=2 * len(both),
-        homography_inlier_ratio=0.35,
-        accepted=accepted,
+        i=i, j=j, F=F / np.linalg.norm(F), sigma_px=0.2, index1=both, index2=both, xy1=xy[i][both],
+        xy2=xy[j][both], affine=np.tile(np.eye(2), (len(both), 1, 1)), candidates=2 * len(both),
+        homography_inlier_ratio=0.35, accepted=accepted,
         reason="" if accepted else "too few verified matches",
-    )
+    )  # fmt: skip
 
 
 def made_up_run(*, names=None, points=1500, seed=4):
@@ -121,18 +112,11 @@ def made_up_run(*, names=None, points=1500, seed=4):
         made_up_pair(i, j, cameras, xy, seen) for i in range(count) for j in range(i + 1, min(i + 7, count))
     ]
     return ReportData(
-        title="Courtyard wall",
-        images=images,
-        reports=_reports(),
-        config_text=CONFIG,
-        summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5},
-        version="0.1.0",
-        unread={"notes.jpg": "it is no image that Pillow can read"},
-        pairs=pairs,
-        metric=metric,
-        affine=dataclasses.replace(metric.reconstruction, stratum="affine"),
-        colors=colors,
-    )
+        title="Courtyard wall", images=images, reports=_reports(), config_text=CONFIG,
+        summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5}, version="0.1.0",
+        unread={"notes.jpg": "it is no image that Pillow can read"}, pairs=pairs, metric=metric,
+        affine=dataclasses.replace(metric.reconstruction, stratum="affine"), colors=colors,
+    )  # fmt: skip
 
 
 def projective_run():
@@ -151,17 +135,12 @@ def _reconstruction(X, cameras, xy, seen, rng):
     P = np.stack([compose_camera(K, R, t) for R, t in zip(*cameras, strict=True)])
     tracks = Tracks(view, point, clean + rng.normal(0, NOISE_PX, clean.shape), count, len(X))
     return reconstruction_of(
-        P * registered[:, None, None],
-        SIZE,
-        X=homogenize(X),
-        tracks=tracks,
-        registered=registered,
-        inlier=rng.random(len(point)) < 0.97,
-        sigma_px=NOISE_PX,
+        P * registered[:, None, None], SIZE, X=homogenize(X), tracks=tracks, registered=registered,
+        inlier=rng.random(len(point)) < 0.97, sigma_px=NOISE_PX,
         reasons=(*[""] * (count - 1), "only 14 matches lead to known points (20 are needed)"),
         K=np.tile(K, (count, 1, 1)) * registered[:, None, None],
         distortion=np.tile([K1, 0.0, 0.0], (count, 1)),
-    )
+    )  # fmt: skip
 
 
 def _reports():
@@ -245,17 +224,12 @@ def sphere_run():
     seen = np.isfinite(maps[2].depth)
     shifted = np.roll(rgb[2], 1, axis=1)
     return ReportData(
-        title="Sphere",
-        images=tuple(map(Image, SPHERE_NAMES, rgb, [SPHERE_SIZE] * len(rgb))),
-        reports=(StageReport("dense", 2.0), StageReport("model", 1.0)),
-        config_text="",
-        summary={},
-        version="0.1.0",
-        metric=MetricResult(sphere_reconstruction(), ({},) * len(maps), {}, trusted=True),
-        model=sphere_model(),
-        depth_maps={m.view: m.depth for m in maps[:-1]},
+        title="Sphere", images=tuple(map(Image, SPHERE_NAMES, rgb, [SPHERE_SIZE] * len(rgb))),
+        reports=(StageReport("dense", 2.0), StageReport("model", 1.0)), config_text="", summary={},
+        version="0.1.0", metric=MetricResult(sphere_reconstruction(), ({},) * len(maps), {}, trusted=True),
+        model=sphere_model(), depth_maps={m.view: m.depth for m in maps[:-1]},
         held_out=HeldOut(2, rgb[2], shifted, seen, psnr_db=27.3456, ssim=0.9123),
-    )
+    )  # fmt: skip
 
 
 class Structure(HTMLParser):

@@ -25,14 +25,11 @@ TIME = "Computing time"
 @pytest.mark.parametrize(
     ("value", "std", "text"),
     [
-        (1520.34, 1.84, "1520.3 ± 1.8"),
-        (1520.34, 4.2, "1520 ± 4"),
-        (1520.34, 0.42, "1520.3 ± 0.4"),
-        (-0.03012, 0.00042, "-0.0301 ± 0.0004"),
-        (512.0, 0.0, "512 (fixed)"),
+        (1520.34, 1.84, "1520.3 ± 1.8"), (1520.34, 4.2, "1520 ± 4"), (1520.34, 0.42, "1520.3 ± 0.4"),
+        (-0.03012, 0.00042, "-0.0301 ± 0.0004"), (512.0, 0.0, "512 (fixed)"),
         (1520.34, float("inf"), "1520 (not determined)"),
     ],
-)
+)  # fmt: skip
 def test_numbers_carry_as_many_digits_as_they_deserve(value, std, text):
     assert plus_minus(value, std) == text
 

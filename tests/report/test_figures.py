@@ -146,11 +146,8 @@ def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness():
     assert steps.max() < 1.6 * steps.min()
     ends = drawing._paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
     assert ["#" + bytes(c).hex() for c in ends[:4]] == [
-        drawing.SCALE[0],
-        drawing.SCALE[0],
-        drawing.SCALE[-1],
-        drawing.SCALE[-1],
-    ]
+        drawing.SCALE[0], drawing.SCALE[0], drawing.SCALE[-1], drawing.SCALE[-1],
+    ]  # fmt: skip
     assert tuple(ends[4]) == drawing.UNKNOWN
 
 

@@ -15,13 +15,10 @@ from thesisrecon.report._page import strip_page
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 MARK = "header-of-a-photograph"
 SNARES = [
-    "<img src=x onerror=alert(1)>",
-    "\"><script>alert('2')",
-    "' onload='alert(3)' x='",
-    "]]>--><svg onload=alert(4)>",
-    "{{ self }}{% raw %}${alert(5)}`",
+    "<img src=x onerror=alert(1)>", "\"><script>alert('2')", "' onload='alert(3)' x='",
+    "]]>--><svg onload=alert(4)>", "{{ self }}{% raw %}${alert(5)}`",
     "\u2028<\u202ebody onpageshow=alert(6)>",
-]
+]  # fmt: skip
 PLAIN = ["a", "b", "c", "d", "e", "f"]
 TEXTS = (0x010E, 0x010F, 0x0110, 0x013B, 0x8298)
 """Description, make, model, artist and copyright."""

@@ -99,15 +99,9 @@ def test_a_failed_run_without_anything_has_a_page():
 def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
     data = dataclasses.replace(synthetic.projective_run(), reconstruction=None, until="matches")
     nothing = dataclasses.replace(
-        data.pairs[0],
-        F=np.zeros((3, 3)),
-        sigma_px=float("nan"),
-        homography_inlier_ratio=float("nan"),
-        xy1=np.zeros((0, 2)),
-        xy2=np.zeros((0, 2)),
-        accepted=False,
-        reason="too few matches for an F",
-    )
+        data.pairs[0], F=np.zeros((3, 3)), sigma_px=float("nan"), homography_inlier_ratio=float("nan"),
+        xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)), accepted=False, reason="too few matches for an F",
+    )  # fmt: skip
     page = render_report(dataclasses.replace(data, pairs=[nothing]))
     assert "too few matches for an F" in page
     assert "<td>–</td><td>–</td>" in page

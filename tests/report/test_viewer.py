@@ -135,11 +135,8 @@ def test_a_stray_does_not_take_the_resolution_of_the_rest():
 
 
 EVIL = [
-    "<img src=x onerror=alert(1)>.jpg",
-    "\"quote'&.png",
-    "</script><script>alert(2)</script>.jpg",
-    "c.jpg",
-]
+    "<img src=x onerror=alert(1)>.jpg", "\"quote'&.png", "</script><script>alert(2)</script>.jpg", "c.jpg",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -36,11 +36,8 @@ NO_RESULT = ("seconds", "elapsed_seconds", "peak_memory_mb", "threads", "executo
 def results(out):
     """Every result file of a run by its hash, and its summary without times."""
     files = [
-        *out.glob("0*/*.npz"),
-        *(out / "sparse").rglob("*.bin"),
-        *out.glob("*.ply"),
-        out / "cameras.json",
-    ]
+        *out.glob("0*/*.npz"), *(out / "sparse").rglob("*.bin"), *out.glob("*.ply"), out / "cameras.json",
+    ]  # fmt: skip
     found = {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
     model = out / "model.glb"
     found["model"] = hashlib.sha256(model.read_bytes()).hexdigest() if model.exists() else ""
@@ -166,13 +163,9 @@ def test_a_scheduler_that_dies_is_reported_and_the_run_continues(lonely, tmp_pat
     config = fake_config(matching=SlowMatcher())
     with pytest.raises(WorkersLost, match=r"scheduler at 127\.0\.0\.1:\d+ is gone \(in the stage matches\)"):
         reconstruct(
-            photographs(4),
-            tmp_path,
-            config=config,
-            until="metric",
-            executor=executor,
+            photographs(4), tmp_path, config=config, until="metric", executor=executor,
             progress=close_at_matches,
-        )
+        )  # fmt: skip
     assert len(list((tmp_path / "02-matches").glob("*.npz"))) >= 2
     result = reconstruct(photographs(4), tmp_path, config=config, until="metric")
     assert result.metric is not None

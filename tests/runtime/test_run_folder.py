@@ -41,17 +41,10 @@ def some_features(value=1.0):
 def some_metric():
     tracks = records.Tracks(np.zeros(1, np.int64), np.zeros(1, np.int64), np.ones((1, 2)), 2, 1)
     reconstruction = records.Reconstruction(
-        stratum="metric",
-        P=np.ones((2, 3, 4)),
-        X=np.ones((1, 4)),
-        registered=np.array([True, False]),
-        valid=np.array([True]),
-        inlier=np.array([True]),
-        tracks=tracks,
-        sizes=np.array([[4, 3], [4, 3]]),
-        sigma_px=0.5,
-        reasons=("", "ünsüitable"),
-    )
+        stratum="metric", P=np.ones((2, 3, 4)), X=np.ones((1, 4)), registered=np.array([True, False]),
+        valid=np.array([True]), inlier=np.array([True]), tracks=tracks, sizes=np.array([[4, 3], [4, 3]]),
+        sigma_px=0.5, reasons=("", "ünsüitable"),
+    )  # fmt: skip
     intervals = ({"focal_px": records.IntrinsicInterval(100.0, 1.0, "data")}, {})
     return records.MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
 

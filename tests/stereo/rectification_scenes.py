@@ -11,16 +11,8 @@ from thesisrecon.geometry.two_view import fundamental_from_cameras
 
 SIZE = (640, 480)
 MOTIONS = (
-    "beside",
-    "toed in",
-    "rolled",
-    "upwards",
-    "parallel",
-    "behind",
-    "forward",
-    "diagonal",
-    "half forward",
-)
+    "beside", "toed in", "rolled", "upwards", "parallel", "behind", "forward", "diagonal", "half forward",
+)  # fmt: skip
 PLANAR = MOTIONS[:6]
 
 
@@ -43,16 +35,13 @@ class PairOfCameras:
 def make_pair(motion, rng, *, noise_px=0.0, points=300):
     """Two cameras about 8 from a cloud of points; the second one moved as ``motion`` says."""
     centre, turn = {
-        "beside": ((1.5, 0.1, 0.05), (0.01, 0.03, 0.02)),
-        "toed in": ((2.5, 0.2, 0.1), (0.0, -0.3, 0.05)),
-        "rolled": ((-1.5, 0.3, 0.1), (0.05, 0.1, 0.9)),
-        "upwards": ((0.1, -1.5, 0.2), (-0.15, 0.0, 0.0)),
-        "parallel": ((1.5, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        "behind": ((-2.0, 0.0, -0.5), (0.0, 0.15, 0.0)),
+        "beside": ((1.5, 0.1, 0.05), (0.01, 0.03, 0.02)), "toed in": ((2.5, 0.2, 0.1), (0.0, -0.3, 0.05)),
+        "rolled": ((-1.5, 0.3, 0.1), (0.05, 0.1, 0.9)), "upwards": ((0.1, -1.5, 0.2), (-0.15, 0.0, 0.0)),
+        "parallel": ((1.5, 0.0, 0.0), (0.0, 0.0, 0.0)), "behind": ((-2.0, 0.0, -0.5), (0.0, 0.15, 0.0)),
         "forward": ((0.1, 0.05, 2.0), (0.01, 0.02, 0.05)),
         "half forward": ((1.2, 0.1, 2.0), (0.0, -0.3, 0.0)),
         "diagonal": ((0.8, 0.1, 2.0), (0.0, -0.05, 0.1)),
-    }[motion]
+    }[motion]  # fmt: skip
     size2 = SIZE if motion == "parallel" else (600, 500)
     K1 = calibration_matrix(700.0, 700.0, 322.0, 236.0)
     K2 = K1 if motion == "parallel" else calibration_matrix(640.0, 640.0, 295.0, 255.0)

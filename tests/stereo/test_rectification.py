@@ -235,16 +235,12 @@ def test_contradictions_and_too_little_are_refused_with_a_reason():
 @pytest.mark.parametrize(
     "change",
     [
-        {"F": np.zeros((3, 3))},
-        {"F": np.eye(2)},
-        {"F": np.full((3, 3), np.nan)},
-        {"xy1": np.zeros((4, 2))},
-        {"xy1": np.full((300, 2), np.inf)},
-        {"size1": (1, 480)},
+        {"F": np.zeros((3, 3))}, {"F": np.eye(2)}, {"F": np.full((3, 3), np.nan)},
+        {"xy1": np.zeros((4, 2))}, {"xy1": np.full((300, 2), np.inf)}, {"size1": (1, 480)},
         {"size2": (640, 0)},
     ],
     ids=lambda change: next(iter(change)),
-)
+)  # fmt: skip
 def test_wrong_calls_are_value_errors(change):
     scene = make_pair("beside", np.random.default_rng(14))
     call = {"F": scene.F, "xy1": scene.xy1, "xy2": scene.xy2, "size1": SIZE, "size2": SIZE} | change
