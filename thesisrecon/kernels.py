@@ -13,11 +13,13 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import logging
 import os
 import pickle
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import IO, TYPE_CHECKING, Any, TypeVar, overload
@@ -34,7 +36,9 @@ from numba.np.arrayobj import _empty_nd_impl
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-CACHE_VARIABLE = "THESISRECON_KERNEL_CACHE"
+_log = logging.getLogger(__name__)
+
+CACHE_VARIABLE = "NUMBA_CACHE_DIR"
 """Environment variable: the folder of the compiled kernels."""
 
 COMPILER_SETTINGS = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VECTORIZE")
@@ -170,7 +174,7 @@ def _has_source_here(function: FunctionType) -> bool:
 
 
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: THESISRECON_KERNEL_CACHE, beside the package, or the user's cache.
+    """Folder of the compiled kernels: in NUMBA_CACHE_DIR, beside the package, or in the user's cache.
 
     Returns
     -------
@@ -178,7 +182,7 @@ def cache_folder() -> Path:
         A folder that can be written to.
     """
     if os.environ.get(CACHE_VARIABLE):
-        return Path(os.environ[CACHE_VARIABLE])
+        return Path(os.environ[CACHE_VARIABLE]) / "thesisrecon"
     beside = PACKAGE / "__pycache__" / "kernels"
     with contextlib.suppress(OSError):
         beside.mkdir(parents=True, exist_ok=True)
@@ -221,8 +225,10 @@ class KernelCache(NullCache):
     def save_overload(self, sig: Any, data: Any) -> None:
         path = self._path(sig, data.codegen)
         # A full disk or a read-only folder costs the cache, not the result.
-        with contextlib.suppress(OSError):
+        try:
             _write(path, _pickled(data._reduce()))
+        except OSError as error:
+            _warn_once(path.parent, error.strerror or type(error).__name__)
         self._unlock(path)
 
     def _path(self, sig: Any, codegen: Any) -> Path:
@@ -254,6 +260,17 @@ class KernelCache(NullCache):
             with contextlib.suppress(OSError):
                 path.with_name(path.name + ".lock").unlink()
             file.close()
+
+
+@cache
+def _warn_once(folder: Path, reason: str) -> None:
+    _log.warning(
+        "compiled kernels cannot be kept in %s (%s): every process compiles them again; set the variable %s to "
+        "a writable folder",
+        folder,
+        reason,
+        CACHE_VARIABLE,
+    )
 
 
 def _read(path: Path, target_context: Any) -> CompileResult | None:

@@ -122,7 +122,7 @@ class Bench:
     @property
     def environment(self) -> dict[str, str]:
         """Environment of a process that imports the copy; its kernels outlive the copy."""
-        return {"PYTHONPATH": str(self.tree), "THESISRECON_KERNEL_CACHE": str(self.out / "kernels")}
+        return {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(self.out / "kernels")}
 
     def set_up(self) -> None:
         shutil.rmtree(self.tree, ignore_errors=True)

@@ -35,10 +35,6 @@ _STAGE_LABELS = {
     "correspondence": "dense correspondence",
     "views": "views",
 }
-_NO_KERNEL_CACHE = (
-    "compiled kernels can be cached neither beside the code nor in the user's cache folder; set the variable "
-    "NUMBA_CACHE_DIR to a writable folder"
-)
 
 
 def parse_folder(text: str | Path) -> Path:
@@ -143,8 +139,6 @@ def exit_code_of(command: Callable[[], object]) -> int:
             return _report(f"{message} (see thesisrecon --help)", USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
-        if "no locator available" in str(error):
-            return _report(_NO_KERNEL_CACHE, USAGE)
         sentence = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 for a traceback"
         return _report(sentence, INTERNAL)
 

@@ -52,7 +52,7 @@ def compile_time_study(until: str = "model", functions: int = 25) -> Iterator[Pa
     """Measure the processor seconds that numba takes, and how many versions of a function it compiles."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "compiled.json"
-        environment = {**os.environ, "THESISRECON_KERNEL_CACHE": str(Path(folder) / "kernels")}
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder) / "kernels")}
         command = [sys.executable, "-c", RUN, str(Path(folder) / "out"), until, str(report)]
         subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
         measured = json.loads(report.read_text(encoding="utf-8"))
