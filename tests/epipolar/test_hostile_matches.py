@@ -9,7 +9,7 @@ from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.configuration import classify_configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
-from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, discard_outliers
+from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
 from thesisrecon.epipolar.refinement import refine_by_rows, refine_fundamental
 from thesisrecon.errors import StageFailure
 from validation.metrics.fundamental_precision import epipolar_distance_interval, epipoles_of
@@ -94,7 +94,6 @@ FUNCTIONS = {
     "reprojection": lambda a, b: refine_fundamental(PAIR.F, a, b, "reprojection"),
     "rows": lambda a, b: refine_by_rows(PAIR.F, a, b),
     "configuration": lambda a, b: classify_configuration(PAIR.F, a, b),
-    "noise": lambda a, b: discard_outliers(PAIR.F, a, b),
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar._frame import PairFrame, as_matches, check_matches
+from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import noise_scale
 from thesisrecon.epipolar._sampling import draw_sample, sampson_distances
 from thesisrecon.epipolar.linear import seven_point
@@ -58,37 +58,16 @@ INLIER_TESTS = {
 }
 
 
-def discard_outliers(
+def _discard_outliers(
     F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest = "sampson"
 ) -> tuple[float, B8]:
-    """Estimate the noise from the median distance and test every match against it.
+    """Noise from the median distance within ``limit_px`` (of at least 8 matches), and the matches that pass.
 
     sigma = 1.4826 (1 + 5 / (n - 7)) median |d|; the thesis divides by Phi(0.75) where Phi^-1(0.75) is meant.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix, px.
-    xy1, xy2 : array_like (N, 2)
-        Matched points, N >= 8, px.
-    limit_px : float
-        The median is taken over matches with a Sampson distance up to this (at least 8). Without it sigma is
-        too large if more than half of the matches are wrong.
-    test : {"sampson", "epipolar-distance", "symmetric-distance"}
-        Distance and limit of an inlier, see :class:`ThesisRansac`.
-
-    Returns
-    -------
-    sigma_px : float
-        Standard deviation of one coordinate.
-    inliers : ndarray (N,) of bool
-        Matches that pass.
+    Without a limit sigma is too large if more than half of the matches are wrong.
     """
-    xy1, xy2 = as_matches(xy1, xy2)
     distances, ratio, most = INLIER_TESTS[test]
     residuals = np.abs(distances(F, xy1, xy2))
-    if len(residuals) < MINIMUM:
-        raise ValueError(f"discard_outliers needs at least {MINIMUM} matches; got {len(residuals)}")
     limit = max(ratio * limit_px, float(np.partition(residuals, MINIMUM - 1)[MINIMUM - 1]))
     sigma = noise_scale(residuals[residuals <= limit]) / ratio
     inliers = residuals**2 <= max(most * sigma**2, EXACT_PX**2)
@@ -262,10 +241,10 @@ def _search_and_refine(
             "check that the images overlap and that the matches are correct",
         )
     F = frame.matrix_in_pixels(found[0])
-    sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or np.inf, test=test)
+    sigma, inliers = _discard_outliers(F, xy1, xy2, limit_px=limit_px or np.inf, test=test)
     for _ in range(rounds):
         F = refine_fundamental(F, xy1[inliers], xy2[inliers], criterion)
-        sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or NEAR_SIGMAS * sigma, test=test)
+        sigma, inliers = _discard_outliers(F, xy1, xy2, limit_px=limit_px or NEAR_SIGMAS * sigma, test=test)
     f = frame.matrix_in_frame(F)
     covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
     return FundamentalFit(F, inliers, sigma, covariance, found[2])

@@ -88,15 +88,7 @@ class _RowMap:
     that order of coordinates, where the thesis has e1. With a dependent column (Luong and Faugeras, IJCV
     1996) R (2, 3) does the same for e1, else it is the identity. No map reaches an epipole with a zero in the
     place of its dependent row: 18 maps (36 with columns) reach every matrix of rank 2.
-
-    Parameters
-    ----------
-    row : int
-        The dependent row.
-    fixed : int
-        Entry of B, row by row, that is 1.
-    column : int, optional
-        The dependent column.
+    ``fixed`` is the entry of B, row by row, that is 1.
     """
 
     row: int
