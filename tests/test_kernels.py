@@ -86,7 +86,7 @@ def test_a_damaged_entry_is_compiled_again(package):
 
 def test_a_folder_that_cannot_be_written_costs_only_the_cache(package):
     (package / "cache").write_text("a file in the place of the folder", encoding="utf-8")
-    warned = "import logging; logging.basicConfig(format='%(message)s', stream=__import__('sys').stdout)" + RUN
+    warned = "import logging, sys; logging.basicConfig(format='%(message)s', stream=sys.stdout)" + RUN
     words = run_in(package, warned)
     assert words[-2:] == ["8.0", "0"]
     assert " ".join(words).count("set the variable NUMBA_CACHE_DIR to a writable folder") == 1

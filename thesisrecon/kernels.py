@@ -265,8 +265,8 @@ class KernelCache(NullCache):
 @cache
 def _warn_once(folder: Path, reason: str) -> None:
     _log.warning(
-        "compiled kernels cannot be kept in %s (%s): every process compiles them again; set the variable %s to "
-        "a writable folder",
+        "compiled kernels cannot be kept in %s (%s): each process compiles them again; "
+        "set the variable %s to a writable folder",
         folder,
         reason,
         CACHE_VARIABLE,
@@ -299,7 +299,7 @@ if TYPE_CHECKING:
     from numpy import full as full
     from numpy import zeros as zeros
 else:
-    # numba compiles NumPy's own functions again in each kernel and for each shape, with their error messages.
+    # numba compiles NumPy's own functions again in each kernel and for each shape, with their messages.
     def empty(shape, dtype=np.float64):
         """`numpy.empty` for kernels."""
         return np.empty(shape, dtype)

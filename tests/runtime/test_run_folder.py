@@ -107,7 +107,7 @@ def test_keys_distinguish_values_types_and_arrays():
         key_of(object())
 
 
-IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "photographs": {"a.jpg": "1", "b.jpg": "2"}}
+IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "images": {"a.jpg": "1", "b.jpg": "2"}}
 
 
 def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp_path):
@@ -120,10 +120,10 @@ def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp
     changed = [
         ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 and is now 6"),
         ({**IDENTITY, "seed": 1}, "seed was 0 and is now 1"),
-        ({**IDENTITY, "photographs": {"a.jpg": "1"}}, "without 'b.jpg'"),
-        ({**IDENTITY, "photographs": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
+        ({**IDENTITY, "images": {"a.jpg": "1"}}, "without 'b.jpg'"),
+        ({**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
         (
-            {**IDENTITY, "photographs": {"a.jpg": "1", "b.jpg": "2", "c.jpg": "4", "d.jpg": "5"}},
+            {**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "2", "c.jpg": "4", "d.jpg": "5"}},
             "new 'c.jpg' and 1 more",
         ),
     ]
@@ -140,9 +140,9 @@ def test_settings_are_judged_before_the_photographs_are_known(tmp_path):
     directory = RunDirectory(tmp_path)
     with directory.claim(IDENTITY, overwrite=False):
         directory.adopt(IDENTITY, overwrite=False)
-    options = {name: value for name, value in IDENTITY.items() if name != "photographs"}
+    options = {name: value for name, value in IDENTITY.items() if name != "images"}
     with directory.claim(options, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
-        directory.adopt({**IDENTITY, "photographs": {"a.jpg": "1"}}, overwrite=False)
+        directory.adopt({**IDENTITY, "images": {"a.jpg": "1"}}, overwrite=False)
     with (
         pytest.raises(UsageError, match="seed was 0"),
         directory.claim({**options, "seed": 2}, overwrite=False),

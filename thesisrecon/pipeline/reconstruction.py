@@ -171,7 +171,7 @@ def _identity(run: Run, inputs: ImageSet) -> dict[str, Any]:
     """Settings, seed and content of the images: runs with equal identity are the same."""
     digests = {p.image.name: p.digest for p in inputs.decoded}
     refused = {name: f"refused: {reason}" for name, reason in inputs.refused.items()}
-    return _settings_identity(run) | {"photographs": digests | refused}
+    return _settings_identity(run) | {"images": digests | refused}
 
 
 def _empty_result(run: Run, inputs: ImageSet) -> RunResult:

@@ -293,7 +293,7 @@ class RunDirectory:
 def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
     """Differences of two JSON values in words."""
     if isinstance(there, dict) and isinstance(here, dict):
-        if place == "photographs":
+        if place == "images":
             yield from _image_differences(there, here)
             return
         for name in [*here, *(k for k in there if k not in here)]:
