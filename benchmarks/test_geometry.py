@@ -13,8 +13,7 @@ from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from validation.harness.stages.bundle import FOCAL_K1
-from validation.references.ceres_bundle import CeresOptions, bundle_adjuster
-from validation.references.colmap_model import colmap_model
+from validation.references.ceres import CeresOptions, bundle_adjuster, colmap_model
 from validation.references.fundamental import SOLVERS
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.streets import SIZE, make_walk

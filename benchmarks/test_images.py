@@ -20,11 +20,13 @@ from thesisrecon.stereo._planar import PlanarRectification, hartley
 from thesisrecon.stereo.rectification import rectify
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
-from validation.references.corners import harris_corners
-from validation.references.rectification import opencv_uncalibrated, warp_perspective
-from validation.references.semi_global import OpenCVSemiGlobal
-from validation.references.sift import compute_sift, grey_of, nearest_two
-from validation.references.sift_front_end import sift_front_end
+from validation.references.opencv import (
+    OpenCVSemiGlobal,
+    harris_corners,
+    opencv_uncalibrated,
+    warp_perspective,
+)
+from validation.references.sift import compute_sift, grey_of, nearest_two, sift_front_end
 from validation.scenes.two_views import make_two_views
 
 DISPARITIES = 64

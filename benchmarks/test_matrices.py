@@ -10,6 +10,13 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
+from benchmarks.references import (
+    colmap_similarity,
+    opencv_homography,
+    opencv_projection,
+    opencv_undistortion,
+    poselib_three_points,
+)
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.geometry.camera_matrix import distort, project_camera, undistort
@@ -18,13 +25,6 @@ from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import estimate_homography
 from validation.metrics.similarity import estimate_similarity
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
-from validation.references.geometry import (
-    colmap_similarity,
-    opencv_homography,
-    opencv_projection,
-    opencv_undistortion,
-    poselib_three_points,
-)
 from validation.references.triangulation import colmap_points
 from validation.scenes.triangulation import beside, cameras_of
 from validation.scenes.two_views import make_two_views

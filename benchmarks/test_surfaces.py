@@ -9,7 +9,7 @@ from benchmarks.conftest import Bench
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
-from validation.references.open3d_surfaces import OpenTsdf
+from validation.references.open3d_geometry import OpenTsdf
 from validation.scenes.image_files import read_rgb
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
 

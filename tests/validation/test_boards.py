@@ -5,8 +5,8 @@ import pytest
 
 from thesisrecon.errors import StageFailure
 from validation.harness.stages.boards import OURS, _metrics
-from validation.references.chessboard import board_corners, calibrate_from_corners
 from validation.references.libraries import NoReference, load
+from validation.references.opencv import board_corners, calibrate_from_corners
 from validation.scenes.boards import CORNERS, K1, LENS, RENDERED, SIZE, K, board_images, make_board
 
 try:

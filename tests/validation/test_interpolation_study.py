@@ -11,7 +11,13 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo._planar import minimum_distortion
 from thesisrecon.views.interpolation import InterpolatedPair, original_from_rectified
-from validation.scenes.between import best_homography, camera_between, camera_centre_of, nearest_place, turned
+from validation.studies.interpolation import (
+    best_homography,
+    camera_between,
+    camera_centre_of,
+    nearest_place,
+    turned,
+)
 
 SIZE = (160, 120)
 

@@ -7,7 +7,7 @@ pytest.importorskip("cv2")
 
 from tests.stereo.rectification_scenes import make_pair
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras, pair_of_fundamental
-from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
+from validation.references.opencv import opencv_calibrated, opencv_uncalibrated
 from validation.studies.rectification import BEST_F, METHODS, RealPair, check_scene, measure, seen_by_other
 
 

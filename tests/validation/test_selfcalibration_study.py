@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from thesisrecon.geometry.camera_matrix import project
-from validation.ablation.tasks.calibration import Cell, assumptions, make_rig
-from validation.metrics.focal_bound import focal_bound
-from validation.scenes.cloud import make_cloud
-from validation.scenes.rigs import cube_rig, noisy_tracks, projective_from_truth
+from validation.ablation.tasks.calibration import Cell, assumptions, focal_bound, make_rig
+from validation.scenes.rigs import cube_rig, make_cloud, noisy_tracks, projective_from_truth
 
 
 @pytest.mark.parametrize("scene", ["cube", "cloud"])

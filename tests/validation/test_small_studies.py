@@ -1,4 +1,4 @@
-"""Studies of growth, pair choice, subsets, killed runs, cost and rounding: what they compute."""
+"""Studies of growth, pair choice, subsets, killed runs and cost: what they compute."""
 
 import json
 import signal
@@ -12,12 +12,12 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from tests.fake_stages import CALLS, FakeDetector, fake_config, photographs
+from tests.fake_stages import CALLS, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
 from validation.metrics.record import Metric
 from validation.scenes.many_views import walk
-from validation.studies import growth, perturbation, timing
+from validation.studies import growth, timing
 from validation.studies.growth import Cost, Growth, Meter, recall_of, table
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
@@ -186,60 +186,6 @@ def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_
     assert next(row for row in rows if row.startswith("| matches, processor s")).endswith("| 1.50 |")
     assert next(row for row in rows if row.startswith("| whole run, peak MB")).endswith("| 1.00 |")
     assert next(row for row in rows if row.startswith("| points")).endswith("| 2.00 |")
-
-
-def test_shaken_numbers_are_moved_by_their_rounding():
-    rng = np.random.default_rng(0)
-    for kind, rel in ((np.float64, 1e-12), (np.float32, 1.3e-7)):
-        values = np.linspace(1.0, 500.0, 1000).astype(kind)
-        apart = np.abs(perturbation.perturbed(values, rng).astype(np.float64) / values - 1.0)
-        assert 0.0 < apart.max() <= rel
-    assert perturbation.perturbed(values, rng).dtype == np.float32
-
-
-@pytest.mark.parametrize("stage", perturbation.STAGES)
-def test_a_shaken_run_lies_beside_the_still_one(stage, tmp_path):
-    """Fakes that know the truth: what is shaken is the stage that was asked for, and nothing comes of it."""
-    config = fake_config()
-    still = reconstruct(photographs(4), tmp_path, config=config, until="metric").metric
-    CALLS.clear()
-    shaken = perturbation.disturbed(config, stage, 1)
-    other = reconstruct(photographs(4), tmp_path, config=shaken, until="metric", overwrite=True).metric
-    assert still is not None
-    assert other is not None
-    assert any(call.startswith("detect") for call in CALLS) == (stage == "corners")
-    assert "tracks" in CALLS
-    moved = perturbation.compare(still, other)
-    assert moved.intrinsics_std == 0.0
-    assert moved.registered == 0
-
-
-def test_changes_are_reported_in_standard_deviations():
-    still = _result()
-    further = replace(still.intrinsics[0]["focal_px"], value=100.5)
-    other = replace(still, intrinsics=({**still.intrinsics[0], "focal_px": further}, *still.intrinsics[1:]))
-    moved = perturbation.compare(still, other)
-    assert moved.intrinsics_std == pytest.approx(0.5)
-    assert moved.centres_rel == pytest.approx(0.0, abs=1e-9)
-    worst = {"corners": [moved], "matches": [replace(moved, intrinsics_std=1.5)], "tracks": [moved]}
-    row = perturbation.rows("a set", worst)[0]
-    assert (row.verdict, row.judged) == ("missed", "matches")
-    assert perturbation.rows("a set", {"corners": [moved]})[0].verdict == "reached"
-
-
-def _result():
-    from tests.fake_stages import FakeCalibrator, FakeMetric, FakeProjective, FakeTracks
-
-    features = [FakeDetector().detect(image) for image in photographs(4)]
-    rng = np.random.default_rng(0)
-    tracks = FakeTracks().build(features, (), rng)
-    projective = FakeProjective().reconstruct(tracks, (), np.full((4, 2), 90), rng=rng)
-
-    class Assumed:
-        mean, focal_known = np.zeros(4), np.zeros(4, dtype=bool)
-
-    calibration = FakeCalibrator().calibrate(projective, prior=Assumed(), rng=rng)
-    return FakeMetric().refine(projective, calibration, prior=Assumed(), rng=rng)
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -5,16 +5,20 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from signal import SIGINT
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.runtime._signals import CODES, with_resume_advice
 from validation.ablation.analysis import analyse
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import Plan, plan_study
-from validation.ablation.progress import progress_view
-from validation.ablation.run import Rows, ablate, parts_of, read_rows
+from validation.ablation.run import ProgressCallback, Rows, State, ablate, parts_of, read_rows
 from validation.ablation.toml import read_study
 
 KEPT = "run the same command to continue from the finished rows in {}"
@@ -94,3 +98,21 @@ def _last_words(rows: Rows, page: Path) -> str:
     failed = sum(bool(r.failure) for r in rows)
     text = counted(len(rows), "row") + f", {failed} of them failed" * bool(failed)
     return f"{text}; the page is {page}"
+
+
+@contextmanager
+def progress_view() -> Iterator[ProgressCallback]:
+    """Show finished and failed rows and the estimated remaining time."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("", total=None)
+
+        def report(state: State) -> None:
+            steps = f"{state.steps_done} of {state.steps} shared steps" if state.steps else ""
+            words = f"{steps}, {state.failed} failed" if state.failed else steps
+            progress.update(task, total=state.total, completed=state.done, description=words)
+
+        yield report

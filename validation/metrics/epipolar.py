@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.two_view import sampson_residuals, symmetric_residuals
+from thesisrecon.geometry.two_view import symmetric_residuals
 
 BoolArray = NDArray[np.bool_]
 
@@ -23,13 +23,6 @@ def rms_epipolar_distance(F: F64 | None, truth: F64) -> float:
         return NONE_PX
     d = symmetric_residuals(F, truth[:, :2], truth[:, 2:])
     return float(min(np.sqrt(np.mean(d**2) / 2.0), NONE_PX))
-
-
-def rms_sampson_distance(F: F64 | None, truth: F64) -> float:
-    """RMS Sampson distance (5.4), px, of right correspondences (M, 4); at most ``NONE_PX``."""
-    if F is None:
-        return NONE_PX
-    return float(min(np.sqrt(np.mean(sampson_residuals(F, truth[:, :2], truth[:, 2:]) ** 2)), NONE_PX))
 
 
 def precision_recall(inliers: BoolArray, right: BoolArray) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
-from thesisrecon.epipolar.precision import epipolar_distance_std, fundamental_covariance
+from thesisrecon.epipolar._refinement import epipolar_distance_std, fundamental_covariance
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras
 from thesisrecon.records import FundamentalFit

@@ -7,7 +7,7 @@ state, so only the order makes its runs differ. Libraries with a seed get it too
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,28 +18,23 @@ from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_poi
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import StageFailure
-from thesisrecon.records import FundamentalFit
 from validation.references.libraries import cv2, poselib, pycolmap
 
 BoolArray = NDArray[np.bool_]
-Answer = tuple[Any, Any, FundamentalFit | None]
+Answer = tuple[Any, Any]
 
 OURS, THESIS = "ours", "ours (thesis)"
 LINEAR, MINIMAL = "ours (eight points)", "ours (seven points)"
 CONFIDENCE, ITERATIONS = 0.9999, 20000
 """Settings of OpenCV instead of its defaults (0.99 and 1000)."""
-MIN_ITERATIONS = 10000
-"""Setting of COLMAP and PoseLib instead of 1000; both stop at 0.9999 or 100000."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """``F`` (3, 3), None if the method gave none, ``inliers`` (N,) as the method reports them; of ours the
-    whole ``fit``."""
+    """``F`` (3, 3), None if the method gave none, ``inliers`` (N,) as the method reports them."""
 
     F: F64 | None
     inliers: BoolArray
-    fit: FundamentalFit | None = None
 
 
 Solver = Callable[[F64, F64, float, int], Answer]
@@ -49,39 +44,39 @@ def _ours(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     try:
         fit = estimate_fundamental(xy1, xy2, threshold_px=threshold_px, seed=seed)
     except StageFailure:
-        return None, None, None
-    return fit.F, fit.inliers, fit
+        return None, None
+    return fit.F, fit.inliers
 
 
 def _thesis(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     try:
         fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, np.random.default_rng(seed))
     except StageFailure:
-        return None, None, None
-    return fit.F, fit.inliers, fit
+        return None, None
+    return fit.F, fit.inliers
 
 
 def _eight_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     """Estimate from the inliers of the library function, as the method has no outlier test."""
-    _, right, fit = _ours(xy1, xy2, threshold_px, seed)
-    return (None, None, None) if fit is None else (estimate_eight_point(xy1[right], xy2[right]), right, None)
+    _, right = _ours(xy1, xy2, threshold_px, seed)
+    return (None, None) if right is None else (estimate_eight_point(xy1[right], xy2[right]), right)
 
 
 def _seven_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     """Return the first of up to three matrices through seven inliers of the library function."""
-    _, right, fit = _ours(xy1, xy2, threshold_px, seed)
-    if fit is None:
-        return None, None, None
+    _, right = _ours(xy1, xy2, threshold_px, seed)
+    if right is None:
+        return None, None
     some = np.random.default_rng(seed).choice(np.flatnonzero(right), 7, replace=False)
     found = estimate_seven_point(xy1[some], xy2[some])
-    return (found[0], right, None) if len(found) else (None, None, None)
+    return (found[0], right) if len(found) else (None, None)
 
 
-def _opencv(method: str, confidence: float = 0.99, iterations: int = 1000) -> Solver:
+def _opencv(method: str) -> Solver:
     def solve(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
         kind = getattr(cv2, method)
-        F, mask = cv2.findFundamentalMat(xy1, xy2, kind, threshold_px, confidence, iterations)
-        return F, mask, None
+        F, mask = cv2.findFundamentalMat(xy1, xy2, kind, threshold_px, CONFIDENCE, ITERATIONS)
+        return F, mask
 
     return solve
 
@@ -98,44 +93,27 @@ def opencv_seven_point(xy1: F64, xy2: F64) -> F64:
     return np.zeros((0, 3, 3)) if F is None else np.asarray(F, dtype=np.float64).reshape(-1, 3, 3)
 
 
-def _colmap(**options: int) -> Solver:
-    def solve(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
-        settings = pycolmap.RANSACOptions(max_error=threshold_px, random_seed=seed, **options)
-        found = pycolmap.estimate_fundamental_matrix(xy1, xy2, settings)
-        return (None, None, None) if found is None else (found["F"], found["inlier_mask"], None)
-
-    return solve
+def _colmap(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+    settings = pycolmap.RANSACOptions(max_error=threshold_px, random_seed=seed)
+    found = pycolmap.estimate_fundamental_matrix(xy1, xy2, settings)
+    return (None, None) if found is None else (found["F"], found["inlier_mask"])
 
 
-def _poselib(**options: int) -> Solver:
-    def solve(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
-        settings = {"max_epipolar_error": threshold_px, "seed": seed, **options}
-        F, mask = poselib.estimate_fundamental(xy1, xy2, settings, {})
-        return F, mask["inliers"], None
-
-    return solve
+def _poselib(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+    F, mask = poselib.estimate_fundamental(xy1, xy2, {"max_epipolar_error": threshold_px, "seed": seed}, {})
+    return F, mask["inliers"]
 
 
-_LONG: tuple[float, int] = (CONFIDENCE, ITERATIONS)
 SOLVERS: dict[str, Solver] = {
     OURS: _ours,
     THESIS: _thesis,
     LINEAR: _eight_points,
     MINIMAL: _seven_points,
-    "USAC_ACCURATE": _opencv("USAC_ACCURATE", *_LONG),
-    "USAC_ACCURATE default": _opencv("USAC_ACCURATE"),
-    "USAC_MAGSAC": _opencv("USAC_MAGSAC", *_LONG),
-    "USAC_MAGSAC default": _opencv("USAC_MAGSAC"),
-    "FM_RANSAC": _opencv("FM_RANSAC", *_LONG),
-    "FM_RANSAC default": _opencv("FM_RANSAC"),
-    "FM_LMEDS": _opencv("FM_LMEDS", *_LONG),
-    "COLMAP": _colmap(),
-    "COLMAP long": _colmap(min_num_trials=MIN_ITERATIONS),
-    "PoseLib": _poselib(),
-    "PoseLib long": _poselib(min_iterations=MIN_ITERATIONS),
+    **{name: _opencv(name) for name in ("USAC_ACCURATE", "USAC_MAGSAC", "FM_RANSAC", "FM_LMEDS")},
+    "COLMAP": _colmap,
+    "PoseLib": _poselib,
 }
-"""All methods by name: OpenCV's with ``CONFIDENCE`` and ``ITERATIONS``, or as it comes ("default"); COLMAP
-and PoseLib as they come, or with ``MIN_ITERATIONS`` ("long")."""
+"""All methods by name: OpenCV's with ``CONFIDENCE`` and ``ITERATIONS``, COLMAP and PoseLib as they come."""
 
 
 def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed: int) -> Estimate:
@@ -145,11 +123,11 @@ def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed:
     """
     order = np.random.default_rng(seed).permutation(len(xy1))
     some1, some2 = np.ascontiguousarray(xy1[order]), np.ascontiguousarray(xy2[order])
-    F, mask, fit = SOLVERS[method](some1, some2, threshold_px, seed)
+    F, mask = SOLVERS[method](some1, some2, threshold_px, seed)
     inliers = np.zeros(len(xy1), dtype=bool)
     F = None if F is None else np.asarray(F, dtype=np.float64)
     # OpenCV returns nothing, zeros or three stacked matrices on failure.
     if F is None or F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
         return Estimate(None, inliers)
     inliers[order] = np.asarray(mask).ravel() > 0
-    return Estimate(F, inliers, None if fit is None else replace(fit, inliers=inliers))
+    return Estimate(F, inliers)

@@ -69,19 +69,16 @@ def _sift(path: Path) -> SiftKeypoints:
         return detect_sift(np.asarray(image.convert("L")))
 
 
-def kusvod2_pairs(
-    cache: Path, names: tuple[str, ...] | None = None, *, mutual: bool = False
-) -> Iterator[RealPair]:
+def kusvod2_pairs(cache: Path, names: tuple[str, ...] | None = None) -> Iterator[RealPair]:
     """The pairs of Lebeda, Matas and Chum (BMVC 2012) with their hand-made correspondences as ``truth``.
 
-    Empty if the images are not on this machine; ``names`` picks some; with ``mutual`` the matches
-    must be each other's nearest.
+    Empty if the images are not on this machine; ``names`` picks some.
     """
     root = data_root()
     for folder in sorted((root / "kusvod2").iterdir()) if root and (root / "kusvod2").is_dir() else []:
         if folder.is_dir() and (names is None or folder.name in names):
             paths = (folder / "A.jpg", folder / "B.jpg")
-            xy1, xy2 = match_images(paths, cache, ratio=HAND_MADE_RATIO, mutual=mutual)
+            xy1, xy2 = match_images(paths, cache, ratio=HAND_MADE_RATIO, mutual=False)
             yield RealPair(folder.name, xy1, xy2, truth=np.loadtxt(folder / "validation.txt", ndmin=2)[:, :4])
 
 

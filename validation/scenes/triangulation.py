@@ -10,8 +10,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.strata import Group
-from validation.scenes.cloud import make_cloud
-from validation.scenes.rigs import Rig
+from validation.scenes.rigs import Rig, make_cloud
 from validation.scenes.transforms import random_transform
 
 CAP_PX = 1000.0

@@ -22,7 +22,7 @@ from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
-from thesisrecon.epipolar.refinement import Criterion, refine_by_rows, refine_fundamental
+from thesisrecon.epipolar.refinement import Criterion, Parameters, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.metrics.fundamental_precision import fundamental_bound
@@ -63,8 +63,10 @@ class Method:
         return F if F is not None and F.shape == (3, 3) and np.isfinite(F).all() and F.any() else None
 
 
-def _refined(refine: Callable[..., F64], criterion: Criterion) -> Estimate:
-    return lambda xy1, xy2, _, __: refine(estimate_eight_point(xy1, xy2), xy1, xy2, criterion)
+def _refined(criterion: Criterion, parameters: Parameters) -> Estimate:
+    return lambda xy1, xy2, _, __: refine_fundamental(
+        estimate_eight_point(xy1, xy2), xy1, xy2, criterion, parameters=parameters
+    )
 
 
 def _linear(*, normalized: bool, rank_two: bool = True) -> Estimate:
@@ -101,12 +103,12 @@ OWN = (
     Method("eight-point, raw pixels, rank 3", _linear(normalized=False, rank_two=False)),
     Method(RAW, _linear(normalized=False)),
     Method(NORMALISED, _linear(normalized=True)),
-    Method("gradient (5.4), thesis' rows", _refined(refine_by_rows, "sampson")),
-    Method("gradient (5.4), orthonormal", _refined(refine_fundamental, "sampson")),
-    Method("epipolar distance (5.6), thesis' rows", _refined(refine_by_rows, "epipolar-distance")),
-    Method("epipolar distance (5.6), orthonormal", _refined(refine_fundamental, "epipolar-distance")),
-    Method("gold standard, thesis' rows", _refined(refine_by_rows, "reprojection")),
-    Method(GOLD, _refined(refine_fundamental, "reprojection")),
+    Method("gradient (5.4), thesis' rows", _refined("sampson", "row")),
+    Method("gradient (5.4), orthonormal", _refined("sampson", "orthonormal")),
+    Method("epipolar distance (5.6), thesis' rows", _refined("epipolar-distance", "row")),
+    Method("epipolar distance (5.6), orthonormal", _refined("epipolar-distance", "orthonormal")),
+    Method("gold standard, thesis' rows", _refined("reprojection", "row")),
+    Method(GOLD, _refined("reprojection", "orthonormal")),
     Method(GOLD_FROM_DEFAULT, _gold_from_default),
     *(
         Method(f"Algorithm 2, {label}", _robust(partial(_thesis, **variant)), robust=True, thresholded=True)

@@ -23,7 +23,7 @@ from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.records import Image, TwoView
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
-from validation.references.sift_front_end import sift_front_end
+from validation.references.sift import sift_front_end
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import camera_pairs
 from validation.studies.runner import Rows, text_table

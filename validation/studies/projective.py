@@ -29,10 +29,9 @@ from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 from thesisrecon.runtime._run import stream
 from validation.metrics.record import Metric
-from validation.scenes.cloud import make_cloud
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks
 from validation.scenes.real import Scene
-from validation.scenes.rigs import Rig, noisy_tracks
+from validation.scenes.rigs import Rig, make_cloud, noisy_tracks
 from validation.scenes.transforms import random_transform
 from validation.studies.runner import Part, Rows, scenes_here
 

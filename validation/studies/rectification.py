@@ -28,7 +28,7 @@ from thesisrecon.stereo._polar import polar
 from thesisrecon.stereo._resampling import Rectification
 from thesisrecon.stereo.rectification import rectify
 from validation.metrics.record import Metric
-from validation.references.rectification import opencv_calibrated, opencv_uncalibrated
+from validation.references.opencv import opencv_calibrated, opencv_uncalibrated
 from validation.studies.measuring import timed
 from validation.studies.runner import Part, Rows, scenes_here
 

@@ -6,7 +6,7 @@ from thesisrecon.records import TexturedMesh
 from validation.harness.records import Judgement
 from validation.metrics.record import Metric
 from validation.references.fundamental import estimate_with
-from validation.references.open3d_meshes import Nearest
+from validation.references.open3d_geometry import Nearest
 from validation.references.triangulation import colmap_points, opencv_linear
 
 METHODS = ("cv2", "pycolmap", "poselib", "open3d")

@@ -11,8 +11,8 @@ from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
-from validation.references import open3d_cameras, open3d_meshes, open3d_surfaces
-from validation.references.open3d_clouds import refine_by_icp
+from validation.references import open3d_geometry
+from validation.references.open3d_geometry import refine_by_icp
 
 # Without libraries of the system (libgomp1, libgl1, libegl1, libx11-6) it cannot be loaded.
 skip_without("open3d")
@@ -35,7 +35,7 @@ def slanted():
 
 def test_a_pixel_is_the_same_pixel_in_its_grid():
     depth_map, view = slanted()
-    mesh = open3d_surfaces.OpenTsdf(voxel_px=0.5).fuse([depth_map], [view])
+    mesh = open3d_geometry.OpenTsdf(voxel_px=0.5).fuse([depth_map], [view])
     assert mesh.colors is not None
     off = mesh.vertices @ NORMAL - 2.3
     # Half a pixel would be 4e-3.
@@ -48,11 +48,11 @@ def test_a_pixel_is_the_same_pixel_in_its_grid():
 def test_meshes_lie_on_the_sphere_and_distances_are_right():
     maps = ring_of()
     views = [photograph(m) for m in maps]
-    fused = open3d_surfaces.OpenTsdf().fuse(maps, views)
-    for mesh in (fused, open3d_surfaces.poisson_mesh(maps, depth=7)):
+    fused = open3d_geometry.OpenTsdf().fuse(maps, views)
+    for mesh in (fused, open3d_geometry.poisson_mesh(maps, depth=7)):
         assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1.0)) < 0.006
     away = np.array([[0.0, 0.0, -3.0], [2.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    np.testing.assert_allclose(open3d_meshes.Nearest(fused).distances(away), [2.0, 1.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(open3d_geometry.Nearest(fused).distances(away), [2.0, 1.0, 0.0], atol=0.01)
     assert fused.colors is not None
     assert np.median(np.abs(fused.colors - paint(fused.vertices))) < 12.0
 
@@ -61,7 +61,7 @@ def test_skew_is_refused():
     skew = K.copy()
     skew[0, 1] = 1.0
     with pytest.raises(ValueError, match="skew"):
-        open3d_cameras.camera_of(np.column_stack([skew, np.zeros(3)]))
+        open3d_geometry.camera_of(np.column_stack([skew, np.zeros(3)]))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def places():
 
 def test_a_glb_opens_in_open3d_with_its_texture(model, tmp_path):
     write_mesh(tmp_path / "model.glb", model)
-    vertices, faces, uv, texture = open3d_meshes.read_glb(tmp_path / "model.glb")
+    vertices, faces, uv, texture = open3d_geometry.read_glb(tmp_path / "model.glb")
     assert len(faces) == len(model.faces)
     assert model.texture is not None
     assert texture.shape == model.texture.shape
@@ -118,10 +118,10 @@ def test_a_glb_opens_in_trimesh_with_its_texture(model, tmp_path):
 
 def test_its_own_pictures_agree_with_ours():
     maps = ring_of()
-    mesh = open3d_surfaces.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
+    mesh = open3d_geometry.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
     camera = Camera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).scaled(2)
     try:
-        theirs = open3d_meshes.render_open3d(mesh, camera)
+        theirs = open3d_geometry.render_open3d(mesh, camera)
     except RuntimeError as error:
         pytest.skip(f"Open3D cannot draw here: {error}")
     ours = render(mesh, camera)
@@ -137,7 +137,7 @@ def test_its_own_pictures_agree_with_ours():
 
 def test_the_matrix_of_a_camera_takes_the_world_to_it(looked):
     for P, true_K, Rt in zip(looked.P, looked.K, looked.P_normalised, strict=True):
-        found, world = open3d_cameras.camera_of(P, shift=0.5)
+        found, world = open3d_geometry.camera_of(P, shift=0.5)
         np.testing.assert_allclose(world[:3], Rt, atol=1e-9)
         np.testing.assert_allclose(found[:2, 2] - 0.5, true_K[:2, 2], atol=1e-6)
         np.testing.assert_allclose(found[0, 0], true_K[0, 0], atol=1e-6)

@@ -7,9 +7,14 @@ from tests.validation.references.conftest import Looked, skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import Image
 from thesisrecon.stereo._planar import PlanarRectification
-from validation.references.corners import harris_corners, sift_corners
-from validation.references.rectification import opencv_calibrated, warp_perspective
-from validation.references.semi_global import MODES, OpenCVSemiGlobal
+from validation.references.opencv import (
+    MODES,
+    OpenCVSemiGlobal,
+    harris_corners,
+    opencv_calibrated,
+    sift_corners,
+    warp_perspective,
+)
 from validation.references.triangulation import opencv_linear, opencv_polynomial
 
 skip_without("cv2")

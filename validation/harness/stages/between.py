@@ -17,7 +17,7 @@ from validation.harness.rows import OURS, Values, row
 from validation.metrics.pictures import psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.references.libraries import one_thread
-from validation.references.semi_global import OpenCVSemiGlobal
+from validation.references.opencv import OpenCVSemiGlobal
 from validation.scenes.image_files import read_rgb
 from validation.scenes.nine_views import (
     BETWEEN,

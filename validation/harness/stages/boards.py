@@ -13,8 +13,8 @@ from thesisrecon.arrays import F64, U8
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, plot, read_arrays, row, scatter
 from validation.metrics.record import Metric
-from validation.references.chessboard import board_corners, calibrate_from_corners
 from validation.references.libraries import one_thread
+from validation.references.opencv import board_corners, calibrate_from_corners
 from validation.scenes.boards import CORNERS, SIZE, WAYS, Board, K, board_images, make_board
 
 OWN = "cv2, stated standard deviation"

@@ -18,8 +18,7 @@ from validation.harness.rows import OURS, each, ratio, read_arrays, row
 from validation.harness.scenes import has_images, load_images
 from validation.harness.stages.cameras import our_model
 from validation.metrics.record import Metric
-from validation.references.ceres_bundle import CeresOptions, refine_with_ceres
-from validation.references.ceres_covariance import ceres_covariances
+from validation.references.ceres import CeresOptions, ceres_covariances, refine_with_ceres
 from validation.scenes.streets import SIZE, make_walk
 
 CERES = "Ceres"

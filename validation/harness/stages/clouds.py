@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,16 +13,16 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.records import Reconstruction
-from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task, slug
+from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task, slug
 from validation.harness.rows import OURS, read_arrays, row
 from validation.harness.scenes import has_images, load_images
 from validation.harness.stages.cameras import COLMAP, COLMAP_PP, read_model
 from validation.metrics.record import Metric
 from validation.metrics.similarity import Similarity, estimate_similarity
-from validation.references.open3d_clouds import refine_by_icp, render_difference
+from validation.references.open3d_geometry import refine_by_icp
 from validation.scenes.real import Scene
 
-ICP, PICTURES = "Open3D, ICP", "Open3D, images"
+ICP = "Open3D, ICP"
 NEAR_PCT = 0.5
 """A point has a partner if the other cloud has a point within this share of its depth (%)."""
 PLOTTED = 6000
@@ -47,7 +45,7 @@ class CloudsStage(Stage):
         return has_images(scene, options)
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
-        return () if options.gates_only else (ICP, PICTURES)
+        return () if options.gates_only else (ICP,)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
@@ -56,9 +54,6 @@ class CloudsStage(Stage):
         place = options.place(task.stage, task.scene, task.method)
         images = load_images(task.scene, options)
         for name, (mine, other, unit) in _pairs_of_clouds(images, _models(images, options)).items():
-            if task.method == PICTURES:
-                render_difference(place / f"{slug(name)}.png", mine, other, NEAR_PCT / 100.0 * unit)
-                continue
             transform = refine_by_icp(mine, other, NEAR_PCT / 100.0 * unit)
             np.savez(place / f"{slug(name)}.npz", transform=transform)
 
@@ -69,7 +64,7 @@ class CloudsStage(Stage):
         if ours is None or (models[COLMAP] is None and models[COLMAP_PP] is None):
             names = ", ".join(name for name, model in models.items() if model is None)
             return Judgement((), notes=[f"There is no model of {names} to compare."])
-        metrics, plots, pictures = list[Metric](), list[Plot](), list[Picture]()
+        metrics, plots = list[Metric](), list[Plot]()
         clouds = _pairs_of_clouds(images, models)
         for name, (mine, other, unit) in clouds.items():
             theirs = models[name]
@@ -78,10 +73,9 @@ class CloudsStage(Stage):
             metrics += _metrics(scene, name, mine, other, unit)
             metrics += _icp_metrics(scene, name, mine, other, unit, outcomes.get(ICP))
             plots.append(_plot(name, mine, other, unit))
-            pictures += _pictures(options.place(self.name, scene), name, outcomes.get(PICTURES))
         few = [name for name in (COLMAP, COLMAP_PP) if models[name] is not None and name not in clouds]
         notes = [f"{name}: too few common cameras to align the clouds." for name in few]
-        return Judgement(metrics, plots, pictures, notes)
+        return Judgement(metrics, plots, notes=notes)
 
 
 def _models(scene: Scene, options: ReportOptions) -> dict[str, Reconstruction | None]:
@@ -250,15 +244,3 @@ def _trace(name: str, X: F64, marker: dict[str, Any]) -> dict[str, Any]:
 def _thinned(X: F64) -> np.ndarray[Any, Any]:
     """Every n-th point."""
     return np.arange(0, len(X), max(1, len(X) // PLOTTED))
-
-
-def _pictures(place: Path, name: str, outcome: Outcome | None) -> list[Picture]:
-    """Copy Open3D's rendering of the difference next to the judgement."""
-    if outcome is None or not outcome.ok:
-        return []
-    file = f"{slug(name)}.png"
-    shutil.copy(outcome.place / file, place / file)
-    words = (
-        f"Points of ours, from blue (on theirs) to red ({NEAR_PCT} % of the distance or more); theirs grey."
-    )
-    return [Picture(file, f"Ours to {name}", words)]

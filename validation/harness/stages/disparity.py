@@ -16,7 +16,7 @@ from validation.harness.records import Judgement, Outcome, Picture, ReportOption
 from validation.harness.rows import OURS, each, ratio, read_arrays, row
 from validation.metrics.depth import bad_pixels
 from validation.references.libraries import one_thread
-from validation.references.semi_global import OpenCVSemiGlobal
+from validation.references.opencv import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 THESIS, SEMI_GLOBAL = "ours (thesis)", "ours (semi-global)"

@@ -21,8 +21,8 @@ from validation.harness.scenes import has_images, load_images
 from validation.harness.stages.fundamental import MATCHES
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
-from validation.references.corners import harris_corners, sift_corners
 from validation.references.libraries import NoReference
+from validation.references.opencv import harris_corners, sift_corners
 from validation.scenes.real import Scene, load_fixture_depth
 from validation.scenes.real_pairs import RealPair, camera_pairs
 from validation.studies.front_end_pairs import RIGHT_PX, PreparedViews, front_ends

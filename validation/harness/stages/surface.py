@@ -21,7 +21,7 @@ from validation.harness.stages.depth import COURTYARD, PRESETS, THESIS, our_maps
 from validation.metrics.depth import coloured, true_from_maps
 from validation.metrics.record import Metric
 from validation.metrics.surfaces import CAPPED, SAMPLES, judge_surface, load_truth
-from validation.references.open3d_surfaces import OpenTsdf, poisson_mesh
+from validation.references.open3d_geometry import OpenTsdf, poisson_mesh
 
 TSDF, POISSON = "Open3D TSDF", "Open3D Poisson"
 SHOWN = (OURS, TSDF, POISSON)

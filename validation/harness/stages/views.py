@@ -22,8 +22,7 @@ from validation.harness.scenes import load_images
 from validation.harness.stages.depth import COURTYARD, our_maps, read_maps, views_of
 from validation.metrics.depth import coloured
 from validation.metrics.record import Metric
-from validation.references.open3d_meshes import render_open3d
-from validation.references.open3d_surfaces import OpenTsdf
+from validation.references.open3d_geometry import OpenTsdf, render_open3d
 
 TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF, 1 px, levelled"
 OWN_PICTURE = "Open3D TSDF, 1 px, its own image"

@@ -1,4 +1,4 @@
-"""Open3D's surfaces of depth maps with the interface of our stage: truncated distances and Poisson.
+"""Open3D with our types: motions by ICP, distances to meshes, images of them, and surfaces of depth maps.
 
 Its voxel grids take the pixel that the truncated coordinates name, so the centre of the top-left pixel is
 (0.5, 0.5) there; its points of a depth image have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0
@@ -9,13 +9,105 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.camera import Camera
+from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from validation.references.libraries import open3d as o3d
-from validation.references.open3d_cameras import camera_of, median_footprint
+
+
+def camera_of(P: F64, *, shift: float = 0.0) -> tuple[F64, F64]:
+    """K (3, 3) with its principal point moved by ``shift`` px, and the world-to-camera matrix (4, 4).
+
+    Raises ``ValueError`` for skew, which Open3D does not support.
+    """
+    K, R, t = decompose_camera(P)
+    if abs(K[0, 1]) > 1e-6 * K[0, 0]:
+        raise ValueError(f"Open3D does not support skew; got {K[0, 1]:.3g} px")
+    K = np.array([[K[0, 0], 0.0, K[0, 2] + shift], [0.0, K[1, 1], K[1, 2] + shift], [0.0, 0.0, 1.0]])
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = R, t
+    return K, world
+
+
+def median_footprint(depth_maps: Sequence[DepthMap]) -> float:
+    """Width of a pixel at its depth, the median over all pixels of all maps."""
+    widths = []
+    for one in depth_maps:
+        K = decompose_camera(one.P)[0]
+        widths.append(one.depth[np.isfinite(one.depth)] / np.sqrt(K[0, 0] * K[1, 1]))
+    return float(np.median(np.concatenate(widths)))
+
+
+ITERATIONS = 60
+
+
+def _cloud(X: F64) -> Any:
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(X, dtype=np.float64)))
+
+
+def refine_by_icp(moving: F64, fixed: F64, reach: float) -> F64:
+    """The motion (4, 4) by which point-to-point ICP, without scale, brings (N, 3) onto (M, 3); pairs are no
+    farther apart than ``reach``."""
+    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(1e-9, 1e-9, ITERATIONS)
+    method = o3d.pipelines.registration.TransformationEstimationPointToPoint(False)
+    found = o3d.pipelines.registration.registration_icp(
+        _cloud(moving), _cloud(fixed), reach, np.eye(4), method, criteria
+    )
+    return np.array(found.transformation, dtype=np.float64)
+
+
+class Nearest:
+    """A surface prepared for distance queries."""
+
+    def __init__(self, mesh: TexturedMesh) -> None:
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(
+            o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
+        )
+
+    def distances(self, points: F64) -> F64:
+        """(N,) distances of points (N, 3) to its nearest place."""
+        found = self._scene.compute_distance(o3d.core.Tensor(points.astype(np.float32)), nthreads=1)
+        return np.asarray(found.numpy(), dtype=np.float64)
+
+
+def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
+    """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
+
+    Raises ``RuntimeError`` if the machine has no graphics that it can use.
+    """
+    width, height = camera.size
+    renderer = o3d.visualization.rendering.OffscreenRenderer(width, height)
+    material = o3d.visualization.rendering.MaterialRecord()
+    material.shader = "defaultUnlit"
+    drawn = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    )
+    if mesh.colors is not None:
+        drawn.vertex_colors = o3d.utility.Vector3dVector(mesh.colors / 255.0)
+    renderer.scene.set_background([0.0, 0.0, 0.0, 1.0])
+    renderer.scene.view.set_post_processing(False)
+    renderer.scene.add_geometry("model", drawn, material)
+    K, world = camera_of(camera.P, shift=0.5)
+    renderer.setup_camera(K, world, width, height)
+    return np.asarray(renderer.render_to_image()).copy()
+
+
+def read_glb(path: Path) -> tuple[F64, I64, F64, U8]:
+    """Vertices (N, 3) in glTF's axes, faces (M, 3), texture coordinates (M, 3, 2), v up, and the texture of a
+    GLB as Open3D reads it."""
+    model = o3d.io.read_triangle_model(str(path))
+    mesh = model.meshes[0].mesh
+    albedo = np.asarray(model.materials[model.meshes[0].material_idx].albedo_img)
+    uv = np.asarray(mesh.triangle_uvs).reshape(-1, 3, 2)
+    faces = np.asarray(mesh.triangles).astype(np.int64)
+    return np.asarray(mesh.vertices).copy(), faces, uv.copy(), albedo[..., :3].copy()
 
 
 @dataclass(frozen=True)

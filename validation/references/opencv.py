@@ -1,0 +1,151 @@
+"""OpenCV with our types: corners, rectification, semi-global matching, and calibration from a chessboard."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thesisrecon.arrays import F32, F64, U8
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.records import Image
+from thesisrecon.stereo._planar import PlanarRectification
+from validation.references.libraries import cv2
+from validation.references.sift import detect_sift, grey_of
+
+BLOCK, APERTURE, K = 3, 3, 0.04
+"""Window, Sobel aperture and k as OpenCV's tutorial has them."""
+
+
+def harris_corners(image: Image, count: int) -> F64:
+    """The strongest local maxima (N, 2) of ``cv2.cornerHarris``, moved to sub-pixel by ``cornerSubPix``."""
+    grey = grey_of(image)
+    response = cv2.cornerHarris(np.asarray(grey, np.float32), BLOCK, APERTURE, K)
+    peak = (response == cv2.dilate(response, np.ones((3, 3), np.uint8))) & (response > 0.0)
+    y, x = np.nonzero(peak)
+    strongest = np.argsort(-response[y, x], kind="stable")[:count]
+    xy = np.stack([x[strongest], y[strongest]], axis=1).astype(np.float32, order="C")
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+    refined = cv2.cornerSubPix(grey, xy.reshape(-1, 1, 2).copy(), (3, 3), (-1, -1), criteria)
+    return np.asarray(refined, dtype=np.float64).reshape(-1, 2)
+
+
+def sift_corners(image: Image, count: int) -> F64:
+    """The strongest SIFT keypoints (N, 2), one where several orientations share a place."""
+    found = detect_sift(grey_of(image))
+    order = np.argsort(-found.response, kind="stable")
+    _, first = np.unique(found.xy[order], axis=0, return_index=True)
+    return np.asarray(found.xy[order][np.sort(first)[:count]], dtype=np.float64)
+
+
+Size = tuple[int, int]
+
+
+def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectification | None:
+    """``cv2.stereoRectifyUncalibrated`` (Hartley), the frame as large as the image as it is used there;
+    None if it refuses."""
+    done, H1, H2 = cv2.stereoRectifyUncalibrated(xy1.copy(), xy2.copy(), F, size)
+    if not done:
+        return None
+    return PlanarRectification(np.stack([_positive(np.asarray(H), size) for H in (H1, H2)]), size)
+
+
+def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
+    """``cv2.stereoRectify`` of two metric cameras without distortion, its defaults, the frame of the
+    image's size."""
+    (K1, R1, t1), (K2, R2, t2) = decompose_camera(P1), decompose_camera(P2)
+    R = R2 @ R1.T
+    none = np.zeros(5)
+    found = cv2.stereoRectify(K1, none, K2, none, size, R, (t2 - R @ t1)[:, None])
+    turn1, turn2, new1, new2 = (np.asarray(part, dtype=np.float64) for part in found[:4])
+    H1 = new1[:, :3] @ turn1 @ np.linalg.inv(K1)
+    H2 = new2[:, :3] @ turn2 @ np.linalg.inv(K2)
+    return PlanarRectification(np.stack([_positive(H, size) for H in (H1, H2)]), size)
+
+
+def warp_perspective(image: NDArray[Any], H: F64, size: Size) -> NDArray[Any]:
+    """The image (H, W, C) whose pixel x goes to H x, H (3, 3), by cubic interpolation."""
+    return np.asarray(cv2.warpPerspective(image, H, size, flags=cv2.INTER_CUBIC))
+
+
+def _positive(H: F64, size: Size) -> F64:
+    """H scaled such that the third coordinate is positive at the image's centre."""
+    third = float(H[2] @ [0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0), 1.0])
+    return np.asarray(H * np.sign(third), dtype=np.float64)
+
+
+MODES = {"SGBM 3-way": "STEREO_SGBM_MODE_SGBM_3WAY", "SGBM HH": "STEREO_SGBM_MODE_HH"}
+
+
+@dataclass(frozen=True)
+class OpenCVSemiGlobal:
+    """``cv2.StereoSGBM`` on colour, block 3, P1 = 216, P2 = 864, with its checks; ``mode`` one of ``MODES``.
+
+    It has no disparities for the left columns that a disparity of the range would take out of the image.
+    With ``widened`` the images are repeated to the left so that it has them.
+    """
+
+    mode: str
+    widened: bool = True
+
+    def match(self, left: U8, right: U8, disparities: int) -> F32:
+        """(H, W) disparities 0 .. disparities - 1 (a multiple of 16) of RGB images, NaN = unknown."""
+        mode = getattr(cv2, MODES[self.mode])
+        matcher = cv2.StereoSGBM.create(0, disparities, 3, 216, 864, 1, 0, 10, 100, 2, mode)
+        extra = disparities if self.widened else 0
+        images = [
+            cv2.copyMakeBorder(image[..., ::-1], 0, 0, extra, 0, cv2.BORDER_REPLICATE)
+            for image in (left, right)
+        ]
+        found = matcher.compute(*images)[:, extra:].astype(np.float32) / np.float32(16.0)
+        found[found < 0.0] = np.nan
+        return np.asarray(found, dtype=np.float32)
+
+
+HALF_WINDOW_PX = 5
+
+
+@dataclass(frozen=True)
+class BoardCalibration:
+    """``K`` (3, 3) and ``k1`` as OpenCV finds them, ``std`` (5,) its deviations of fx, fy, cx, cy, k1, and
+    ``rms_px`` of the corners."""
+
+    K: F64
+    k1: float
+    std: F64
+    rms_px: float
+
+
+def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
+    """(N, 2) inner corners, ``size`` along and across, row by row from the corner that comes first on the
+    image's diagonal; :class:`StageFailure` if OpenCV does not find them."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    found, corners = cv2.findChessboardCorners(grey, size)
+    if not found:
+        raise StageFailure(
+            "OpenCV finds no board", "an image without all corners", "keep the board in the frame"
+        )
+    until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+    fine = cv2.cornerSubPix(grey, corners, (HALF_WINDOW_PX, HALF_WINDOW_PX), (-1, -1), until)
+    xy = np.asarray(fine, dtype=np.float64).reshape(-1, 2)
+    return xy if xy[0].sum() <= xy[-1].sum() else xy[::-1].copy()
+
+
+def calibrate_from_corners(X: F64, corners: Sequence[F64], size: tuple[int, int]) -> BoardCalibration:
+    """``cv2.calibrateCamera`` of board points X (N, 3) and what each image of ``size`` shows of them;
+    free are fx, fy, cx, cy and k1."""
+    points = [X.astype(np.float32)] * len(corners)
+    places = [np.ascontiguousarray(xy, dtype=np.float32) for xy in corners]
+    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    found = cv2.calibrateCameraExtended(points, places, size, np.eye(3), np.zeros(5), flags=flags)
+    rms, K, distortion, std = found[0], found[1], found[2], found[5]
+    return BoardCalibration(
+        np.asarray(K, dtype=np.float64),
+        float(np.ravel(distortion)[0]),
+        np.asarray(np.ravel(std)[:5], dtype=np.float64),
+        float(rms),
+    )
