@@ -4,19 +4,18 @@ import logging
 
 import pytest
 
+LOCAL = {
+    "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": ":0", "worker_dashboard_address": None,
+    "silence_logs": logging.ERROR,
+}  # fmt: skip
+"""Options of a Dask cluster on loopback."""
+
 
 @pytest.fixture(scope="module")
 def dask_cluster():
     """A scheduler and two worker processes on loopback."""
     distributed = pytest.importorskip("distributed", reason="the extra distributed is not installed")
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        dashboard_address=":0",
-        worker_dashboard_address=None,
-        silence_logs=logging.ERROR,
-    ) as running:
+    with distributed.LocalCluster(n_workers=2, **LOCAL) as running:
         yield running
 
 

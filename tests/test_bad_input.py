@@ -1,6 +1,4 @@
-"""Bad input through the command line: each item gets one clear sentence, exit code 2 or 3, and nothing is
-lost.
-"""
+"""Bad input through the command line gets one sentence and exit code 2 or 3, and nothing is lost."""
 
 import json
 import shutil
@@ -58,20 +56,24 @@ def refused(answer):
     return {entry["name"]: entry["reason"] for entry in answer.summary["refused"]}
 
 
-def test_one_image(folder, reconstruct):
-    shutil.copy(courtyard(1)[0], folder)
-    answer = reconstruct()
-    assert answer.code == 3
-    assert "1 usable image; at least two different ones are needed" in answer.sentence
-    assert answer.summary["images"] == 1
+TWO_REGISTERED = {"stratum": "projective", "registered": 2}
 
 
-def test_two_identical_images(folder, reconstruct):
-    for name in ("a.jpg", "b.jpg"):
-        shutil.copy(courtyard(1)[0], folder / name)
+@pytest.mark.parametrize(
+    ("copies", "sentence", "found"),
+    [
+        ({"a.jpg": 0}, "1 usable image; at least two different ones are needed", {"images": 1}),
+        ({"a.jpg": 0, "b.jpg": 0}, "b.jpg has the same pixels as a.jpg", {}),
+        ({"a.jpg": 0, "b.jpg": 1}, "self-calibration needs at least 3 registered images", TWO_REGISTERED),
+    ],
+)
+def test_too_few_images(copies, sentence, found, folder, reconstruct):
+    for name, k in copies.items():
+        shutil.copy(courtyard(2)[k], folder / name)
     answer = reconstruct()
     assert answer.code == 3
-    assert "b.jpg has the same pixels as a.jpg" in answer.sentence
+    assert sentence in answer.sentence
+    assert found.items() <= answer.summary.items()
 
 
 def test_damaged_files_among_good_ones(folder, reconstruct):
@@ -136,15 +138,6 @@ def test_images_without_common_corners(folder, reconstruct):
     assert answer.code == 3
     assert "no two images could be matched" in answer.sentence
     assert answer.summary["pairs"]["matched"] == 6
-
-
-def test_two_views_are_too_few_for_self_calibration(folder, reconstruct):
-    for path in courtyard(2):
-        shutil.copy(path, folder)
-    answer = reconstruct()
-    assert answer.code == 3
-    assert "self-calibration needs at least 3 registered images" in answer.sentence
-    assert (answer.summary["stratum"], answer.summary["registered"]) == ("projective", 2)
 
 
 SIZE = (480, 360)

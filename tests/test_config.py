@@ -271,14 +271,6 @@ def test_a_principal_point_far_outside_of_the_picture_is_refused():
         stages_view(IntrinsicsOptions(principal_point_px=(1e5, 1500.0)))
 
 
-@pytest.mark.parametrize("name", ["default", "thesis"])
-def test_presets_survive_their_own_text(name):
-    """A deviation that a mode makes idle stands in the text, as the default it is."""
-    assert config_from_toml(toml_from_config(preset(name)), preset(name)) == preset(name)
-    known = IntrinsicsOptions(principal_point="known", k1="known")
-    assert (known.principal_point_std_rel, known.k1_std) == (0.01, 0.05)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -13,7 +13,6 @@ from tests.report.synthetic import SIZE, made_up_cameras, made_up_run
 from thesisrecon.records import HeldOut
 from thesisrecon.report import _drawing as drawing
 from thesisrecon.report import _figures as figures
-from thesisrecon.report import _figures as figures_module
 
 
 def test_the_scene_is_valid_json_with_escaped_names():
@@ -42,19 +41,12 @@ def test_the_matrix_is_symmetric_and_marks_rejected_pairs():
 
 def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch):
     data = made_up_run(points=300)
-    monkeypatch.setattr(figures_module, "MAX_MATRIX", 3)
+    monkeypatch.setattr(figures, "MAX_MATRIX", 3)
     figure = figures.pair_matrix_figure(data.pairs, [p.name for p in data.images])
     accepted = figure["data"][0]
     assert accepted["x"] == ["views 1–3", "views 4–6", "views 7–9"]
     inside = max(p.inliers for p in data.pairs if p.j < 3)
     assert accepted["customdata"][0][0] == inside
-
-
-def test_a_pair_without_matches_has_a_colour():
-    data = made_up_run(points=100)
-    empty = dataclasses.replace(data.pairs[0], xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
-    figure = figures.pair_matrix_figure([empty], ["a", "b"])
-    assert figure["data"][0]["z"][0][1] == 0.0
 
 
 def test_histogram_bars_stand_on_the_ground():
@@ -99,8 +91,8 @@ def test_the_lines_pass_through_the_numbered_matches():
 
 def test_a_pair_without_matches_is_no_error():
     data = made_up_run(points=100)
-    pair = data.pairs[0]
-    empty = dataclasses.replace(pair, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    empty = dataclasses.replace(data.pairs[0], xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    assert figures.pair_matrix_figure([empty], ["a", "b"])["data"][0]["z"][0][1] == 0.0
     drawn = drawing.draw_pair(empty, data.images[0], data.images[1])
     assert opened(drawn.uri).size == (drawn.width, drawn.height)
     assert min(drawn.width, drawn.height) > 100
@@ -220,17 +212,13 @@ def test_up_is_found_in_any_frame():
     assert (upright @ turn @ [0, 0, 1])[1] > 0.99
 
 
-def test_up_of_a_ring_of_cameras_is_its_axis():
+def test_up_of_a_ring_of_cameras_is_its_axis_and_parallel_cameras_have_one():
     level = [rotation(np.array([0.0, 1.0, 0.0]), angle) for angle in np.linspace(0, 2 * np.pi, 9)[:-1]]
     tilted = np.stack([rotation(np.array([1.0, 0.0, 0.0]), -0.4) @ R for R in level])
-    assert (figures.upright_rotation(tilted) @ [0, -1, 0])[2] > 0.999
-
-
-def test_parallel_cameras_and_cameras_that_look_down_have_an_up():
     ahead = np.tile(np.eye(3), (4, 1, 1))
-    assert (figures.upright_rotation(ahead) @ [0, -1, 0])[2] > 0.999
-    single = figures.upright_rotation(np.eye(3)[None])
-    assert (single @ [0, 0, 1])[1] > 0.999
+    for rotations in (tilted, ahead):
+        assert (figures.upright_rotation(rotations) @ [0, -1, 0])[2] > 0.999
+    assert (figures.upright_rotation(ahead[:1]) @ [0, 0, 1])[1] > 0.999
 
 
 def test_strays_are_left_out_and_many_points_are_thinned():
@@ -256,15 +244,11 @@ def test_the_pyramids_point_at_the_scene():
     assert (scene.corners[:, :2, 2].mean(axis=1) > scene.corners[:, 2:, 2].mean(axis=1)).all()
 
 
-def test_nothing_registered_gives_no_scene():
-    data = made_up_run(points=50)
-    nothing = np.zeros_like(data.metric.reconstruction.registered)
-    assert figures.build_scene(dataclasses.replace(data.metric.reconstruction, registered=nothing)) is None
-
-
 def test_a_scene_without_points_still_shows_its_cameras():
     data = made_up_run(points=50)
-    nothing = np.zeros_like(data.metric.reconstruction.valid)
-    scene = figures.build_scene(dataclasses.replace(data.metric.reconstruction, valid=nothing))
+    reconstruction = data.metric.reconstruction
+    nothing = {name: np.zeros_like(getattr(reconstruction, name)) for name in ("registered", "valid")}
+    assert figures.build_scene(dataclasses.replace(reconstruction, registered=nothing["registered"])) is None
+    scene = figures.build_scene(dataclasses.replace(reconstruction, valid=nothing["valid"]))
     assert len(scene.points) == 0
     assert len(scene.centres) == 8

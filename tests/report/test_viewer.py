@@ -156,10 +156,16 @@ def witness(request, browser, report):
 
 
 @pytest.mark.browser
-def test_nothing_complains_runs_or_reaches_out(witness):
+def test_nothing_complains_runs_reaches_out_or_is_too_wide(witness):
     witness.page.hover("#matrix-figure .nsewdrag")
     assert witness.errors == []
     assert all(url.startswith(("file:", "data:", "blob:")) for url in witness.requests)
+    width = witness.page.evaluate("document.documentElement.scrollWidth")
+    assert width <= witness.page.viewport_size["width"]
+    overhang = witness.page.evaluate(
+        "(() => { const t = document.querySelector('.listing'); return t.scrollWidth - t.clientWidth; })()"
+    )
+    assert overhang <= 0
 
 
 @pytest.mark.browser
@@ -171,20 +177,6 @@ def test_the_canvas_shows_points_and_cameras(witness):
     orange = ((pixels[..., 0] > 200) & (np.abs(pixels[..., 1] - 159) < 40) & (pixels[..., 2] < 110)).sum()
     assert drawn > 0.01
     assert orange > 50
-
-
-@pytest.mark.browser
-def test_the_page_fits_the_screen(witness):
-    width = witness.page.evaluate("document.documentElement.scrollWidth")
-    assert width <= witness.page.viewport_size["width"]
-
-
-@pytest.mark.browser
-def test_the_table_of_pairs_shows_its_last_column(witness):
-    overhang = witness.page.evaluate(
-        "(() => { const t = document.querySelector('.listing'); return t.scrollWidth - t.clientWidth; })()"
-    )
-    assert overhang <= 0
 
 
 @pytest.mark.browser
@@ -387,17 +379,11 @@ def test_it_comes_back_after_the_graphics_card_was_lost(model_page):
 
 
 @pytest.mark.browser
-def test_nothing_complains_reaches_out_or_is_too_wide(model_page):
+def test_all_is_shown_and_nothing_complains_reaches_out_or_is_too_wide(model_page):
     assert model_page.errors == []
     assert all(url.startswith(("file:", "data:", "blob:")) for url in model_page.requests)
-    assert (
-        model_page.page.evaluate("document.documentElement.scrollWidth")
-        <= (model_page.page.viewport_size["width"])
-    )
-
-
-@pytest.mark.browser
-def test_pictures_of_depth_and_comparison_are_shown(model_page):
+    width = model_page.page.evaluate("document.documentElement.scrollWidth")
+    assert width <= model_page.page.viewport_size["width"]
     widths = model_page.page.evaluate(
         "[...document.querySelectorAll('#depth img, #held-out img')].map(i => i.complete && i.naturalWidth)"
     )

@@ -3,7 +3,6 @@
 import builtins
 import concurrent.futures as futures
 import hashlib
-import logging
 import os
 import signal
 import socket
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests import fake_stages as fakes
-from tests.conftest import address
+from tests.conftest import LOCAL, address
 from tests.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import ImageOptions, PipelineConfig
@@ -24,7 +23,6 @@ from thesisrecon.io._files import read_json
 from thesisrecon.pipeline import _state as preparing
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.runtime import _executors as cluster
 from thesisrecon.runtime import _executors as workers
 from thesisrecon.runtime._executors import Workers
 
@@ -138,22 +136,13 @@ def test_a_killed_worker_process_is_reported_and_the_run_continues(tmp_path):
 def lonely():
     """A scheduler and its worker in this process, to be closed in the middle."""
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        protocol="tcp://",
-        host="127.0.0.1",
-        dashboard_address=":0",
-        worker_dashboard_address=None,
-        silence_logs=logging.ERROR,
-    ) as running:
+    with distributed.LocalCluster(n_workers=1, processes=False, protocol="tcp://", **LOCAL) as running:
         yield address(running), running
 
 
 def test_a_scheduler_that_dies_is_reported_and_the_run_continues(lonely, tmp_path, monkeypatch):
     executor, running = lonely
-    monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
+    monkeypatch.setattr(workers, "ANSWER_S", 2.0)
     monkeypatch.setattr(workers, "CHECK_S", 0.5)
 
     def close_at_matches(stage, done, _):
@@ -201,7 +190,7 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
 
 def test_an_unreachable_scheduler_is_reported_on_the_command_line(monkeypatch, tmp_path, capsys):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
+    monkeypatch.setattr(workers, "ANSWER_S", 0.5)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -213,18 +202,12 @@ def test_an_unreachable_scheduler_is_reported_on_the_command_line(monkeypatch, t
     assert not (tmp_path / "out").exists()
 
 
-def test_a_worker_with_other_code_is_refused():
+def test_workers_of_other_code_unknown_tasks_and_invalid_executors_are_refused():
     with pytest.raises(UsageError, match="another version of thesisrecon"):
         workers._answer("another", b"")
-
-
-def test_a_task_that_a_worker_cannot_load_is_named():
     missing = b"cno_such_module\nfunction\n."
     with pytest.raises(UsageError, match="cannot load its task: No module named 'no_such_module'"):
         workers._answer(workers.package_key(), missing)
-
-
-def test_invalid_executors_are_rejected():
     with pytest.raises(UsageError, match="or a concurrent"):
         Workers(1, 3)
 

@@ -110,6 +110,11 @@ def test_keys_distinguish_values_types_and_arrays():
 IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "images": {"a.jpg": "1", "b.jpg": "2"}}
 
 
+def claim_is_refused(directory, words, identity=IDENTITY, *, overwrite=False):
+    with pytest.raises(UsageError, match=words), directory.claim(identity, overwrite=overwrite):
+        pass
+
+
 def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp_path):
     directory = RunDirectory(tmp_path / "new" / "out")
     with directory.claim(IDENTITY, overwrite=False):
@@ -128,8 +133,7 @@ def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp
         ),
     ]
     for identity, words in changed:
-        with pytest.raises(UsageError, match=words), directory.claim(identity, overwrite=False):
-            pass
+        claim_is_refused(directory, words, identity)
     assert read_json(directory.path / "run.json") == IDENTITY
     assert directory.stage("01").load("a", "key") is not None
     with directory.claim(changed[0][0], overwrite=True):
@@ -143,11 +147,7 @@ def test_settings_are_judged_before_the_photographs_are_known(tmp_path):
     options = {name: value for name, value in IDENTITY.items() if name != "images"}
     with directory.claim(options, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
         directory.adopt({**IDENTITY, "images": {"a.jpg": "1"}}, overwrite=False)
-    with (
-        pytest.raises(UsageError, match="seed was 0"),
-        directory.claim({**options, "seed": 2}, overwrite=False),
-    ):
-        pass
+    claim_is_refused(directory, "seed was 0", {**options, "seed": 2})
 
 
 def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_path):
@@ -173,33 +173,22 @@ def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_p
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
-    with (
-        pytest.raises(UsageError, match=r"holds 'letter\.txt', which thesisrecon did not create"),
-        RunDirectory(tmp_path).claim(IDENTITY, overwrite=True),
-    ):
-        pass
+    words = r"holds 'letter\.txt', which thesisrecon did not create"
+    claim_is_refused(RunDirectory(tmp_path), words, overwrite=True)
     assert not (tmp_path / "run.json").exists()
 
 
 def test_two_runs_cannot_share_a_folder(tmp_path):
     directory = RunDirectory(tmp_path / "out")
-    with (
-        directory.claim(IDENTITY, overwrite=False),
-        pytest.raises(UsageError, match="another run is writing"),
-        directory.claim(IDENTITY, overwrite=False),
-    ):
-        pass
+    with directory.claim(IDENTITY, overwrite=False):
+        claim_is_refused(directory, "another run is writing")
     with directory.claim(IDENTITY, overwrite=False):
         pass
 
 
 def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path):
     (tmp_path / "file").write_text("")
-    with (
-        pytest.raises(UsageError, match="cannot be written"),
-        RunDirectory(tmp_path / "file" / "out").claim(IDENTITY, overwrite=False),
-    ):
-        pass
+    claim_is_refused(RunDirectory(tmp_path / "file" / "out"), "cannot be written")
 
 
 def test_cached_results_are_shared_by_key(tmp_path):

@@ -8,7 +8,6 @@ import pytest
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.surface import _texture_blending
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import _texture_kernels as kernels
 from thesisrecon.surface.fusion import VolumetricFusion
@@ -143,7 +142,7 @@ def test_depths_that_one_image_contradicts_are_removed(sphere, monkeypatch):
     hit = facing & (np.abs(x - 80) < 15) & (np.abs(y - 60) < 15)
     prepared, error = blending.prepare_views(sphere, views), []
     for scatter in (1e6, 20.0):
-        monkeypatch.setattr(_texture_blending, "SCATTER", scatter)
+        monkeypatch.setattr(blending, "SCATTER", scatter)
         color = blending.blend_colors(prepared, sphere.vertices, vertex_normals(sphere))[0]
         error.append(float(np.sqrt(np.mean((color - paint(sphere.vertices))[hit] ** 2))))
     assert error[0] > 12.0
