@@ -10,7 +10,7 @@ from thesisrecon.epipolar.configuration import classify_configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
-from thesisrecon.epipolar.refinement import refine_by_rows, refine_fundamental
+from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.errors import StageFailure
 from validation.metrics.fundamental_precision import epipolar_distance_interval, epipoles_of
 
@@ -92,7 +92,7 @@ FUNCTIONS = {
     "gradient": lambda a, b: refine_fundamental(PAIR.F, a, b),
     "epipolar distance": lambda a, b: refine_fundamental(PAIR.F, a, b, "epipolar-distance"),
     "reprojection": lambda a, b: refine_fundamental(PAIR.F, a, b, "reprojection"),
-    "rows": lambda a, b: refine_by_rows(PAIR.F, a, b),
+    "rows": lambda a, b: refine_fundamental(PAIR.F, a, b, parameters="row"),
     "configuration": lambda a, b: classify_configuration(PAIR.F, a, b),
 }
 

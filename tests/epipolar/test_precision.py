@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from tests.epipolar.pairs import make_pair
+from thesisrecon.epipolar._refinement import epipolar_distance_std
 from thesisrecon.epipolar.configuration import Configuration
-from thesisrecon.epipolar.precision import epipolar_distance_std
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
 from thesisrecon.records import FundamentalFit

@@ -8,7 +8,7 @@ import pytest
 from tests.epipolar.pairs import angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.epipolar.linear import estimate_eight_point
-from thesisrecon.epipolar.refinement import _RowMap, refine_by_rows, refine_fundamental
+from thesisrecon.epipolar.refinement import _RowMap, refine_fundamental
 from thesisrecon.geometry.two_view import enforce_rank_two, epipoles
 
 BOTH = pytest.mark.parametrize("and_columns", [False, True])
@@ -53,18 +53,18 @@ def test_every_map_gives_rank_two_and_its_parameters_back():
         np.testing.assert_allclose(chart.parameters(F), parameters, atol=1e-9, err_msg=str(chart))
 
 
-@BOTH
+@pytest.mark.parametrize("parameters", ["row", "row-and-column"])
 @pytest.mark.parametrize("criterion", ["sampson", "epipolar-distance", "reprojection"])
-def test_same_minimum_as_the_orthonormal_representation(criterion, and_columns):
+def test_same_minimum_as_the_orthonormal_representation(criterion, parameters):
     for seed in range(3):
         rng = np.random.default_rng(seed)
         xy1, xy2, _ = spoil(make_pair(60, rng), rng, sigma=1.0, outliers=0.0)
         start = estimate_eight_point(xy1, xy2)
-        found = refine_by_rows(start, xy1, xy2, criterion, and_columns=and_columns)
+        found = refine_fundamental(start, xy1, xy2, criterion, parameters=parameters)
         assert angle_between(found, refine_fundamental(start, xy1, xy2, criterion)) < 1e-6
 
 
 def test_a_start_without_rank_is_rejected():
     pair = make_pair(10, np.random.default_rng(0))
     with pytest.raises(ValueError, match="rank 2"):
-        refine_by_rows(np.zeros((3, 3)), pair.xy1, pair.xy2)
+        refine_fundamental(np.zeros((3, 3)), pair.xy1, pair.xy2)

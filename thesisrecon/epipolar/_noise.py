@@ -165,13 +165,12 @@ def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
     At most one of the matches at one position (within 2 px in either image) is right, and all of them agree
     with every F whose epipole lies there: together they count once.
     """
-    return 1.0 / np.maximum(_matches_per_cell(xy1), _matches_per_cell(xy2))
-
-
-def _matches_per_cell(xy: F64) -> F64:
-    cell = np.floor(xy / _SAME_PX).astype(np.int64)
-    _, place, count = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True, return_counts=True)
-    return np.asarray(count[place], dtype=np.float64)
+    numbers = np.zeros(len(xy1), dtype=np.int64)
+    for xy in (xy1, xy2):
+        x, y = np.floor(xy / _SAME_PX).astype(np.int64).T
+        _, cell, count = np.unique(x * 1_000_003 + y, return_inverse=True, return_counts=True)
+        numbers = np.maximum(numbers, count[cell])
+    return np.asarray(1.0 / numbers)
 
 
 def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: int) -> float:

@@ -1,4 +1,4 @@
-"""Kernels of section 5.3: criteria of F and their minimisation over matrices of rank 2.
+"""Sections 5.3 and 5.5: criteria of F, their minimisation over matrices of rank 2, the covariance of F.
 
 F = U diag(cos phi, sin phi, 0) V' is the orthonormal representation of Bartoli and Sturm (IJCV 2004). Points
 are rows (x1, y1, x2, y2) in a common frame, F is a row-major vector of 9. A criterion is SAMPSON (5.4),
@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.epipolar._frame import PairFrame, as_matches
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.kernels import copy_to, empty, kernel
 from thesisrecon.numerics.small_solvers import orthogonalize_columns, solve_damped
 
@@ -19,6 +21,8 @@ CORRECTIONS = 8
 BLOCK = 128
 # Stands for an infinite width of the loss; its square is still finite.
 UNBOUNDED = 1e150
+# Smallest curvature relative to the largest: the F of a plane stays uncertain but finite.
+FLATTEST_REL = 1e-14
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
@@ -290,3 +294,43 @@ def refine(
         if gain <= 1e-6 * cost:
             break
     return cost, steps
+
+
+def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
+    """Covariance (9, 9) of vec(F), px and unit norm, to first order: sigma^2 B (J'J)^-1 B', of rank 7.
+
+    J are the derivatives of the Sampson distances by the seven parameters and B those of vec(F). ``f`` (9,),
+    inliers (N, 4) and the noise ``sigma`` of a coordinate are in the frame.
+    """
+    U, V, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((9, 7))
+    G, h = np.empty((9, 9)), np.empty(9)
+    phi = orthonormal_from_fundamental(f, U, V)
+    orthonormal_tangent(U, V, phi, B)
+    normal_equations(f, points, SAMPSON, np.inf, UNBOUNDED, G, h)
+    values, vectors = np.linalg.eigh(B.T @ G @ B)
+    half = B @ (vectors / np.sqrt(np.maximum(values, FLATTEST_REL * max(values[-1], 1e-300))))
+    to_pixels = frame.to_pixels
+    pixels = to_pixels @ f
+    norm = float(np.linalg.norm(pixels))
+    moved = to_pixels @ half / norm
+    moved -= np.outer(pixels, pixels @ moved) / norm**2
+    covariance: F64 = sigma**2 * moved @ moved.T
+    return covariance
+
+
+def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
+    """Standard deviation (N,) of the distances of exact matches to their epipolar lines in image 2.
+
+    First order in the error of F alone. A match with own noise sigma has sqrt(std^2 + sigma^2 (1 + g1 / g2))
+    with g1 and g2 the squared gradients of x2' F x1 by x1 and x2.
+    """
+    xy1, xy2 = as_matches(xy1, xy2)
+    x1, x2 = homogenize(xy1), homogenize(xy2)
+    lines = x1 @ F.T
+    norm = np.sqrt(np.sum(lines[:, :2] ** 2, axis=1, keepdims=True)) + 1e-300
+    # The distance is x2 . l / |l12|; near 0 only the derivative of the numerator matters.
+    foot = x2.copy()
+    foot[:, :2] -= np.sum(x2 * lines, axis=1, keepdims=True) * lines[:, :2] / norm**2
+    gradient = (foot[:, :, None] * x1[:, None, :]).reshape(-1, 9) / norm
+    variance = np.einsum("na,ab,nb->n", gradient, covariance, gradient)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -54,13 +54,8 @@ def _apply_transform(T: Nine, x: float, y: float) -> Three:
 def _basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, float]:
     """Coefficients of F13, F21, F23, F31, F32 in v' F u = 0, with F12 minus their sum."""
     first = v[0] * u[1]
-    return (
-        v[0] * u[2] - first,
-        v[1] * u[0] - first,
-        v[1] * u[2] - first,
-        v[2] * u[0] - first,
-        v[2] * u[1] - first,
-    )
+    F13, F21, F23 = v[0] * u[2] - first, v[1] * u[0] - first, v[1] * u[2] - first
+    return F13, F21, F23, v[2] * u[0] - first, v[2] * u[1] - first
 
 
 @kernel(inline="always", error_model="numpy")

@@ -16,9 +16,8 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import chance_of_agreement, log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._planes import DominantPlane, find_dominant_plane, fundamentals_of_plane
-from thesisrecon.epipolar._refinement import SAMPSON, refine
+from thesisrecon.epipolar._refinement import SAMPSON, epipolar_distance_std, refine
 from thesisrecon.epipolar._sampling import sampson_distances
-from thesisrecon.epipolar.precision import epipolar_distance_std
 from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 

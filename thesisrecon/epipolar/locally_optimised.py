@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import NoiseMixture, noise_scale, noise_width
-from thesisrecon.epipolar._refinement import SAMPSON, refine
+from thesisrecon.epipolar._refinement import SAMPSON, fundamental_covariance, refine
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
-from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.errors import StageFailure
 from thesisrecon.numerics.noise import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit
@@ -228,26 +227,23 @@ def _best_and_competing(ends: list[tuple[float, F64]], same: float) -> tuple[F64
     return best, competing_models
 
 
-def _noise(r: F64, gate: float) -> NoiseMixture | None:
-    """Fit the noise of residuals (N,) in ascending order; None if too few belong to it."""
-    near = r[: np.searchsorted(r, noise_width(r, gate))]
-    if len(near) < MINIMUM:
-        return None
-    return NoiseMixture.fit(r, max(noise_scale(near), EXACT), spread=SPREAD)
-
-
 def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
-    """Refine ``f`` in place with the loss fitted to its residuals; return the noise and the loss."""
+    """Refine ``f`` in place with the loss fitted to its residuals; return the noise and the loss.
+
+    The noise is None if fewer than eight residuals belong to it.
+    """
     loss = (0.0, 0.0)
     for k in range(NOISE_REFINEMENTS + 1):
         r = np.sort(sampson_distances(f, points))
-        noise = _noise(r, gate)
-        if noise is None or k == NOISE_REFINEMENTS:
+        near = r[: np.searchsorted(r, noise_width(r, gate))]
+        if len(near) < MINIMUM:
+            return None, loss
+        noise = NoiseMixture.fit(r, max(noise_scale(near), EXACT), spread=SPREAD)
+        if k == NOISE_REFINEMENTS:
             break
         limit = noise.limit
         if k > 0:
-            free = max(noise.core * len(r) - PARAMETERS, 1.0)
-            few = 1.0 + FEW_MATCHES / free
+            few = 1.0 + FEW_MATCHES / max(noise.core * len(r) - PARAMETERS, 1.0)
             limit = min(limit, few * noise.core_limit)
         limit = max(limit, EXACT, 1.001 * float(r[MINIMUM - 1]))
         near = r[: np.searchsorted(r, limit)]

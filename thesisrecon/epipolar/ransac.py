@@ -12,9 +12,9 @@ from numpy.random import Generator
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import noise_scale
+from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.epipolar._sampling import draw_sample, sampson_distances
 from thesisrecon.epipolar.linear import seven_point
-from thesisrecon.epipolar.precision import fundamental_covariance
 from thesisrecon.epipolar.refinement import Criterion, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import epipolar_distances, sampson_residuals, symmetric_residuals

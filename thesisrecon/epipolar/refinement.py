@@ -26,13 +26,15 @@ from thesisrecon.geometry.two_view import epipoles, unit_norm
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 
 Criterion = Literal["sampson", "epipolar-distance", "reprojection"]
+Parameters = Literal["orthonormal", "row", "row-and-column"]
 _CRITERIA = {"sampson": SAMPSON, "epipolar-distance": EPIPOLAR_DISTANCE, "reprojection": REPROJECTION}
 MAX_ITERATIONS = 50
-# Number of times the map is chosen again after the estimate has left it.
 MAPS_TRIED = 4
 
 
-def refine_fundamental(F: F64, xy1: F64, xy2: F64, criterion: Criterion = "sampson") -> F64:
+def refine_fundamental(
+    F: F64, xy1: F64, xy2: F64, criterion: Criterion = "sampson", *, parameters: Parameters = "orthonormal"
+) -> F64:
     """Minimise a criterion of section 5.3 over matrices of rank 2 by Levenberg-Marquardt.
 
     F = U diag(cos phi, sin phi, 0) V' [1]_ has rank 2 without the thesis' exception of an epipole at
@@ -47,6 +49,9 @@ def refine_fundamental(F: F64, xy1: F64, xy2: F64, criterion: Criterion = "samps
         Matched points, N >= 7, px.
     criterion : {"sampson", "epipolar-distance", "reprojection"}
         (5.4), (5.6) or the reprojection error.
+    parameters : {"orthonormal", "row", "row-and-column"}
+        The above, or one row (and one column) a combination of the others as in the thesis: 18 (36) maps,
+        which reach the same minimum more slowly.
 
     Returns
     -------
@@ -75,8 +80,11 @@ def refine_fundamental(F: F64, xy1: F64, xy2: F64, criterion: Criterion = "samps
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=7)
     frame = PairFrame.of(xy1, xy2)
-    f = check_start(F, frame)
-    refine(f, frame.points(xy1, xy2), _CRITERIA[criterion], np.inf, UNBOUNDED, MAX_ITERATIONS)
+    f, points = check_start(F, frame), frame.points(xy1, xy2)
+    if parameters == "orthonormal":
+        refine(f, points, _CRITERIA[criterion], np.inf, UNBOUNDED, MAX_ITERATIONS)
+    else:
+        f = _refine_by_rows(f, points, _CRITERIA[criterion], and_columns=parameters == "row-and-column")
     return frame.matrix_in_pixels(f)
 
 
@@ -124,41 +132,16 @@ class _RowMap:
         return (rows if self.column is None else np.delete(rows, self.column, axis=1)).ravel()
 
 
-def refine_by_rows(
-    F: F64, xy1: F64, xy2: F64, criterion: Criterion = "sampson", *, and_columns: bool = False
-) -> F64:
-    """Minimise a criterion of section 5.3 in the thesis' parameters of F.
-
-    It reaches the minimum of :func:`refine_fundamental` more slowly.
-
-    Parameters
-    ----------
-    F : array_like (3, 3)
-        Start, rank 2 or 3, px.
-    xy1, xy2 : array_like (N, 2)
-        Matched points, N >= 7, px.
-    criterion : {"sampson", "epipolar-distance", "reprojection"}
-        (5.4), (5.6) or the reprojection error.
-    and_columns : bool
-        Use the 36 maps of Luong and Faugeras instead of the 18 of rows.
-
-    Returns
-    -------
-    ndarray (3, 3)
-        Refined F, rank 2, unit norm.
-    """
-    xy1, xy2 = check_matches(xy1, xy2, needed=7)
-    frame = PairFrame.of(xy1, xy2)
-    points = frame.points(xy1, xy2)
-    current = check_start(F, frame).reshape(3, 3)
+def _refine_by_rows(f: F64, points: F64, criterion: int, *, and_columns: bool) -> F64:
+    """Minimise a criterion in the thesis' parameters; the map is chosen again when the estimate leaves it."""
+    current = f.reshape(3, 3)
     for _ in range(MAPS_TRIED):
         chart = _RowMap.best_for(current, and_columns=and_columns)
 
         def residuals(p: F64, chart: _RowMap = chart) -> F64:
-            f = chart.matrix(p).ravel()
-            return np.asarray(residuals_and_derivatives(f, points, _CRITERIA[criterion])[0])
+            return np.asarray(residuals_and_derivatives(chart.matrix(p).ravel(), points, criterion)[0])
 
         current = chart.matrix(minimize_residuals(residuals, chart.parameters(current)).x)
         if _RowMap.best_for(current, and_columns=and_columns) == chart:
             break
-    return frame.matrix_in_pixels(current.ravel())
+    return current.ravel()
