@@ -11,12 +11,7 @@ from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.metrics.epipolar import NONE_PX, precision_recall, rms_epipolar_distance
 from validation.references.fundamental import MINIMAL, SOLVERS, estimate_with
 from validation.scenes.real import load_real_scene
-from validation.scenes.real_pairs import (
-    adelaide_pairs,
-    camera_pairs,
-    exact_correspondences,
-    kusvod2_pairs,
-)
+from validation.scenes.real_pairs import adelaide_pairs, camera_pairs, exact_correspondences, kusvod2_pairs
 
 
 def test_errors_of_a_shifted_rectified_pair():

@@ -3,22 +3,13 @@
 import shutil
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 
 from thesisrecon.io._images import DEMO_IMAGES, demo_images
 from validation.scenes.real import ROOT
 from validation.studies.package.built import NEEDED, wheel_faults
-from validation.studies.package.environments import (
-    Part,
-    counted,
-    dependencies,
-    lowest_versions,
-    quick_parts,
-    run_part,
-    suite_faults,
-)
+from validation.studies.package.environments import dependencies, lowest_versions, run_suite
 from validation.studies.package.installed import Watched, trespasses, watch
 
 
@@ -40,35 +31,15 @@ def test_lowest_versions_are_those_of_the_project_and_need_a_bound():
         lowest_versions(["scipy"])
 
 
-def test_every_test_but_those_of_validation_is_in_one_part_of_the_quick_suite():
-    asked = [Path(word) for words in quick_parts().values() for word in words if word.startswith("/")]
-    found = [file for path in asked for file in ([path] if path.is_file() else path.rglob("test_*.py"))]
-    tests = ROOT / "tests"
-    assert sorted(found) == sorted(
-        p for p in tests.rglob("test_*.py") if tests / "validation" not in p.parents
-    )
-
-
-def test_a_part_is_run_by_the_interpreter_of_its_folder_and_counted(tmp_path):
+def test_the_suite_is_run_by_the_interpreter_of_its_folder(tmp_path):
     interpreter = tmp_path / "bin" / "python"
     interpreter.parent.mkdir()
     interpreter.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n', encoding="utf-8")
     interpreter.chmod(0o755)
-    (tmp_path / "test_a.py").write_text("def test_a(): assert 1\ndef test_b(): assert 0\n", encoding="utf-8")
-    asked = ["-c", "/dev/null", "--rootdir", str(tmp_path), str(tmp_path / "test_a.py")]
-    part = run_part(tmp_path, "some/part", asked)
-    assert (part.counts, part.code) == ({"passed": 1, "failed": 1}, 1)
-    assert "assert 0" in (tmp_path / "logs" / "some-part.log").read_text(encoding="utf-8")
-    assert suite_faults([part]) == ["some/part ended with code 1"]
-
-
-def test_a_suite_is_well_where_something_passed_and_nothing_broke():
-    well = Part("a", counted(["7 passed, 2 skipped, 1 deselected in 3.2s"]), 0, 3.0)
-    assert well.counts == {"passed": 7, "skipped": 2}
-    empty, crashed = Part("b", {}, 5, 1.0), Part("c", counted(["Segmentation fault"]), -11, 1.0)
-    assert suite_faults([well, empty]) == []
-    assert suite_faults([empty]) == ["no test ran"]
-    assert suite_faults([well, crashed]) == ["c ended with code -11"]
+    file = tmp_path / "test_a.py"
+    for value, faults in ((1, []), (0, ["pytest ended with code 1"])):
+        file.write_text(f"def test_a(): assert {value}\n", encoding="utf-8")
+        assert run_suite(tmp_path, ["-c", "/dev/null", "--rootdir", str(tmp_path), str(file)]) == faults
 
 
 def test_missing_and_foreign_files_of_a_wheel_are_reported():

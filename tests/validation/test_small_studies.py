@@ -1,4 +1,4 @@
-"""Studies of growth, pair choice, subsets, killed runs and cost: what they compute."""
+"""Studies of growth, subsets, killed runs and cost: what they compute."""
 
 import json
 import signal
@@ -18,33 +18,16 @@ from thesisrecon.pipeline.reconstruction import reconstruct
 from validation.metrics.record import Metric
 from validation.scenes.many_views import walk
 from validation.studies import growth, timing
-from validation.studies.growth import Cost, Growth, Meter, recall_of, table
+from validation.studies.growth import Cost, Meter
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
 from validation.studies.runner import MODULES, load_study, run_studies, run_study, study_parser, text_table
 from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
 from validation.studies.timing import ratio_table, ratios_to_ours
 
-ROW = Growth(
-    "all-pairs", 10, 45, 45, 2, 1.0, 0.0, 9.0, 10.0, None, ((0, 1, True), (0, 2, False), (1, 2, True))
-)
-
 
 def test_the_exponent_is_that_of_a_power():
     assert exponent([10, 30, 100], [3 * n**1.5 for n in (10, 30, 100)]) == pytest.approx(1.5)
-
-
-def test_recall_counts_the_accepted_pairs_alone():
-    assert recall_of(replace(ROW, pair_list=((0, 1, True), (0, 2, False))), ROW) == 0.5
-    assert recall_of(ROW, ROW) == 1.0
-
-
-def test_the_table_names_shares_and_exponents():
-    more = replace(ROW, images=20, possible=190, tried=95, cpu_s=40.0, recall=0.985, overlapping_tried=1.0)
-    text = table([ROW, more])
-    assert "95 of 190 (50 %)" in text
-    assert "| 100.0 % | 98.5 % |" in text
-    assert "processor time 2.00" in text
 
 
 def matched_scene():

@@ -33,10 +33,7 @@ class _Verdict:
 
 
 def write_pages(
-    options: ReportOptions,
-    stages: Mapping[str, Stage],
-    judged: Judged,
-    results: Results,
+    options: ReportOptions, stages: Mapping[str, Stage], judged: Judged, results: Results
 ) -> Path:
     """Write all pages and return the path of the first."""
     scenes = [s for s in options.scenes if any(scene == s for _, scene in judged)]

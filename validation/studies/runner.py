@@ -41,7 +41,6 @@ MODULES = {
     "factorization": "projective",
     "front-end": "front_end",
     "full-disk": "robustness",
-    "growth": "growth",
     "growth-of-cost": "growth",
     "harsh": "harsh",
     "interpolation": "interpolation",
@@ -61,7 +60,6 @@ MODULES = {
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 """Folder that keeps SIFT matches of image pairs between studies."""
 HELP = {
-    "all_pairs_up_to": "largest set of which all pairs are tried",
     "benchmark": "JSON file of pytest-benchmark",
     "cache": "folder that keeps SIFT matches",
     "cameras": "shared: one camera for all images; per-image: one for each",
@@ -89,7 +87,6 @@ HELP = {
     "ratios": "JSON file for the ratios",
     "readme": "Markdown file whose table of measurements is replaced",
     "repeats": "repetitions; the least or the median counts",
-    "same_scenes": "cut all sets from the same scenes: overlapping pairs grow with the square of the size",
     "scenes": "names of image sets (default: all on this machine)",
     "seed": "random seed",
     "seeds": "random seeds, or their number",

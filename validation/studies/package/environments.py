@@ -1,18 +1,13 @@
-"""Virtual environments of the package checks, and the quick suite in them, one part of ``tests/`` after the
-other.
-"""
+"""Virtual environments of the package checks, and the quick suite in them."""
 
 from __future__ import annotations
 
 import os
 import re
-import resource
 import subprocess
 import sys
 import tomllib
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from validation.scenes.real import ROOT
@@ -73,35 +68,6 @@ def clean_environment(**more: str) -> Mapping[str, str]:
 
 TOOLS = ("pytest>=8.2", "hypothesis>=6.100", "pytest-benchmark>=4.0")
 QUICK = ("-m", "not slow and not real and not browser")
-COUNTED = re.compile(r"(\d+) (passed|failed|skipped|xfailed|errors?)\b")
-NOTHING_TO_RUN = 5
-"""Exit code of pytest if the marks exclude every test."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """Result of pytest on one part: counts by word, exit code, processor seconds."""
-
-    name: str
-    counts: Mapping[str, int]
-    code: int
-    seconds: float
-
-    def __str__(self) -> str:
-        ended = "nothing to run" if self.code == NOTHING_TO_RUN else f"ended with code {self.code}"
-        counts = ", ".join(f"{n} {word}" for word, n in self.counts.items()) or ended
-        return f"{self.name}: {counts}; {self.seconds:.0f} s"
-
-
-def quick_parts(tests: Path = ROOT / "tests") -> dict[str, list[str]]:
-    """Return the arguments of pytest for each part of the quick suite.
-
-    A part is a folder of tests; the files of ``tests/`` are one more. ``tests/validation`` is left out,
-    because its references are no dependencies.
-    """
-    folders = sorted(p for p in tests.iterdir() if p.is_dir() and any(p.rglob("test_*.py")))
-    parts = {f"tests/{f.name}": [str(f), *QUICK] for f in folders if f.name != "validation"}
-    return parts | {"tests/*.py": [*map(str, sorted(tests.glob("test_*.py"))), *QUICK]}
 
 
 def suite_environment(out: Path, name: str, python: str, constraints: Sequence[str]) -> Path:
@@ -117,45 +83,20 @@ def suite_environment(out: Path, name: str, python: str, constraints: Sequence[s
     return place
 
 
-def run_part(place: Path, name: str, arguments: Sequence[str]) -> Part:
-    """Run pytest in the environment of ``place``; its output is kept in ``logs/`` there."""
-    log = place / "logs" / f"{re.sub(r'[^A-Za-z0-9]+', '-', name).strip('-')[-80:]}.log"
-    log.parent.mkdir(exist_ok=True)
+def run_suite(place: Path, tests: Sequence[str]) -> list[str]:
+    """Run the quick suite, or these ``tests``, in the environment of ``place``; return its faults.
+
+    ``tests/validation`` is left out, because its references are no dependencies. The output is kept.
+    """
+    log = place / "log"
     threads = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
     environment = clean_environment(PYTHONPATH=str(ROOT), NUMBA_CACHE_DIR=str(place / "kernels"), **threads)
-    before = _children_seconds()
+    chosen = tests or [str(ROOT / "tests"), "--ignore", str(ROOT / "tests" / "validation"), *QUICK]
     with log.open("w", encoding="utf-8") as log_file:
         code = subprocess.run(
-            [str(place / "bin" / "python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments],
-            cwd=ROOT,
-            env=environment,
-            stdout=log_file,
-            stderr=subprocess.STDOUT,
-            check=False,
-        ).returncode
+            [str(place / "bin" / "python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", *chosen],
+            cwd=ROOT, env=environment, stdout=log_file, stderr=subprocess.STDOUT, check=False,
+        ).returncode  # fmt: skip
     lines = log.read_text(encoding="utf-8").splitlines()
-    part = Part(name, counted(lines), code, _children_seconds() - before)
-    print(
-        "\n".join([line for line in lines if line.startswith(("FAILED", "ERROR"))] + [str(part)]), flush=True
-    )
-    return part
-
-
-def counted(lines: Sequence[str]) -> dict[str, int]:
-    return {word: int(n) for n, word in COUNTED.findall(lines[-1] if lines else "")}
-
-
-def suite_faults(parts: Sequence[Part]) -> list[str]:
-    """Return the faults of a suite, and print its counts."""
-    total: Counter[str] = Counter()
-    for part in parts:
-        total.update(part.counts)
-    counts = ", ".join(f"{n} {word}" for word, n in total.items())
-    print(f"{counts or 'nothing'} in {sum(p.seconds for p in parts) / 60:.0f} processor minutes")
-    faults = [f"{p.name} ended with code {p.code}" for p in parts if p.code not in (0, NOTHING_TO_RUN)]
-    return faults if faults or total["passed"] else ["no test ran"]
-
-
-def _children_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    print("\n".join([*(x for x in lines if x.startswith(("FAILED", "ERROR"))), *lines[-1:]]), flush=True)
+    return [f"pytest ended with code {code}"] if code else []

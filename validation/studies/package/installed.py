@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import subprocess
 import tempfile
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,27 +58,10 @@ def processor_seconds(interpreter: Path, code: str, repeats: int) -> float:
     return min(float(run.stderr.split()[-1]) for run in runs[1:])
 
 
-def shares(interpreter: Path, code: str, most: int = 10) -> list[tuple[str, float]]:
-    """Return milliseconds of an import by package, from ``-X importtime``."""
-    command = [str(interpreter), "-X", "importtime", "-c", code]
-    output = subprocess.run(
-        command, env=clean_environment(), check=True, capture_output=True, text=True
-    ).stderr
-    found: Counter[str] = Counter()
-    for line in output.splitlines():
-        own, _, name = line.removeprefix("import time:").split("|") if line.count("|") == 2 else ("", "", "")
-        if own.strip().isdigit():
-            parts = name.strip().split(".")
-            found[".".join(parts[:2]) if parts[0] in ("scipy", "thesisrecon") else parts[0]] += int(own)
-    return [(name, micro / 1000.0) for name, micro in found.most_common(most)]
-
-
 def check_imports(interpreter: Path, repeats: int = 5) -> list[str]:
     """Print the import times; return those above their bounds."""
     taken = {name: processor_seconds(interpreter, code, repeats) for name, code in statements().items()}
     print(text_table(["", "processor s"], ([name, f"{s:.2f}"] for name, s in taken.items())))
-    largest = shares(interpreter, "import thesisrecon; thesisrecon.reconstruct")
-    print("of thesisrecon.reconstruct, ms:", ", ".join(f"{name} {ms:.0f}" for name, ms in largest))
     bound = ["import thesisrecon", *(f"thesisrecon {words}" for words in COMMANDS)]
     faults = [f"{n} takes {taken[n]:.2f} s, at most {LIMIT_S}" for n in bound if taken[n] > LIMIT_S]
     most = max(TIMES_NUMBA * taken["numba"], LIMIT_S)

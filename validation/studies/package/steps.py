@@ -2,8 +2,8 @@
 
 ``build`` makes wheel and sdist in OUT/dist and checks them; the later steps use them. ``install`` puts the
 wheel into an empty environment; ``imports``, ``typed``, ``quiet`` and ``demo`` use it from empty folders.
-``lowest`` and ``newest`` run the quick suite with the lowest and newest versions of the dependencies, part by
-part. Each environment is made once and keeps the output of pytest in ``logs/``.
+``lowest`` and ``newest`` run the quick suite with the lowest and newest versions of the dependencies. Each
+environment is made once and keeps the output of pytest.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from validation.studies.package.environments import (
     install,
     lowest_versions,
     make_environment,
-    quick_parts,
-    run_part,
+    run_suite,
     suite_environment,
-    suite_faults,
 )
 from validation.studies.package.installed import check_imports, trespasses, watch
 from validation.studies.runner import Part, Rows, pick
@@ -128,8 +126,7 @@ class Checks:
 
     def _suite(self, name: str, constraints: list[str]) -> list[str]:
         place = suite_environment(self.out, name, self.python, constraints)
-        parts = {" ".join(self.pytest): self.pytest} if self.pytest else quick_parts()
-        return suite_faults([run_part(place, part, words) for part, words in parts.items()])
+        return run_suite(place, self.pytest)
 
 
 STEPS: dict[str, Callable[[Checks], list[str]]] = {
