@@ -13,7 +13,6 @@ from pathlib import Path
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.runtime._signals import with_resume_advice
 from validation.ablation import command as ablation
-from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
 from validation.harness.process import own_cores
@@ -41,8 +40,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"validation: {error}", file=sys.stderr)
         return 2
     with with_resume_advice("run the same command to start again"):
-        for words in ask_canaries(options).values():
-            print(f"validation: {words}", file=sys.stderr)
         try:
             judged = run_tasks(options, STAGES, _print_progress)
         except ValueError as error:

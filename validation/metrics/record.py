@@ -53,20 +53,6 @@ def markdown_table(metrics: list[Metric]) -> str:
     return "\n".join(lines)
 
 
-def summary_table(metrics: list[Metric], names: tuple[str, ...]) -> str:
-    """The rows of these names over all scenes, one table, a row for each scene."""
-    methods = list(dict.fromkeys(method for metric in metrics for method in metric.values))
-    lines = [f"| | scene | {' | '.join(methods)} | target |", f"| --- | --- |{' --- |' * (len(methods) + 1)}"]
-    for name in names:
-        for metric in (m for m in metrics if m.name.startswith(name)):
-            numbers = " | ".join(_number(metric.values.get(method)) for method in methods)
-            sign = "<=" if metric.at_most else ">="
-            target = "" if metric.target is None else f"{sign} {_number(metric.target)} {metric.verdict}"
-            label = f"{metric.name}, {metric.unit}" if metric.unit else metric.name
-            lines.append(f"| {label} | {metric.scene} | {numbers} | {target} |")
-    return "\n".join(lines)
-
-
 def _number(value: float | None) -> str:
     if value is None:
         return "-"

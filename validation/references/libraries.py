@@ -1,17 +1,15 @@
 """Lazy import of the reference libraries for their adapters.
 
-A library that is missing, does not load, or fails its check raises :class:`NoReference` on use; other
-libraries keep working.
+A library that is missing or does not load raises :class:`NoReference` on use; other libraries keep working.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["Library", "NoReference", "cv2", "load", "one_thread", "open3d", "poselib", "pycolmap", "refuse"]
+__all__ = ["Library", "NoReference", "cv2", "load", "one_thread", "open3d", "poselib", "pycolmap"]
 
 PACKAGES = {
     "cv2": "opencv-contrib-python-headless",
@@ -21,8 +19,6 @@ PACKAGES = {
 }
 """Reference libraries: module names and pip names."""
 NAMES = {"cv2": "OpenCV", "pycolmap": "pycolmap", "poselib": "PoseLib", "open3d": "Open3D"}
-
-_refused: dict[str, str] = {}
 
 
 class NoReference(ImportError):
@@ -45,10 +41,8 @@ class Library:
 def load(module: str) -> ModuleType:
     """The reference library ``module``, one of :data:`PACKAGES`.
 
-    Raises :class:`NoReference` if it is refused, missing, or does not load.
+    Raises :class:`NoReference` if it is missing or does not load.
     """
-    if module in _refused:
-        raise NoReference(_refused[module])
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -57,12 +51,6 @@ def load(module: str) -> ModuleType:
         raise NoReference(f"{NAMES[module]} does not load: {error}") from error
     except (ImportError, OSError) as error:
         raise NoReference(f"{NAMES[module]} does not load: {error}") from error
-
-
-def refuse(libraries: Mapping[str, str]) -> None:
-    """Make these libraries raise :class:`NoReference` with these messages from now on."""
-    _refused.clear()
-    _refused.update(libraries)
 
 
 def one_thread() -> None:

@@ -24,8 +24,7 @@ from validation.harness.scenes import truth_of
 from validation.metrics.cameras import CameraErrors, measure_cameras
 from validation.metrics.intervals import LEVEL, focal_errors_pct, interval_scores, join_scores
 from validation.metrics.record import Metric
-from validation.references.colmap_mapping import Start, map_with_pycolmap, read_run
-from validation.references.colmap_matching import match_with_pycolmap
+from validation.references.colmap import Start, map_with_pycolmap, match_with_pycolmap, read_run
 from validation.scenes.real import REAL_SCENES, Scene
 from validation.scenes.zoomed import rezoom_scene, windowed_scene
 from validation.studies.coverage import (

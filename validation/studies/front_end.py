@@ -22,7 +22,7 @@ from thesisrecon import reconstruct
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.records import Reconstruction, RunResult, TwoView
 from validation.metrics.record import Metric
-from validation.references.colmap_run import reconstruct_with_pycolmap
+from validation.references.colmap import reconstruct_with_pycolmap
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS
 from validation.studies.front_end_pairs import (
     OURS,

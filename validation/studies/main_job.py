@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.io._files import write_text
 from thesisrecon.records import Reconstruction
 from validation.harness.process import Process, own_cores, run_process
 from validation.harness.scenes import truth_of
@@ -30,8 +29,8 @@ from validation.metrics.cameras import (
     measure_cameras,
     measure_reprojection,
 )
-from validation.metrics.record import Metric, summary_table
-from validation.references.colmap_mapping import read_run
+from validation.metrics.record import Metric
+from validation.references.colmap import read_run
 from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import REAL_SCENES, Scene
 from validation.studies.runner import Part, Rows, scenes_here
@@ -135,20 +134,6 @@ def _claims(
 METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colmap-principal-point"}
 
 
-README_BEGIN, README_END = "<!-- measured: begin -->", "<!-- measured: end -->"
-README_ROWS = (
-    "cameras registered",
-    "focal error",
-    "principal point error",
-    "mean camera-centre error",
-    "median rotation error",
-    "median reprojection",
-    "points",
-    "wall time",
-    "peak memory",
-)
-
-
 def run_method(method: str, scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> Outcome:
     """Run one method on one scene in the emptied folder ``out`` and read its result."""
     images = scene.image_paths[0].parent
@@ -172,7 +157,7 @@ def _command(method: str, images: Path, out: Path, threads: int) -> list[str]:
         ours = [sys.executable, "-m", "thesisrecon", "reconstruct", str(images), "-o", str(out)]
         ours += ["--until", "metric"]  # the last stage that the references have
         return [*ours, "--preset", METHODS[method], "--cameras", "shared", "--threads", str(threads)]
-    theirs = [sys.executable, "-m", "validation.references.colmap_run", str(images), str(out)]
+    theirs = [sys.executable, "-m", "validation.references.colmap", str(images), str(out)]
     extra = ["--refine-principal-point"] if method == COLMAP_PP else []
     return [*theirs, "--threads", str(threads), *extra]
 
@@ -240,17 +225,6 @@ def warm_up(scene: Scene, out: Path, *, threads: int, environment: dict[str, str
     return cold.wall_s
 
 
-def write_readme(readme: Path, rows: dict[str, list[Metric]], facts: dict[str, Any]) -> None:
-    """Replace the table between the markers of a Markdown file."""
-    text = readme.read_text(encoding="utf-8")
-    before, rest = text.split(README_BEGIN)
-    _, after = rest.split(README_END)
-    table = summary_table([metric for metrics in rows.values() for metric in metrics], README_ROWS)
-    given = "; ".join(f"{name}: {value}" for name, value in facts.items())
-    measured = f"{README_BEGIN}\n{table}\n\n{given}.\n{README_END}"
-    write_text(readme, before + measured + after)
-
-
 def _notes(outcomes: dict[str, Outcome]) -> str:
     lines = []
     for method, run in outcomes.items():
@@ -267,7 +241,6 @@ def main_job_study(
     scenes: Sequence[str] = ("courtyard", *REAL_SCENES),
     repeats: int = 1,
     threads: int = 2,
-    readme: Path | None = None,
 ) -> Iterator[Part]:
     """Run both presets and COLMAP on the same images and compare them with the truth."""
     found = scenes_here(scenes)
@@ -284,12 +257,7 @@ def main_job_study(
         "first run, kernels compiling": f"{seconds:.1f} s on {first.name}",
     }
     yield "; ".join(f"{name}: {value}" for name, value in facts.items())
-    rows: dict[str, list[Metric]] = {}
     for scene in found:
-        rows[scene.name], outcomes = measure_scene(
-            scene, out, threads=threads, repeats=repeats, environment=environment
-        )
-        yield rows[scene.name]
+        rows, outcomes = measure_scene(scene, out, threads=threads, repeats=repeats, environment=environment)
+        yield rows
         yield _notes(outcomes)
-    if readme is not None:
-        write_readme(readme, rows, facts)

@@ -85,7 +85,6 @@ HELP = {
     "pytest": "arguments of pytest in place of the quick suite",
     "python": "interpreter of the new environments",
     "ratios": "JSON file for the ratios",
-    "readme": "Markdown file whose table of measurements is replaced",
     "repeats": "repetitions; the least or the median counts",
     "scenes": "names of image sets (default: all on this machine)",
     "seed": "random seed",

@@ -1,4 +1,4 @@
-"""A reference that is missing, changed, crashes or hangs leaves rows that say so; the report stands."""
+"""A reference that is missing, crashes or hangs leaves rows that say so; the report stands."""
 
 import ast
 import json
@@ -11,24 +11,18 @@ import pytest
 
 from tests.validation.harness.reference_stages import METHODS, STAGES
 from validation.command import main
-from validation.harness.canaries import ask_canaries
 from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
 from validation.harness.process import own_cores
 from validation.harness.records import ReportOptions
 from validation.harness.results import collect
 from validation.harness.schedule import run_tasks
-from validation.references.libraries import NAMES, PACKAGES, NoReference, load, refuse
+from validation.references.libraries import NAMES, PACKAGES, NoReference, load
 
 ROOT = Path(__file__).parents[3]
 MISSING = "raise ModuleNotFoundError(\"No module named '{0}'\", name='{0}')"
 CRASHING = "import os; os.abort()"
 HANGING = "import time; time.sleep(600)"
-TRANSPOSED = """
-import numpy as np
-def estimate_fundamental(xy1, xy2, settings, options):
-    return np.array([[0.0, 0, 0], [0, 0, 2], [0, -1, 0]]), {"inliers": [True] * len(xy1)}
-"""
 
 
 def not_installed(library):
@@ -65,29 +59,21 @@ def test_one_that_is_missing_leaves_the_others(library, stub, tmp_path):
     assert judged[0].metrics[0].values == {library: None, other: 1.0}
 
 
-def test_changed_crashing_hanging_and_missing_ones_are_known_before_the_report(stub, tmp_path):
-    stubs = {"poselib": TRANSPOSED, "cv2": CRASHING, "pycolmap": HANGING, "open3d": MISSING.format("open3d")}
+def test_crashing_hanging_and_missing_ones_leave_rows_that_say_so(stub, tmp_path):
+    stubs = {"cv2": CRASHING, "pycolmap": HANGING, "open3d": MISSING.format("open3d")}
     for library, text in stubs.items():
         (stub / f"{library}.py").write_text(text)
-    limit_s = 12.0  # others are to answer within it, on a machine with other work too
-    refused = ask_canaries(options_for(tmp_path, "-".join(METHODS), limit_s))
-    version = refused["poselib"].split()[1]
-    assert refused == {
-        "cv2": "OpenCV crashed with signal 6 on a small question",
-        "pycolmap": "pycolmap did not answer a small question within 12 s",
-        "poselib": f"PoseLib {version} gives F of matches with y2 = 2 y1 as [[ 0. 0. 0.] [ 0. 0. 2.] "
-        "[ 0. -1. 0.]]; this harness expects [[ 0. 0. 0.] [ 0. 0. -1.] [ 0. 2. 0.]]",
-        "open3d": not_installed("open3d"),
-    }
-    options = options_for(tmp_path, "-".join(METHODS))
+    options = options_for(tmp_path, "-".join(stubs), limit_s=12.0)
     judged = run_tasks(options, STAGES, lambda _: None)
     ((_, outcomes),) = judged.values()
-    # Nobody waits for one that is known to hang.
-    assert {name: o.failure for name, o in outcomes.items()} == refused
-    results = collect(options, judged, {})
-    page = write_pages(options, STAGES, judged, results).read_text(encoding="utf-8")
-    assert page.count("pycolmap did not answer a small question within 12 s") == 2
-    assert "Not used: OpenCV crashed" in results.environment[PACKAGES["cv2"]]
+    failures = {
+        "cv2": "crashed with signal 6",
+        "pycolmap": "exceeded the time limit of 12 s",
+        "open3d": not_installed("open3d"),
+    }
+    assert {name: o.failure for name, o in outcomes.items()} == failures
+    page = write_pages(options, STAGES, judged, collect(options, judged, {})).read_text(encoding="utf-8")
+    assert all(words in page for words in failures.values())
 
 
 def test_report_and_check_run_without_any(stub, tmp_path):
@@ -101,7 +87,7 @@ def test_report_and_check_run_without_any(stub, tmp_path):
         text=True,
         check=False,
     )
-    assert done.stderr.splitlines() == [f"validation: {not_installed(library)}" for library in NAMES]
+    assert done.stderr == ""
     reported = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))
     assert reported["failures"] == {"bundle/street/Ceres": not_installed("pycolmap")}
     promised = [key for key in read_gates() if key.startswith("bundle/street/")]
@@ -130,15 +116,6 @@ def test_a_library_that_does_not_load_states_why(stub, monkeypatch):
     monkeypatch.delitem(sys.modules, "open3d", raising=False)
     with pytest.raises(NoReference, match=r"^Open3D does not load: libGL\.so\.1: cannot open"):
         load("open3d")
-
-
-def test_rejected_references_are_not_called():
-    try:
-        refuse({"poselib": "PoseLib is odd today"})
-        with pytest.raises(NoReference, match="odd today"):
-            load("poselib")
-    finally:
-        refuse({})
 
 
 def test_wrong_options_call_no_library(tmp_path):

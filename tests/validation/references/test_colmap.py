@@ -9,8 +9,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.numerics.metric_cameras import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from validation.references.ceres import cameras_from_colmap, colmap_model
-from validation.references.colmap_mapping import give_calibration
-from validation.references.colmap_matching import match_with_pycolmap
+from validation.references.colmap import give_calibration, match_with_pycolmap
 from validation.references.colmap_reading import read_colmap_model
 from validation.references.libraries import pycolmap
 from validation.references.triangulation import colmap_points

@@ -23,8 +23,7 @@ from validation.harness.scenes import has_images, load_images, truth_of
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
-from validation.references.colmap_mapping import Start, map_with_pycolmap
-from validation.references.colmap_matching import match_with_pycolmap
+from validation.references.colmap import Start, map_with_pycolmap, match_with_pycolmap
 from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import Scene
 

@@ -1,10 +1,13 @@
-"""COLMAP's reconstruction of what it has matched (Schönberger and Frahm, CVPR 2016; Pan et al., ECCV 2024).
+"""COLMAP from images to cameras: ``python -m validation.references.colmap IMAGES OUT``.
 
-Models come back in our types and pixels.
+SIFT, exhaustive matching and mapping (Schönberger and Frahm, CVPR 2016; Pan et al., ECCV 2024). Prior-free:
+EXIF focal lengths are replaced by COLMAP's default, 1.2 times the long side, and refined. Models come back in
+our types and pixels.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import time
@@ -17,9 +20,50 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.records import Reconstruction
-from validation.references.colmap_matching import DEFAULT_FOCAL_REL, forget_focal_priors
 from validation.references.colmap_reading import read_colmap_model
 from validation.references.libraries import pycolmap
+
+DEFAULT_FOCAL_REL = 1.2
+
+
+def match_with_pycolmap(
+    images: Path, out: Path, *, shared_camera: bool = True, threads: int = 2
+) -> dict[str, float]:
+    """SIFT and exhaustive matching of all pairs with their verification; the seconds of both.
+
+    ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database and
+    the times.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    pycolmap.set_random_seed(0)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    database, seconds, start = out / "database.db", {}, time.perf_counter()
+
+    mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+    pycolmap.extract_features(
+        database, images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu
+    )
+    forget_focal_priors(database)
+    seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
+
+    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+    seconds["match"] = time.perf_counter() - start
+    write_text(out / "seconds.json", json.dumps(seconds))
+    return seconds
+
+
+def forget_focal_priors(database: Path, focal_rel: float = DEFAULT_FOCAL_REL) -> None:
+    """Replace every focal length, including EXIF ones, by a guess."""
+    store = pycolmap.Database.open(database)
+    for camera in store.read_all_cameras():
+        guess = focal_rel * max(camera.width, camera.height)
+        camera.params = [guess, *camera.params[1:]]
+        camera.has_prior_focal_length = False
+        store.update_camera(camera)
+    store.close()
 
 
 @dataclass(frozen=True)
@@ -138,3 +182,38 @@ def give_calibration(database: Path, K: Mapping[str, F64]) -> None:
         camera.has_prior_focal_length = True
         store.update_camera(camera)
     store.close()
+
+
+def reconstruct_with_pycolmap(
+    images: Path,
+    out: Path,
+    *,
+    shared_camera: bool = True,
+    refine_principal_point: bool = False,
+    threads: int = 2,
+) -> ReferenceRun:
+    """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
+
+    ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database, the
+    models and the times. Raises ``StageFailure`` if COLMAP makes no model.
+    """
+    match_with_pycolmap(images, out, shared_camera=shared_camera, threads=threads)
+    return map_incrementally(images, out, mapper_options(threads, refine_principal_point))
+
+
+def main() -> None:
+    """One run as a process of its own."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("images", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--refine-principal-point", action="store_true")
+    parser.add_argument("--threads", type=int, default=2)
+    parsed = parser.parse_args()
+    refine = parsed.refine_principal_point
+    reconstruct_with_pycolmap(
+        parsed.images, parsed.out, refine_principal_point=refine, threads=parsed.threads
+    )
+
+
+if __name__ == "__main__":
+    main()
