@@ -19,8 +19,7 @@ from thesisrecon.selfcalibration._critical_motions import (
     projective_infinity_shifts,
 )
 from thesisrecon.selfcalibration._frame import normalized_frame
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from thesisrecon.selfcalibration.identifiability import (
+from thesisrecon.selfcalibration._identifiability import (
     MAX_FOCAL_STD,
     MAX_NOISE_RATIO,
     MIN_INFINITY_SHIFT,
@@ -29,6 +28,7 @@ from thesisrecon.selfcalibration.identifiability import (
     check_identifiability,
     identifiability_without_calibration,
 )
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 
 CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]

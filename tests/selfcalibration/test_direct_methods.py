@@ -14,11 +14,12 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from thesisrecon.selfcalibration.kruppa import KruppaEquations, _kruppa_cost, _Pairs, kruppa_residuals
-from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric, linear_quadric, rank_three
+from thesisrecon.selfcalibration.kruppa import KruppaEquations, _kruppa_cost, _kruppa_residuals, _Pairs
+from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
 
 FREE = RotationCriterion(focal_weight=0.0)
@@ -227,7 +228,7 @@ def random_pair(seed, K1, K2):
 
 
 def kruppa_of(F, *calibrations):
-    return kruppa_residuals(F[None], *((K @ K.T)[None, None] for K in calibrations))
+    return _kruppa_residuals(F[None], *((K @ K.T)[None, None] for K in calibrations))
 
 
 @settings(max_examples=60, derandomize=True, deadline=None)

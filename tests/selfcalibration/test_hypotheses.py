@@ -8,11 +8,11 @@ import pytest
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.selfcalibration._candidates import select_candidate
+from thesisrecon.selfcalibration._candidates import plane_from_focals, select_candidate
+from thesisrecon.selfcalibration._dual_quadric import quadric_hypotheses
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement, plane_from_focals
-from thesisrecon.selfcalibration.quadric import quadric_hypotheses
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.stratified import Stratified
 
 METHODS = [HypothesesAndRefinement(), Stratified()]

@@ -25,7 +25,7 @@ from thesisrecon.report._data import ReportData, point_colors, summarize
 from thesisrecon.report._page import render_report
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
-from thesisrecon.selfcalibration.stratified import affine_camera_centres, upgrade_to_affine
+from thesisrecon.selfcalibration.stratified import upgrade_to_affine
 from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
@@ -43,7 +43,8 @@ def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
     """Write the affine points within ``MAX_AFFINE`` and the camera centres (red) as a PLY file."""
     X = affine.X[:, :3]
     near = affine.valid & (np.abs(X) < MAX_AFFINE).all(axis=1)
-    centres = affine_camera_centres(affine)
+    P = affine.P[affine.registered]
+    centres = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]
     centres = centres[np.isfinite(centres).all(axis=1)]
     red = np.tile(np.array([255, 0, 0], dtype=np.uint8), (len(centres), 1))
     write_point_cloud(path, np.concatenate([X[near], centres]), np.concatenate([colors[near], red]))

@@ -1,8 +1,4 @@
-"""Candidates of self-calibration: from plane at infinity and calibrations to the selected upgrade.
-
-Each candidate becomes an upgrade with most points in front of the cameras, or is rejected; the best ones are
-kept, and the identifiability of the motion is checked.
-"""
+"""Candidates of self-calibration: from plane at infinity and calibrations to the selected upgrade."""
 
 from __future__ import annotations
 
@@ -17,11 +13,11 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.records import Reconstruction, SelfCalibration, Upgrade
 from thesisrecon.selfcalibration._frame import ReferenceFrame, metric_from_calibration
-from thesisrecon.selfcalibration._refinement import RotationCriterion, focal_std
-from thesisrecon.selfcalibration.identifiability import (
+from thesisrecon.selfcalibration._identifiability import (
     check_identifiability,
     identifiability_without_calibration,
 )
+from thesisrecon.selfcalibration._refinement import RotationCriterion, focal_std
 
 P = ParamSpec("P")
 
@@ -99,6 +95,35 @@ def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) ->
     return groups
 
 
+def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
+    """Return planes (2 B, 3) from focal lengths (B,) of the reference and another camera.
+
+    For both signs of the other camera, since a projective camera has none (R. Gherardi, A. Fusiello,
+    "Practical autocalibration", ECCV 2010).
+    """
+    K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
+    K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
+    t = frame.a[other] / K2
+    rotation = _rotation_to_first_axis(t)
+    W = rotation @ ((frame.A[other][None] / K2[:, :, None]) * K1[:, None, :])
+    planes = []
+    for sign in (1.0, -1.0):
+        w1, w2, w3 = sign * W[:, 0], sign * W[:, 1], sign * W[:, 2]
+        length = np.maximum(np.linalg.norm(w3, axis=1, keepdims=True), 1e-300)
+        baseline = sign * np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
+        planes.append(-(np.cross(w2, w3) / length - w1) / baseline / K1)
+    return np.concatenate(planes)
+
+
+def _rotation_to_first_axis(t: F64) -> F64:
+    """Return rotations R (B, 3, 3) with R t = (|t|, 0, 0)."""
+    first = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
+    helper = np.eye(3)[np.abs(first).argmin(axis=1)]
+    second = np.cross(first, helper)
+    second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-300)
+    return np.stack([first, second, np.cross(first, second)], axis=1)
+
+
 def candidates_from_parameters(frame: ReferenceFrame, theta: F64, cost: F64, method: str) -> list[Candidate]:
     """Return one candidate with square pixels for each row (plane, log focal lengths) (B, 3 + G)."""
     K = square_pixel_calibrations(theta[:, 3:][:, frame.group])
@@ -129,14 +154,9 @@ def distinct_candidates(
 
 
 def select_candidate(
-    frame: ReferenceFrame,
-    reconstruction: Reconstruction,
-    criterion: RotationCriterion,
-    candidates: Sequence[Candidate],
-    *,
-    max_candidates: int = 1,
-    min_in_front_ratio: float = 0.5,
-) -> SelfCalibration:
+    frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion,
+    candidates: Sequence[Candidate], *, max_candidates: int = 1, min_in_front_ratio: float = 0.5,
+) -> SelfCalibration:  # fmt: skip
     """Select the best candidates with enough points in front and check their identifiability.
 
     ``StageFailure`` if no candidate places a share ``min_in_front_ratio`` of the observations in front.
@@ -172,11 +192,8 @@ def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction,
             "the images contradict it: omit it, or set a larger focal_std_rel",
         )
     sentences = identifiability_without_calibration(reconstruction, frame.prior).sentences
-    return StageFailure(
-        "self-calibration failed",
-        evidence,
-        "; ".join(sentences) or "take images from more directions and rotate the camera between them",
-    )
+    advice = "; ".join(sentences) or "take images from more directions and rotate the camera between them"
+    return StageFailure("self-calibration failed", evidence, advice)
 
 
 def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_std: F64) -> F64:
@@ -202,12 +219,9 @@ def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_
 
 
 def _distinct_upgrades(
-    frame: ReferenceFrame,
-    reconstruction: Reconstruction,
-    candidates: Sequence[Candidate],
-    max_candidates: int,
-    min_in_front_ratio: float,
-) -> list[tuple[Candidate, Upgrade]]:
+    frame: ReferenceFrame, reconstruction: Reconstruction, candidates: Sequence[Candidate],
+    max_candidates: int, min_in_front_ratio: float,
+) -> list[tuple[Candidate, Upgrade]]:  # fmt: skip
     """Return the best candidates of different focal lengths with their upgrades."""
     chosen: list[tuple[Candidate, Upgrade]] = []
     for candidate in sorted(candidates, key=lambda a: a.cost):

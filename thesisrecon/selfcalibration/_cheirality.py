@@ -67,13 +67,9 @@ class CheiralityRegion:
 
     @classmethod
     def of(
-        cls,
-        frame: ReferenceFrame,
-        reconstruction: Reconstruction,
-        *,
-        max_points: int,
-        rng: np.random.Generator,
-    ) -> CheiralityRegion:
+        cls, frame: ReferenceFrame, reconstruction: Reconstruction, *,
+        max_points: int, rng: np.random.Generator,
+    ) -> CheiralityRegion:  # fmt: skip
         """Compute the region, without polytopes below eight usable points; ``rng`` selects ``max_points``."""
         X, C = _cheirality_inequalities(frame, reconstruction, max_points=max_points, rng=rng)
         found = [_polytope_of(X, sign * C) for sign in (1.0, -1.0)] if len(X) >= 8 else []

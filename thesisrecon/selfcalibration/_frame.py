@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
@@ -110,11 +109,11 @@ def _focal_prior(prior: IntrinsicsPrior, group: I64, views: I64, unit: F64) -> t
 
 def _require_cameras_of_full_rank(P: F64) -> None:
     """Raise ``StageFailure`` if a camera (R, 3, 4) has rank below 3 or all centres coincide."""
-    if not np.isfinite(P).all() or (np.linalg.norm(P, axis=(1, 2)) == 0.0).any():
-        bad = int((~np.isfinite(P)).any(axis=(1, 2)).sum() + (np.linalg.norm(P, axis=(1, 2)) == 0.0).sum())
+    size = np.linalg.norm(P, axis=(1, 2))
+    if bad := int((~np.isfinite(P).all(axis=(1, 2)) | (size == 0.0)).sum()):
         evidence = f"{bad} of {len(P)} projective cameras are zero or not finite"
     else:
-        S = np.linalg.svd(P / np.linalg.norm(P, axis=(1, 2))[:, None, None], compute_uv=False)
+        S = np.linalg.svd(P / size[:, None, None], compute_uv=False)
         flat = int((S[:, 2] < _RANK_TOLERANCE * S[:, 0]).sum())
         centres = np.linalg.svd(P)[2][:, 3]
         apart = float(np.sqrt(np.maximum(1.0 - (centres @ centres[0]) ** 2, 0.0)).max())
@@ -154,19 +153,13 @@ def metric_from_calibration(p: F64, K: F64) -> F64:
         return np.full((4, 4), np.nan)
 
 
-def example_frame(n: int = 6, f: float = 1.2) -> tuple[ReferenceFrame, F64]:
-    """Return ``n`` exact cameras of focal length ``f`` and the plane at infinity p (3,), for the examples."""
-    rng = np.random.default_rng(0)
-    K, p = np.diag([f, f, 1.0]), np.array([0.1, -0.2, 0.3])
-    R = scipy.spatial.transform.Rotation.from_rotvec(
-        0.4 * rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]
-    ).as_matrix()
-    a = rng.normal(size=(n, 3)) * (np.arange(n) > 0)[:, None]
-    A = K @ R @ np.linalg.inv(K) + a[:, :, None] * p
-    unit, group = np.tile(np.eye(3), (n, 1, 1)), np.zeros(n, dtype=np.int64)
-    prior = IntrinsicsPrior.unshared(np.tile([np.nan, 1, 0, 0, 0, 0], (n, 1)), np.zeros((n, 6)))
-    unknown = np.array([np.nan]), np.array([np.inf])
-    return ReferenceFrame(A, a, np.arange(n), 0, group, unit, np.eye(4), *unknown, prior), p
+def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
+    """Return A_i - a_i p' (3.29) of planes (B, 3) with determinant 1 (B, R, 3, 3); NaN through a centre."""
+    H = frame.A[None] - frame.a[None, :, :, None] * planes[:, None, None, :]
+    det = np.linalg.det(H)
+    size = np.linalg.norm(H, axis=(-2, -1)) ** 3
+    det = np.where(np.abs(det) > 1e-13 * size, det, np.nan)
+    return np.asarray(H / np.cbrt(det)[..., None, None])
 
 
 @dataclass(frozen=True)

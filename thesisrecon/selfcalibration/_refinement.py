@@ -17,13 +17,13 @@ from thesisrecon.arrays import F64
 from thesisrecon.numerics.noise import soft_l1
 from thesisrecon.selfcalibration._frame import ReferenceFrame
 
-_UPPER = np.triu_indices(3)
-_ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
+UPPER = np.triu_indices(3)
+ENTRY_WEIGHT = np.where(UPPER[0] == UPPER[1], 1.0, np.sqrt(2.0))
 
 
-def weighted_entries(M: F64) -> F64:
+def _weighted_entries(M: F64) -> F64:
     """Return the upper triangles (..., 6) of symmetric matrices, whose norm is the Frobenius norm."""
-    return np.asarray(M[..., _UPPER[0], _UPPER[1]] * _ENTRY_WEIGHT, dtype=np.float64)
+    return np.asarray(M[..., UPPER[0], UPPER[1]] * ENTRY_WEIGHT, dtype=np.float64)
 
 
 def quadratic_rows(x: F64, y: F64) -> F64:
@@ -40,7 +40,7 @@ def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -
     """
     C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
     difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
-    return weighted_entries(difference)
+    return _weighted_entries(difference)
 
 
 def _unit(conic: F64) -> F64:
@@ -77,7 +77,7 @@ class RotationCriterion:
         CC = C @ C.swapaxes(-1, -2)
         trace = np.trace(CC, axis1=-2, axis2=-1)[..., None, None]
         E = 3.0 * CC / np.maximum(trace, 1e-300) - np.eye(3)
-        return weighted_entries(E)
+        return _weighted_entries(E)
 
     def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
         """Return the robust cost (B,) per camera of planes (B, 3) with log focal lengths (B, G)."""
@@ -92,17 +92,17 @@ class RotationCriterion:
         scale = np.where(known, frame.focal_std, 1.0)
         return np.where(known, self.noise * (log_f - np.where(known, frame.focal_mean, 0.0)) / scale, weak)
 
-    def _weighted_residuals(self, frame: ReferenceFrame, theta: F64, weights: F64) -> F64:
-        """Return residuals (B, 6 R + G) of cameras and focal priors with fixed robust weights (B, R)."""
-        residuals = self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) * weights[..., None]
-        return np.concatenate(
-            [residuals.reshape(len(theta), -1), self._focal_prior_residuals(frame, theta[:, 3:])], axis=1
-        )
-
-    def _weights(self, frame: ReferenceFrame, theta: F64) -> F64:
-        """Return the square roots (B, R) of the soft-L1 weights of the cameras."""
+    def _linearized(self, frame: ReferenceFrame, theta: F64) -> tuple[F64, F64]:
+        """Return residuals (B, 6 R + G) of cameras and focal priors, soft-L1 weighted, and derivatives."""
         norm2 = np.sum(self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) ** 2, axis=-1)
-        return np.asarray((1.0 + norm2 / self.scale**2) ** -0.25, dtype=np.float64)
+        root_weights = (1.0 + norm2 / self.scale**2) ** -0.25
+
+        def residuals(x: F64) -> F64:
+            cameras = self.camera_residuals(frame, x[:, :3], x[:, 3:]) * root_weights[..., None]
+            priors = self._focal_prior_residuals(frame, x[:, 3:])
+            return np.concatenate([cameras.reshape(len(x), -1), priors], axis=1)
+
+        return residuals(theta), numerical_jacobian(residuals, theta)
 
 
 class _Schedule(NamedTuple):
@@ -116,13 +116,9 @@ class _Schedule(NamedTuple):
 
 
 def _descend(
-    normal_equations: Callable[[F64], tuple[F64, F64]],
-    cost_of: Callable[[F64], F64],
-    project: Callable[[F64], F64],
-    x: F64,
-    iterations: int,
-    schedule: _Schedule,
-) -> tuple[F64, F64]:
+    normal_equations: Callable[[F64], tuple[F64, F64]], cost_of: Callable[[F64], F64],
+    project: Callable[[F64], F64], x: F64, iterations: int, schedule: _Schedule,
+) -> tuple[F64, F64]:  # fmt: skip
     """Run Levenberg-Marquardt on all rows of x (B, D) until every row has finished; return x and costs (B,).
 
     ``normal_equations`` returns J'J (B, D, D) and the gradient (B, D); ``project`` moves a trial into bounds.
@@ -163,9 +159,7 @@ def refine_hypotheses(
     """Refine hypotheses (p, log f) (B, 3 + G) at once; return them with their costs (B,)."""
 
     def normal_equations(x: F64) -> tuple[F64, F64]:
-        weights = criterion._weights(frame, x)
-        r = criterion._weighted_residuals(frame, x, weights)
-        J = numerical_jacobian(lambda t: criterion._weighted_residuals(frame, t, weights), x)
+        r, J = criterion._linearized(frame, x)
         if planes_only:
             J[:, :, 3:] = 0.0
         return np.einsum("bri,brj->bij", J, J), np.einsum("bri,br->bi", J, r)
@@ -174,10 +168,8 @@ def refine_hypotheses(
         normal_equations,
         lambda x: criterion.cost(frame, x[:, :3], x[:, 3:]),
         lambda x: np.concatenate([x[:, :3], np.clip(x[:, 3:], -4.0, 5.4)], axis=1),
-        theta,
-        25,
-        _Schedule(1e-3, 5.0, 1e8, 1e-10, skip_nonfinite=False),
-    )
+        theta, 25, _Schedule(1e-3, 5.0, 1e8, 1e-10, skip_nonfinite=False),
+    )  # fmt: skip
 
 
 def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> F64:
@@ -186,10 +178,7 @@ def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -
     From (J'J)^-1 with the noise of the residuals (five independent entries per camera, minus the unknowns);
     inf if J'J is singular to rounding.
     """
-    row = theta[None]
-    weights = criterion._weights(frame, row)
-    r = criterion._weighted_residuals(frame, row, weights)[0]
-    J = numerical_jacobian(lambda t: criterion._weighted_residuals(frame, t, weights), row)[0]
+    r, J = (part[0] for part in criterion._linearized(frame, theta[None]))
     dof = max(5 * len(frame.views) - len(theta), 1)
     noise = float(np.sqrt(np.sum(r**2) / dof))
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)

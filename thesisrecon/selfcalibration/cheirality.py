@@ -1,8 +1,4 @@
-"""Hartley's search for the plane at infinity within the cheirality bounds (HZ 21).
-
-R. Hartley, "Chirality", IJCV 26(1), 1998; R. Hartley, E. Hayman, L. de Agapito, I. Reid, "Camera calibration
-and the search for infinity", ICCV 1999.
-"""
+"""Hartley's search for the plane at infinity within the cheirality bounds (HZ 21; IJCV 26(1), 1998)."""
 
 from __future__ import annotations
 
@@ -19,15 +15,15 @@ from thesisrecon.selfcalibration._frame import (
     PlaneCandidates,
     ProjectiveScene,
     ReferenceFrame,
-    square_pixel_constraints,
+    infinite_homographies,
 )
+from thesisrecon.selfcalibration._image_conic import solve_conic_batch
 from thesisrecon.selfcalibration._refinement import minimize_batch
-from thesisrecon.selfcalibration.absolute_conic import ConicBatch, infinite_homographies, solve_conic_batch
 
 
 @dataclass(frozen=True)
 class CheiralitySearch:
-    """Grid search for the plane at infinity within the cheirality bounds (Hartley et al., ICCV 1999; HZ 21).
+    """Grid search for the plane at infinity (R. Hartley, E. Hayman, L. de Agapito, I. Reid, ICCV 1999).
 
     Each plane of the grid gives infinite homographies and, linearly, the image of the absolute conic; planes
     whose equations have exactly one solution are the candidates.
@@ -54,22 +50,15 @@ class CheiralitySearch:
 
         Parameters
         ----------
-        scene : ProjectiveScene
-            Cameras, points and prior.
-        rng : numpy.random.Generator
-            Selects the points.
+        scene, rng : ProjectiveScene, numpy.random.Generator
+            Cameras, points and prior; selects the points.
 
         Returns
         -------
         PlaneCandidates
-            The planes.
-
-        Raises
-        ------
-        StageFailure
-            If no plane within the bounds gives a real image of the absolute conic.
+            The planes. ``StageFailure`` if none within the bounds gives a real image of the absolute conic.
         """
-        planes, _ = self.search(scene.frame, scene.reconstruction, rng, scene.constraints)
+        planes, _ = self.search(scene.frame, scene.reconstruction, scene.constraints, rng)
         if not len(planes):
             raise StageFailure(
                 "the cheirality search found no plane at infinity",
@@ -79,30 +68,23 @@ class CheiralitySearch:
         return PlaneCandidates(planes)
 
     def search(
-        self,
-        frame: ReferenceFrame,
-        reconstruction: Reconstruction,
+        self, frame: ReferenceFrame, reconstruction: Reconstruction, constraints: ConicConstraints,
         rng: np.random.Generator,
-        constraints: ConicConstraints | None = None,
-    ) -> tuple[F64, F64]:
+    ) -> tuple[F64, F64]:  # fmt: skip
         """Find planes and focal lengths.
 
         Parameters
         ----------
         frame, reconstruction : ReferenceFrame, Reconstruction
             Cameras, and the projective reconstruction.
-        rng : numpy.random.Generator
-            Selects the points.
-        constraints : ConicConstraints, optional
-            Prior knowledge of the cameras; by default square pixels and a central principal point.
+        constraints, rng : ConicConstraints, numpy.random.Generator
+            Prior knowledge of the cameras; selects the points.
 
         Returns
         -------
         planes, focals : ndarray (B, 3), (B,)
             Planes p, best first, possibly none, and unit-free focal lengths of the reference camera.
         """
-        if constraints is None:
-            constraints = square_pixel_constraints(frame)
         region = CheiralityRegion.of(frame, reconstruction, max_points=self.max_points, rng=rng)
         parts = [self._minima(frame, constraints, polytope) for polytope in region.polytopes]
         if not parts:
@@ -116,20 +98,24 @@ class CheiralitySearch:
     ) -> tuple[F64, F64, F64]:
         """Return planes, squared focal lengths and scores of the refined local minima of the grid."""
 
-        def scan(v: F64) -> ConicBatch:
-            found = solve_conic_batch(infinite_homographies(frame, polytope.reference_planes(v)), constraints)
-            outside = ~polytope.contains(v)
-            return ConicBatch(found.f2, np.where(outside[:, None], np.nan, found.residuals))
+        def scan(v: F64) -> tuple[F64, F64]:
+            H = infinite_homographies(frame, polytope.reference_planes(v))
+            f2, residuals = solve_conic_batch(H, constraints)
+            return f2, np.where(polytope.contains(v)[:, None], residuals, np.nan)
+
+        def score(residuals: F64) -> F64:
+            return np.asarray(np.nan_to_num(np.linalg.norm(residuals, axis=1), nan=np.inf))
 
         axes = [np.linspace(low, high, self.steps + 2)[1:-1] for low, high in polytope.box]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        best = _local_minima(scan(grid.reshape(-1, 3)).score.reshape(grid.shape[:3]))[: self.max_candidates]
+        scores = score(scan(grid.reshape(-1, 3))[1]).reshape(grid.shape[:3])
+        best = _local_minima(scores)[: self.max_candidates]
         v = grid.reshape(-1, 3)[best]
         if len(v):
             # The score is flat along valleys that are not aligned with the axes of the grid.
-            v = minimize_batch(lambda x: scan(x).residuals, v, iterations=self.refine_iterations)[0]
-        found = scan(v)
-        return polytope.reference_planes(v), found.f2, found.score
+            v = minimize_batch(lambda x: scan(x)[1], v, iterations=self.refine_iterations)[0]
+        f2, residuals = scan(v)
+        return polytope.reference_planes(v), f2, score(residuals)
 
 
 def _local_minima(score: F64) -> I64:

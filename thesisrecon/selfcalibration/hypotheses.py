@@ -1,8 +1,4 @@
-"""Chapter 7 combined: hypotheses of all methods, one refinement, cheirality.
-
-Each closed form fails on some image sets. All of them only propose hypotheses; one robust criterion over all
-cameras, cheirality and later the metric bundle adjustment decide.
-"""
+"""Chapter 7 combined: each closed form fails on some image sets, so all of them only propose hypotheses."""
 
 from __future__ import annotations
 
@@ -21,17 +17,19 @@ from thesisrecon.selfcalibration._candidates import (
     distinct_candidates,
     group_focals_from_planes,
     group_log_focals,
+    plane_from_focals,
     select_candidate,
 )
+from thesisrecon.selfcalibration._dual_quadric import minimize_quadric, quadric_hypotheses
 from thesisrecon.selfcalibration._frame import (
     ReferenceFrame,
     SolverUnknowns,
     normalized_frame,
     solver_unknowns,
+    square_pixel_constraints,
 )
 from thesisrecon.selfcalibration._refinement import RotationCriterion, refine_hypotheses
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
-from thesisrecon.selfcalibration.quadric import minimize_quadric, quadric_hypotheses
 
 # Standard deviation of principal point (long sides), aspect or skew beyond which estimating focal lengths
 # alone is insufficient.
@@ -120,7 +118,7 @@ class HypothesesAndRefinement:
             f1, f2 = _focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
             found.append((plane_from_focals(frame, int(other), f1, f2), np.concatenate([f1, f1])))
         if self.search is not None:
-            found.append(self.search.search(frame, reconstruction, rng))
+            found.append(self.search.search(frame, reconstruction, square_pixel_constraints(frame), rng))
         p = np.concatenate([part[0] for part in found])
         f = np.concatenate([part[1] for part in found])
         good = np.isfinite(p).all(axis=1) & np.isfinite(f)
@@ -133,54 +131,3 @@ def _focal_pairs(focals: F64, same_camera: bool) -> tuple[F64, F64]:
         return focals, focals
     first, second = np.meshgrid(focals[::2], focals[::2])
     return first.ravel(), second.ravel()
-
-
-def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
-    """Compute planes at infinity from the focal lengths of the reference and another camera.
-
-    Parameters
-    ----------
-    frame, other : ReferenceFrame, int
-        Cameras, and the place of the other one.
-    f_reference, f_other : ndarray (B,)
-        Unit-free focal lengths.
-
-    Returns
-    -------
-    ndarray (2 B, 3)
-        Planes for both signs of the other camera, since a projective camera has none.
-
-    References
-    ----------
-    R. Gherardi, A. Fusiello, "Practical autocalibration", ECCV 2010.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.selfcalibration._frame import example_frame
-    >>> frame, p = example_frame(f=1.2)
-    >>> planes = plane_from_focals(frame, 1, np.array([1.2]), np.array([1.2]))
-    >>> bool(np.abs(planes - p).max(axis=1).min() < 1e-9)
-    True
-    """
-    K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
-    K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
-    t = frame.a[other] / K2
-    rotation = _rotation_to_first_axis(t)
-    W = rotation @ ((frame.A[other][None] / K2[:, :, None]) * K1[:, None, :])
-    planes = []
-    for sign in (1.0, -1.0):
-        w1, w2, w3 = sign * W[:, 0], sign * W[:, 1], sign * W[:, 2]
-        length = np.maximum(np.linalg.norm(w3, axis=1, keepdims=True), 1e-300)
-        baseline = sign * np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
-        planes.append(-(np.cross(w2, w3) / length - w1) / baseline / K1)
-    return np.concatenate(planes)
-
-
-def _rotation_to_first_axis(t: F64) -> F64:
-    """Return rotations R (B, 3, 3) with R t = (|t|, 0, 0)."""
-    first = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
-    helper = np.eye(3)[np.abs(first).argmin(axis=1)]
-    second = np.cross(first, helper)
-    second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-300)
-    return np.stack([first, second, np.cross(first, second)], axis=1)

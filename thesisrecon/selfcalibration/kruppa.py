@@ -27,6 +27,7 @@ from thesisrecon.selfcalibration._candidates import (
     Candidate,
     as_stage_failure,
     group_log_focals,
+    plane_from_focals,
     select_candidate,
     square_pixel_calibrations,
 )
@@ -37,7 +38,6 @@ from thesisrecon.selfcalibration._frame import (
     solver_unknowns,
 )
 from thesisrecon.selfcalibration._refinement import RotationCriterion, central_differences, refine_hypotheses
-from thesisrecon.selfcalibration.hypotheses import plane_from_focals
 
 _ROOT2 = np.sqrt(2.0)
 # Number of planes to refine for each calibration.
@@ -73,30 +73,10 @@ def _overlapping_pairs(frame: ReferenceFrame, reconstruction: Reconstruction, mi
     return _Pairs(i, j, np.array(found).reshape(-1, 3, 3))
 
 
-def kruppa_residuals(F: F64, dual_i: F64, dual_j: F64) -> F64:
-    """Compute the residuals of the Kruppa equations for all pairs.
+def _kruppa_residuals(F: F64, dual_i: F64, dual_j: F64) -> F64:
+    """Return cross products (B, M, 3) of the unit triples, for F (M, 3, 3) and dual conics (B, M, 3, 3).
 
-    Parameters
-    ----------
-    F : ndarray (M, 3, 3)
-        Fundamental matrices of any norm.
-    dual_i, dual_j : ndarray (B, M, 3, 3)
-        Dual images K K' of the absolute conic in the first and second camera of each pair.
-
-    Returns
-    -------
-    ndarray (B, M, 3)
-        Cross products of the two unit triples (sine of their angle); at most two entries are independent.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.geometry.homogeneous import cross_matrix
-    >>> K, R, t = np.diag([2.0, 2.0, 1.0]), np.diag([1.0, -1.0, -1.0]), np.array([1.0, 2.0, 3.0])
-    >>> F = np.linalg.inv(K).T @ cross_matrix(t) @ R @ np.linalg.inv(K)
-    >>> w = (K @ K.T)[None, None]
-    >>> bool(np.abs(kruppa_residuals(F[None], w, w)).max() < 1e-12)
-    True
+    At most two entries are independent.
     """
     U, s, Vt = np.linalg.svd(F)
     left = s[:, :2, None] * Vt[:, :2]
@@ -115,7 +95,7 @@ def _direction(rows: F64, dual: F64) -> F64:
 def _pair_residuals(pairs: _Pairs, K: F64) -> F64:
     """Return the residuals (B, M, 3) of all pairs for calibrations K (B, R, 3, 3)."""
     w = K @ K.swapaxes(-1, -2)
-    return kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])
+    return _kruppa_residuals(pairs.F, w[:, pairs.i], w[:, pairs.j])
 
 
 def _kruppa_cost(pairs: _Pairs, K: F64, *, loss_scale: float) -> F64:
@@ -172,12 +152,8 @@ class KruppaEquations:
 
     @as_stage_failure
     def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
-    ) -> SelfCalibration:
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator  # noqa: ARG002
+    ) -> SelfCalibration:  # fmt: skip
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = normalized_frame(reconstruction, prior)
         pairs = _overlapping_pairs(frame, reconstruction, self.min_common_points)

@@ -21,23 +21,11 @@ from thesisrecon.selfcalibration._refinement import minimize_batch
 _SLACK = _LOSS_SCALE = 0.05
 
 
-def modulus_coefficients(A: F64, a: F64, pairs: I64) -> F64:
-    """Compute the affine coefficients of l0 ... l3 for pairs of cameras.
+def _modulus_coefficients(A: F64, a: F64, pairs: I64) -> F64:
+    """Return c (M, 4, 4) with l_k(p) = c[k, :3] . p + c[k, 3] for pairs (M, 2) of cameras [A | a].
 
     From det(lambda X - Y) = lambda^3 det X - lambda^2 tr(adj(X) Y) + lambda tr(X adj(Y)) - det Y, X = A_i -
     a_i p', Y = A_j - a_j p'; affine, since p changes both by matrices of rank 1.
-
-    Parameters
-    ----------
-    A, a : ndarray (R, 3, 3), (R, 3)
-        Cameras [A | a].
-    pairs : ndarray (M, 2) of int
-        Pairs of cameras.
-
-    Returns
-    -------
-    ndarray (M, 4, 4)
-        c with l_k(p) = c[k, :3] . p + c[k, 3].
     """
     probes = np.concatenate([np.eye(3), np.zeros((1, 3))])
     H = A[None] - a[None, :, :, None] * probes[:, None, None, :]
@@ -52,52 +40,13 @@ def _adjugate(M: F64) -> F64:
     return np.stack(rows, axis=-2)
 
 
-def modulus_quartic(coefficients: F64, planes: F64) -> F64:
-    """Evaluate the published constraint l3 l1^3 - l2^3 l0, divided by the size of its terms.
+def _modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
+    """Return residuals -l2 / (l3 c) - l1 / (l3 c^2) (B, M) of planes (B, 3), and the mean of both terms.
 
-    Parameters
-    ----------
-    coefficients, planes : ndarray (M, 4, 4), (B, 3)
-        Result of :func:`modulus_coefficients`, and planes p.
-
-    Returns
-    -------
-    ndarray (B, M)
-        Residuals in [-1, 1].
+    The mean is 1 + 2 cos(angle) at a solution, so at most 3 in size.
     """
-    l0, l1, l2, l3 = np.moveaxis(_values(coefficients, planes), -1, 0)
-    left, right = l3 * l1**3, l2**3 * l0
-    return np.asarray((left - right) / np.maximum(np.abs(left) + np.abs(right), 1e-300))
-
-
-def _values(coefficients: F64, planes: F64) -> F64:
-    return np.asarray(np.einsum("mkc,bc->bmk", coefficients[..., :3], planes) + coefficients[..., 3])
-
-
-def modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
-    """Evaluate the constraint in the form -l2 / (l3 c) = l1 / (l3 c^2).
-
-    Parameters
-    ----------
-    coefficients, planes : ndarray (M, 4, 4), (B, 3)
-        Result of :func:`modulus_coefficients`, and planes p.
-
-    Returns
-    -------
-    residuals, trace : ndarray (B, M)
-        Difference of the two sides, and their mean: 1 + 2 cos(angle) at a solution, so at most 3 in size.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.selfcalibration._frame import example_frame
-    >>> frame, p = example_frame(n=3)
-    >>> coefficients = modulus_coefficients(frame.A, frame.a, np.array([[0, 1], [0, 2], [1, 2]]))
-    >>> residuals, trace = modulus_residuals(coefficients, p[None])
-    >>> bool(np.abs(residuals).max() < 1e-9 and (np.abs(trace) <= 3).all())
-    True
-    """
-    l0, l1, l2, l3 = np.moveaxis(_values(coefficients, planes), -1, 0)
+    values = np.einsum("mkc,bc->bmk", coefficients[..., :3], planes) + coefficients[..., 3]
+    l0, l1, l2, l3 = np.moveaxis(values, -1, 0)
     l3 = np.where(np.abs(l3) < 1e-12, 1e-12, l3)
     cube = -l0 / l3
     c = np.cbrt(np.where(np.abs(cube) < 1e-9, 1e-9, cube))
@@ -131,20 +80,13 @@ class ModulusConstraint:
 
         Parameters
         ----------
-        scene : ProjectiveScene
-            Cameras, points and prior.
-        rng : numpy.random.Generator
-            Draws the starts.
+        scene, rng : ProjectiveScene, numpy.random.Generator
+            Cameras, points and prior; draws the starts.
 
         Returns
         -------
         PlaneCandidates
-            The planes.
-
-        Raises
-        ------
-        StageFailure
-            Below three views of one constant K, or if no solution keeps the scene on one side.
+            The planes. ``StageFailure`` below three views of one K, or if none keeps the scene on one side.
         """
         frame = scene.frame
         pairs = _pairs_of_constant_cameras(scene.constraints.first)
@@ -156,11 +98,11 @@ class ModulusConstraint:
             )
         region = CheiralityRegion.of(frame, scene.reconstruction, max_points=self.max_points, rng=rng)
         starts = region.sample(self.starts, rng)
-        coefficients = modulus_coefficients(frame.A, frame.a, pairs)
+        coefficients = _modulus_coefficients(frame.A, frame.a, pairs)
         planes, cost = minimize_batch(
-            lambda p: modulus_residuals(coefficients, p)[0], starts, iterations=60, loss_scale=_LOSS_SCALE
+            lambda p: _modulus_residuals(coefficients, p)[0], starts, iterations=60, loss_scale=_LOSS_SCALE
         )
-        is_rotation = np.abs(modulus_residuals(coefficients, planes)[1]) <= 3.0 + _SLACK
+        is_rotation = np.abs(_modulus_residuals(coefficients, planes)[1]) <= 3.0 + _SLACK
         fit = np.isfinite(cost) & (is_rotation.mean(axis=1) >= 0.9)
         fit[fit] = region.wrong_side_ratio(planes[fit]) <= self.max_wrong_side_ratio
         planes, cost = planes[fit], cost[fit]

@@ -1,14 +1,12 @@
 """Plane at infinity from parallel lines, given or detected in the images (chapter 7, stratified).
 
-Three vanishing points that are not collinear span the plane. Each image proposes vanishing points (pairs of
-segments, consensus of all). Proposals of two images triangulate to a point of projective space; its support
-are the segments of all images that point to it. Orthogonal directions constrain K: v_a' w v_b = 0 (HZ 8.6).
+Vanishing points of two images triangulate to a point of projective space; its support are the segments of all
+images that point to it. Three such points span the plane.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
@@ -24,9 +22,7 @@ from thesisrecon.selfcalibration._refinement import minimize_batch
 
 # Segments within this many tolerances of a direction are not offered to another one.
 _NEAR_TOLERANCES = 4.0
-
 _AMBIGUOUS = -2
-
 _FIRST_NOISE_PX, _MIN_NOISE_PX = 0.5, 1e-3
 _MIN_SEGMENTS = 6
 _MIN_SPREAD = 1e-3
@@ -76,10 +72,7 @@ def _support(segments: _SegmentSet, v: F64, tolerance_px: float) -> F64:
 def _propose_vanishing_points(
     segments: _SegmentSet, *, max_points: int, samples: int, tolerance_px: float, rng: np.random.Generator
 ) -> F64:
-    """Return homogeneous vanishing points (K, 3) of one image by consensus, best supported first.
-
-    The segments of a point are removed before the next.
-    """
+    """Return homogeneous vanishing points (K, 3) of one image, each from the segments left by the others."""
     found: list[F64] = []
     left = segments
     while len(found) < max_points and len(left.half) >= 5:
@@ -96,17 +89,13 @@ def _propose_vanishing_points(
         mine = _support(left, best[None], tolerance_px) > 0
         if mine.sum() < 4:
             break
-        best = _nearest_to_lines(lines[mine], left.half[mine])
+        unit = lines[mine] / np.linalg.norm(lines[mine], axis=1, keepdims=True)
+        best = np.linalg.svd(unit * left.half[mine][:, None], full_matrices=False)[2][2]
         found.append(best)
         left = left.subset(
             ~mine & (np.abs(left.endpoint_distances_px(best[None])) > _NEAR_TOLERANCES * tolerance_px)
         )
     return np.array(found).reshape(-1, 3)
-
-
-def _nearest_to_lines(lines: F64, weight: F64) -> F64:
-    scaled = lines / np.linalg.norm(lines, axis=1, keepdims=True) * weight[:, None]
-    return np.asarray(np.linalg.svd(scaled, full_matrices=False)[2][2])
 
 
 def _triangulate_directions(P: F64, v: F64) -> F64:
@@ -120,13 +109,9 @@ def _triangulate_directions(P: F64, v: F64) -> F64:
 
 
 def _find_parallel_directions(
-    frame: ReferenceFrame,
-    segments: _SegmentSet,
-    proposals: list[F64],
-    *,
-    max_directions: int,
-    tolerance_px: float,
-) -> tuple[F64, I64]:
+    frame: ReferenceFrame, segments: _SegmentSet, proposals: list[F64], *,
+    max_directions: int, tolerance_px: float,
+) -> tuple[F64, I64]:  # fmt: skip
     """Match vanishing points over all images; return points at infinity (D, 4), directions of segments (S,).
 
     Best supported first, -1 for no direction. Each has support in three cameras, since the third confirms the
@@ -157,18 +142,14 @@ def _find_parallel_directions(
 
 def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
     """Return points (B, 4) of all pairs of vanishing points that nearly lie on each other's epipolar line."""
-    i, j, v1, v2 = [], [], [], []
-    for a, b in combinations(range(len(P)), 2):
-        first, second = np.indices((len(proposals[a]), len(proposals[b]))).reshape(2, -1)
-        i.append(np.full(len(first), a))
-        j.append(np.full(len(first), b))
-        v1.append(proposals[a][first])
-        v2.append(proposals[b][second])
-    pair = np.column_stack([np.concatenate(i), np.concatenate(j)])
-    v = np.stack([np.concatenate(v1), np.concatenate(v2)], axis=1)
+    view = np.repeat(np.arange(len(P)), [len(points) for points in proposals])
+    i, j = np.nonzero(view[:, None] < view)
+    pair = np.column_stack([i, j])[np.lexsort((j, i, view[j], view[i]))]
+    v = np.concatenate(proposals)[pair]
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
-    X = _triangulate_directions(P[pair], v)
-    seen = np.einsum("bnij,bj->bni", P[pair], X)
+    cameras = P[view[pair]]
+    X = _triangulate_directions(cameras, v)
+    seen = np.einsum("bnij,bj->bni", cameras, X)
     sine = np.linalg.norm(np.cross(seen, v), axis=-1) / np.maximum(np.linalg.norm(seen, axis=-1), 1e-300)
     return np.asarray(X[sine.max(axis=1) < 0.1])
 
@@ -268,7 +249,7 @@ class ParallelLines:
     detector : LineSegments
         Segment detector.
     orthogonal_directions : bool
-        The three best supported (of given points: first) directions are orthogonal, which constrains K.
+        The three best supported (of given points: first) directions are orthogonal: v_a' w v_b = 0 (HZ 8.6).
     vanishing_points_per_image, max_directions : int
         Maximum numbers of proposals per image and of directions.
     samples : int
@@ -292,42 +273,18 @@ class ParallelLines:
     max_wrong_side_ratio: float = 0.02
     max_candidates: int = 5
 
-    def with_images(self, images: Iterable[Image]) -> ParallelLines:
-        """Return the same method with images.
-
-        Parameters
-        ----------
-        images : iterable of Image
-            One image per view.
-
-        Returns
-        -------
-        ParallelLines
-            Method with images.
-        """
-        return replace(self, images=tuple(images))
-
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """Find candidate planes at infinity, best supported first: one from given points, or several.
 
         Parameters
         ----------
-        scene : ProjectiveScene
-            Cameras, points and prior.
-        rng : numpy.random.Generator
-            Draws pairs of segments.
+        scene, rng : ProjectiveScene, numpy.random.Generator
+            Cameras, points and prior; draws pairs of segments.
 
         Returns
         -------
         PlaneCandidates
-            The planes.
-
-        Raises
-        ------
-        StageFailure
-            If fewer than three directions are found, or no plane keeps the scene on one side.
-        ValueError
-            If neither points nor images were given.
+            The planes. ``StageFailure`` without three directions, or if no plane keeps the scene on one side.
         """
         if self.points is not None:
             X = _points_at_infinity(scene.frame, self.points)

@@ -1,9 +1,4 @@
-"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3).
-
-Linear: M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002. A camera with square pixels, no skew and a central
-principal point gives six equations linear in the quadric, whose weights assume a focal length near 1.
-Nonlinear: M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999, over the plane and all unknown intrinsics.
-"""
+"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3)."""
 
 from __future__ import annotations
 
@@ -11,132 +6,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thesisrecon.arrays import F64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics.noise import huber
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
-    FOCAL_LIMITS,
-    Candidate,
     as_stage_failure,
     candidates_from_parameters,
     group_focals_from_planes,
     select_candidate,
 )
-from thesisrecon.selfcalibration._frame import (
-    ReferenceFrame,
-    SolverUnknowns,
-    normalized_frame,
-    solver_unknowns,
-)
-from thesisrecon.selfcalibration._refinement import (
-    RotationCriterion,
-    central_differences,
-    dual_image_residuals,
-    quadratic_rows,
-)
-
-_MIN_NOISE = 1e-9
-_REWEIGHTINGS = 4
-# Maximum number of noise estimates.
-_NOISE_PASSES = 6
-
-
-def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
-    """Solve the weighted linear equations of the absolute dual quadric.
-
-    Uncertainties: 9 (focal length), 0.2 (aspect), 0.01 (skew), 0.1 (principal point); rows are divided by w33
-    of the previous iterate, first by the norm of its row (the 1 of the paper depends on the camera scale).
-
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    focals : ndarray (B,)
-        Normalizing focal lengths.
-
-    Returns
-    -------
-    ndarray (B, 4, 4)
-        Quadrics of unit norm in the reference frame, of rank 4 under noise (see :func:`rank_three`).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.selfcalibration._frame import example_frame
-    >>> frame, p = example_frame(f=1.2)
-    >>> Q = linear_quadric(frame, np.array([1.2]))[0]
-    >>> bool(np.abs(Q @ np.append(p, 1.0)).max() < 1e-9)
-    True
-    """
-    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
-    P[:, :, :2] /= focals[:, None, None, None]
-    p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
-    w11, w22, w33 = (quadratic_rows(p, p) for p in (p1, p2, p3))
-    rows = np.stack(
-        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, quadratic_rows(p1, p2) / 0.01,
-         quadratic_rows(p1, p3) / 0.1, quadratic_rows(p2, p3) / 0.1], axis=2,
-    )  # fmt: skip
-    nu = np.linalg.norm(w33, axis=-1)
-    q = np.zeros((len(focals), 10))
-    for _ in range(_REWEIGHTINGS):
-        weighted = rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]
-        A = weighted.reshape(len(focals), -1, 10)
-        # SVD of A, since A'A would lose half the digits.
-        q = np.linalg.svd(A, full_matrices=A.shape[1] < 10)[2][:, 9]
-        nu = np.abs(np.einsum("bvk,bk->bv", w33, q))
-    upper, Q = np.triu_indices(4), np.zeros((len(q), 4, 4))
-    Q[:, upper[0], upper[1]] = Q[:, upper[1], upper[0]] = q
-    Q *= np.where(np.trace(Q[:, :3, :3], axis1=1, axis2=2) < 0, -1.0, 1.0)[:, None, None]
-    return Q
-
-
-def rank_three(Q: F64) -> tuple[F64, F64]:
-    """Set the eigenvalue of smallest magnitude to 0.
-
-    Parameters
-    ----------
-    Q : ndarray (B, 4, 4)
-        Symmetric matrices.
-
-    Returns
-    -------
-    Q, null : ndarray (B, 4, 4), (B, 4)
-        Nearest quadrics of rank 3, and their null vectors, the planes at infinity.
-    """
-    value, vector = np.linalg.eigh(Q)
-    smallest = np.abs(value).argmin(axis=1)
-    null = np.take_along_axis(vector, smallest[:, None, None], axis=2)[:, :, 0]
-    np.put_along_axis(value, smallest[:, None], 0.0, axis=1)
-    return np.asarray((vector * value[:, None, :]) @ vector.swapaxes(1, 2)), null
-
-
-def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
-    """Propose planes at infinity and reference focal lengths from linear quadrics.
-
-    Parameters
-    ----------
-    frame : ReferenceFrame
-        Cameras.
-    focals : ndarray (B,)
-        Normalizing focal lengths.
-
-    Returns
-    -------
-    p, f : ndarray (B', 3), (B',)
-        Finite planes, and focal lengths of the reference camera; the normalizing one if w* is not positive.
-    """
-    try:
-        Q, null = rank_three(linear_quadric(frame, focals))
-    except np.linalg.LinAlgError:
-        return np.zeros((0, 3)), np.zeros(0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        p = null[:, :3] / null[:, 3:]
-        f2 = (Q[:, 0, 0] + Q[:, 1, 1]) / (2.0 * Q[:, 2, 2])
-    f = np.sqrt(np.where(np.isfinite(f2) & (f2 > 0), f2, focals**2))
-    good = np.isfinite(p).all(axis=1)
-    return p[good], np.clip(f[good], *FOCAL_LIMITS)
+from thesisrecon.selfcalibration._dual_quadric import minimize_quadric, quadric_hypotheses
+from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
+from thesisrecon.selfcalibration._refinement import RotationCriterion
 
 
 @dataclass(frozen=True)
@@ -159,92 +39,20 @@ class LinearQuadric:
 
     @as_stage_failure
     def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
-    ) -> SelfCalibration:
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator  # noqa: ARG002
+    ) -> SelfCalibration:  # fmt: skip
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = normalized_frame(reconstruction, prior)
         p, f = quadric_hypotheses(frame, np.array([self.normalising_focal]))
         log_f = group_focals_from_planes(frame, p, f)
         cost = self.criterion.cost(frame, p, log_f)
-        candidates = candidates_from_parameters(
-            frame, np.concatenate([p, log_f], axis=1), cost, "linear quadric"
-        )
+        theta = np.concatenate([p, log_f], axis=1)
+        candidates = candidates_from_parameters(frame, theta, cost, "linear quadric")
         found = select_candidate(frame, reconstruction, self.criterion, candidates)
         # The error is a bias, not noise: it has no standard deviation.
         K_std = found.K_std.copy()
         K_std[frame.views[:, None], (0, 1), (0, 1)] = np.nan
         return replace(found, K_std=K_std)
-
-
-def minimize_quadric(
-    frame: ReferenceFrame,
-    unknown: SolverUnknowns,
-    plane: F64,
-    log_f: F64,
-    *,
-    method: str,
-    loss_scale: float = 0.05,
-) -> Candidate:
-    """Minimize the nonlinear quadric criterion from one starting point.
-
-    The priors are weighed against the noise of the residuals: the first pass assumes 1 %, each further one
-    uses the previous estimate until it no longer falls.
-
-    Parameters
-    ----------
-    frame, unknown : ReferenceFrame, SolverUnknowns
-        Cameras and their unknown intrinsics.
-    plane, log_f : ndarray (3,), (R,)
-        Starting plane at infinity and log focal lengths.
-    method : str
-        Name of the method in the result.
-    loss_scale : float
-        Residual beyond which Huber's loss is linear: bad cameras do not bias the rest.
-
-    Returns
-    -------
-    Candidate
-        The nearest minimum with its standard deviations.
-    """
-    # Both sides also agree as all focal lengths go to 0: the weak prior makes that cost more than noise.
-    unknown = unknown.with_focal_prior()
-    theta, noise = np.concatenate([plane, unknown.from_log_focals(log_f[None])[0]]), 0.01
-    for _ in range(_NOISE_PASSES):
-        supposed = noise
-        theta, noise, covariance, cost = _minimize(frame, unknown, theta, noise, loss_scale)
-        if noise > 0.7 * supposed:
-            break
-    K = unknown.calibrations(theta[None, 3:])[0]
-    K_std = unknown.calibration_std(theta[3:], covariance[3:, 3:])
-    return Candidate(theta[:3], K, cost, method, K_std)
-
-
-def _minimize(
-    frame: ReferenceFrame, unknown: SolverUnknowns, theta: F64, noise: float, loss_scale: float
-) -> tuple[F64, float, F64, float]:
-    def residuals(batch: F64) -> F64:
-        K = unknown.calibrations(batch[:, 3:])
-        data = dual_image_residuals(frame.A, frame.a, K, K[:, frame.reference], batch[:, :3])
-        return np.concatenate(
-            [data.reshape(len(batch), -1), noise * unknown.prior_residuals(batch[:, 3:])], axis=1
-        )
-
-    found = minimize_residuals(
-        lambda x: residuals(x[None])[0], theta,
-        jacobian=lambda x: central_differences(residuals, x, 1e-6 * (1.0 + np.abs(x))),
-        loss=lambda s: huber(s, loss_scale), max_iterations=100, tolerance=1e-14,
-    )  # fmt: skip
-    data = found.residual[: 6 * len(frame.views)]
-    # Five independent entries per camera except the reference, whose residuals vanish.
-    free = np.isinf(unknown.std).sum() + 3
-    dof = max(5 * (len(frame.views) - 1) - int(free), 1)
-    noise = max(float(np.sqrt(np.sum(data**2) / dof)), _MIN_NOISE)
-    scale = noise**2 * max(len(found.residual) - len(theta), 1) / max(2.0 * found.cost, 1e-300)
-    return found.x, noise, found.covariance * scale, float(np.sum(data**2) / len(frame.views))
 
 
 @dataclass(frozen=True)
@@ -271,12 +79,8 @@ class NonlinearQuadric:
 
     @as_stage_failure
     def calibrate(
-        self,
-        reconstruction: Reconstruction,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,  # noqa: ARG002 - one signature for all methods
-    ) -> SelfCalibration:
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator  # noqa: ARG002
+    ) -> SelfCalibration:  # fmt: skip
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = normalized_frame(reconstruction, prior)
         unknown = solver_unknowns(frame, prior)

@@ -14,13 +14,13 @@ from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import Candidate, as_stage_failure, select_candidate
+from thesisrecon.selfcalibration._dual_quadric import minimize_quadric
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, projective_scene
 from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
-from thesisrecon.selfcalibration.quadric import minimize_quadric
 
 # Number of closed-form candidates to refine.
 _MAX_REFINED = 3
@@ -69,7 +69,7 @@ class Stratified:
         """
         if not isinstance(self.plane, ParallelLines):
             return self
-        return replace(self, plane=self.plane.with_images(images))
+        return replace(self, plane=replace(self.plane, images=tuple(images)))
 
     @as_stage_failure
     def calibrate(
@@ -192,20 +192,3 @@ def _facing(affine: Reconstruction) -> F64:
     depth = np.einsum("kj,kj->k", affine.P[view, 2], affine.X[point])
     balance = np.bincount(view, np.sign(depth), minlength=len(affine.P))
     return affine.P * np.where(balance < 0.0, -1.0, 1.0)[:, None, None]
-
-
-def affine_camera_centres(reconstruction: Reconstruction) -> F64:
-    """Return the centres of the registered cameras of an affine or metric reconstruction.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Affine or metric reconstruction.
-
-    Returns
-    -------
-    ndarray (R, 3)
-        Camera centres.
-    """
-    P = reconstruction.P[reconstruction.registered]
-    return np.asarray(-np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0])

@@ -1,9 +1,7 @@
-"""Identifiability of the calibration from the images, checked before anything depends on it.
+"""Identifiability of the calibration: the nearest critical motion, and whether the prior resolves it.
 
-Which critical motion is nearest, and is the calibration determined under the prior of the intrinsics? The
-second follows from the covariance of the focal lengths with free poses and points, because the prior may
-resolve a critical motion: a turntable leaves the scale along its axis and the aspect ratio undetermined;
-square pixels resolve both.
+The covariance of the focal lengths with free poses and points decides: a turntable leaves the scale along its
+axis and the aspect ratio undetermined; square pixels resolve both.
 """
 
 from __future__ import annotations
@@ -121,24 +119,7 @@ def check_identifiability(
 
     A metric bundle adjustment of a subset of the observations gives cameras and the covariance of their focal
     lengths under the prior; a second covariance, with free aspect ratio and principal point, shows what
-    depends on these.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    upgrade : Upgrade
-        Metric upgrade to check.
-    prior : IntrinsicsPrior
-        Prior of the intrinsics of every view.
-
-    Returns
-    -------
-    IdentifiabilityReport
-        ``evidence`` holds the measures of critical motions,
-        ``focal_long_sides`` (median), ``focal_std_rel`` (worst view), ``focal_std_rel_median``,
-        ``focal_std_rel_free`` (median, free aspect ratio and principal point), ``principal_point_std_free``
-        (long sides), ``rotation_significance``, ``excess_equations`` and ``noise_px``.
+    depends on these. ``evidence`` holds the measures of critical motions and those of :func:`_report`.
     """
     problem = _bundle_problem(reconstruction, upgrade, prior)
     if problem is None:
@@ -151,18 +132,7 @@ def check_identifiability(
 def identifiability_without_calibration(
     reconstruction: Reconstruction, prior: IntrinsicsPrior
 ) -> IdentifiabilityReport:
-    """Report the identifiability from projective cameras alone, after self-calibration failed.
-
-    Parameters
-    ----------
-    reconstruction, prior : Reconstruction, IntrinsicsPrior
-        Projective reconstruction, and the prior of the intrinsics of every view.
-
-    Returns
-    -------
-    IdentifiabilityReport
-        Not identifiable; with the nearest critical motion if there is one.
-    """
+    """Report the nearest critical motion of the projective cameras alone, after self-calibration failed."""
     frame = build_frame(reconstruction, prior)
     evidence = projective_infinity_shifts(frame.A, frame.a)
     motion, distance = nearest_critical_motion(evidence)
@@ -227,13 +197,9 @@ class _Problem:
         # Shared values take those of the first view.
         first = np.unique(shared[:, 0], return_index=True)[1][np.unique(shared[:, 0], return_inverse=True)[1]]
         intrinsics = np.column_stack([fit.cameras.intrinsics[:, 0], fit.cameras.intrinsics[first, 1:]])
-        return replace(
-            self,
-            cameras=replace(fit.cameras, shared=shared, intrinsics=intrinsics),
-            X=fit.X,
-            prior=IntrinsicsPrior.unshared(intrinsics, std),
-            sigma_px=max(fit.sigma_px, 1e-6),
-        )
+        cameras = replace(fit.cameras, shared=shared, intrinsics=intrinsics)
+        prior = IntrinsicsPrior.unshared(intrinsics, std)
+        return replace(self, cameras=cameras, X=fit.X, prior=prior, sigma_px=max(fit.sigma_px, 1e-6))
 
 
 def _bundle_problem(
@@ -264,11 +230,7 @@ def _bundle_problem(
 
 
 def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
-    """Return the noise (px) of one coordinate about the projective cameras and points.
-
-    Corrected for the 3 N + 11 V - 15 fitted parameters; the noise estimate of the projective stage has a
-    floor.
-    """
+    """Return the noise (px) of the projective cameras, corrected for the 3 N + 11 V - 15 parameters."""
     t = reconstruction.tracks
     view, point = t.view_index[index], t.point_index[index]
     x = np.einsum("kij,kj->ki", reconstruction.P[view], reconstruction.X[point])
@@ -323,6 +285,7 @@ def _metric_frame(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) 
 def _report(
     problem: _Problem, fit: MetricBundleResult, free: MetricBundleResult, excess: int
 ) -> IdentifiabilityReport:
+    """Return the report; focal lengths in long sides, ``focal_std_rel`` of the worst view, others medians."""
     cameras, views = fit.cameras, problem.views
     focal = cameras.intrinsics[cameras.group, 0]
     metric = UpgradedCameras(
@@ -362,9 +325,8 @@ def _report(
     )
     given = float(problem.prior.std[:, 0].max())
     sentences = _sentences(motion, evidence, identifiable=identifiable, focal_std=given)
-    return IdentifiabilityReport(
-        identifiable, motion, distance < 1.0, evidence, sentences, tuple(int(v) for v in undetermined)
-    )
+    views_without = tuple(int(v) for v in undetermined)
+    return IdentifiabilityReport(identifiable, motion, distance < 1.0, evidence, sentences, views_without)
 
 
 def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
@@ -401,7 +363,7 @@ def _sentences(
     sentences = []
     if evidence["excess_equations"] < 0:
         sentences.append(
-            f"too few images for the unknown intrinsics: {-evidence['_excess_equations']:.0f} equations are "
+            f"too few images for the unknown intrinsics: {-evidence['excess_equations']:.0f} equations are "
             "missing; add images, or let them share one camera"
         )
     if is_critical:
