@@ -6,8 +6,6 @@ that noise has the standard deviation of one coordinate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.random import Generator
 
@@ -197,23 +195,10 @@ def count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
     return counts
 
 
-@dataclass(frozen=True)
-class DominantPlane:
-    """The plane ``h`` (9,) that most inliers of an F lie on, and the squared distances (N,) in sigma^2."""
-
-    h: F64
-    squared: F64
-
-    @property
-    def off(self) -> B8:
-        """Points (N,) off the plane."""
-        return np.asarray(self.squared > OFF_PLANE)
-
-
 def find_dominant_plane(
     f: F64, points: F64, inliers: B8, *, sigma: float, rng: Generator
-) -> DominantPlane | None:
-    """Find the plane of F with most of its inliers; None if there is none.
+) -> tuple[F64, F64] | None:
+    """Plane h (9,) of F with most of its inliers, and squared distances (N,) in sigma^2; None without one.
 
     Least squares over the inliers within 5 sigma of the best of 100 sampled planes.
     """
@@ -232,7 +217,7 @@ def find_dominant_plane(
     refine_plane(h, some, 2.0 * GATE * sigma, SUBSET_STEPS)
     refine_plane(h, mine, GATE * sigma, ALL_STEPS)
     squared = np.asarray(_plane_distances(h, points)) / sigma**2
-    return DominantPlane(h, squared) if (squared < GATE**2).any() else None
+    return (h, squared) if (squared < GATE**2).any() else None
 
 
 def plane_covariance(h: F64, points: F64, sigma: float) -> F64:

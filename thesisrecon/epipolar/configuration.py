@@ -1,10 +1,8 @@
 """Section 5.5: which model explains a pair: general F, plane, pure rotation or pure translation.
 
-Matches of a plane or of a rotating camera are explained by a homography and leave the epipoles undetermined;
-for a camera that moves without rotation F is [e]x with two degrees of freedom instead of seven. A simpler
-model is accepted unless its residuals exceed the noise, or more of the matches that it does not explain agree
-with F than expected by chance. A homography is a pure rotation if it is K R K^-1 with square pixels (HZ 13.2,
-19.6).
+A homography explains a plane or a rotating camera, [e]x one that does not rotate. A simpler model is accepted
+unless its residuals exceed the noise, or more of the matches that it does not explain agree with F than
+expected by chance. A homography K R K^-1 with square pixels is a pure rotation (HZ 13.2, 19.6).
 """
 
 from __future__ import annotations
@@ -203,19 +201,19 @@ def _classify(case: _InlierData) -> Configuration:
     rng = np.random.default_rng(0)
     plane = find_dominant_plane(case.f, case.points, case.agree, sigma=case.sigma, rng=rng)
     if plane is not None:
-        squared = plane.squared * case.sigma**2
+        h, squared = plane[0], plane[1] * case.sigma**2
         noise = _plane_noise(squared[case.agree])
         near, far = squared < NEAR * noise**2, squared > FAR * noise**2
         errors = _excess_errors(case, near, float(squared[near].sum()))
         if errors < STANDARD_ERRORS and case.false_alarms(far, EPIPOLE) > MAX_CHANCE:
             inliers = case.points[near]
             # Least squares of all of them, for which the covariance holds.
-            refine_plane(plane.h, inliers, 1e6 * noise, 4)
-            H = plane.h.reshape(3, 3)
+            refine_plane(h, inliers, 1e6 * noise, 4)
+            H = h.reshape(3, 3)
             # Student's limit, since the noise is estimated.
             limit = float(scipy.special.stdtrit(len(inliers) - 7, 1.0 - ROTATION_RISK))
             rotation = (
-                _eigenvalue_errors(H, plane_covariance(plane.h, inliers, noise)) < limit
+                _eigenvalue_errors(H, plane_covariance(h, inliers, noise)) < limit
                 and _rotation_test(H, inliers[:, :2], inliers[:, 2:]) <= 1.0
             )
             return Configuration.ROTATION if rotation else Configuration.PLANE

@@ -1,8 +1,7 @@
 """Section 5.5: do the matches determine F, or does another F explain them as well?
 
-If most matches lie on one plane with homography H, every [e]x H explains them, and the epipole depends on the
-few matches off the plane. A wrong F then has as many inliers as the right one. Which simpler model explains
-the matches is a different question: :mod:`thesisrecon.epipolar.configuration`.
+If most matches lie on one plane with homography H, every [e]x H explains them: the epipole depends on the few
+matches off the plane, and a wrong F has as many inliers as the right one.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from numpy.random import Generator
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import chance_of_agreement, log10_false_alarms, multiplicity_weights
-from thesisrecon.epipolar._planes import DominantPlane, find_dominant_plane, fundamentals_of_plane
+from thesisrecon.epipolar._planes import OFF_PLANE, find_dominant_plane, fundamentals_of_plane
 from thesisrecon.epipolar._refinement import SAMPSON, epipolar_distance_std, refine
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.kernels import empty, kernel, zeros
@@ -142,7 +141,7 @@ class _CompetingModel:
 
 
 def _competing_starts(
-    f: F64, points: F64, weights: F64, plane: DominantPlane, *, band: float, rng: Generator
+    f: F64, points: F64, weights: F64, h: F64, off_plane: B8, *, band: float, rng: Generator
 ) -> tuple[F64, float]:
     """Other F (S, 9) of the plane, and the fraction of matches off it that an F explains by chance.
 
@@ -150,7 +149,7 @@ def _competing_starts(
     on all matches off the plane; the best distinct ones remain. In half of the pairs one match agrees with
     ``f`` and the other does not, since a wrong F often shares most of its inliers with the right one.
     """
-    off = np.flatnonzero(plane.off)
+    off = np.flatnonzero(off_plane)
     if len(off) < 3:
         return np.empty((0, 9)), 0.0
     off = off[rng.permutation(len(off))[:COMPETING_SUBSET]]
@@ -161,7 +160,7 @@ def _competing_starts(
         half = PAIRS // 2
         pairs[:half, 0] = agreeing[rng.integers(0, len(agreeing), half)]
         pairs[:half, 1] = others[rng.integers(0, len(others), half)]
-    F, agree, sums = fundamentals_of_plane(plane.h, points[off], np.stack([w, w * ~own]), pairs, WIDE * band)
+    F, agree, sums = fundamentals_of_plane(h, points[off], np.stack([w, w * ~own]), pairs, WIDE * band)
     # The two matches that define a model always agree with it.
     beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
     chosen, count = np.empty(2 * COMPETING, dtype=np.int64), 0
@@ -239,16 +238,14 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     error_px = _expected_error(fit, xy1, xy2)
     if plane is None:
         return DegeneracyReport(False, ("F has too few inliers",), expected_error_px=error_px)
+    h, off_plane = plane[0], plane[1] > OFF_PLANE
     weights, band = multiplicity_weights(xy1, xy2), band_px * frame.scale
-    of_plane, chance_of_model = _competing_starts(f, points, weights, plane, band=band, rng=rng)
+    of_plane, chance_of_model = _competing_starts(f, points, weights, h, off_plane, band=band, rng=rng)
     starts = [*of_plane, *(frame.matrix_in_frame(F) for F in fit.competing_models)]
     models = [_competing_model(start, f, points, weights, band) for start in starts]
-    on_inliers = fit.inliers & plane.off
-    agreeing, tried = float(weights[on_inliers].sum()), float(weights[plane.off].sum())
-    near = 2.0 * sigma_px * frame.scale
-    part = _contradicted_fraction(
-        points[fit.inliers], weights[fit.inliers], plane.h, on_inliers[fit.inliers], near
-    )
+    mine, near = fit.inliers, 2.0 * sigma_px * frame.scale
+    agreeing, tried = float(weights[mine & off_plane].sum()), float(weights[off_plane].sum())
+    part = _contradicted_fraction(points[mine], weights[mine], h, off_plane[mine], near)
     contradicted = agreeing * part
     chance_of_match = chance_of_agreement(xy1, xy2, band_px)
     chance = max(chance_of_model, chance_of_match)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -30,10 +30,7 @@ NEAR_SIGMAS = 2.5
 
 
 class _InlierTest(NamedTuple):
-    """Distances (N,), their ratio to the Sampson distance for images of equal weight, and the squared limit.
-
-    The limit is in variances of one coordinate.
-    """
+    """Distances (N,), their ratio to Sampson's for images of equal weight, squared limit in variances."""
 
     distances: Callable[[F64, F64, F64], F64]
     ratio: float
@@ -74,9 +71,6 @@ def _discard_outliers(
     return sigma, inliers if inliers.sum() >= MINIMUM else residuals <= limit
 
 
-_Model = TypeVar("_Model")
-
-
 @dataclass(frozen=True)
 class _SampleConsensus:
     """Algorithm 2: the model with the most data within a threshold.
@@ -94,17 +88,17 @@ class _SampleConsensus:
 
     def search(
         self,
-        solve: Callable[[I64], list[_Model]],
-        residuals: Callable[[_Model], F64],
+        solve: Callable[[I64], list[F64]],
+        residuals: Callable[[F64], F64],
         sample_size: int,
         n: int,
-        rng: np.random.Generator,
-    ) -> tuple[_Model, B8, int] | None:
+        rng: Generator,
+    ) -> tuple[F64, B8, int] | None:
         """Return the best model of n data, its inliers (n,) and the number of samples; None without a model.
 
         ``solve`` gives the models of some data by their indices, ``residuals`` the distances (n,) of a model.
         """
-        best: tuple[_Model, B8] | None = None
+        best: tuple[F64, B8] | None = None
         best_rank, drawn = (-np.inf, 0.0), 0
         sample = np.empty(sample_size, dtype=np.int64)
         while drawn < self.max_samples and best_rank[0] <= self.stop_inlier_ratio * n:

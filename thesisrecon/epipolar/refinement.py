@@ -1,8 +1,7 @@
 """Section 5.3: minimise a geometric criterion over the seven degrees of freedom of F.
 
 The criteria are the Sampson distance (5.4), which the thesis calls the gradient criterion, the distances to
-the epipolar lines (5.6) and the reprojection error. Two parameterisations: the orthonormal one, which has no
-exception, and that of the thesis, in which one row is a combination of the others.
+the epipolar lines (5.6) and the reprojection error.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Section 3.6.3: the trifocal tensor with the least reprojection error of points and lines in three views.
 
-Linear equations; the least algebraic error over both epipoles (HZ, algorithm 16.2); the least reprojection
-error over cameras, points and lines (HZ 16.4).
+Linear equations; least algebraic error (HZ, algorithm 16.2); least reprojection error (HZ 16.4).
 """
 
 from __future__ import annotations
