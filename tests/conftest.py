@@ -24,6 +24,12 @@ def address(running):
     return str(running.scheduler_address).replace("tcp://", "dask://")
 
 
+def refuses(error, words, call, *arguments, **options):
+    """Require that a call raises the error with these words."""
+    with pytest.raises(error, match=words):
+        call(*arguments, **options)
+
+
 def pytest_collection_modifyitems(items):
     """Move files with a slow test to the front."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}

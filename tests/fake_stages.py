@@ -5,6 +5,8 @@ Every call that computes something is written to ``CALLS``.
 
 # ruff: noqa: ARG002 (a fake takes what the real stage takes, and ignores most of it)
 
+import hashlib
+import json
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -204,6 +206,17 @@ def fake_config(**changes):
         selfcalibration=FakeCalibrator(), metric=FakeMetric(), dense=FakeDense(),
     )  # fmt: skip
     return replace(config, **changes)
+
+
+def read(path):
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def kept_bytes(out):
+    """Every result file of a run up to metric, and its hash."""
+    files = [*out.glob("0*/*.npz"), *(out / "sparse" / "0").iterdir()]
+    files += [out / "points.ply", out / "cameras.json"]
+    return {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
 
 
 def interrupt_at(stage, done):

@@ -1,8 +1,5 @@
-"""The composer: resuming, determinism, second attempts, and what it leaves behind, around stages that are
-fakes.
-"""
+"""The composer around fake stages: resuming, determinism, second attempts, and what it leaves behind."""
 
-import hashlib
 import json
 import struct
 from dataclasses import replace
@@ -13,7 +10,8 @@ import pytest
 import trimesh
 
 from tests import fake_stages as fakes
-from tests.fake_stages import CALLS, fake_config, interrupt_at, photographs
+from tests.conftest import refuses
+from tests.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
@@ -37,18 +35,6 @@ def run(out, n=4, **given):
     given.setdefault("threads", 2)
     given.setdefault("until", "metric")
     return reconstruct(photographs(n), out, **given)
-
-
-def read(path):
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def kept_bytes(out):
-    """Every result file of a run and its hash."""
-    files = [
-        *out.glob("0*/*.npz"), *(out / "sparse" / "0").iterdir(), out / "points.ply", out / "cameras.json",
-    ]  # fmt: skip
-    return {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
 
 
 def test_a_run_writes_all_documented_files(tmp_path):
@@ -167,8 +153,7 @@ def test_a_run_stopped_between_depth_maps_goes_on(tmp_path):
 
 def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path):
     config = fake_config(dense=fakes.FakeDense(confirmed=False))
-    with pytest.raises(StageFailure, match="no depth was found"):
-        run(tmp_path, until="model", config=config)
+    refuses(StageFailure, "no depth was found", run, tmp_path, until="model", config=config)
     assert (tmp_path / "cameras.json").exists()
     assert "no depth" in read(tmp_path / "summary.json")["failure"]
 
@@ -237,10 +222,8 @@ def test_the_folder_is_judged_before_any_photograph_is_read(tmp_path, monkeypatc
         raise AssertionError("photographs were read")
 
     monkeypatch.setattr("thesisrecon.io._images.read_images", read_nothing)
-    with pytest.raises(UsageError, match="seed was 0 and is now 1"):
-        run(tmp_path / "out", seed=1)
-    with pytest.raises(UsageError, match="cannot be written"):
-        run(tmp_path / "file" / "out")
+    refuses(UsageError, "seed was 0 and is now 1", run, tmp_path / "out", seed=1)
+    refuses(UsageError, "cannot be written", run, tmp_path / "file" / "out")
 
 
 def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path):
@@ -248,11 +231,7 @@ def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path
     CALLS.clear()
     run(tmp_path, 4, overwrite=True)
     assert [c for c in CALLS if c.startswith("detect")] == ["detect 03.png"]
-    assert sorted(c for c in CALLS if c.startswith("match")) == [
-        "match (0, 3)",
-        "match (1, 3)",
-        "match (2, 3)",
-    ]
+    assert sorted(c for c in CALLS if c.startswith("match")) == [f"match ({k}, 3)" for k in range(3)]
 
 
 def test_the_page_is_called_after_the_photographs(tmp_path):
@@ -342,11 +321,7 @@ def test_every_failed_check_is_reported_once(tmp_path):
 
 def test_a_failed_attempt_is_followed_by_another(tmp_path):
     result = run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=2)))
-    assert [c for c in CALLS if c.startswith("projective")] == [
-        "projective 0",
-        "projective 1",
-        "projective 2",
-    ]
+    assert [c for c in CALLS if c.startswith("projective")] == [f"projective {k}" for k in range(3)]
     assert result.metric.trusted
     assert result.warnings == ("3 initial pairs were tried; the best result is used",)
 
@@ -416,14 +391,12 @@ class NamelessDetector(fakes.FakeDetector):
     ],
 )  # fmt: skip
 def test_wrong_options_are_rejected_before_any_output(tmp_path, options, words):
-    with pytest.raises(UsageError, match=words):
-        run(tmp_path / "out", **options)
+    refuses(UsageError, words, run, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_option_is_a_wrong_call(tmp_path):
-    with pytest.raises(TypeError, match="did you mean threads"):
-        run(tmp_path / "out", thread=3)
+    refuses(TypeError, "did you mean threads", run, tmp_path / "out", thread=3)
 
 
 def test_the_first_error_of_a_worker_ends_the_rest():
@@ -446,11 +419,8 @@ def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path):
     assert read(tmp_path / "summary.json")["pairs"]["possible"] == 6
     CALLS.clear()
     more = run(tmp_path, config=fake_config(), until="matches", overwrite=True)
-    assert sorted(c for c in CALLS if c.startswith("match")) == [
-        "match (0, 2)",
-        "match (0, 3)",
-        "match (1, 3)",
-    ]
+    matched = ["match (0, 2)", "match (0, 3)", "match (1, 3)"]
+    assert sorted(c for c in CALLS if c.startswith("match")) == matched
     assert "pairs" not in more.summary["resumed"]
 
 

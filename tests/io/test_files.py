@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.io.test_colmap import export, scene
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
 from thesisrecon.io import _files as files
@@ -100,16 +101,13 @@ def test_only_regular_files_of_a_size_are_read(tmp_path):
     path.write_bytes(b"\xef\xbb\xbfgr\xc3\xb6\xc3\x9fe")
     assert files.read_text(path) == "größe"
     assert len(files.read_bytes(path, largest=11)) == 10
-    with pytest.raises(OSError, match=r"larger than 0 MiB"):
-        files.read_bytes(path, largest=9)
+    refuses(OSError, r"larger than 0 MiB", files.read_bytes, path, largest=9)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UsageError, match="pipe cannot be read: it is a pipe, a device or a socket"):
         files.read_text(tmp_path / "pipe")
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match="not a UTF-8 text"):
-        files.read_pairs(tmp_path / "binary")
-    with pytest.raises(UsageError, match="cannot be read: No such file"):
-        files.read_text(tmp_path / "nowhere")
+    refuses(UsageError, "not a UTF-8 text", files.read_pairs, tmp_path / "binary")
+    refuses(UsageError, "cannot be read: No such file", files.read_text, tmp_path / "nowhere")
     # Files of the system say that they are empty.
     if Path("/proc/self/status").exists():
         assert b"Pid:" in files.read_bytes(Path("/proc/self/status"))
@@ -129,8 +127,7 @@ def test_names_with_and_without_blanks(tmp_path):
 def test_a_line_that_is_not_a_pair_is_named(tmp_path, line):
     path = tmp_path / "pairs.txt"
     path.write_text(f"a.jpg b.jpg\n{line}\n", encoding="utf-8")
-    with pytest.raises(UsageError, match=r"line 2 of .* must hold two file names"):
-        files.read_pairs(path)
+    refuses(UsageError, r"line 2 of .* must hold two file names", files.read_pairs, path)
 
 
 ONE = {
@@ -167,13 +164,10 @@ def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
     ],
 )
 def test_other_files_are_rejected(content, words, tmp_path):
-    with pytest.raises(UsageError, match=words):
-        read_cameras(written(tmp_path, content))
+    refuses(UsageError, words, read_cameras, written(tmp_path, content))
 
 
 def test_an_absent_or_damaged_file_is_reported(tmp_path):
-    with pytest.raises(UsageError, match=r"there is no cameras\.json"):
-        read_cameras(tmp_path / "cameras.json")
+    refuses(UsageError, r"there is no cameras\.json", read_cameras, tmp_path / "cameras.json")
     (tmp_path / "cameras.json").write_text("{", encoding="utf-8")
-    with pytest.raises(UsageError, match="does not hold cameras"):
-        read_cameras(tmp_path / "cameras.json")
+    refuses(UsageError, "does not hold cameras", read_cameras, tmp_path / "cameras.json")

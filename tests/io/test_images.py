@@ -8,6 +8,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from tests.conftest import refuses
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
@@ -170,16 +171,13 @@ def test_arrays_and_files_with_the_same_name_are_distinguished(tmp_path):
     arrays = read_images([picture(0), picture(1)[..., 0]], max_size_px=90)
     assert [image.name for image in arrays.images] == ["image-0", "image-1"]
     assert arrays.images[0].size == (90, 75)
-    with pytest.raises(ValueError, match=r"uint8; got \(3,\)"):
-        read_images([np.zeros(3)], max_size_px=90)
+    refuses(ValueError, r"uint8; got \(3,\)", read_images, [np.zeros(3)], max_size_px=90)
 
 
 def test_a_missing_folder_is_reported(tmp_path):
-    with pytest.raises(UsageError, match="no folder"):
-        list_images(tmp_path / "absent")
+    refuses(UsageError, "no folder", list_images, tmp_path / "absent")
     (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="not a folder"):
-        list_images(tmp_path / "file")
+    refuses(UsageError, "not a folder", list_images, tmp_path / "file")
 
 
 @pytest.mark.parametrize(
@@ -333,6 +331,5 @@ def test_an_unwritable_animation_is_reported(tmp_path):
     (one,) = frames(tmp_path, 1)
     with pytest.raises(UsageError, match=r"absent\.png cannot be read"):
         write_animation(tmp_path / "all.webp", [one, tmp_path / "absent.png"])
-    with pytest.raises(UsageError, match="cannot be written"):
-        write_frame(one, 1, solid(0))
+    refuses(UsageError, "cannot be written", write_frame, one, 1, solid(0))
     assert not (tmp_path / "all.webp").exists()

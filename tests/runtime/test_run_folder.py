@@ -10,6 +10,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.fake_stages import fake_config, photographs
 from thesisrecon import records
 from thesisrecon.cli.main import run_command
@@ -76,14 +77,12 @@ def test_another_key_or_absence_recomputes_and_damage_is_reported(tmp_path):
     good = (tmp_path / "a.npz").read_bytes()
     for bad in (b"", b"text", good[: len(good) // 2], good[:300] + b"\0" * 40 + good[340:]):
         (tmp_path / "a.npz").write_bytes(bad)
-        with pytest.raises(ChangedRecord, match=r"a\.npz: "):
-            folder.load("a", "key")
+        refuses(ChangedRecord, r"a\.npz: ", folder.load, "a", "key")
 
 
 def test_a_pickle_is_never_loaded(tmp_path):
     np.savez(tmp_path / "a.npz", description=np.array([{"key": "key"}], dtype=object))
-    with pytest.raises(ChangedRecord, match="allow_pickle"):
-        StageFolder(tmp_path).load("a", "key")
+    refuses(ChangedRecord, "allow_pickle", StageFolder(tmp_path).load, "a", "key")
 
 
 def test_the_manifest_ends_a_stage_and_removes_stale_files(tmp_path):
@@ -103,8 +102,7 @@ def test_keys_distinguish_values_types_and_arrays():
     keys = [key_of(1), key_of("1"), key_of(1, 1), key_of(np.arange(3)), key_of(np.arange(3.0)), key_of(None)]
     assert len(set(keys)) == len(keys)
     assert key_of({"a": 1, "b": 2}) == key_of({"b": 2, "a": 1})
-    with pytest.raises(TypeError, match="plain values"):
-        key_of(object())
+    refuses(TypeError, "plain values", key_of, object())
 
 
 IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "images": {"a.jpg": "1", "b.jpg": "2"}}
@@ -247,8 +245,7 @@ def saved(path, record, *, packed=False, **arrays):
 
 
 def refused(path, words="npz: "):
-    with pytest.raises(ChangedRecord, match=words):
-        read_record(path, "k")
+    refuses(ChangedRecord, words, read_record, path, "k")
     return True
 
 
@@ -347,8 +344,7 @@ def test_a_file_in_the_place_of_a_folder_of_the_run(whole, tmp_path):
     out = tmp_path / "out"
     run(out, until="features")
     (out / "02-matches").write_text("of nobody")
-    with pytest.raises(OutputError, match=r"02-matches.* move away the file that stands where a folder"):
-        run(out)
+    refuses(OutputError, r"02-matches.* move away the file that stands where a folder", run, out)
     (out / "02-matches").unlink()
     run(out)
     assert different(outputs(out), whole[0]) == ()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
+from tests.conftest import refuses
 from tests.surface.sphere import SHAPE, K, looking_at_origin, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
@@ -75,13 +76,11 @@ def test_memory_is_kept_by_larger_voxels(ring):
 
 @pytest.mark.parametrize("setting", [{"voxel_px": 0.0}, {"voxel_px": np.nan}, {"max_blocks": 7}])
 def test_settings_under_which_voxels_would_grow_for_ever_are_refused(setting):
-    with pytest.raises(ValueError, match="must be"):
-        VolumetricFusion(**setting)
+    refuses(ValueError, "must be", VolumetricFusion, **setting)
 
 
 def test_voxels_stop_growing_with_as_few_blocks_as_there_may_be(ring):
-    with pytest.raises(StageFailure, match="no surface"):
-        VolumetricFusion(max_blocks=8).fuse(ring[:1])
+    refuses(StageFailure, "no surface", VolumetricFusion(max_blocks=8).fuse, ring[:1])
 
 
 def test_seen_through_points_are_removed(ring):
@@ -98,15 +97,11 @@ def test_seen_through_points_are_removed(ring):
 def test_hopeless_maps_are_refused(ring):
     empty = DepthMap(0, ring[0].P, np.full(SHAPE, np.nan, np.float32), ring[0].std, ring[0].views)
     for maps in ([], [empty], [empty, empty]):
-        with pytest.raises(StageFailure, match="no surface"):
-            DepthSheets().fuse(maps)
-    with pytest.raises(StageFailure, match="no surface"):
-        VolumetricFusion().fuse([empty])
-    with pytest.raises(ValueError, match="must be"):
-        DepthSheets(step=0)
+        refuses(StageFailure, "no surface", DepthSheets().fuse, maps)
+    refuses(StageFailure, "no surface", VolumetricFusion().fuse, [empty])
+    refuses(ValueError, "must be", DepthSheets, step=0)
     vague = DepthMap(0, ring[0].P, ring[0].depth, np.full(SHAPE, 10.0, np.float32), ring[0].views)
-    with pytest.raises(StageFailure, match="no surface"):
-        VolumetricFusion().fuse([vague])
+    refuses(StageFailure, "no surface", VolumetricFusion().fuse, [vague])
 
 
 def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
@@ -90,16 +91,13 @@ def test_a_shape_alone_is_grey():
 
 def test_wrong_calls_are_refused():
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
-    with pytest.raises(ValueError, match="at least one sample"):
-        render(wall(), camera, samples=0)
+    refuses(ValueError, "at least one sample", render, wall(), camera, samples=0)
     with pytest.raises(ValueError, match="vertices that do not exist"):
         render(TexturedMesh(np.zeros((2, 3)), np.array([[0, 1, 2]])), camera)
     with pytest.raises(ValueError, match="uv must be"):
         render(wall(uv=np.zeros((1, 3, 2)), texture=np.zeros((2, 2, 3), np.uint8)), camera)
-    with pytest.raises(ValueError, match="colors must be"):
-        render(wall(colors=np.zeros((1, 3), np.uint8)), camera)
-    with pytest.raises(ValueError, match="either a direction or a position"):
-        Light()
+    refuses(ValueError, "colors must be", render, wall(colors=np.zeros((1, 3), np.uint8)), camera)
+    refuses(ValueError, "either a direction or a position", Light)
 
 
 SPHERE_SIZE = (160, 120)
@@ -200,7 +198,5 @@ def test_pixels_at_the_rim_are_not_whole():
 @pytest.mark.parametrize("compare", [psnr_db, ssim, match_exposure])
 def test_pictures_that_do_not_belong_together_are_refused(compare):
     real, noisy = pictures()
-    with pytest.raises(ValueError, match="one size"):
-        compare(real, noisy[:-1], np.ones((40, 50), bool))
-    with pytest.raises(ValueError, match="no pixel is shown by both"):
-        compare(real, noisy, np.zeros((40, 50), bool))
+    refuses(ValueError, "one size", compare, real, noisy[:-1], np.ones((40, 50), bool))
+    refuses(ValueError, "no pixel is shown by both", compare, real, noisy, np.zeros((40, 50), bool))
