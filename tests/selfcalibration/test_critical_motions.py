@@ -128,6 +128,13 @@ def test_the_counting_argument(known, views, spare):
     assert _excess_equations(prior_for(estimate, known), registered) == spare
 
 
+def test_missing_equations_are_reported_with_their_number():
+    estimate = projective_reconstruction(make_scene(views=3))
+    unknown = IntrinsicsOptions(cameras="per-image", principal_point_std_rel=None)
+    sentences = identifiability_without_calibration(estimate, prior_for(estimate, unknown)).sentences
+    assert any("2 equations are missing" in sentence for sentence in sentences)
+
+
 def test_square_pixels_resolve_a_turntable_and_this_is_reported():
     identifiability = report_at_the_truth(make_sequence(Motion.TURNTABLE, np.random.default_rng(4)))
     assert identifiability.identifiable
