@@ -1,6 +1,5 @@
 """The command line on the project's own photographs: one whole run, killed once, and what it prints."""
 
-import json
 import os
 import re
 import shutil
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.fake_stages import kept_bytes, read
 from thesisrecon.cli import common
 from thesisrecon.cli import runs as cli
 from thesisrecon.cli.main import run_command
@@ -28,9 +28,7 @@ SMALL = ["--max-size", "640", "--threads", "2", "--until", "metric"]
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory):
-    """A few neighbouring views of the courtyard, in a folder whose name has a space and a letter beyond
-    ASCII.
-    """
+    """Neighbouring views of the courtyard; the folder's name has a space and a letter beyond ASCII."""
     folder = tmp_path_factory.mktemp("cli") / "my phötographs"
     folder.mkdir()
     for path in sorted((COURTYARD / "images").iterdir())[:VIEWS]:
@@ -44,9 +42,7 @@ def command(*arguments):
 
 @pytest.fixture(scope="module")
 def killed_and_resumed(photographs):
-    """The output of a run that was killed while it matched and then started again; and how many pairs were
-    kept.
-    """
+    """The output of a run that was killed while it matched and started again; how many pairs were kept."""
     out = photographs.parent / "out"
     arguments = command("reconstruct", photographs, "-o", out, *SMALL)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -67,10 +63,6 @@ def killed_and_resumed(photographs):
     return out, kept
 
 
-def read(path):
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
 def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed):
     out, kept = killed_and_resumed
     assert kept >= 2
@@ -89,14 +81,6 @@ def test_a_kill_and_the_number_of_threads_change_no_byte(killed_and_resumed, pho
     arguments = command("reconstruct", photographs, "-o", tmp_path / "out", *SMALL, "--threads", "1")
     subprocess.run(arguments, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, capture_output=True)
     assert kept_bytes(tmp_path / "out") == kept_bytes(out)
-
-
-def kept_bytes(out):
-    """Every result file of a run."""
-    files = [
-        *out.glob("0*/*.npz"), *(out / "sparse" / "0").iterdir(), out / "points.ply", out / "cameras.json",
-    ]  # fmt: skip
-    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(files)}
 
 
 def test_the_preset_of_the_thesis_runs_to_the_end(photographs, tmp_path, capsys):
@@ -284,7 +268,7 @@ def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, cap
     given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
     assert run_command([*given, "--pairs", str(knowledge)]) == 0
     assert "of 2 image pairs accepted (15 are possible)" in capsys.readouterr().out
-    pairs = json.loads((out / "summary.json").read_text(encoding="utf-8"))["pairs"]
+    pairs = read(out / "summary.json")["pairs"]
     assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 15, "the listed pairs")
     assert "2 of 15 pairs were matched: the listed pairs." in (out / "report.html").read_text(
         encoding="utf-8"
@@ -294,10 +278,7 @@ def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, cap
         assert run_command([*given, "--pairs", str(knowledge), "--overwrite"]) == 2
         assert words in capsys.readouterr().err
     # The run that was there is whole.
-    assert json.loads((out / "run.json").read_text(encoding="utf-8"))["settings"]["pairs"]["listed"][0] == [
-        names[1],
-        names[0],
-    ]
+    assert read(out / "run.json")["settings"]["pairs"]["listed"][0] == [names[1], names[0]]
     assert (out / "report.html").is_file()
 
 

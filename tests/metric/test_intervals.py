@@ -5,19 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.metric.test_population import true_calibration
-from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from tests.metric.test_population import refine
+from tests.synthetic import make_scene
 from thesisrecon.metric._adjustment import tail_width
 from thesisrecon.metric._uncertainty import FocalShrinkage, lack_of_fit
-from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.numerics.block_scatter import BlockScatter
-
-
-def refine(scene):
-    start = projective_reconstruction(scene)
-    rng = np.random.default_rng(0)
-    return MetricRefinement().refine(start, true_calibration(scene), prior=prior_for(start), rng=rng)
 
 
 def test_deviations_are_of_the_stated_size_on_normal_noise():
@@ -76,11 +68,7 @@ def test_the_tail_of_normal_noise_is_one():
 def test_other_estimates_have_intervals_that_hold_the_truth():
     """Aspect, skew and the whole lens; priors are reported as assumed."""
     scene = make_scene(sigma_px=0.5, points=300, seed=2)
-    start = projective_reconstruction(scene)
-    options = IntrinsicsOptions(aspect="constant", skew="constant", skew_std_px=50.0)
-    found = MetricRefinement().refine(
-        start, true_calibration(scene), prior=prior_for(start, options), rng=np.random.default_rng(0)
-    )
+    found = refine(scene, aspect="constant", skew="constant", skew_std_px=50.0)
     for name, truth in (("aspect", 1.0), ("skew_px", 0.0), ("k2", 0.0), ("k3", 0.0)):
         interval = found.intrinsics[0][name]
         assert interval.std > 0.0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.metric.test_population import true_calibration
+from tests.metric.test_population import refine
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
@@ -130,14 +130,6 @@ def test_the_same_seed_gives_the_same_bytes():
     assert first.reconstruction.X.tobytes() == second.reconstruction.X.tobytes()
 
 
-def refine(scene, *, start=None, cameras="shared"):
-    start = projective_reconstruction(scene) if start is None else start
-    options = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
-    rng = np.random.default_rng(0)
-    prior = prior_for(start, options)
-    return MetricRefinement().refine(start, true_calibration(scene), prior=prior, rng=rng)
-
-
 def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it():
     scene = make_scene(points=500, seed=2)
     distortion, t = np.array([-0.03, 0.02, -0.02]), scene.tracks
@@ -147,7 +139,7 @@ def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it():
         X = scene.X[t.point_index[mine]]
         xy[mine] = project_camera(scene.K[v], scene.R[v], scene.t[v], X, distortion=distortion)
     xy += 0.05 * np.random.default_rng(0).normal(size=xy.shape)
-    result = refine(replace(scene, tracks=replace(t, xy=xy)))
+    result = refine(replace(scene, tracks=replace(t, xy=xy)), cameras="shared")
     r = np.linspace(0.1, 0.6, 20)
     powers = np.stack([r**2, r**4, r**6])
     np.testing.assert_allclose(result.reconstruction.distortion[0] @ powers, distortion @ powers, atol=1e-3)
@@ -157,7 +149,7 @@ def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it():
 
 def test_a_principal_point_far_off_the_middle_is_found():
     scene = make_scene(sigma_px=0.2, points=500, principal_shift=(120.0, -80.0), seed=3)
-    K = refine(scene).reconstruction.K
+    K = refine(scene, cameras="shared").reconstruction.K
     np.testing.assert_allclose(K[:, :2, 2] - scene.K[:, :2, 2], 0.0, atol=3.0)
     np.testing.assert_allclose(K[:, 0, 0], 1500.0, rtol=5e-3)
 
@@ -174,7 +166,7 @@ def test_a_photograph_of_other_points_is_refused_with_its_share():
     start = projective_reconstruction(spoiled)
     inlier = start.inlier.copy()
     inlier[wrong] = False
-    result = refine(spoiled, start=replace(start, inlier=inlier))
+    result = refine(spoiled, cameras="shared", start=replace(start, inlier=inlier))
     assert not result.reconstruction.registered[6]
     assert "matches agree" in result.reconstruction.reasons[6]
     assert result.reconstruction.registered.sum() == 7
@@ -187,7 +179,7 @@ def test_a_camera_made_wrong_is_sought_again():
     # A camera that is metric but elsewhere: the upgrade cannot tell, its matches can.
     P = start.P.copy()
     P[6] = P[5]
-    result = refine(scene, start=replace(start, P=P))
+    result = refine(scene, cameras="shared", start=replace(start, P=P))
     assert result.reconstruction.registered.all()
     C = -np.einsum("vba,vb->va", *_poses(result.reconstruction))
     truth = scene.centres

@@ -26,10 +26,9 @@ def true_calibration(scene):
     return SelfCalibration(upgrade.metric_from_projective, K, np.zeros_like(K), True, (), (upgrade,))
 
 
-def refine(scene, *, common_prior=True):
-    start = projective_reconstruction(scene)
-    prior = prior_for(start, IntrinsicsOptions(cameras="per-image", common_prior=common_prior))
-    rng = np.random.default_rng(0)
+def refine(scene, *, start=None, **options):
+    start = projective_reconstruction(scene) if start is None else start
+    rng, prior = np.random.default_rng(0), prior_for(start, IntrinsicsOptions(**options))
     return MetricRefinement().refine(start, true_calibration(scene), prior=prior, rng=rng)
 
 
@@ -87,7 +86,7 @@ def test_nothing_is_shrunk_if_all_is_shared_or_too_few_are_of_one_kind():
 
 def test_a_badly_determined_focal_is_shrunk_and_named():
     scene = with_few_points(make_scene(sigma_px=0.5, points=400, seed=11), 3, 30)
-    alone, together = refine(scene, common_prior=False), refine(scene)
+    alone, together = (refine(scene, cameras="per-image", common_prior=common) for common in (False, True))
     assert alone.reconstruction.registered.all()
     assert together.reconstruction.registered.all()
     wide, narrow = alone.intrinsics[3]["focal_px"], together.intrinsics[3]["focal_px"]
@@ -105,7 +104,7 @@ def test_a_badly_determined_focal_is_shrunk_and_named():
 
 def test_zoomed_photographs_keep_their_own_focals():
     scene = make_scene(sigma_px=0.3, points=400, zoom=0.4, seed=12)
-    result = refine(scene)
+    result = refine(scene, cameras="per-image")
     K = result.reconstruction.K
     np.testing.assert_allclose(K[:, 0, 0] / scene.K[:, 0, 0], 1.0, atol=0.01)
     assert not any("shrunk" in intervals["focal_px"].source for intervals in result.intrinsics)
