@@ -1,14 +1,11 @@
-"""Error of F against the truth; precision and recall of its inliers."""
+"""Error of F against the truth."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.two_view import symmetric_residuals
-
-BoolArray = NDArray[np.bool_]
 
 NONE_PX = 99.0
 """Error of a missing F, and the maximum reported error."""
@@ -23,12 +20,3 @@ def rms_epipolar_distance(F: F64 | None, truth: F64) -> float:
         return NONE_PX
     d = symmetric_residuals(F, truth[:, :2], truth[:, 2:])
     return float(min(np.sqrt(np.mean(d**2) / 2.0), NONE_PX))
-
-
-def precision_recall(inliers: BoolArray, right: BoolArray) -> tuple[float, float]:
-    """Share of the inliers (N,) that are right, and of the right matches (N,) that are inliers.
-
-    Without inliers both are 0.
-    """
-    both = float(np.sum(inliers & right))
-    return both / max(float(inliers.sum()), 1.0), both / max(float(right.sum()), 1.0)

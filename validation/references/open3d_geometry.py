@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
@@ -97,17 +96,6 @@ def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
     K, world = camera_of(camera.P, shift=0.5)
     renderer.setup_camera(K, world, width, height)
     return np.asarray(renderer.render_to_image()).copy()
-
-
-def read_glb(path: Path) -> tuple[F64, I64, F64, U8]:
-    """Vertices (N, 3) in glTF's axes, faces (M, 3), texture coordinates (M, 3, 2), v up, and the texture of a
-    GLB as Open3D reads it."""
-    model = o3d.io.read_triangle_model(str(path))
-    mesh = model.meshes[0].mesh
-    albedo = np.asarray(model.materials[model.meshes[0].material_idx].albedo_img)
-    uv = np.asarray(mesh.triangle_uvs).reshape(-1, 3, 2)
-    faces = np.asarray(mesh.triangles).astype(np.int64)
-    return np.asarray(mesh.vertices).copy(), faces, uv.copy(), albedo[..., :3].copy()
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from thesisrecon.arrays import F64
@@ -23,27 +22,23 @@ from thesisrecon.io._files import write_atomically
 from validation.references.sift import SiftKeypoints, detect_sift, match_sift
 from validation.scenes.real import Scene, data_root
 
-BoolArray = NDArray[np.bool_]
-
 HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8
 CONSISTENT_PX = 1.5
 """Sampson distance to the true F within which a match of a scene with cameras counts as right."""
 FARTHEST = 3.0
 """Depth in medians beyond which such a match counts as wrong."""
-ADELAIDE = ("biscuit", "book")
 SCENES_WITH_CAMERAS = ("fountain-P11", "Herz-Jesus-P8")
 
 
 @dataclass(frozen=True)
 class RealPair:
     """Matches ``xy1``, ``xy2`` (N, 2) px, and what is known: ``truth`` (M, 4) right correspondences that no
-    method is given, ``right`` (N,) whether each match is right, ``F`` (3, 3) of the true cameras."""
+    method is given, ``F`` (3, 3) of the true cameras."""
 
     name: str
     xy1: F64
     xy2: F64
     truth: F64 | None = None
-    right: BoolArray | None = None
     F: F64 | None = None
 
 
@@ -114,16 +109,3 @@ def exact_correspondences(P1: F64, P2: F64, xy1: F64, xy2: F64) -> F64:
     typical = np.median(depths, axis=1, keepdims=True)
     seen = np.all((depths > 0.0) & (depths < FARTHEST * typical), axis=0)
     return np.hstack([exact1, exact2])[seen]
-
-
-def adelaide_pairs() -> Iterator[RealPair]:
-    """The matches of AdelaideRMF (Wong et al., ICCV 2011) with their labels as ``right``.
-
-    Nothing where they are not on this machine.
-    """
-    root = data_root()
-    for name in ADELAIDE:
-        path = root / "adelaide" / name / "matches.txt" if root else None
-        if path is not None and path.is_file():
-            rows = np.loadtxt(path, skiprows=1)
-            yield RealPair(name, rows[:, :2].copy(), rows[:, 2:4].copy(), right=rows[:, 4] > 0)
