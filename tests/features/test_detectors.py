@@ -65,11 +65,14 @@ def test_thesis_corners_keep_their_distance_and_their_number():
     assert distance.min() >= 0.02 * 400
 
 
-def test_corners_cover_the_image_though_one_side_is_faint():
+def test_corners_that_are_spread_cover_the_image_though_one_side_is_faint():
     gray = texture(400, 1100)
     gray[:, 550:] = 128 + 0.15 * (gray[:, 550:] - 128)
     features = MultiScaleCorners(full_corners=600, half_corners=300).detect(photograph(gray))
     assert (features.xy[:, 0] > 560).mean() > 0.1
+    strongest = MultiScaleCorners(full_corners=600, half_corners=0, spread=False).detect(photograph(gray))
+    assert set(strongest.scale.tolist()) == {1.0}
+    assert (strongest.xy[:, 0] > 560).mean() < 0.05
 
 
 @pytest.mark.parametrize(("width", "scales"), [(420, {0.5, 1.0}), (1040, {1.0, 2.0})])
@@ -179,36 +182,18 @@ def test_each_selection_keeps_the_number_and_the_strongest(selection):
     assert np.array_equal(features.xy[0], everything.xy[0])
 
 
-def test_the_strongest_of_each_size_where_corners_are_not_spread():
-    gray = texture(400, 1100)
-    gray[:, 550:] = 128 + 0.15 * (gray[:, 550:] - 128)
-    features = MultiScaleCorners(full_corners=600, half_corners=0, spread=False).detect(photograph(gray))
-    assert set(features.scale.tolist()) == {1.0}
-    assert (features.xy[:, 0] > 560).mean() < 0.05
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("derivative_taps", (-1.0, 1.0)), ("derivative_taps", (1.0, 1.0, 1.0)),
-        ("derivative_taps", (0.5, 0.0, -0.5)), ("harris_k", 0.3), ("integration_taps", 4),
-        ("integration_sigma_px", 0.0),
-    ],
-)  # fmt: skip
-def test_a_measure_that_cannot_be_is_refused(field, value):
-    with pytest.raises(ValueError, match=field):
-        CornerMeasure(**{field: value})
-
-
 @pytest.mark.parametrize(
     ("kind", "field", "value"),
     [
         (HarrisCorners, "max_corners", 0), (HarrisCorners, "threshold_rel", 2.0),
         (HarrisCorners, "threshold_rel", np.nan), (HarrisCorners, "spacing_rel", -0.1),
         (MultiScaleCorners, "seeds_per_level", -5), (MultiScaleCorners, "full_corners", -1),
-        (MultiScaleCorners, "levels", 0),
+        (MultiScaleCorners, "levels", 0), (CornerMeasure, "derivative_taps", (-1.0, 1.0)),
+        (CornerMeasure, "derivative_taps", (1.0, 1.0, 1.0)), (CornerMeasure, "integration_taps", 4),
+        (CornerMeasure, "derivative_taps", (0.5, 0.0, -0.5)), (CornerMeasure, "harris_k", 0.3),
+        (CornerMeasure, "integration_sigma_px", 0.0),
     ],
 )  # fmt: skip
-def test_a_detector_that_cannot_be_is_refused(kind, field, value):
+def test_a_detector_or_measure_that_cannot_be_is_refused(kind, field, value):
     with pytest.raises(ValueError, match=field):
         kind(**{field: value})

@@ -97,8 +97,6 @@ def wrong_focal(value):
 
 
 PROFILE = PIL.ImageCms.ImageCmsProfile(PIL.ImageCms.createProfile("LAB")).tobytes()
-
-
 # Unusual images that are valid.
 PHOTOGRAPHS = [
     ("sixteen bits.png", sixteen_bits()), ("cmyk.jpg", files.encoded("JPEG", picture().convert("CMYK"))),

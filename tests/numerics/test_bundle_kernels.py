@@ -298,8 +298,6 @@ def test_leverages_are_the_diagonal_of_the_projection_onto_the_points():
 
 
 FREE = np.array([True, False, False, True, True, True])
-
-
 SIGMA = 0.5
 
 

@@ -19,8 +19,6 @@ from thesisrecon.views.interpolation import (
 )
 
 SIZE = (160, 120)
-
-
 SHIFTS = np.linspace(0.0, 1.0, 7)
 
 

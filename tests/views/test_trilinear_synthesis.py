@@ -12,11 +12,7 @@ from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, camera_at
 from thesisrecon.views.trilinear_synthesis import _extrapolate_inverse_depth, prepare_synthesis
 
 SIZE = (160, 120)
-
-
 K = calibration_matrix(150.0, 150.0, 81.0, 58.0)
-
-
 PAIR = CalibratedPair(
     K, K, Rotation.from_rotvec([0.01, -0.08, 0.02]).as_matrix(), np.array([-0.98, 0.15, 0.1])
 )
