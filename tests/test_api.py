@@ -9,6 +9,7 @@ import pytest
 
 import thesisrecon
 from tests import fake_stages as fakes
+from tests.conftest import refuses
 from tests.synthetic import reconstruction_of
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
@@ -49,10 +50,8 @@ def test_two_photographs_give_verified_matches_and_f():
 def test_photographs_that_cannot_be_read_or_matched_are_failures(tmp_path):
     (tmp_path / "a.jpg").write_text("no picture")
     noise = [np.random.default_rng(k).integers(0, 256, (200, 200, 3), dtype=np.uint8) for k in range(2)]
-    with pytest.raises(StageFailure, match=r"a\.jpg is not an image"):
-        thesisrecon.match_pair(tmp_path / "a.jpg", noise[0])
-    with pytest.raises(StageFailure, match="do not match"):
-        thesisrecon.match_pair(*noise)
+    refuses(StageFailure, r"a\.jpg is not an image", thesisrecon.match_pair, tmp_path / "a.jpg", noise[0])
+    refuses(StageFailure, "do not match", thesisrecon.match_pair, *noise)
 
 
 def test_self_calibration_groups_views_by_size_and_takes_a_prior():
@@ -76,14 +75,12 @@ def test_self_calibration_groups_views_by_size_and_takes_a_prior():
 def test_only_a_projective_reconstruction_is_calibrated():
     metric = replace(small_reconstruction(), stratum="metric")
     for stage in (thesisrecon.self_calibrate, thesisrecon.upgrade_affine):
-        with pytest.raises(ValueError, match="takes a projective reconstruction; got metric"):
-            stage(metric)
+        refuses(ValueError, "takes a projective reconstruction; got metric", stage, metric)
 
 
 def test_a_seed_is_a_whole_number():
     for seed in (np.random.default_rng(0), -1, 0.5, True):
-        with pytest.raises(ValueError, match="the seed must be a whole number of at least 0; got"):
-            stream(seed, "matches")
+        refuses(ValueError, "the seed must be a whole number of at least 0; got", stream, seed, "matches")
     assert stream(np.int64(3), "matches").integers(1000) == stream(3, "matches").integers(1000)
 
 
@@ -132,8 +129,7 @@ def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path):
     np.testing.assert_array_equal(again.disparity, found.disparity)
     with pytest.raises(UsageError, match="nothing"):
         thesisrecon.match_rectified(tmp_path / "nothing.png", right, max_disparity_px=12)
-    with pytest.raises(ValueError, match="same shape"):
-        thesisrecon.match_rectified(left, right[:-2], max_disparity_px=12)
+    refuses(ValueError, "same shape", thesisrecon.match_rectified, left, right[:-2], max_disparity_px=12)
 
 
 def test_a_model_is_rendered_through_the_front_door():

@@ -10,6 +10,7 @@ import PIL.Image
 import pytest
 
 import thesisrecon
+from tests.conftest import refuses
 from tests.synthetic import texture
 from thesisrecon import view_interpolation as between
 from thesisrecon.cli import view_files as sequences
@@ -65,12 +66,9 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
 
 def test_wrong_calls_of_the_front_door_are_refused(wall):
     left, right = wall
-    with pytest.raises(ValueError, match="between 0"):
-        thesisrecon.interpolate_view(left, right, 1.5)
-    with pytest.raises(ValueError, match="one size"):
-        thesisrecon.interpolate_view(left, right[:-3], 0.5)
-    with pytest.raises(ValueError, match="uint8"):
-        thesisrecon.interpolate_view(left.astype(float), right, 0.5)
+    refuses(ValueError, "between 0", thesisrecon.interpolate_view, left, right, 1.5)
+    refuses(ValueError, "one size", thesisrecon.interpolate_view, left, right[:-3], 0.5)
+    refuses(ValueError, "uint8", thesisrecon.interpolate_view, left.astype(float), right, 0.5)
     with pytest.raises(ValueError, match="shape of the images"):
         thesisrecon.interpolate_view(left, right, 0.5, disparity=np.zeros((3, 4), np.float32))
     d = np.zeros(left.shape[:2], np.float32)
@@ -78,8 +76,7 @@ def test_wrong_calls_of_the_front_door_are_refused(wall):
     for odd in ([d, d], d[..., None]):
         with pytest.raises(ValueError, match=r"\(H, W\), or a tuple"):
             thesisrecon.interpolate_view(left, right, 0.5, disparity=odd)
-    with pytest.raises(UsageError, match="no image file"):
-        thesisrecon.interpolate_view(Path("nowhere.png"), right, 0.5)
+    refuses(UsageError, "no image file", thesisrecon.interpolate_view, Path("nowhere.png"), right, 0.5)
 
 
 def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monkeypatch):
@@ -88,8 +85,7 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
         between.prepare_pair(a, Image("0.jpg", a.rgb.copy(), a.size))
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         between.prepare_pair(a, photograph(2, (40, 20)))
-    with pytest.raises(UsageError, match="same image"):
-        interpolated_sequence([a, b, a], 3)
+    refuses(UsageError, "same image", interpolated_sequence, [a, b, a], 3)
     with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
     # Forward motion: both epipoles at (21, 14).
@@ -104,8 +100,7 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
         between.prepare_pair(a, b)
     # An image and its copy: any F fits.
     pair.xy2 = xy + rng.normal(0.0, 0.01, xy.shape)
-    with pytest.raises(StageFailure, match="no parallax"):
-        between.prepare_pair(a, b)
+    refuses(StageFailure, "no parallax", between.prepare_pair, a, b)
 
 
 def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
@@ -122,8 +117,7 @@ def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
     with pytest.raises(StageFailure, match=r"too distorted; a number; take the images side by side"):
         between.prepare_pair(photograph(0), photograph(1), config=config)
     Dense.failure = StageFailure("no parallax")
-    with pytest.raises(StageFailure, match="no parallax"):
-        between.prepare_pair(photograph(0), photograph(1), config=config)
+    refuses(StageFailure, "no parallax", between.prepare_pair, photograph(0), photograph(1), config=config)
 
 
 @pytest.fixture
@@ -245,5 +239,4 @@ def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_
 def test_a_folder_of_other_files_is_refused(tmp_path):
     photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    with pytest.raises(UsageError, match="which this command did not create"):
-        interpolate_images(tmp_path, photographs)
+    refuses(UsageError, "which this command did not create", interpolate_images, tmp_path, photographs)

@@ -163,14 +163,10 @@ def test_3_42_every_pair_of_the_family_has_the_fundamental_matrix(rng):
 
 
 @holds_for_every()
-def test_3_2_homogeneous_coordinates_mean_the_same_at_every_scale(rng):
+def test_3_2_homogeneous_coordinates_have_any_scale_and_unit_normals_measure_distances(rng):
     X = rng.normal(size=(5, 3))
     scale = rng.uniform(0.1, 5.0, (5, 1)) * rng.choice([-1.0, 1.0], (5, 1))
     np.testing.assert_allclose(dehomogenize(scale * homogenize(X)), X, rtol=1e-12)
-
-
-@holds_for_every()
-def test_3_2_unit_normals_measure_distances(rng):
     line, plane = rng.normal(size=3), rng.normal(size=4)
     for dual in (line, plane):
         n = unit_normals(dual)

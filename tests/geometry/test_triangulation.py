@@ -46,14 +46,11 @@ def two_views(kind, rng, n=40):
     c = rng.normal(size=3)
     X = np.column_stack([rng.uniform(-2.0, 2.0, (n, 2)), rng.uniform(3.0, 9.0, n), np.ones(n)])
     if kind in ("forward", "near the epipoles"):
-        c, R = (
-            np.append(rng.normal(0.0, 0.1, 2), 1.0),
-            Rotation.from_rotvec(rng.normal(0.0, 0.05, 3)).as_matrix(),
-        )
+        c = np.append(rng.normal(0.0, 0.1, 2), 1.0)
+        R = Rotation.from_rotvec(rng.normal(0.0, 0.05, 3)).as_matrix()
     if kind == "near the epipoles":
-        X[:, :3] = c * rng.uniform(1.5, 6.0, (n, 1)) + rng.normal(size=(n, 3)) * 10 ** rng.uniform(
-            -6, -1.5, (n, 1)
-        )
+        X[:, :3] = c * rng.uniform(1.5, 6.0, (n, 1))
+        X[:, :3] += rng.normal(size=(n, 3)) * 10 ** rng.uniform(-6, -1.5, (n, 1))
     if kind == "rectified":
         c, R = np.array([1.0, 0.0, 0.0]), np.eye(3)
     if kind == "epipole at infinity":

@@ -16,6 +16,18 @@ FEATURES = ["--until", "features", "--threads", "1", "--max-size", "1600"]
 TOO_LONG = "x" * 5000
 
 
+CAMERA = {
+    "name": "a.png", "width": 160, "height": 120, "K": [[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]],
+    "R": np.eye(3).tolist(), "t": [0.0, 0.0, 3.0],
+}  # fmt: skip
+SUMMARY = {
+    "images": 2, "registered": 2, "points": 9, "stratum": "metric", "reprojection_rms_px": 0.1,
+    "reprojection_median_px": 0.1, "cameras": [], "refused": [], "warnings": [], "failure": "",
+    "pairs": {"matched": 1, "accepted": 1, "verified_matches": 9}, "resumed": [], "seconds": {"total": 1.0},
+}  # fmt: skip
+"""An entry of cameras.json, and a summary.json."""
+
+
 def picture(seed=0, size=(96, 80)):
     """A colourful picture without two equal corners."""
     rng = np.random.default_rng(seed)

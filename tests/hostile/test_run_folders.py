@@ -139,13 +139,7 @@ def test_nothing_is_written_through_the_links_of_a_folder(tmp_path, run_cli):
 
 
 def summary_of_run(**changes):
-    whole = {
-        "images": 2, "registered": 2, "points": 9, "stratum": "metric", "reprojection_rms_px": 0.1,
-        "reprojection_median_px": 0.1, "cameras": [], "refused": [], "warnings": [], "failure": "",
-        "pairs": {"matched": 1, "accepted": 1, "verified_matches": 9}, "resumed": [],
-        "seconds": {"total": 1.0},
-    }  # fmt: skip
-    return json.dumps(whole | changes)
+    return json.dumps(files.SUMMARY | changes)
 
 
 SUMMARIES = [

@@ -8,14 +8,9 @@ import pytest
 from tests.hostile import files
 from tests.hostile.files import links, picture, pipe, sparse, writes
 
-CAMERA = {
-    "name": "a.png", "width": 160, "height": 120, "K": [[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]],
-    "R": np.eye(3).tolist(), "t": [0.0, 0.0, 3.0],
-}  # fmt: skip
-
 
 def camera(**changes):
-    return writes(json.dumps({"cameras": [CAMERA | changes]}))
+    return writes(json.dumps({"cameras": [files.CAMERA | changes]}))
 
 
 NO_CAMERAS = [

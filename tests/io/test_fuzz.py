@@ -13,7 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.hostile.files import glb, require_sentence, triangle
+from tests.hostile.files import CAMERA, glb, require_sentence, triangle
+from tests.hostile.files import SUMMARY as WHOLE
 from tests.io.test_images import picture
 from tests.io.test_meshes import roof
 from tests.runtime.test_run_folder import some_metric
@@ -57,21 +58,11 @@ def saved(kind):
     return Reader(name, make, lambda path: read_images(path.parent, max_size_px=99))
 
 
-CAMERAS = {
-    "cameras": [
-        {
-            "name": "a.png", "width": 160, "height": 120, "K": [[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]],
-            "R": np.eye(3).tolist(), "t": [0.0, 0.0, 3.0],
-        }
-    ]
-}  # fmt: skip
+CAMERAS = {"cameras": [CAMERA]}
 REPORT = {"stage": "x", "seconds": 1.0, "counts": {"a": 1}, "metrics": {"b": 0.5}, "warnings": ["c"]}
 MANIFEST = {"keys": {"a": "1"}, "report": REPORT}
 SUMMARY = {
-    "images": 2, "registered": 2, "points": 9, "stratum": "metric", "reprojection_rms_px": 0.1,
-    "reprojection_median_px": 0.1, "refused": [{"name": "a", "reason": "b"}], "warnings": ["c"],
-    "failure": "", "pairs": {"matched": 1, "accepted": 1, "verified_matches": 9}, "resumed": [],
-    "seconds": {"total": 1.0},
+    **WHOLE, "refused": [{"name": "a", "reason": "b"}], "warnings": ["c"],
     "cameras": [{"camera": 0, "corners": 9, **{
         name: {"value": 1.0, "std": 0.1, "source": "data"}
         for name in ("focal_px", "principal_x_px", "principal_y_px", "aspect", "skew_px")

@@ -125,12 +125,9 @@ def test_degenerate_input_is_guarded():
 
 
 @pytest.mark.parametrize("field", ["sigma_px", "loss_px"])
-def test_options_that_mean_nothing_are_refused(field):
+def test_options_and_observations_that_mean_nothing_are_refused(field):
     with pytest.raises(ValueError, match="positive"):
         BundleOptions(**{field: 0})
-
-
-def test_observations_of_different_lengths_are_refused():
     block = make_block(views=4, points=20)
     with pytest.raises(ValueError, match="observations need"):
         _refine(block.cameras, block.X, Observations(block.view, block.point[1:], block.xy), free=FOCAL)

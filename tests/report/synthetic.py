@@ -154,19 +154,12 @@ def _reports():
     )
 
 
+# The 3D views need WebGL; without a graphics card Chromium needs the last two to draw it.
 ARGUMENTS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    # The 3D views need WebGL; without a graphics card Chromium needs these options to draw it.
-    "--use-angle=swiftshader",
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-]
+]  # fmt: skip
 
 
 class Witness:

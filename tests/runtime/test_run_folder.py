@@ -50,7 +50,7 @@ def some_metric():
     return records.MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
 
 
-def test_records_survive_the_disk(tmp_path):
+def test_records_survive_the_disk_and_equal_ones_give_equal_bytes(tmp_path):
     folder = StageFolder(tmp_path / "01")
     folder.save("a", "key", some_features())
     folder.save("b", "key", some_metric())
@@ -62,9 +62,6 @@ def test_records_survive_the_disk(tmp_path):
     assert metric.intrinsics[0]["focal_px"] == records.IntrinsicInterval(100.0, 1.0, "data")
     assert metric.failed_checks == ("a doubt",)
     assert metric.reconstruction.registered.dtype == np.bool_
-
-
-def test_equal_records_give_equal_bytes():
     assert bytes_from_record(some_metric(), "k") == bytes_from_record(some_metric(), "k")
     assert bytes_from_record(some_features(1.0), "k") != bytes_from_record(some_features(2.0), "k")
 
