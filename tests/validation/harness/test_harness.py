@@ -109,7 +109,7 @@ def test_results_are_written_and_read(ran, tmp_path):
     options, judged, _ = ran
     results = collect(options, judged, GATES)
     write_results(tmp_path, results)
-    assert read_results(tmp_path) == results
+    assert read_results(tmp_path).rows == results.rows
     with (tmp_path / "tables" / "toy.csv").open(encoding="utf-8") as source:
         first = next(csv.DictReader(source))
     assert (first["key"], first["ours"], first["good"], first["crashing"]) == (
@@ -124,7 +124,8 @@ def test_two_runs_report_the_same_numbers_but_for_times(ran, tmp_path):
     options, judged, _ = ran
     quick = toy_options(tmp_path, quick=True)
     first, second = (collect(quick, run_tasks(quick, STAGES, lambda _: None), GATES) for _ in range(2))
-    assert [(r.key, r.value) for r in first.rows] == [(r.key, r.value) for r in second.rows]
+    numbers = [[(r.key, r.value) for r in found.rows if r.unit != "s"] for found in (first, second)]
+    assert numbers[0] == numbers[1]
     assert first.rows[0].value == collect(options, judged, GATES).rows[0].value
 
 
