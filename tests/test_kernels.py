@@ -110,3 +110,13 @@ def test_two_processes_at_once_compile_once(package):
         done = list(pool.map(lambda _: run_in(package), range(3)))
     assert [value for value, _ in done] == ["8.0"] * 3
     assert sorted(hits for _, hits in done) == ["0", "1", "1"]
+
+
+def test_an_entry_of_a_record_that_has_moved_is_compiled_again(package):
+    record = "from typing import NamedTuple\n\n\nclass Pair(NamedTuple):\n    x: float\n    y: float\n"
+    (package / "records_here.py").write_text(record, encoding="utf-8")
+    edit(package / "caller.py", "return 2.0 * inner(x)", "return inner(x.x)")
+    code = RUN.replace("caller.outer(3.0)", "caller.outer(records.Pair(3.0, 1.0))")
+    assert run_in(package, code.replace("sys,", "sys, records_here as records,")) == ["4.0", "0"]
+    (package / "records_here.py").rename(package / "records_there.py")
+    assert run_in(package, code.replace("sys,", "sys, records_there as records,")) == ["4.0", "0"]

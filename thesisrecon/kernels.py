@@ -282,8 +282,12 @@ def _read(path: Path, target_context: Any) -> CompileResult | None:
     digest, content = stored[:32], stored[32:]
     if hashlib.sha256(content).digest() != digest:
         return None
+    try:
+        payload = pickle.loads(content)
+    except (ImportError, AttributeError):  # a record of the kernel has moved to another module
+        return None
     rebuild: Callable[..., CompileResult] = CompileResult._rebuild
-    return rebuild(target_context, *pickle.loads(content))
+    return rebuild(target_context, *payload)
 
 
 def _write(path: Path, content: bytes) -> None:
