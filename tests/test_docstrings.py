@@ -48,11 +48,16 @@ def test_the_examples_in_docstrings_run():
     names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in paths}
     exported = [getattr(thesisrecon, name) for name in thesisrecon.__all__ if name != "__version__"]
     names |= {e.__module__ for e in exported}
+    # Examples of chapter 7 continue that of self_calibrate.
+    projective = {}
+    for example in doctest.DocTestParser().get_examples(thesisrecon.self_calibrate.__doc__):
+        exec(example.source, projective)
+    projective = {"projective": projective["projective"]}
     finder, tried, output = doctest.DocTestFinder(), 0, io.StringIO()
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     with redirect_stdout(output):
         for name in sorted(names):
-            for example in finder.find(importlib.import_module(name), name):
+            for example in finder.find(importlib.import_module(name), name, extraglobs=projective):
                 tried += len(example.examples)
                 runner.run(example)
     assert runner.failures == 0, output.getvalue()

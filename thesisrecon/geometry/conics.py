@@ -144,6 +144,13 @@ def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
     -------
     ndarray (3, 3)
         K with positive focal lengths and K33 = 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+    >>> bool(np.allclose(calibration_from_image(image_of_absolute_conic(K)), K))
+    True
     """
     if not np.isfinite(image).all() or not (is_dual or np.linalg.cond(image) < 1e15):
         raise ValueError("calibration_from_image needs a finite invertible conic")

@@ -124,6 +124,13 @@ def cross_matrix(a: F64) -> F64:
     Returns
     -------
     ndarray (..., 3, 3)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> a, b = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
+    >>> bool(np.allclose(cross_matrix(a) @ b, np.cross(a, b)))
+    True
     """
     z = np.zeros(a.shape[:-1])
     rows = [z, -a[..., 2], a[..., 1], a[..., 2], z, -a[..., 0], -a[..., 1], a[..., 0], z]

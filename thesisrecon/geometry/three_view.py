@@ -115,6 +115,17 @@ def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
     -------
     ndarray (N, 2)
         Pixels of view 3; inf or NaN for points of the line through the centres of views 1 and 2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> P = np.eye(3, 4) + np.array([0.0, 1, 2])[:, None, None] * np.outer([1.0, 0.5, 0.1], [0, 0, 0, 1])
+    >>> X = np.array([[0.5, -0.2, 4.0, 1]])
+    >>> x1, x2, x3 = X @ P.transpose(0, 2, 1)
+    >>> T = tensor_from_cameras(*P)
+    >>> xy1, xy2, xy3 = (x[:, :2] / x[:, 2:] for x in (x1, x2, x3))
+    >>> bool(np.allclose(transfer_points(T, xy1, xy2), xy3))
+    True
     """
     F21, _ = fundamentals_from_tensor(T)
     xy1, xy2 = correct_matches(F21, xy1, xy2)

@@ -32,6 +32,16 @@ class LinearQuadric:
         In long sides; 1.67 is the 60 mm lens of Pollefeys et al. on 36 mm film.
     criterion : RotationCriterion
         Criterion that orders the candidates.
+
+    Examples
+    --------
+    ``projective`` as in the example of `thesisrecon.self_calibrate`:
+
+    >>> from thesisrecon import PipelineConfig, self_calibrate
+    >>> from thesisrecon.selfcalibration.quadric import LinearQuadric
+    >>> config = PipelineConfig(selfcalibration=LinearQuadric(normalising_focal=1.25))
+    >>> round(self_calibrate(projective, config=config).K[0, 0, 0])
+    800
     """
 
     normalising_focal: float = 1.67
@@ -69,6 +79,16 @@ class NonlinearQuadric:
         Residual beyond which an entry counts linearly (Huber).
     criterion : RotationCriterion
         Criterion that selects the starts.
+
+    Examples
+    --------
+    ``projective`` as in the example of `thesisrecon.self_calibrate`:
+
+    >>> from thesisrecon import PipelineConfig, self_calibrate
+    >>> from thesisrecon.selfcalibration.quadric import NonlinearQuadric
+    >>> config = PipelineConfig(selfcalibration=NonlinearQuadric())
+    >>> round(self_calibrate(projective, config=config).K[0, 0, 0])
+    800
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)

@@ -45,6 +45,16 @@ class Stratified:
         Required share of observations with positive depth.
     criterion : RotationCriterion
         Criterion for the standard deviations of the focal lengths.
+
+    Examples
+    --------
+    ``projective`` as in the example of `thesisrecon.self_calibrate`:
+
+    >>> from thesisrecon import PipelineConfig, self_calibrate
+    >>> from thesisrecon.selfcalibration.stratified import Stratified
+    >>> config = PipelineConfig(selfcalibration=Stratified())
+    >>> round(self_calibrate(projective, config=config).K[0, 0, 0])
+    800
     """
 
     plane: CheiralitySearch | ModulusConstraint | ParallelLines = field(default_factory=CheiralitySearch)
