@@ -12,7 +12,7 @@ from thesisrecon.epipolar import linear
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.geometry.optimal_triangulation import correct_matches
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals
-from thesisrecon.numerics.small_solvers import solve_damped
+from thesisrecon.numerics._small_solvers import solve_damped
 
 seeds = st.integers(0, 2**31)
 

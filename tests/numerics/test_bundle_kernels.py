@@ -12,19 +12,19 @@ from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
 from thesisrecon.numerics import _schur
 from thesisrecon.numerics._elimination import ReducedSums, sum_leverages
-from thesisrecon.numerics._schur import BundleSystem, build_layout
-from thesisrecon.numerics.block_scatter import block_scatter
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.metric_cameras import (
+from thesisrecon.numerics._metric_cameras import (
     MetricCameras,
     MetricModel,
     linearize_metric,
     metric_cost,
     move_poses,
 )
+from thesisrecon.numerics._schur import BundleSystem, build_layout
+from thesisrecon.numerics._small_solvers import floored_diagonal
+from thesisrecon.numerics.block_scatter import block_scatter
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics.noise import huber
 from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
-from thesisrecon.numerics.small_solvers import floored_diagonal
 
 
 def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):

@@ -21,9 +21,9 @@ from thesisrecon.projective._track_selection import (
 from thesisrecon.projective.factorization import Factorization
 from thesisrecon.projective.incremental import (
     IncrementalProjective,
-    find_inconsistent_view,
-    projection_std_px,
-    resect_ransac,
+    _find_inconsistent_view,
+    _projection_std_px,
+    _resect_ransac,
 )
 from thesisrecon.projective.sequential import SequentialProjective
 from thesisrecon.records import DegeneracyReport, Tracks
@@ -138,7 +138,7 @@ def test_robust_resection_finds_the_camera_among_wrong_points():
     xy = project(scene.P[1], Xh)
     wrong = np.arange(len(xy)) < 90
     xy[wrong] += rng.uniform(30, 300, (90, 2))
-    P, inlier = resect_ransac(Xh, xy, threshold_px=2.0, rng=rng)
+    P, inlier = _resect_ransac(Xh, xy, threshold_px=2.0, rng=rng)
     assert P is not None
     np.testing.assert_array_equal(inlier, ~wrong)
     np.testing.assert_allclose(project(P, Xh[~wrong]), xy[~wrong], atol=1e-3)
@@ -153,7 +153,7 @@ def test_spread_of_the_gate_is_the_spread_of_perturbed_cameras():
     draws = P + (rng.normal(size=(20000, 12)) @ A.T).reshape(-1, 3, 4)
     xh = np.einsum("dab,nb->dna", draws, X)
     measured = np.sqrt((xh[..., :2] / xh[..., 2:]).var(axis=0).mean(axis=1))
-    np.testing.assert_allclose(projection_std_px(P, A @ A.T, X), measured, rtol=0.05)
+    np.testing.assert_allclose(_projection_std_px(P, A @ A.T, X), measured, rtol=0.05)
 
 
 def test_selection_keeps_the_longest_tracks_of_every_view():
@@ -277,14 +277,14 @@ def test_a_camera_that_wrong_matches_placed_is_discarded_with_its_reason():
 def test_the_view_that_contradicts_its_pairs_is_named():
     scene = make_scene(seed=6)
     pairs, registered = true_pairs(scene), np.ones(8, dtype=bool)
-    assert find_inconsistent_view(scene.P, registered, pairs, threshold_px=1.0, min_ratio=1.0) is None
+    assert _find_inconsistent_view(scene.P, registered, pairs, threshold_px=1.0, min_ratio=1.0) is None
     P = scene.P.copy()
     P[3] = P[3] + 0.05 * np.random.default_rng(0).normal(size=(3, 4)) * np.abs(P[3])
-    found = find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=0.5)
+    found = _find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=0.5)
     assert found is not None
     assert found[0] == 3
     registered[3] = False
-    assert find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=1.0) is None
+    assert _find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=1.0) is None
 
 
 def test_a_beginning_in_a_corner_gives_way_to_one_that_reaches_more():

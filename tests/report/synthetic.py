@@ -16,8 +16,8 @@ from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
 from thesisrecon.report._data import ReportData
+from thesisrecon.surface._mesh import simplify_mesh
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 SIZE = (480, 320)

@@ -17,11 +17,11 @@ from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _s
 from thesisrecon.stereo.depth import (
     _complete_depths,
     _confirm_depths,
+    _pinhole_view,
     _region_sizes,
-    pinhole_view,
-    select_neighbours,
-    shared_projections,
-    sparse_points,
+    _select_neighbours,
+    _shared_projections,
+    _sparse_points,
 )
 
 
@@ -32,7 +32,7 @@ def walled():
 
 def views_of(walled, **options):
     return {
-        i: pinhole_view(image, walled.reconstruction, i, **options) for i, image in enumerate(walled.images)
+        i: _pinhole_view(image, walled.reconstruction, i, **options) for i, image in enumerate(walled.images)
     }
 
 
@@ -43,14 +43,14 @@ def test_an_undistorted_view_equals_the_view_without_distortion(walled):
         assert 0.8 < view.seen.mean() <= 1.0
         apart = view.rgb.astype(float) - straight.images[i].rgb
         assert np.median(np.abs(apart[view.seen])) < 2.0
-        plain = pinhole_view(straight.images[i], straight.reconstruction, i)
+        plain = _pinhole_view(straight.images[i], straight.reconstruction, i)
         assert (plain.rgb == straight.images[i].rgb).all()
 
 
 def test_a_smaller_view_has_the_camera_of_its_pixels(walled):
     view, small = views_of(walled)[1], views_of(walled, max_side=120)[1]
     assert small.seen.shape == (SIZE[1] // 2, SIZE[0] // 2)
-    X = sparse_points(walled.reconstruction).X
+    X = _sparse_points(walled.reconstruction).X
     np.testing.assert_allclose(project(small.P, X), (project(view.P, X) + 0.5) / 2.0 - 0.5, atol=1e-9)
     assert np.linalg.norm(small.P[2, :3]) == pytest.approx(1.0)
 
@@ -58,27 +58,27 @@ def test_a_smaller_view_has_the_camera_of_its_pixels(walled):
 def test_views_are_refused_with_a_sentence(walled):
     image, reconstruction = walled.images[0], walled.reconstruction
     with pytest.raises(ValueError, match="metric"):
-        pinhole_view(image, replace(reconstruction, K=None), 0)
+        _pinhole_view(image, replace(reconstruction, K=None), 0)
     with pytest.raises(ValueError, match="px; got"):
-        pinhole_view(image, replace(reconstruction, sizes=reconstruction.sizes + 1), 0)
+        _pinhole_view(image, replace(reconstruction, sizes=reconstruction.sizes + 1), 0)
 
 
 def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):
-    views, points = views_of(walled), sparse_points(walled.reconstruction)
-    assert set(select_neighbours(points, views, 1, 2)) == {0, 2}
-    assert set(select_neighbours(points, views, 2, 2)) == {1, 3}
+    views, points = views_of(walled), _sparse_points(walled.reconstruction)
+    assert set(_select_neighbours(points, views, 1, 2)) == {0, 2}
+    assert set(_select_neighbours(points, views, 2, 2)) == {1, 3}
     S = np.diag([1e3, 1e3, 1e3, 1.0])
     larger = {i: replace(view, P=1e3 * view.P @ np.linalg.inv(S)) for i, view in views.items()}
     farther = replace(points, X=1e3 * points.X)
-    assert select_neighbours(farther, larger, 1) == select_neighbours(points, views, 1)
+    assert _select_neighbours(farther, larger, 1) == _select_neighbours(points, views, 1)
 
 
 def test_a_view_without_baseline_or_points_is_not_a_neighbour(walled):
-    views, points = views_of(walled), sparse_points(walled.reconstruction)
+    views, points = views_of(walled), _sparse_points(walled.reconstruction)
     same = {0: views[0], 1: replace(views[1], P=views[0].P)}
-    assert not select_neighbours(points, same, 0)
+    assert not _select_neighbours(points, same, 0)
     few = replace(points, seen=points.seen & (np.arange(points.seen.shape[1]) < 5))
-    assert not select_neighbours(few, views, 0)
+    assert not _select_neighbours(few, views, 0)
 
 
 def true_correspondence(P, pair, method, larger=1):
@@ -140,9 +140,9 @@ def test_disparities_are_interpolated_on_a_surface_and_not_across_its_edge():
 
 
 def test_brightness_is_made_alike(walled):
-    views, points = views_of(walled), sparse_points(walled.reconstruction)
+    views, points = views_of(walled), _sparse_points(walled.reconstruction)
     darker = np.rint(views[1].rgb * np.array([0.8, 0.7, 0.9])).astype(np.uint8)
-    xy = shared_projections(points, views[0], views[1])
+    xy = _shared_projections(points, views[0], views[1])
     gain = _brightness_gain(views[0].rgb, darker, *xy) / _brightness_gain(views[0].rgb, views[1].rgb, *xy)
     np.testing.assert_allclose(gain, 1.0 / np.array([0.8, 0.7, 0.9]), rtol=0.02)
     assert (_brightness_gain(views[0].rgb, darker, xy[0][:3], xy[1][:3]) == 1.0).all()

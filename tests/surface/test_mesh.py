@@ -11,9 +11,9 @@ from scipy.sparse.csgraph import connected_components
 from tests.surface.sphere import ring_of
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface._bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
+from thesisrecon.surface._mesh import face_areas, simplify_mesh
 from thesisrecon.surface.bspline import _basis, _energies
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.mesh import face_areas, simplify_mesh
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.zbuffer import rasterize
 from thesisrecon.records import DepthMap, TexturedMesh
+from thesisrecon.surface._mesh import connected_parts, face_areas, remove_small_parts
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion, _incidence_cosines
 from thesisrecon.surface.linear import LinearSurface, surface_from_depth
-from thesisrecon.surface.mesh import connected_parts, face_areas, remove_small_parts
 from thesisrecon.surface.model import SurfaceModel
 
 

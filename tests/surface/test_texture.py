@@ -10,8 +10,8 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import _texture_kernels as kernels
+from thesisrecon.surface._mesh import face_neighbours, vertex_normals
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.mesh import face_neighbours, vertex_normals
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas, _pack_rectangles
 from thesisrecon.views.render import render

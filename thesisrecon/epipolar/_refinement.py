@@ -13,7 +13,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame, as_matches
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.kernels import copy_to, empty, kernel
-from thesisrecon.numerics.small_solvers import orthogonalize_columns, solve_damped
+from thesisrecon.numerics._small_solvers import orthogonalize_columns, solve_damped
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.

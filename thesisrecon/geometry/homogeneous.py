@@ -9,7 +9,18 @@ from thesisrecon.arrays import F64
 
 
 def checked_inverse(G: F64, caller: str) -> F64:
-    """Invert matrices (..., d, d) that are finite and not singular."""
+    """Invert a matrix; a singular one is a ``ValueError`` in the name of the caller.
+
+    Parameters
+    ----------
+    G, caller : ndarray (n, n), str
+        Matrix, and the function for the message.
+
+    Returns
+    -------
+    ndarray (n, n)
+        The inverse.
+    """
     require_finite(caller, G)
     try:
         return np.asarray(np.linalg.inv(G), dtype=np.float64)
@@ -18,7 +29,18 @@ def checked_inverse(G: F64, caller: str) -> F64:
 
 
 def checked_unit(array: F64, caller: str) -> F64:
-    """Scale an array that is finite and not zero to unit Frobenius norm."""
+    """Scale to unit Frobenius norm; zeros are a ``ValueError`` in the name of the caller.
+
+    Parameters
+    ----------
+    array, caller : ndarray, str
+        Array, and the function for the message.
+
+    Returns
+    -------
+    ndarray
+        The array over its norm.
+    """
     require_finite(caller, array)
     norm = float(np.linalg.norm(array))
     if not norm > 0.0:

@@ -25,7 +25,7 @@ from thesisrecon.matching._prepared import (
     sample_window,
     select_matches,
 )
-from thesisrecon.numerics.small_solvers import solve_damped
+from thesisrecon.numerics._small_solvers import solve_damped
 from thesisrecon.records import Matches
 
 # The kernels below are called for every window and step, so they are inlined.

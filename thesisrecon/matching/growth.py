@@ -28,7 +28,7 @@ from thesisrecon.matching._prepared import (
     select_matches,
 )
 from thesisrecon.matching._seeds import corners_of_seeds, match_seeds, neighbour_support
-from thesisrecon.numerics.small_solvers import solve_damped
+from thesisrecon.numerics._small_solvers import solve_damped
 from thesisrecon.records import Features, Image, Matches, Seeds
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.

@@ -13,7 +13,7 @@ import scipy
 from thesisrecon.arrays import F64, I64
 from thesisrecon.kernels import kernel
 from thesisrecon.numerics._elimination import ReducedSums
-from thesisrecon.numerics.small_solvers import solve_positive
+from thesisrecon.numerics._small_solvers import solve_positive
 
 # Cost of an operation relative to dense Cholesky: narrow bands compute slower.
 BAND_COST = 2.0

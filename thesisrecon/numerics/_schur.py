@@ -28,8 +28,8 @@ from thesisrecon.numerics._reduced_solvers import (
     choose_solver,
     solve_dense,
 )
+from thesisrecon.numerics._small_solvers import floored_diagonal
 from thesisrecon.numerics.observations import Jacobians, Observations, SortedObservations
-from thesisrecon.numerics.small_solvers import floored_diagonal
 
 CHUNK = 16384
 # Every chunk has its own sums: few chunks if these are large.

@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics.small_solvers import floored_diagonal, solve_positive
+from thesisrecon.numerics._small_solvers import floored_diagonal, solve_positive
 
 State = TypeVar("State")
 Step = TypeVar("Step")

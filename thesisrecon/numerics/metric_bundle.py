@@ -17,9 +17,7 @@ from thesisrecon.numerics._intrinsic_unknowns import (
     assign_columns,
     number_unknowns,
 )
-from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
-from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
-from thesisrecon.numerics.metric_cameras import (
+from thesisrecon.numerics._metric_cameras import (
     POSE_DOF,
     MetricCameras,
     MetricModel,
@@ -28,6 +26,8 @@ from thesisrecon.numerics.metric_cameras import (
     move_poses,
     project_metric,
 )
+from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
+from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.numerics.observations import (
     Jacobians,
     Observations,

@@ -24,14 +24,38 @@ class SortedObservations:
     order: I64
 
     def unsort(self, values: F64) -> F64:
-        """Return values (K, ...) of observations in the caller's order."""
+        """Bring one value per sorted observation to the order of the caller.
+
+        Parameters
+        ----------
+        values : ndarray (K, ...)
+            Values of the sorted observations.
+
+        Returns
+        -------
+        ndarray (K, ...)
+            The values in the caller's order.
+        """
         out = np.empty_like(values)
         out[self.order] = values
         return out
 
 
 def sort_observations(observations: Observations, n_views: int, n_points: int) -> SortedObservations:
-    """Check and sort observations; raise ``ValueError`` for wrong shapes, indices or pixels."""
+    """Sort observations by point, with the places at which each point begins.
+
+    Parameters
+    ----------
+    observations : Observations
+        Observations in any order.
+    n_views, n_points : int
+        Numbers of views and points.
+
+    Returns
+    -------
+    SortedObservations
+        The observations by point and view.
+    """
     view = np.ascontiguousarray(observations.view_index, dtype=np.int64)
     point = np.ascontiguousarray(observations.point_index, dtype=np.int64)
     xy = np.ascontiguousarray(observations.xy, dtype=np.float64)

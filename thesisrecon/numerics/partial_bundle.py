@@ -10,6 +10,13 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
 from thesisrecon.kernels import empty, kernel
+from thesisrecon.numerics._metric_cameras import (
+    MetricModel,
+    linearize_metric,
+    metric_cost,
+    move_poses,
+    project_metric,
+)
 from thesisrecon.numerics._projective_kernels import (
     UnitState,
     linearize_projective,
@@ -17,14 +24,8 @@ from thesisrecon.numerics._projective_kernels import (
     tangent_reflectors,
     tangent_step,
 )
+from thesisrecon.numerics._small_solvers import away_from_zero, invert_positive_3x3, loss_value, loss_weight
 from thesisrecon.numerics.levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
-from thesisrecon.numerics.metric_cameras import (
-    MetricModel,
-    linearize_metric,
-    metric_cost,
-    move_poses,
-    project_metric,
-)
 from thesisrecon.numerics.observations import (
     Jacobians,
     Observations,
@@ -32,7 +33,6 @@ from thesisrecon.numerics.observations import (
     Weighting,
     sort_observations,
 )
-from thesisrecon.numerics.small_solvers import away_from_zero, invert_positive_3x3, loss_value, loss_weight
 
 # Iterations of minimize_reprojection; the median point takes three or four.
 _MAX_ITERATIONS = 200

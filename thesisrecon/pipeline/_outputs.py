@@ -26,7 +26,7 @@ from thesisrecon.report._page import render_report
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
-from thesisrecon.surface.mesh import simplify_mesh
+from thesisrecon.surface._mesh import simplify_mesh
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 DEPTH_PX = 400

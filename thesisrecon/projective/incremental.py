@@ -40,7 +40,7 @@ _SAMPLE = 6
 _BATCH, _MAX_BATCHES = 64, 12
 
 
-def resect_ransac(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -> tuple[F64 | None, B8]:
+def _resect_ransac(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -> tuple[F64 | None, B8]:
     """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
 
     Samples are drawn in batches until one without outliers was drawn with probability 0.999. Points X (M, 4)
@@ -97,7 +97,7 @@ def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
     return np.where((xh[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
 
 
-def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
+def _projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
     """Return the standard deviations (N,) px of projections under the covariance (12, 12) of a camera.
 
     The root of half the trace of J C J'; inf near the principal plane.
@@ -114,7 +114,7 @@ def projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
     return np.where(np.isfinite(spread), spread, np.inf)
 
 
-def find_inconsistent_view(
+def _find_inconsistent_view(
     P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float, min_ratio: float
 ) -> tuple[int, float] | None:
     """Return the view that agrees least with the verified matches of its pairs, and its inlier ratio.
@@ -309,7 +309,7 @@ class IncrementalProjective:
         t, early = model.tracks, self.outlier_sigmas[0]
         k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
         X, xy = model.X[t.point_index[k]], t.xy[k]
-        P, inlier = resect_ransac(X, xy, threshold_px=early * model.sigma_px, rng=rng)
+        P, inlier = _resect_ransac(X, xy, threshold_px=early * model.sigma_px, rng=rng)
         if P is None or inlier.sum() < self.min_points or inlier.mean() < _MIN_INLIER_RATIO:
             model.reasons[view] = (
                 f"only {int(inlier.sum())} of {len(k)} points of the model are inliers of its resection"
@@ -333,7 +333,7 @@ class IncrementalProjective:
         P = refined * np.sign(np.median(X @ refined[2]))
         if self.max_projection_std_rel is None:
             return False, P
-        std_px = projection_std_px(refined, covariance * model.sigma_px**2, model.X[model.valid])
+        std_px = _projection_std_px(refined, covariance * model.sigma_px**2, model.X[model.valid])
         limit = self.max_projection_std_rel * float(model.sizes[view].max())
         quantile = float(np.quantile(std_px, _STD_QUANTILE))
         if quantile < limit:
@@ -354,7 +354,7 @@ class IncrementalProjective:
         reason = f"only {counts[view]} of its points are inliers of the finished model ({shares[view]:.0%})"
         if shares[view] >= _MIN_INLIER_RATIO:
             threshold, ratio = self.outlier_sigmas[0] * model.sigma_px, self.min_epipolar_inlier_ratio
-            found = find_inconsistent_view(
+            found = _find_inconsistent_view(
                 model.P, model.registered, pairs, threshold_px=threshold, min_ratio=ratio
             )
             if found is None:

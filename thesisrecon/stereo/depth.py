@@ -35,7 +35,7 @@ class SparsePoints:
     seen: B8  #: (V, N) whether a view observes a point
 
 
-def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
+def _sparse_points(reconstruction: Reconstruction) -> SparsePoints:
     """The valid points of a metric reconstruction with their inlier observations."""
     tracks = reconstruction.tracks
     seen = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
@@ -46,7 +46,7 @@ def sparse_points(reconstruction: Reconstruction) -> SparsePoints:
     return SparsePoints(reconstruction.X[valid, :3] / reconstruction.X[valid, 3:], seen[:, valid])
 
 
-def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> tuple[F64, F64]:
+def _shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> tuple[F64, F64]:
     """Pixels (N, 2) in two views of the points that one of them observes, if inside both images.
 
     Points that only one view observes count too: the depth range must cover the whole visible scene.
@@ -63,7 +63,7 @@ def shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> 
     return places[0][keep], places[1][keep]
 
 
-def select_neighbours(
+def _select_neighbours(
     points: SparsePoints, views: Mapping[int, PinholeView], view: int, max_neighbours: int = 4
 ) -> tuple[int, ...]:
     """Select the neighbours of a view greedily, the most useful first.
@@ -112,7 +112,7 @@ def _weights(points: SparsePoints, centres: Mapping[int, F64], view: int, other:
     return weights
 
 
-def pinhole_view(
+def _pinhole_view(
     image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
 ) -> PinholeView:
     """Undistort an image of a metric reconstruction, its longest side at most ``max_side`` pixels.
@@ -322,13 +322,13 @@ class MultiViewStereo:
         """See `thesisrecon.config.DepthEstimator.prepare`."""
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
-        points = sparse_points(reconstruction)
+        points = _sparse_points(reconstruction)
         registered = np.flatnonzero(reconstruction.registered).tolist()
         views, matched = (
-            {i: pinhole_view(images[i], reconstruction, i, max_side=side) for i in registered}
+            {i: _pinhole_view(images[i], reconstruction, i, max_side=side) for i in registered}
             for side in (self.max_side, min(self.match_side, self.max_side))
         )
-        chosen = {i: select_neighbours(points, views, i, self.max_neighbours) for i in views}
+        chosen = {i: _select_neighbours(points, views, i, self.max_neighbours) for i in views}
         return MultiViewScene(views, points, chosen, matched)
 
     def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
@@ -340,7 +340,7 @@ class MultiViewStereo:
             a, b = (scene.matched.get(k, scene.views[k]) for k in (i, j))
             shapes = scene.views[i].seen.shape, scene.views[j].seen.shape
             try:
-                return self.pairs.correspond(a, b, *shared_projections(scene.points, a, b), shapes=shapes)
+                return self.pairs.correspond(a, b, *_shared_projections(scene.points, a, b), shapes=shapes)
             except StageFailure:
                 return None
 

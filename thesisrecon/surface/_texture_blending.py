@@ -13,6 +13,7 @@ from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.zbuffer import rasterize, rasterize_corners
 from thesisrecon.records import PinholeView, TexturedMesh
+from thesisrecon.surface._mesh import components, vertex_normals
 from thesisrecon.surface._texture_kernels import (
     ViewSurface,
     combine_colors,
@@ -21,7 +22,6 @@ from thesisrecon.surface._texture_kernels import (
     grow_colors,
     observe_points,
 )
-from thesisrecon.surface.mesh import components, vertex_normals
 
 DEPTH_TOLERANCE_PX = 3.0
 """Depth tolerance of visible vertices in pixel sizes: the z-buffer holds one depth per pixel."""

@@ -26,8 +26,8 @@ from thesisrecon.surface._fusion_kernels import (
     place_vertices,
     touched_blocks,
 )
+from thesisrecon.surface._mesh import remove_small_parts, remove_unused_vertices, select_faces
 from thesisrecon.surface.linear import GRAZING_DEG, max_depth_slope, surface_from_depth, triangulate_grid
-from thesisrecon.surface.mesh import remove_small_parts, remove_unused_vertices, select_faces
 
 MIN_COSINE = 0.1
 """Lower limit of the incidence cosine."""

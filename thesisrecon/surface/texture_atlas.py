@@ -15,6 +15,7 @@ from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.raster import resample, smooth
 from thesisrecon.records import PinholeView, TexturedMesh
+from thesisrecon.surface._mesh import face_neighbours
 from thesisrecon.surface._texture_blending import (
     choose_views,
     face_quality,
@@ -23,7 +24,6 @@ from thesisrecon.surface._texture_blending import (
     project_to_view,
     view_camera,
 )
-from thesisrecon.surface.mesh import face_neighbours
 
 CHART_MARGIN = 2
 """Pixels around each chart, so that reduced textures do not mix charts."""

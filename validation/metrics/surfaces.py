@@ -9,8 +9,8 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.records import DepthMap, TexturedMesh
+from thesisrecon.surface._mesh import face_areas
 from thesisrecon.surface.linear import surface_from_depth
-from thesisrecon.surface.mesh import face_areas
 from validation.metrics.depth import true_depth
 from validation.references.open3d_geometry import Nearest
 from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene
