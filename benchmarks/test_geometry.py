@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.conftest import Bench
 from thesisrecon.epipolar.configuration import Configuration
-from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
+from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from validation.harness.stages.bundle import FOCAL_K1

@@ -85,7 +85,9 @@ def test_a_stage_imports_only_foundations_and_itself():
 
 def test_foundations_import_only_foundations():
     used = {p: parts_used(p) - FOUNDATIONS for p in modules_of(FOUNDATIONS)}
-    used |= {p: names | ({"logging", "random"} & imported_modules(p)) for p, names in used.items()}
+    # kernels.py warns where machine code cannot be kept.
+    barred = {p: {"random"} if home(p) == "kernels" else {"logging", "random"} for p in used}
+    used |= {p: names | (barred[p] & imported_modules(p)) for p, names in used.items()}
     assert report(used) == []
 
 

@@ -10,7 +10,7 @@ from thesisrecon.epipolar import _refinement as rank2
 from thesisrecon.epipolar import _sampling as kernels
 from thesisrecon.epipolar import linear
 from thesisrecon.epipolar._frame import PairFrame
-from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals
 from thesisrecon.numerics._small_solvers import solve_damped
 

@@ -7,7 +7,7 @@ from scipy.ndimage import convolve1d
 from tests.synthetic import texture
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.raster import cubic_weights, gaussian_taps, halve, resample, smooth
+from thesisrecon.geometry.image_filters import cubic_weights, gaussian_taps, halve, resample, smooth
 from thesisrecon.geometry.zbuffer import Raster, rasterize
 
 

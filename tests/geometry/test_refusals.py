@@ -6,7 +6,7 @@ import numpy as np
 
 from thesisrecon.geometry import camera_matrix, conics, strata, three_view, two_view
 from thesisrecon.geometry.homogeneous import normalizing_transform
-from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.resection import resect_linear
 from validation.metrics.similarity import estimate_similarity
 

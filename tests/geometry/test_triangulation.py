@@ -17,7 +17,7 @@ from thesisrecon.geometry.camera_matrix import (
     project,
     undistort,
 )
-from thesisrecon.geometry.optimal_triangulation import (
+from thesisrecon.geometry.polynomial_triangulation import (
     _roots_in_unit_interval,
     correct_matches,
     triangulate_polynomial,

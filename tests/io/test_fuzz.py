@@ -205,7 +205,7 @@ def test_tables_of_other_types_raise_only_documented_errors(reader, content, tmp
 
 @few
 @given(data=st.data())
-def test_settings_of_other_types_are_refused_in_a_sentence(data):
+def test_settings_of_other_types_raise_only_documented_errors(data):
     whole = {"features": {"kind": "harris-corners"}, "intrinsics": {"focal_px": 9.0, "focal_std_rel": 0.1}}
     whole |= {"images": {"max_size_px": 640}}
     whole |= {"dense": {"pairs": {"matcher": {"kind": "maximum-likelihood-scanline"}}}}

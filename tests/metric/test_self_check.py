@@ -21,7 +21,7 @@ from thesisrecon.metric._shared_camera import (
     inconsistent_principal_point,
 )
 from thesisrecon.metric._uncertainty import widen_unverified_focals
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
 

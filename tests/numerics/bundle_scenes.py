@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 
 
 @dataclass(frozen=True)

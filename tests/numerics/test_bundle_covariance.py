@@ -9,7 +9,7 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import _covariance as bundle_covariance
 from thesisrecon.numerics import _reduced_solvers as kernels
 from thesisrecon.numerics._covariance import gauge_directions, robust_sigma
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics.observations import Observations
 

@@ -12,7 +12,7 @@ from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
 from thesisrecon.numerics import _schur
 from thesisrecon.numerics._elimination import ReducedSums, sum_leverages
-from thesisrecon.numerics._metric_cameras import (
+from thesisrecon.numerics._metric_kernels import (
     MetricCameras,
     MetricModel,
     linearize_metric,

@@ -5,7 +5,7 @@ from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import _schur
 from thesisrecon.numerics._intrinsic_unknowns import number_unknowns
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics._reduced_solvers import BandedCholesky
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics.observations import Observations

@@ -12,9 +12,9 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.stereo import _planar as planar
 from thesisrecon.stereo import rectification
-from thesisrecon.stereo._distortion import jacobians, matches_in_frame, measure_quality
 from thesisrecon.stereo._epipolar_pair import MAX_GROWTH, MAX_SHRINK, pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo._polar import PolarRectification, polar
+from thesisrecon.stereo._rectification_quality import jacobians, matches_in_frame, measure_quality
 from thesisrecon.stereo._resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
 from thesisrecon.stereo.rectification import disparity_range, rectify, rectify_cameras, rectify_pair
 

@@ -1,8 +1,8 @@
 """Section 5.5: which model explains a pair: general F, plane, pure rotation or pure translation.
 
-A homography explains a plane or a rotating camera, [e]x one that does not rotate. A simpler model is accepted
-unless its residuals exceed the noise, or more of the matches that it does not explain agree with F than
-expected by chance. A homography K R K^-1 with square pixels is a pure rotation (HZ 13.2, 19.6).
+A homography explains a plane or a rotating camera, [e]x one that does not rotate. A simpler model is rejected
+if its residuals exceed the noise, or if F explains more of the remaining matches than chance would. A
+homography K R K^-1 with square pixels is a pure rotation (HZ 13.2, 19.6).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features._kernels import sample_patches
 from thesisrecon.features.harris import CornerMeasure, select_spread
-from thesisrecon.geometry.raster import halve, resample, smooth
+from thesisrecon.geometry.image_filters import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
 
@@ -124,7 +124,7 @@ class MultiScaleCorners:
 
 
 def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> tuple[list[F32], list[F64]]:
-    """Sizes of an image (H, W), smaller by 1/sqrt(2) each, and their image pixels per pixel in x and y.
+    """Levels of a pyramid, each 1/sqrt(2) of the one before: sizes, and image pixels per pixel (x, y).
 
     No side is below 16. Halving drops an odd row, so its scale is 2.
     """

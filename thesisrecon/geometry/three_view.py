@@ -17,7 +17,7 @@ from thesisrecon.geometry.homogeneous import (
     homogenize,
     require_finite,
 )
-from thesisrecon.geometry.optimal_triangulation import correct_matches
+from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.two_view import unit_norm
 
 

@@ -10,7 +10,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.camera_matrix import distort, undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics.partial_bundle import refine_points
 from thesisrecon.records import Reconstruction, Tracks, Upgrade
 

@@ -17,7 +17,7 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, WIDTH, MetricEstimate
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.numerics.metric_bundle import MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics.observations import Observations

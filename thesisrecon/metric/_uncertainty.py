@@ -190,7 +190,7 @@ class FocalShrinkage:
         others = np.where(
             self.weight < 0.5,
             "; the stated value rests on the other cameras",
-            ", and no other camera of its kind constrains it",
+            ", and the other cameras of its kind hardly constrain it",
         )
         return tuple(
             f"Image #{view}: its own matches determine the focal length only to {self.own_std[view]:.0%} "

@@ -1,1 +1,1 @@
-"""Estimation: Levenberg-Marquardt, robust losses, RANSAC, noise (5.4) and bundle adjustment (6.7)."""
+"""Estimation: Levenberg-Marquardt, robust losses, noise (5.4) and bundle adjustment (6.7)."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.numerics._metric_cameras import FOCAL, POSE_DOF
+from thesisrecon.numerics._metric_kernels import FOCAL, POSE_DOF
 from thesisrecon.numerics._reduced_solvers import ReducedSystem, order_views
 from thesisrecon.numerics.levenberg_marquardt import invert_information
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._metric_cameras import FOCAL, POSE_DOF, MetricCameras
+from thesisrecon.numerics._metric_kernels import FOCAL, POSE_DOF, MetricCameras
 
 NONE = -1
 # Larger steps of log f are rejected anyway; the bound avoids overflow.

@@ -16,7 +16,7 @@ from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._covariance import gauge_directions, invert_in_inner_gauge
 from thesisrecon.numerics._intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
-from thesisrecon.numerics._metric_cameras import POSE_DOF, MetricCameras, MetricModel, linearize_metric
+from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
 from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
 
 # Number of pose unknowns tested besides all intrinsics.

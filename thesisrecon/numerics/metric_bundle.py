@@ -17,7 +17,7 @@ from thesisrecon.numerics._intrinsic_unknowns import (
     assign_columns,
     number_unknowns,
 )
-from thesisrecon.numerics._metric_cameras import (
+from thesisrecon.numerics._metric_kernels import (
     POSE_DOF,
     MetricCameras,
     MetricModel,

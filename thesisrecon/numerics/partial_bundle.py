@@ -10,7 +10,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
 from thesisrecon.kernels import empty, kernel
-from thesisrecon.numerics._metric_cameras import (
+from thesisrecon.numerics._metric_kernels import (
     MetricModel,
     linearize_metric,
     metric_cost,

@@ -16,7 +16,6 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.stereo._distortion import disparity_gradients, homography_jacobians, singular_values
 from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
     MIN_MATCHES,
@@ -25,6 +24,11 @@ from thesisrecon.stereo._epipolar_pair import (
     frame_size,
     plane_from_angle,
     scale_and_shift,
+)
+from thesisrecon.stereo._rectification_quality import (
+    disparity_gradients,
+    homography_jacobians,
+    singular_values,
 )
 from thesisrecon.stereo._resampling import Rectification
 
@@ -135,7 +139,7 @@ def loop_zhang(pair: EpipolarPair) -> PlanarRectification:
 
 
 def minimum_distortion(pair: EpipolarPair) -> PlanarRectification:
-    """Rectify with the least distortion of :class:`thesisrecon.stereo._distortion.RectificationQuality`.
+    """Rectify with the least distortion (`thesisrecon.stereo._rectification_quality.RectificationQuality`).
 
     Least squares over the line at infinity and the scale and shear of both first rows (5 parameters), from
     the solution of :func:`loop_zhang`: the variance of the log singular values of both homographies,

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.stereo._distortion import disparity_gradients, matches_in_frame
 from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
     MIN_MATCHES,
@@ -22,6 +21,7 @@ from thesisrecon.stereo._epipolar_pair import (
     frame_size,
     image_corners,
 )
+from thesisrecon.stereo._rectification_quality import disparity_gradients, matches_in_frame
 from thesisrecon.stereo._resampling import Rectification
 
 ANGLES = 4096

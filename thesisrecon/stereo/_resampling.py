@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from thesisrecon.arrays import F32, F64
-from thesisrecon.geometry.raster import cubic_weights
+from thesisrecon.geometry.image_filters import cubic_weights
 from thesisrecon.kernels import empty, kernel
 
 MAX_TAPS = 24

@@ -9,7 +9,6 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.stereo._distortion import RectificationQuality, matches_in_frame, measure_quality
 from thesisrecon.stereo._epipolar_pair import (
     EpipolarPair,
     Size,
@@ -19,6 +18,7 @@ from thesisrecon.stereo._epipolar_pair import (
 )
 from thesisrecon.stereo._planar import common_orientation, hartley, loop_zhang, minimum_distortion
 from thesisrecon.stereo._polar import PolarRectification, polar
+from thesisrecon.stereo._rectification_quality import RectificationQuality, matches_in_frame, measure_quality
 from thesisrecon.stereo._resampling import Rectification
 
 MAX_TURN_DEG, MAX_ASPECT = 5.0, 0.1

@@ -45,7 +45,7 @@ def _join(parent: I64, a: int, b: int) -> None:
 
 @kernel
 def _number_coefficients(first: I64, columns: int, start: I64, linked: I64, coefficient: I64) -> int:
-    """Number a coefficient for every node and connected set of pieces within its sixteen cells.
+    """Number the coefficients: at each node, one for each connected set of pieces in the 16 cells around it.
 
     ``first`` (cells + 1,) is the first piece of each cell; ``linked[start[k]:start[k + 1]]`` are the pieces
     of other cells connected to piece k. ``coefficient`` (N, 16) receives the number at node (i, j) of each

@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.raster import resample, smooth
+from thesisrecon.geometry.image_filters import resample, smooth
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface._mesh import face_neighbours
 from thesisrecon.surface._texture_blending import (
@@ -160,7 +160,7 @@ def _pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
 def _fill(
     views: Sequence[PinholeView], label: I64, rectangles: I64, offsets: I64, size: tuple[int, int]
 ) -> U8:
-    """Texture (H, W, 3) with the image rectangle of every chart of view ``label`` at its position."""
+    """Texture (H, W, 3): the rectangle of each chart, copied from view ``label`` to its place."""
     texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
     for v, (left, top, right, bottom), (x, y) in zip(label, rectangles, offsets, strict=True):
         if v >= 0:

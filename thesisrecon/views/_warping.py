@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, F64, I16, I32
-from thesisrecon.geometry.raster import cubic_weights
+from thesisrecon.geometry.image_filters import cubic_weights
 from thesisrecon.geometry.zbuffer import run_in_strips
 from thesisrecon.kernels import empty, kernel
 
@@ -97,7 +97,7 @@ def _draw_footprint(
     rows: tuple[int, int],
     picture: tuple[F32, F32],
 ) -> None:
-    """Draw what a pixel covers, half a pixel to each side, moved as its neighbours are."""
+    """Draw the parallelogram onto which a pixel maps, from the positions of its neighbours."""
     target, inverse_depth = surface
     source, front = picture
     across, down = empty(3), empty(3)

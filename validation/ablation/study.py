@@ -101,7 +101,8 @@ class Study:
     baseline : the name of the variant that the others are compared with; the first where empty.
     start : the name of the unchanged configuration in the modes that begin with it.
     metrics : the task's numbers to analyse, all if empty. A plain function as a task lists its numbers here.
-        what it tells.
+    title, words : the heading of the page and a sentence below it.
+    folder : the folder of files that values name.
     task : what a row runs, a :class:`Task` or a function (config, scene, seed) -> {metric: number}; the
         reconstruction of images if None.
     config : the configuration to change.

@@ -15,7 +15,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import cross_matrix, scene_frame
 from thesisrecon.numerics._covariance import gauge_directions
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics.observations import Observations
 from validation.references.libraries import pycolmap
 

@@ -15,7 +15,6 @@ from thesisrecon.geometry.camera_matrix import project, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.records import Reconstruction, TwoView
-from thesisrecon.stereo._distortion import RectificationQuality, jacobians, measure_quality
 from thesisrecon.stereo._epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo._planar import (
     PlanarRectification,
@@ -25,6 +24,7 @@ from thesisrecon.stereo._planar import (
     minimum_distortion,
 )
 from thesisrecon.stereo._polar import polar
+from thesisrecon.stereo._rectification_quality import RectificationQuality, jacobians, measure_quality
 from thesisrecon.stereo._resampling import Rectification
 from thesisrecon.stereo.rectification import rectify
 from validation.metrics.record import Metric

@@ -13,7 +13,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.optimal_triangulation import triangulate_polynomial
+from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
 from validation.ablation.study import Measure, Place, Task

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics._metric_cameras import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics.observations import Observations
 from thesisrecon.records import Reconstruction
