@@ -36,7 +36,7 @@ def render(
     size: Annotated[
         str | None,
         typer.Option(
-            "--size", metavar="WxH", help="Frame size (px); by default the aspect ratio of the first image."
+            "--size", metavar="WxH", help="Frame size (px); by default that of the first image, at most 1000."
         ),
     ] = None,
     light: Annotated[
@@ -97,7 +97,7 @@ def interpolate(
     ],
     method: Annotated[
         Literal["interpolation", "tensor"],
-        typer.Option("--method", help="Image interpolation (section 1.2) or trilinear tensor (1.3)."),
+        typer.Option("--method", help="Matched and blended (thesis 1.2), or by the trilinear tensor (1.3)."),
     ] = "interpolation",
     frames: Frames = 21,
     seed: Seed = 0,

@@ -1,4 +1,4 @@
-"""Kernels of the seven-point search: a batched solver, Sampson distances and the truncated score.
+"""Kernels of the default estimator: batched seven-point solver, Sampson distances and truncated score.
 
 In the projective basis of four of the seven matches F has a zero diagonal and entries that sum to zero, and
 three equations leave a pencil by minors without pivoting: the loop vectorises and is four times faster than

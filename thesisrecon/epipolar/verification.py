@@ -1,4 +1,4 @@
-"""Verification of a pair: which matches to keep once F is known, and whether to accept the pair."""
+"""Verification of a pair: inliers of F, share explained by one homography, whether to accept the pair."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sparse linear system of bundle adjustment: points are eliminated, cameras are solved together.
+"""Schur complement of bundle adjustment: points are eliminated, cameras are solved together.
 
 [[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then b = -V^-1 (h
 + W' a). Points are eliminated in chunks: the sum of their sums loses fewer digits than one long sum.

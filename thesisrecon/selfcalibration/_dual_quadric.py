@@ -1,4 +1,4 @@
-"""Absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3).
+"""Solvers of the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3).
 
 Linear: M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002. A camera with square pixels, no skew and a central
 principal point gives six equations linear in the quadric, whose weights assume a focal length near 1.

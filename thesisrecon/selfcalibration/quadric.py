@@ -1,4 +1,4 @@
-"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3)."""
+"""Methods of the pipeline: self-calibration by the absolute dual quadric (section 7.3, direct; HZ 19.3)."""
 
 from __future__ import annotations
 
