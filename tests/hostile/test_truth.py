@@ -51,13 +51,6 @@ def test_a_truth_of_wrong_types_is_refused(text, tmp_path, validated):
     assert "cameras.json must " in said
 
 
-@pytest.mark.parametrize("make", [pipe, links("/dev/zero"), sparse(10**13), writes(files.deep_json())])
-def test_an_invalid_report_to_compare_with_is_rejected(make, tmp_path, validated):
-    make(tmp_path / "results.json")
-    command = ["report", "-o", str(tmp_path / "out"), "--against", str(tmp_path)]
-    assert "holds no report to compare with" in validated(command)
-
-
 STUDIES = [
     (pipe, "cannot be read: it is a pipe"),
     (links("/dev/zero"), "cannot be read: it is a pipe, a device"),
