@@ -120,3 +120,17 @@ def test_an_entry_of_a_record_that_has_moved_is_compiled_again(package):
     assert run_in(package, code.replace("sys,", "sys, records_here as records,")) == ["4.0", "0"]
     (package / "records_here.py").rename(package / "records_there.py")
     assert run_in(package, code.replace("sys,", "sys, records_there as records,")) == ["4.0", "0"]
+
+
+def test_a_compilation_that_fails_or_is_done_holds_no_lock(package):
+    code = """
+        import caller
+        try:
+            caller.outer("text")
+        except Exception as error:
+            print(type(error).__name__, len(caller.outer._cache._locks), len(caller.inner._cache._locks))
+        caller.outer(3.0)
+        print(len(caller.outer._cache._locks), len(caller.inner._cache._locks))
+        """
+    assert run_in(package, textwrap.dedent(code)) == ["TypingError", "0", "0", "0", "0"]
+    assert not list((package / "cache" / "thesisrecon").glob("*.lock"))

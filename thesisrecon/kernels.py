@@ -18,6 +18,7 @@ import os
 import pickle
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -40,6 +41,9 @@ _log = logging.getLogger(__name__)
 
 CACHE_VARIABLE = "NUMBA_CACHE_DIR"
 """Environment variable: the folder of the compiled kernels."""
+
+MAX_WAIT_S = 60.0
+"""Longest wait for another process that compiles the same kernel."""
 
 COMPILER_SETTINGS = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VECTORIZE")
 """Settings of numba that change the machine code."""
@@ -80,7 +84,8 @@ def kernel(function: Any = None, **options: Any) -> Any:
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher: Any = numba.njit(nogil=True, **options)(function)
         if isinstance(dispatcher, Dispatcher):  # a plain function where NUMBA_DISABLE_JIT is set
-            vars(dispatcher)["_cache"] = KernelCache(dispatcher)
+            stored = vars(dispatcher)["_cache"] = KernelCache(dispatcher)
+            vars(dispatcher)["compile"] = stored.releasing(dispatcher.compile)
             vars(dispatcher)["get_call_template"] = _without_literals(dispatcher.get_call_template)
         return dispatcher
 
@@ -246,19 +251,44 @@ class KernelCache(NullCache):
         name = f"{function.__module__.removeprefix('thesisrecon.')}.{function.__name__}"
         return cache_folder() / f"{name}-{key}"
 
+    def releasing(self, compile_signature: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Release the lock of a compilation however it ends."""
+
+        def compile_and_release(signature: Any) -> Any:
+            before = set(self._locks)
+            try:
+                return compile_signature(signature)
+            finally:
+                for path in set(self._locks) - before:
+                    self._unlock(path)
+
+        return compile_and_release
+
     def _lock(self, path: Path) -> None:
+        """Wait until nobody else compiles the entry, or it is there, or too long."""
         # Where the file system has no locks, two processes may compile the same: no harm.
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             file = path.with_name(path.name + ".lock").open("wb")
-            self._locks[path] = file
-            fcntl.flock(file, fcntl.LOCK_EX)
+            end = time.monotonic() + MAX_WAIT_S
+            while True:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    self._locks[path] = file
+                    return
+                except BlockingIOError:
+                    if path.exists() or time.monotonic() > end:
+                        file.close()
+                        return
+                    time.sleep(0.02)
 
     def _unlock(self, path: Path) -> None:
         file = self._locks.pop(path, None)
         if file is not None:
             with contextlib.suppress(OSError):
                 path.with_name(path.name + ".lock").unlink()
+                # A forked process may hold the same open file.
+                fcntl.flock(file, fcntl.LOCK_UN)
             file.close()
 
 
