@@ -110,10 +110,11 @@ def read_mutations(path: Path = MUTATIONS_FILE) -> list[Mutation]:
 
 
 @dataclass(frozen=True)
-class Bench:
-    """A copy of the tree in ``out``, in which one fault at a time is planted, and its checks."""
+class CopiedTree:
+    """The parts ``copied`` from the repository, in the folder ``out``; one fault at a time is planted."""
 
     out: Path
+    copied: tuple[str, ...] = COPIED
 
     @property
     def tree(self) -> Path:
@@ -127,7 +128,7 @@ class Bench:
     def set_up(self) -> None:
         shutil.rmtree(self.tree, ignore_errors=True)
         self.tree.mkdir(parents=True)
-        for name in COPIED:
+        for name in self.copied:
             source, target = ROOT / name, self.tree / name
             if source.is_dir():
                 shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
@@ -148,6 +149,10 @@ class Bench:
         finally:
             path.write_text(sound, encoding="utf-8")
             os.utime(path, (before, before))
+
+
+class Bench(CopiedTree):
+    """A copy of the tree and its checks."""
 
     def check(self, name: str, wanted: Sequence[Mutation], resume: str = "") -> Checked:
         """Run ``python -m validation check`` in the tree for these faults.

@@ -1,0 +1,308 @@
+"""Mutation testing: ``python -m validation.mutants -o OUT [--sample 25] [--packages ...]``.
+
+Draws random faults from all single changes in the functions of a package: an operator, comparison, condition,
+number, an opposite function, or a removed statement. Each is planted in a copy of the tree. The tests of its
+package run first, then those of modules that import it. Constants of modules and classes are not changed. OUT
+gets ``mutants.md`` and ``mutants.json``; the exit code is 1 if fewer than 85 % are caught. ``--again``
+repeats the uncaught faults of OUT.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import itertools
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.errors import counted
+from thesisrecon.runtime._signals import install_signal_handlers
+from validation.harness.process import own_cores, run_process
+from validation.mutations import CopiedTree
+from validation.scenes.real import ROOT
+
+PACKAGES = ("geometry", "epipolar", "selfcalibration", "numerics")
+MIN_SCORE = 0.85
+LIMIT_S = 420.0
+"""Time limit of a test run (s)."""
+COLD_S = 3600.0
+"""Time limit without a fault, when all kernels are compiled (s)."""
+OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult, ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+    ast.LShift: ast.RShift, ast.RShift: ast.LShift, ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE,
+    ast.GtE: ast.Lt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.In: ast.NotIn,
+    ast.And: ast.Or, ast.Or: ast.And,
+}  # fmt: skip
+BORDER: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
+}  # fmt: skip
+"""Opposites of integer comparisons; equality of floats is too rare to test."""
+OPPOSITES = {
+    a: b
+    for pair in (
+        ("min", "max"), ("minimum", "maximum"), ("argmin", "argmax"), ("any", "all"), ("sin", "cos"),
+        ("zeros", "ones"), ("zeros_like", "ones_like"), ("floor", "ceil"),
+    )
+    for a, b in (pair, pair[::-1])
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """The fault ``number`` of ``file``: in ``line``, the code ``old`` becomes ``new``."""
+
+    file: str
+    line: int
+    old: str
+    new: str
+    number: int
+
+    def apply(self, text: str) -> str:
+        """Return the text with the fault, without comments."""
+        tree = ast.parse(text)
+        next(itertools.islice(_faults(tree), self.number, None))
+        return ast.unparse(tree)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Result of a fault: ``by`` names the failing test, empty if it was not caught."""
+
+    mutant: Mutant
+    by: str
+    seconds: float
+
+
+def mutants_of(root: Path, package: str) -> list[Mutant]:
+    """Return all faults of a package, file by file."""
+    found = []
+    for path in sorted((root / "thesisrecon" / package).rglob("*.py")):
+        file = path.relative_to(root).as_posix()
+        for number, (line, old, new) in enumerate(_faults(ast.parse(path.read_text(encoding="utf-8")))):
+            found.append(Mutant(file, line, old, new, number))
+    return found
+
+
+def _faults(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
+    """Yield line, old and new code of each fault; the tree has it until the next one is asked for."""
+    for function in [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]:
+        for parent in _inside(function):
+            for name, value in ast.iter_fields(parent):
+                if name == "annotation" or (parent is function and name != "body"):
+                    continue
+                for k, node in enumerate(value if isinstance(value, list) else [value]):
+                    for new in _changes(node):
+                        text = ast.unparse(node), ast.unparse(new)
+                        for put in (new, node):
+                            whole = [*value[:k], put, *value[k + 1 :]] if isinstance(value, list) else put
+                            setattr(parent, name, whole)
+                            if put is new:
+                                yield node.lineno, *text
+
+
+def _inside(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a function and the nodes in it, without nested functions, messages and assertions."""
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.FunctionDef | ast.Raise | ast.Assert | ast.arguments):
+            yield from _inside(child)
+
+
+def _changes(node: Any) -> Iterator[ast.AST]:
+    """Yield what may stand in the place of a node."""
+
+    def changed(**fields: Any) -> ast.AST:
+        found: ast.AST = type(node)(**{**dict(ast.iter_fields(node)), **fields})
+        return found
+
+    match node:
+        case ast.BinOp() | ast.BoolOp() | ast.AugAssign():
+            if type(node.op) in OPPOSITE:
+                yield changed(op=OPPOSITE[type(node.op)]())
+        case ast.Compare():
+            operands = [node.left, *node.comparators]
+            for k, op in enumerate(node.ops):
+                whole = _is_whole(operands[k]) or _is_whole(operands[k + 1])
+                for table in (OPPOSITE, BORDER) if whole else (OPPOSITE,):
+                    if type(op) in table:
+                        yield changed(ops=[*node.ops[:k], table[type(op)](), *node.ops[k + 1 :]])
+        case ast.UnaryOp(op=ast.USub() | ast.Not()):
+            yield node.operand
+        case ast.Constant(value=bool(value)):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int(value)):
+            yield ast.Constant(value + 1)
+        case ast.Constant(value=float(value)):
+            yield ast.Constant(2.0 * value if value else 1.0)
+        case ast.Name(id=name, ctx=ast.Load()) if name in OPPOSITES:
+            yield changed(id=OPPOSITES[name])
+        case ast.Attribute(attr=name) if name in OPPOSITES:
+            yield changed(attr=OPPOSITES[name])
+        case ast.If() | ast.While() | ast.IfExp():
+            yield changed(test=ast.UnaryOp(ast.Not(), node.test))
+    if isinstance(node, ast.AugAssign) or (
+        isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript)
+    ):
+        yield ast.Pass()
+
+
+def _is_whole(node: ast.expr) -> bool:
+    """Return whether an operand is certainly an integer."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int)
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len"
+
+
+def imports_of(path: Path) -> set[str]:
+    """Return the imports of a file: modules and names in them."""
+    found = set[str]()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def draw(root: Path, package: str, count: int, seed: int) -> list[Mutant]:
+    """Draw ``count`` faults of a package (or all) in file order."""
+    everything = mutants_of(root, package)
+    rng = np.random.default_rng([seed, PACKAGES.index(package)])
+    chosen = rng.permutation(len(everything))[:count]
+    return [everything[k] for k in sorted(chosen)]
+
+
+@dataclass(frozen=True)
+class Bench(CopiedTree):
+    """A copy of the library with its tests."""
+
+    copied: tuple[str, ...] = ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml")
+
+    def judges(self, file: str) -> list[list[str]]:
+        """Return two lists of test files: those of the module's package, then those of its importers."""
+        package = Path(file).parts[1]
+        tests = sorted((self.tree / "tests").rglob("test_*.py"))
+        own = [t for t in tests if (self.tree / "tests" / package) in t.parents]
+        near = {_module(file)}
+        modules = sorted((self.tree / "thesisrecon").rglob("*.py"))
+        users = {_module(str(m.relative_to(self.tree))) for m in modules if imports_of(m) & near}
+        own.sort(key=lambda t: not imports_of(t) & near)
+        others = [t for t in tests if t not in own and "validation" not in t.parts]
+        others = [t for t in others if imports_of(t) & (near | users)]
+        others.sort(key=lambda t: not imports_of(t) & near)
+        return [[str(t.relative_to(self.tree)) for t in chosen] for chosen in (own, others) if chosen]
+
+    def run_tests(
+        self, files: Sequence[str], name: str, *, limit_s: float = LIMIT_S
+    ) -> tuple[int, float, str]:
+        """Return the exit code of pytest (99 on time-out), seconds and the first failed test."""
+        log = self.out / "logs" / f"{name}.log"
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no"]
+        command += ["-m", "not slow and not browser and not real", *files]
+        environment = self.environment | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        where: Any = {"cores": own_cores(), "environment": environment, "cwd": self.tree}
+        process = run_process(command, log=log, limit_s=limit_s, **where)
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+        failed = [line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR")) and " " in line]
+        return 99 if process.timed_out else process.code, process.wall_s, failed[0] if failed else ""
+
+
+def _module(file: str) -> str:
+    return ".".join(Path(file).with_suffix("").parts).removesuffix(".__init__")
+
+
+def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterator[Verdict]:
+    """Yield the verdict of each fault in order.
+
+    Raises ``ValueError`` if a test fails without a fault.
+    """
+    bench.set_up()
+    judges = {file: bench.judges(file) for file in dict.fromkeys(m.file for m in mutants)}
+    if not warm:
+        everything = sorted({test for lists in judges.values() for files in lists for test in files})
+        code, _, failed = bench.run_tests(everything, "sound", limit_s=COLD_S)
+        if code == 99:
+            raise ValueError(f"the tests take more than {COLD_S / 60:.0f} min without any fault")
+        if code != 0:
+            raise ValueError(f"{failed or 'a test'} fails without any fault")
+    for number, mutant in enumerate(mutants):
+        text = mutant.apply((bench.tree / mutant.file).read_text(encoding="utf-8"))
+        by, seconds = "", 0.0
+        with bench.planted(mutant.file, text):
+            for files in judges[mutant.file]:
+                code, spent, failed = bench.run_tests(files, f"{number:03d}")
+                seconds += spent
+                if code not in (0, 5):
+                    by = failed or ("time-out" if code == 99 else f"pytest ended with {code}")
+                    break
+        yield Verdict(mutant, by, seconds)
+
+
+def table(verdicts: Sequence[Verdict]) -> str:
+    """Return Markdown: the score of each package, then every fault."""
+    lines = ["| package | faults | caught | score |", "| --- | --- | --- | --- |"]
+    for package in PACKAGES:
+        own = [v for v in verdicts if Path(v.mutant.file).parts[1] == package]
+        if own:
+            caught = sum(bool(v.by) for v in own)
+            lines.append(f"| {package} | {len(own)} | {caught} | {100.0 * caught / len(own):.0f} % |")
+    lines += ["", "| file | line | was | became | caught by |", "| --- | --- | --- | --- | --- |"]
+    for v in verdicts:
+        words = [" ".join(text.split()).replace("|", "\\|")[:60] for text in (v.mutant.old, v.mutant.new)]
+        by = v.by.replace("|", "\\|") or "**not caught**"
+        lines.append(f"| {v.mutant.file} | {v.mutant.line} | `{words[0]}` | `{words[1]}` | {by} |")
+    return "\n".join(lines)
+
+
+def read_verdicts(path: Path) -> list[Verdict]:
+    """Read the verdicts written by :func:`main`."""
+    return [
+        Verdict(Mutant(**found["mutant"]), found["by"], found["seconds"])
+        for found in json.loads(path.read_text(encoding="utf-8"))
+    ]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run; exit code 0: enough faults were caught, 1: too few, or a test fails without a fault."""
+    parser = argparse.ArgumentParser(prog="python -m validation.mutants", description=__doc__)
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/mutants"))
+    parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=PACKAGES)
+    parser.add_argument("--sample", type=int, default=25, help="number of faults of each package")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--warm", action="store_true", help="skip the test run without faults")
+    parser.add_argument("--again", action="store_true", help="repeat the uncaught faults of OUT")
+    parsed = parser.parse_args(arguments)
+    parsed.out.mkdir(parents=True, exist_ok=True)
+    results: dict[Mutant, Verdict] = {}
+    if parsed.again:
+        results = {v.mutant: v for v in read_verdicts(parsed.out / "mutants.json")}
+        everything = {m for package in PACKAGES for m in mutants_of(ROOT, package)}
+        mutants = [m for m, verdict in results.items() if not verdict.by and m in everything]
+    else:
+        mutants = [m for package in parsed.packages for m in draw(ROOT, package, parsed.sample, parsed.seed)]
+    try:
+        for count, verdict in enumerate(judge_all(Bench(parsed.out.resolve()), mutants, warm=parsed.warm)):
+            results[verdict.mutant] = verdict
+            print(f"{count + 1} of {len(mutants)}: {table([verdict]).splitlines()[-1]}", flush=True)
+            verdicts = list(results.values())
+            (parsed.out / "mutants.md").write_text(table(verdicts) + "\n", encoding="utf-8")
+            (parsed.out / "mutants.json").write_text(json.dumps([asdict(v) for v in verdicts], indent=1))
+    except ValueError as error:
+        print(f"mutants: {error}", file=sys.stderr)
+        return 1
+    score = sum(bool(v.by) for v in results.values()) / max(len(results), 1)
+    faults = counted(len(results), "fault")
+    print(f"{faults}, {100.0 * score:.0f} % caught; the table is {parsed.out / 'mutants.md'}")
+    return int(score < MIN_SCORE)
+
+
+if __name__ == "__main__":
+    install_signal_handlers("mutants")
+    raise SystemExit(main())
