@@ -52,7 +52,7 @@ PACKAGE = Path(__file__).parent
 
 _pickled: Callable[[Any], bytes] = dumps
 
-# Level 2 compiles a third faster than numba's default of 3, and the kernels are as fast.
+# Level 2 compiles a third faster than numba's default of 3.
 if "NUMBA_OPT" not in os.environ:
     vars(numba.config)["OPT"] = type(vars(numba.config)["OPT"])(2)
 
@@ -223,8 +223,6 @@ class KernelCache(NullCache):
         if found is None and path not in self._locks:
             self._lock(path)
             found = _read(path, target_context)
-            if found is not None:
-                self._unlock(path)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -234,7 +232,6 @@ class KernelCache(NullCache):
             _write(path, _pickled(data._reduce()))
         except OSError as error:
             _warn_once(path.parent, error.strerror or type(error).__name__)
-        self._unlock(path)
 
     def _path(self, sig: Any, codegen: Any) -> Path:
         function = self._dispatcher.py_func
@@ -252,7 +249,7 @@ class KernelCache(NullCache):
         return cache_folder() / f"{name}-{key}"
 
     def releasing(self, compile_signature: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """Release the lock of a compilation however it ends."""
+        """Release the lock of a compilation however it ends; loading and saving happen inside it."""
 
         def compile_and_release(signature: Any) -> Any:
             before = set(self._locks)
@@ -265,7 +262,7 @@ class KernelCache(NullCache):
         return compile_and_release
 
     def _lock(self, path: Path) -> None:
-        """Wait until nobody else compiles the entry, or it is there, or too long."""
+        """Lock an entry; wait at most MAX_WAIT_S for another process that compiles it."""
         # Where the file system has no locks, two processes may compile the same: no harm.
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -286,7 +283,7 @@ class KernelCache(NullCache):
         file = self._locks.pop(path, None)
         if file is not None:
             with contextlib.suppress(OSError):
-                path.with_name(path.name + ".lock").unlink()
+                path.with_name(path.name + ".lock").unlink(missing_ok=True)
                 # A forked process may hold the same open file.
                 fcntl.flock(file, fcntl.LOCK_UN)
             file.close()
@@ -325,7 +322,6 @@ def _write(path: Path, content: bytes) -> None:
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
         file.write(hashlib.sha256(content).digest() + content)
     Path(file.name).replace(path)
-
 
 
 if TYPE_CHECKING:
