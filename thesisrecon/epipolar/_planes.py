@@ -273,13 +273,8 @@ def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
 
 
 @kernel(error_model="numpy")
-def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
-    """Compute [e2]x H with the epipole of each pair of matches off the plane (plane plus parallax).
-
-    For ``weights`` (M, N) and ``pairs`` (S, 2): F (S, 9), inliers (S, N) as 0 or 1, sums (S, M) of their
-    weights.
-    """
-    columns = np.ascontiguousarray(points.T)
+def _fundamentals_of_plane(h: F64, points: F64, columns: F64, pairs: I64, gate: float) -> tuple[F64, F64]:
+    """F (S, 9) and inliers (S, N) of :func:`fundamentals_of_plane`; ``columns`` (4, N) are the same points."""
     lines = _parallax_lines(h, points)
     F, agree, e2 = empty((len(pairs), 9)), empty((len(pairs), len(points))), empty(3)
     for s in range(len(pairs)):
@@ -287,9 +282,14 @@ def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: f
         e2[0], e2[1], e2[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
         _fundamental_of_plane(h, e2, F[s])
         _inlier_mask(F[s], columns, gate, agree[s])
-    sums = zeros((len(pairs), len(weights)))
-    for s in range(len(pairs)):
-        for m in range(len(weights)):
-            for k in range(len(points)):
-                sums[s, m] += agree[s, k] * weights[m, k]
-    return F, agree, sums
+    return F, agree
+
+
+def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
+    """Compute [e2]x H with the epipole of each pair of matches off the plane (plane plus parallax).
+
+    For ``weights`` (M, N) and ``pairs`` (S, 2): F (S, 9), inliers (S, N) as 0 or 1, sums (S, M) of their
+    weights.
+    """
+    F, agree = _fundamentals_of_plane(h, points, np.ascontiguousarray(points.T), pairs, gate)
+    return F, agree, agree @ weights.T
