@@ -274,7 +274,7 @@ def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
 
 @kernel(error_model="numpy")
 def _fundamentals_of_plane(h: F64, points: F64, columns: F64, pairs: I64, gate: float) -> tuple[F64, F64]:
-    """F (S, 9) and inliers (S, N) of :func:`fundamentals_of_plane`; ``columns`` (4, N) are the same points."""
+    """F (S, 9) and inliers (S, N) of :func:`fundamentals_of_plane`; ``columns`` (4, N) are ``points`` too."""
     lines = _parallax_lines(h, points)
     F, agree, e2 = empty((len(pairs), 9)), empty((len(pairs), len(points))), empty(3)
     for s in range(len(pairs)):
