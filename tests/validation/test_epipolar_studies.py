@@ -103,5 +103,8 @@ def test_perfect_projections_give_perfect_epipolar_lines():
 def test_the_command_states_if_the_bound_was_reached(capsys):
     base = ["--trials", "30", "--points", "100", "--noise", "0.5", "--wrong", "0"]
     assert run_study("epipolar-methods", [*base, "--methods", NORMALISED]) == 0
-    run_study("epipolar-methods", [*base, "--methods", GOLD])
-    assert capsys.readouterr().out.count("RMS (median)") == 2
+    missed = run_study("epipolar-methods", [*base, "--methods", GOLD])
+    printed = capsys.readouterr().out
+    assert printed.count("RMS (median)") == 2
+    # With 30 trials only, the gold standard may miss its bound; the exit code is what the table states.
+    assert missed == ("missed" in printed)
