@@ -8,6 +8,7 @@ import PIL.Image
 import pytest
 
 import thesisrecon
+from tests.conftest import refuses
 from thesisrecon.cli.view_files import interpolate_images, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
@@ -62,8 +63,7 @@ def test_a_given_focal_length_is_used(found):
 
 
 def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
-    with pytest.raises(ValueError, match="det -1"):
-        thesisrecon.synthesize_view("no.jpg", "file.jpg", -np.eye(3), np.zeros(3))
+    refuses(ValueError, "det -1", thesisrecon.synthesize_view, "no.jpg", "file.jpg", -np.eye(3), np.zeros(3))
     with pytest.raises(ValueError, match="three finite"):
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), [0.0, 1.0])
     with pytest.raises(ValueError, match="K must be"):
@@ -114,10 +114,8 @@ def test_films_are_of_two_different_photographs(found):
     first, second = found.images
     with pytest.raises(UsageError, match="2 images; got 3"):
         trilinear_sequence((first, second, first), 5, config=SMALL, seed=0)
-    with pytest.raises(UsageError, match="the same image"):
-        trilinear_sequence((first, first), 5, config=SMALL, seed=0)
+    refuses(UsageError, "the same image", trilinear_sequence, (first, first), 5, config=SMALL, seed=0)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(UsageError, match="there is no image file"):
-        match_images(tmp_path / "none.png", tmp_path / "none.png")
+    refuses(UsageError, "there is no image file", match_images, tmp_path / "none.png", tmp_path / "none.png")

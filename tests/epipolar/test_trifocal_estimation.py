@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refuses
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_POINTS,
     NO_SEGMENTS,
@@ -220,10 +221,8 @@ def test_a_few_wrong_matches_do_not_spoil_the_tensor():
 def test_matches_that_cannot_work_are_named():
     rng = np.random.default_rng(0)
     points, segments = matches(three_cameras(rng), rng, 6, 0, 0.0)
-    with pytest.raises(StageFailure, match="too few matches"):
-        estimate_trifocal(points, segments)
-    with pytest.raises(StageFailure, match="too few matches"):
-        estimate_trifocal(NO_POINTS, NO_SEGMENTS)
+    refuses(StageFailure, "too few matches", estimate_trifocal, points, segments)
+    refuses(StageFailure, "too few matches", estimate_trifocal, NO_POINTS, NO_SEGMENTS)
     flat = np.column_stack([rng.uniform(-2.0, 2.0, (20, 2)), np.zeros(20)])
     line = np.outer(np.linspace(-1.0, 1.0, 20), [1.0, 0.5, 0.2])
     twice = np.tile(rng.uniform(-1.0, 1.0, (5, 3)), (4, 1))
@@ -236,10 +235,8 @@ def test_matches_that_cannot_work_are_named():
         (np.ones((8, 2)), "needs points"),
         (np.ones(5), "needs points"),
     ):
-        with pytest.raises(ValueError, match=text):
-            estimate_trifocal(wrong)
-    with pytest.raises(ValueError, match="loss_px"):
-        estimate_trifocal(points, segments, loss_px=0.0)
+        refuses(ValueError, text, estimate_trifocal, wrong)
+    refuses(ValueError, "loss_px", estimate_trifocal, points, segments, loss_px=0.0)
 
 
 def _read(kind):

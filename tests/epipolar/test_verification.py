@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.epipolar.pairs import SIZE, Pair, make_pair, spoil
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
 from thesisrecon.epipolar.ransac import ThesisRansac
@@ -131,12 +132,9 @@ def test_verification_is_the_same_every_time_and_safe_on_nothing():
 def test_wrong_calls():
     xy = np.random.default_rng(0).uniform(0, 100, (12, 2))
     fit = FundamentalFit(np.eye(3), np.ones(11, bool), 0.1, np.zeros((9, 9)))
-    with pytest.raises(ValueError, match="11"):
-        PairVerification().verify(as_matches(xy, xy), fit, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="min_inliers"):
-        PairVerification(min_inliers=3)
-    with pytest.raises(ValueError, match="min_inlier_ratio"):
-        PairVerification(min_inlier_ratio=1.5)
+    refuses(ValueError, "11", PairVerification().verify, as_matches(xy, xy), fit, np.random.default_rng(0))
+    refuses(ValueError, "min_inliers", PairVerification, min_inliers=3)
+    refuses(ValueError, "min_inlier_ratio", PairVerification, min_inlier_ratio=1.5)
 
 
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).resolve().parents[2] / "../shared/data"))

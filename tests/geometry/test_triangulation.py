@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import thesisrecon
+from tests.conftest import refuses
 from tests.geometry import properties as twins
 from tests.geometry.properties import holds_for_every, random_camera
 from tests.synthetic import make_scene, projective_reconstruction
@@ -278,8 +279,7 @@ def test_every_method_rejects_invalid_input(method):
     xy = images(P, X)
 
     def refused(cameras, pixels, match):
-        with pytest.raises(ValueError, match=match):
-            triangulate(cameras, pixels, method=method)
+        refuses(ValueError, match, triangulate, cameras, pixels, method=method)
 
     refused(P[0], xy, r"P \(V, 3, 4\)")
     refused(P, xy[:1], r"xy \(V, N, 2\)")
@@ -295,20 +295,15 @@ def test_single_methods_reject_their_own_failures():
     xy = images(P, X)
     with pytest.raises(ValueError, match="different centres"):
         triangulate_polynomial(np.stack([P[0], np.diag([1.0, 2.0, 3.0]) @ P[0]]), xy)
-    with pytest.raises(ValueError, match="rank 3"):
-        triangulate_polynomial(np.stack([P[0], P[1] * [[1.0], [1.0], [0.0]]]), xy)
-    with pytest.raises(ValueError, match="exactly two"):
-        triangulate(np.concatenate([P, P]), np.concatenate([xy, xy]))
+    refuses(ValueError, "rank 3", triangulate_polynomial, np.stack([P[0], P[1] * [[1.0], [1.0], [0.0]]]), xy)
+    refuses(ValueError, "exactly two", triangulate, np.concatenate([P, P]), np.concatenate([xy, xy]))
     with pytest.raises(ValueError, match="finite cameras"):
         triangulate(
             np.stack([P[0], np.eye(3, 4) * [[1.0], [1.0], [0.0]] + [0, 0, 0, 1.0]]), xy, method="midpoint"
         )
-    with pytest.raises(ValueError, match="polynomial, linear, midpoint, iterated, optimal"):
-        triangulate(P, xy, method="guess")
-    with pytest.raises(ValueError, match="rank 2"):
-        correct_matches(np.outer([1.0, 2.0, 3.0], [2.0, 1.0, 1.0]), *xy)
-    with pytest.raises(ValueError, match=r"xy2 \(N, 2\)"):
-        correct_matches(fundamental_from_cameras(*P), xy[0], xy[1][:3])
+    refuses(ValueError, "polynomial, linear, midpoint, iterated, optimal", triangulate, P, xy, method="guess")
+    refuses(ValueError, "rank 2", correct_matches, np.outer([1.0, 2.0, 3.0], [2.0, 1.0, 1.0]), *xy)
+    refuses(ValueError, r"xy2 \(N, 2\)", correct_matches, fundamental_from_cameras(*P), xy[0], xy[1][:3])
 
 
 def test_linear_resection_recovers_the_camera():

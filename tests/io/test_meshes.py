@@ -1,9 +1,9 @@
 """Meshes and point clouds as files."""
 
 import numpy as np
-import pytest
 import trimesh
 
+from tests.conftest import refuses
 from thesisrecon.errors import UsageError
 from thesisrecon.io._exports import write_point_cloud
 from thesisrecon.io._meshes import _split_seams, read_mesh, write_mesh
@@ -94,14 +94,12 @@ def test_colours_of_vertices_and_bare_meshes_are_read(tmp_path):
 
 def test_an_unreadable_glb_is_reported(tmp_path):
     path = tmp_path / "model.glb"
-    with pytest.raises(UsageError, match="there is no mesh"):
-        read_mesh(path)
+    refuses(UsageError, "there is no mesh", read_mesh, path)
     write_mesh(path, roof())
     whole = path.read_bytes()
     for damaged in (b"", b"glTF", whole[:40], whole[: len(whole) // 2], b"x" + whole[1:]):
         path.write_bytes(damaged)
-        with pytest.raises(UsageError, match=r"model\.glb (cannot be read|holds no surface)"):
-            read_mesh(path)
+        refuses(UsageError, r"model\.glb (cannot be read|holds no surface)", read_mesh, path)
 
 
 def test_another_reader_finds_points_and_colours(tmp_path):
@@ -113,6 +111,5 @@ def test_another_reader_finds_points_and_colours(tmp_path):
     np.testing.assert_array_equal(cloud.colors[:, :3], rgb)
     write_point_cloud(tmp_path / "none.ply", np.zeros((0, 3)), rgb[:0])
     assert b"element vertex 0\n" in (tmp_path / "none.ply").read_bytes()
-    with pytest.raises(ValueError, match="finite"):
-        write_point_cloud(tmp_path / "nan.ply", np.full((2, 3), np.nan), rgb[:2])
+    refuses(ValueError, "finite", write_point_cloud, tmp_path / "nan.ply", np.full((2, 3), np.nan), rgb[:2])
     assert not (tmp_path / "nan.ply").exists()

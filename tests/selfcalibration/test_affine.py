@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import thesisrecon
+from tests.conftest import refuses
 from tests.selfcalibration.stratified_scenes import CENTRED, prior_for
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.config import PipelineConfig
@@ -91,13 +92,10 @@ def test_a_located_plane_is_not_needed_where_one_is_given():
 def test_wrong_calls_and_hopeless_data_are_refused():
     given = projective_reconstruction(make_scene(seed=3), seed=3)
     affine = upgrade_to_affine(given, np.array([0.0, 0.0, 0.0, 1.0]))
-    with pytest.raises(ValueError, match="affine"):
-        upgrade_to_affine(affine, np.ones(4))
-    with pytest.raises(ValueError, match="plane"):
-        upgrade_to_affine(given, np.zeros(4))
+    refuses(ValueError, "affine", upgrade_to_affine, affine, np.ones(4))
+    refuses(ValueError, "plane", upgrade_to_affine, given, np.zeros(4))
     few = replace(given, registered=np.arange(8) < 2)
-    with pytest.raises(StageFailure, match="at least 3"):
-        thesisrecon.upgrade_affine(few)
+    refuses(StageFailure, "at least 3", thesisrecon.upgrade_affine, few)
     with pytest.raises(ValueError, match="an image for each"):
         thesisrecon.upgrade_affine(given, config=PipelineConfig(selfcalibration=Stratified(ParallelLines())))
 

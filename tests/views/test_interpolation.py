@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refuses
 from tests.synthetic import texture
 from thesisrecon.geometry.camera_matrix import compose_camera, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -89,8 +90,7 @@ def test_corners_behind_a_camera_are_left_out_of_the_frame():
     G = original_from_rectified(np.stack([H, np.eye(3)]), SIZE, 0.0)
     np.testing.assert_allclose(G / G[2, 2], np.linalg.inv(H) / np.linalg.inv(H)[2, 2], atol=1e-9)
     H[2] = [0.0, 0.0, -1.0]
-    with pytest.raises(ValueError, match="infinity"):
-        original_from_rectified(np.stack([H, np.eye(3)]), SIZE, 0.5)
+    refuses(ValueError, "infinity", original_from_rectified, np.stack([H, np.eye(3)]), SIZE, 0.5)
 
 
 class Stage:
@@ -251,10 +251,8 @@ def test_wrong_calls_are_refused():
     image, nothing = np.zeros((20, 30, 3), np.uint8), sure(np.zeros((20, 30), np.float32))
     pair = rectified_pair(image, image, (nothing, nothing))
     for s in (-0.1, 1.01, np.nan):
-        with pytest.raises(ValueError, match="from 0"):
-            pair.view(s)
-    with pytest.raises(ValueError, match="one size"):
-        rectified_pair(image, image[:-1], (nothing, nothing))
+        refuses(ValueError, "from 0", pair.view, s)
+    refuses(ValueError, "one size", rectified_pair, image, image[:-1], (nothing, nothing))
     with pytest.raises(ValueError, match="one shape"):
         rectified_pair(image, image, (nothing, sure(np.zeros((20, 29), np.float32))))
 

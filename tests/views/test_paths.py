@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refuses
 from tests.surface.sphere import K, looking_at_origin
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
@@ -233,11 +234,8 @@ def test_points_lie_on_the_surface_by_its_area():
 def test_wrong_calls_are_refused():
     cameras = ring(np.array([0.0]))
     for path in (lambda c, n: paths.orbit(c, ball(), n), paths.interpolate_cameras):
-        with pytest.raises(ValueError, match="at least one camera"):
-            path([], 5)
-        with pytest.raises(ValueError, match="at least one frame; got 0"):
-            path(cameras, 0)
-    with pytest.raises(ValueError, match="none that is finite"):
-        paths.orbit(cameras, np.full((4, 3), np.nan), 5)
+        refuses(ValueError, "at least one camera", path, [], 5)
+        refuses(ValueError, "at least one frame; got 0", path, cameras, 0)
+    refuses(ValueError, "none that is finite", paths.orbit, cameras, np.full((4, 3), np.nan), 5)
     with pytest.raises(ValueError, match="all points and cameras are in one place"):
         paths.orbit(cameras, np.tile(cameras[0].centre, (4, 1)), 5)
