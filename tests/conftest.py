@@ -4,6 +4,8 @@ import logging
 
 import pytest
 
+from thesisrecon.cli.main import run_command
+
 LOCAL = {
     "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": ":0", "worker_dashboard_address": None,
     "silence_logs": logging.ERROR,
@@ -28,6 +30,22 @@ def refuses(error, words, call, *arguments, **options):
     """Require that a call raises the error with these words."""
     with pytest.raises(error, match=words):
         call(*arguments, **options)
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command line that must end with this exit code and one line of explanation; return the line."""
+
+    def run(arguments, code=2):
+        capsys.readouterr()
+        assert run_command([str(argument) for argument in arguments]) == code
+        said = capsys.readouterr().err
+        assert said.startswith("thesisrecon: ")
+        assert said.count("\n") == 1
+        assert "Traceback" not in said
+        return said
+
+    return run
 
 
 def pytest_collection_modifyitems(items):

@@ -214,7 +214,7 @@ def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
         (["folder", "0004.jpg"], "is a folder", 2),
     ],
 )
-def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_path, capsys):
+def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_path, refused):
     (tmp_path / "copy.jpg").write_bytes((COURTYARD / "0004.jpg").read_bytes())
     (tmp_path / "text.jpg").write_text("no picture", encoding="utf-8")
     (tmp_path / "folder").mkdir()
@@ -222,17 +222,10 @@ def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_
         picture.resize((512, 384)).save(tmp_path / "small.jpg")
     noise = np.random.default_rng(0).integers(0, 256, (768, 1024, 3), dtype=np.uint8)
     PIL.Image.fromarray(noise).save(tmp_path / "noise.png")
-    placed = [
-        str((COURTYARD if (COURTYARD / word).is_file() else tmp_path) / word)
-        if "." in word or word == "folder"
-        else word
-        for word in arguments
-    ]
+    places = {word: (COURTYARD if (COURTYARD / word).is_file() else tmp_path) / word for word in arguments}
+    placed = [places[word] if "." in word or word == "folder" else word for word in arguments]
     out = tmp_path / "out"
-    assert run_command(["interpolate", *placed, "-o", str(out)]) == code
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
+    assert words in refused(["interpolate", *placed, "-o", out], code)
     assert not out.exists()
 
 

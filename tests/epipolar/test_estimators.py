@@ -17,15 +17,8 @@ from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, Thes
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry import two_view
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.geometry.two_view import (
-    _algebraic_residuals,
-    epipolar_distances,
-    fundamental_from_cameras,
-    sampson_residuals,
-    symmetric_residuals,
-    unit_norm,
-)
 from thesisrecon.records import FundamentalFit, Matches
 from validation.scenes.two_views import make_two_views
 
@@ -42,7 +35,7 @@ ROBUST = [
 
 def error_px(F, pair):
     """RMS distance of exact matches to their epipolar lines."""
-    return float(np.sqrt(np.mean(symmetric_residuals(F, pair.xy1, pair.xy2) ** 2) / 2))
+    return float(np.sqrt(np.mean(two_view.symmetric_residuals(F, pair.xy1, pair.xy2) ** 2) / 2))
 
 
 @settings(max_examples=25, deadline=None)
@@ -76,7 +69,7 @@ def test_seven_point_contains_the_truth_and_every_solution_is_valid(seed):
     for candidate in F:
         assert np.linalg.norm(candidate) == pytest.approx(1.0)
         assert np.linalg.svd(candidate, compute_uv=False)[2] < 1e-10
-        assert symmetric_residuals(candidate, pair.xy1, pair.xy2).max() < 1e-4
+        assert two_view.symmetric_residuals(candidate, pair.xy1, pair.xy2).max() < 1e-4
     assert min(angle_between(candidate, pair.F) for candidate in F) < 1e-5
 
 
@@ -96,7 +89,7 @@ def test_refinement_reaches_the_bound_of_the_noise(criterion):
         xy1, xy2, _ = spoil(pair, rng, sigma=sigma, outliers=0.0)
         F = refine_fundamental(estimate_eight_point(xy1, xy2), xy1, xy2, criterion)
         assert np.linalg.svd(F, compute_uv=False)[2] < 1e-12
-        ratios.append(np.mean(sampson_residuals(F, xy1, xy2) ** 2) / (sigma**2 * (n - 7) / n))
+        ratios.append(np.mean(two_view.sampson_residuals(F, xy1, xy2) ** 2) / (sigma**2 * (n - 7) / n))
     assert np.mean(ratios) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (n - 7) / 60))
 
 
@@ -192,8 +185,8 @@ def test_the_default_moves_with_the_pixels(seed, scale, shift, turn):
     fit = LocallyOptimisedRansac().estimate(xy1, xy2, np.random.default_rng(0))
     variant = LocallyOptimisedRansac(threshold_px=scale, inlier_floor_px=0.3 * scale)
     moved = variant.estimate(moved1, moved2, np.random.default_rng(0))
-    r = np.abs(sampson_residuals(fit.F, xy1, xy2)[fit.inliers])
-    r_moved = np.abs(sampson_residuals(moved.F, moved1, moved2)[fit.inliers])
+    r = np.abs(two_view.sampson_residuals(fit.F, xy1, xy2)[fit.inliers])
+    r_moved = np.abs(two_view.sampson_residuals(moved.F, moved1, moved2)[fit.inliers])
     np.testing.assert_allclose(r_moved / scale, r, atol=0.05)
     assert moved.sigma_px / scale == pytest.approx(fit.sigma_px, rel=0.1)
 
@@ -306,8 +299,8 @@ def plane_with_parallax(counts, *, sigma=0.2, flat=300):
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         xy2[some] += rng.uniform(60.0, 200.0, (count, 1)) * along
     xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (xy1, xy2))
-    F = unit_norm(cross_matrix(POLES[0]) @ H)
-    inliers = np.abs(sampson_residuals(F, xy1, xy2)) < 1.0
+    F = two_view.unit_norm(cross_matrix(POLES[0]) @ H)
+    inliers = np.abs(two_view.sampson_residuals(F, xy1, xy2)) < 1.0
     return FundamentalFit(F, inliers, sigma, 1e-16 * np.eye(9)), xy1, xy2
 
 
@@ -316,7 +309,7 @@ def test_an_epipole_that_explains_as_many_is_a_reason():
     found = assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(0))
     assert any("another F explains" in reason for reason in found.reasons)
     assert found.competing_model is not None
-    of_competing = np.abs(sampson_residuals(found.competing_model, xy1, xy2))
+    of_competing = np.abs(two_view.sampson_residuals(found.competing_model, xy1, xy2))
     assert (of_competing[-30:] < 1.0).mean() > 0.9
     assert (of_competing[:100] < 1.0).mean() > 0.9
 
@@ -370,7 +363,7 @@ def test_both_images_are_conditioned():
             np.array([[t, 0, -2.0], [0, t, 7.0], [0, 0, 1]]),
         )
         moved = estimate_eight_point(s * xy1 + [5.0, 3.0], t * xy2 + [-2.0, 7.0])
-        assert angle_between(unit_norm(T.T @ moved @ S), F) < 1e-9
+        assert angle_between(two_view.unit_norm(T.T @ moved @ S), F) < 1e-9
 
 
 def test_a_plane_of_much_noise_is_still_explained_by_a_homography():
@@ -400,23 +393,25 @@ def test_algorithm_2_minimises_the_chosen_criterion():
 @holds_for_every()
 def test_5_5_and_5_6_the_two_distances_are_multiples_of_one_residual(rng):
     F, xy1, xy2 = rng.normal(size=(3, 3)), rng.normal(size=(20, 2)), rng.normal(size=(20, 2))
-    d = epipolar_distances(F, xy1, xy2)
-    np.testing.assert_allclose(np.sqrt(np.sum(d**2, axis=1)), symmetric_residuals(F, xy1, xy2), rtol=1e-9)
+    d = two_view.epipolar_distances(F, xy1, xy2)
+    np.testing.assert_allclose(
+        np.sqrt(np.sum(d**2, axis=1)), two_view.symmetric_residuals(F, xy1, xy2), rtol=1e-9
+    )
     # 1 / s^2 = 1 / d1^2 + 1 / d2^2: the Sampson distance is the shorter of all three.
-    s = np.abs(sampson_residuals(F, xy1, xy2))
+    s = np.abs(two_view.sampson_residuals(F, xy1, xy2))
     np.testing.assert_allclose(s * np.sqrt(np.sum(d**2, axis=1)), d[:, 0] * d[:, 1], rtol=1e-9)
-    assert (2.0 * s <= symmetric_residuals(F, xy1, xy2) * (1.0 + 1e-9)).all()
+    assert (2.0 * s <= two_view.symmetric_residuals(F, xy1, xy2) * (1.0 + 1e-9)).all()
 
 
 def test_5_3_the_residual_over_its_gradient_has_the_noise_of_a_coordinate():
     rng, sigma = np.random.default_rng(0), 0.7
     pair = make_pair(300, rng)
-    F = fundamental_from_cameras(pair.P1, pair.P2)
+    F = two_view.fundamental_from_cameras(pair.P1, pair.P2)
     found = []
     for _ in range(20):
         xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (pair.xy1, pair.xy2))
-        found.append(sampson_residuals(F, xy1, xy2))
-        raw = _algebraic_residuals(F, xy1, xy2)
+        found.append(two_view.sampson_residuals(F, xy1, xy2))
+        raw = two_view._algebraic_residuals(F, xy1, xy2)
         assert np.std(raw / found[-1]) > 0.0
     assert np.std(found) == pytest.approx(sigma, rel=0.03)
 
@@ -425,7 +420,7 @@ def test_5_3_the_residual_over_its_gradient_has_the_noise_of_a_coordinate():
 def test_the_share_of_right_matches_that_pass(test, share):
     rng = np.random.default_rng(1)
     pair = make_pair(4000, rng)
-    F = fundamental_from_cameras(pair.P1, pair.P2)
+    F = two_view.fundamental_from_cameras(pair.P1, pair.P2)
     xy1, xy2 = (xy + rng.normal(0.0, 0.5, xy.shape) for xy in (pair.xy1, pair.xy2))
     sigma, inliers = _discard_outliers(F, xy1, xy2, test=test)
     assert sigma == pytest.approx(0.5, rel=0.1)
@@ -453,7 +448,7 @@ FAST = LocallyOptimisedRansac()
 
 
 def squared_error(F, pair, good):
-    return float(np.mean(symmetric_residuals(F, pair.xy1[good], pair.xy2[good]) ** 2) / 2.0)
+    return float(np.mean(two_view.symmetric_residuals(F, pair.xy1[good], pair.xy2[good]) ** 2) / 2.0)
 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
@@ -486,7 +481,7 @@ def test_noise_with_a_heavy_tail_keeps_its_tail_as_inliers_where_it_is_asked_for
     assert everything.inliers[wrong].mean() < 0.05
     assert precise.inliers[tail].mean() < 0.75
     np.testing.assert_array_equal(precise.F, everything.F)
-    r = np.abs(sampson_residuals(precise.F, xy1, xy2))
+    r = np.abs(two_view.sampson_residuals(precise.F, xy1, xy2))
     np.testing.assert_array_equal(precise.inliers, r < max(2.5 * precise.sigma_px, 0.3))
 
 

@@ -8,17 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics import _metric_kernels, _schur
 from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
-from thesisrecon.numerics import _schur
 from thesisrecon.numerics._elimination import ReducedSums, sum_leverages
-from thesisrecon.numerics._metric_kernels import (
-    MetricCameras,
-    MetricModel,
-    linearize_metric,
-    metric_cost,
-    move_poses,
-)
 from thesisrecon.numerics._schur import BundleSystem, build_layout
 from thesisrecon.numerics._small_solvers import floored_diagonal
 from thesisrecon.numerics.block_scatter import block_scatter
@@ -31,11 +24,11 @@ def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):
     c, n = block.cameras, len(xy)
     width = c.intrinsics.shape[1]
     J = Jacobians.empty(n, 6, width)
-    model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    model = _metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     seen, weighting = Observations(block.view, block.point, xy), Weighting(sigma, delta)
     own = np.zeros(0, dtype=np.int64)
-    cost = linearize_metric(model, seen, weighting, own, np.arange(width), J)
-    assert metric_cost(model, seen, weighting) == pytest.approx(cost, rel=1e-12)
+    cost = _metric_kernels.linearize_metric(model, seen, weighting, own, np.arange(width), J)
+    assert _metric_kernels.metric_cost(model, seen, weighting) == pytest.approx(cost, rel=1e-12)
     return cost, J
 
 
@@ -44,7 +37,7 @@ def _moved(cameras, pose, intrinsics):
     q = cameras.intrinsics + intrinsics
     q[:, 0] = cameras.intrinsics[:, 0] * np.exp(intrinsics[:, 0])
     t = np.einsum("vab,vb->va", turn, cameras.t) + pose[:, 3:]
-    return MetricCameras(turn @ cameras.R, t, q, cameras.group)
+    return _metric_kernels.MetricCameras(turn @ cameras.R, t, q, cameras.group)
 
 
 @pytest.mark.parametrize("lens", [(), (-0.03, 0.02)])
@@ -87,7 +80,7 @@ def test_poses_move_by_the_exponential_map(size):
     R, t = Rotation.random(9, random_state=rng).as_matrix(), rng.normal(size=(9, 3))
     step = size * rng.normal(size=(9, 6))
     R_out, t_out = np.empty_like(R), np.empty_like(t)
-    move_poses(R, t, step, R_out, t_out)
+    _metric_kernels.move_poses(R, t, step, R_out, t_out)
     turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
     np.testing.assert_allclose(R_out, turn @ R, atol=1e-15)
     np.testing.assert_allclose(t_out, np.einsum("vab,vb->va", turn, t) + step[:, 3:], atol=2e-15)
@@ -174,8 +167,8 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     if solver == "banded":
         layout = replace(layout, solver=solvers.BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
     J = layout.jacobians()
-    model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
-    cost = linearize_metric(model, o.seen, Weighting(1.0, np.inf), own, common, J)
+    model = _metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    cost = _metric_kernels.linearize_metric(model, o.seen, Weighting(1.0, np.inf), own, common, J)
     gradient = np.zeros(layout.size)
     gradient[[6, 40]] = [3.0, -3.0]
     prior = np.array([6, 40]), np.array([40, -1]), np.array([2e4, 5e3]), gradient
@@ -271,11 +264,11 @@ def test_a_bending_loss_keeps_the_gradient_and_bends_the_curvature():
     block = make_block()
     c, n = block.cameras, len(block.xy)
     xy = block.xy + np.random.default_rng(1).normal(size=block.xy.shape)
-    model = MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    model = _metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     seen, own, common = Observations(block.view, block.point, xy), np.array([0, 3]), np.array([4, 5])
     plain, bent = Jacobians.empty(n, 8, 2), Jacobians.empty(n, 8, 2)
     for J, least in ((plain, 1.0), (bent, 0.2)):
-        linearize_metric(model, seen, Weighting(1.0, 1.1, least), own, common, J)
+        _metric_kernels.linearize_metric(model, seen, Weighting(1.0, 1.1, least), own, common, J)
     for a, b in ((plain.A, bent.A), (plain.E, bent.E), (plain.B, bent.B)):
         gradient = np.einsum("kic,ki->kc", a, plain.residual)
         np.testing.assert_allclose(np.einsum("kic,ki->kc", b, bent.residual), gradient, rtol=1e-9, atol=1e-9)

@@ -7,16 +7,7 @@ import pytest
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DegeneracyReport, IntrinsicInterval, RunResult
-from thesisrecon.report._assessment import (
-    _interval_text,
-    _named_number,
-    assess,
-    decimals,
-    duration,
-    grouped,
-    key_facts,
-    plus_minus,
-)
+from thesisrecon.report import _assessment
 from thesisrecon.report._data import ResidualSummary, summarize
 
 TIME = "Computing time"
@@ -31,37 +22,37 @@ TIME = "Computing time"
     ],
 )  # fmt: skip
 def test_numbers_carry_as_many_digits_as_they_deserve(value, std, text):
-    assert plus_minus(value, std) == text
+    assert _assessment.plus_minus(value, std) == text
 
 
 def test_shared_values_are_one_and_varying_ones_a_range():
     same = [IntrinsicInterval(800.0, 1.5, "a")] * 3
-    assert _interval_text(same, "px") == "800.0 ± 1.5\u202fpx"
+    assert _assessment._interval_text(same, "px") == "800.0 ± 1.5\u202fpx"
     varying = [*same, IntrinsicInterval(900.0, 1.5, "a")]
-    assert _interval_text(varying, "px") == "800.0 to 900.0\u202fpx (± 1.5)"
+    assert _assessment._interval_text(varying, "px") == "800.0 to 900.0\u202fpx (± 1.5)"
 
 
 def test_words_for_numbers():
-    assert decimals(0.256, 2) == "0.26"
-    assert decimals(float("nan"), 2) == "–"
-    assert grouped(1234567) == "1\u202f234\u202f567"
-    assert duration(3.04) == "3.0\u202fs"
-    assert duration(125) == "2\u202fmin 05\u202fs"
-    assert duration(7325) == "2\u202fh 02\u202fmin"
-    assert _named_number("sigma_px", 0.19) == ("sigma", "0.19\u202fpx")
-    assert _named_number("focal_spread_rel", 0.0008) == ("focal spread", "0.08\u202f%")
-    assert _named_number("accepted", 26) == ("accepted", "26")
-    assert _named_number("score", float("nan")) == ("score", "nan")
+    assert _assessment.decimals(0.256, 2) == "0.26"
+    assert _assessment.decimals(float("nan"), 2) == "–"
+    assert _assessment.grouped(1234567) == "1\u202f234\u202f567"
+    assert _assessment.duration(3.04) == "3.0\u202fs"
+    assert _assessment.duration(125) == "2\u202fmin 05\u202fs"
+    assert _assessment.duration(7325) == "2\u202fh 02\u202fmin"
+    assert _assessment._named_number("sigma_px", 0.19) == ("sigma", "0.19\u202fpx")
+    assert _assessment._named_number("focal_spread_rel", 0.0008) == ("focal spread", "0.08\u202f%")
+    assert _assessment._named_number("accepted", 26) == ("accepted", "26")
+    assert _assessment._named_number("score", float("nan")) == ("score", "nan")
 
 
 def test_the_assessment_is_honest():
     data = made_up_run(points=100)
     assert data.metric is not None
-    assert assess(data).word == "Trusted, but incomplete"
+    assert _assessment.assess(data).word == "Trusted, but incomplete"
     doubt = dataclasses.replace(data.metric, trusted=False, failed_checks=("pure rotation",))
-    assessment = assess(dataclasses.replace(data, metric=doubt))
+    assessment = _assessment.assess(dataclasses.replace(data, metric=doubt))
     assert (assessment.level, assessment.reasons) == ("doubt", ("Pure rotation.",))
-    early = assess(projective_run())
+    early = _assessment.assess(projective_run())
     assert early.level == "open"
     assert "projective reconstruction" in early.sentence
 
@@ -69,7 +60,7 @@ def test_the_assessment_is_honest():
 def test_a_failure_states_reason_evidence_and_advice():
     failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
     data = dataclasses.replace(projective_run(), reconstruction=None, until=None, failure=failure)
-    assessment = assess(dataclasses.replace(data, reports=data.reports[:2]))
+    assessment = _assessment.assess(dataclasses.replace(data, reports=data.reports[:2]))
     assert assessment.level == "bad"
     assert assessment.sentence == "No pair overlaps."
     assert assessment.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
@@ -77,13 +68,13 @@ def test_a_failure_states_reason_evidence_and_advice():
 
 
 def test_the_head_of_the_page_summarises_the_run():
-    labels = [fact.label for fact in key_facts(made_up_run(points=100), None)]
+    labels = [fact.label for fact in _assessment.key_facts(made_up_run(points=100), None)]
     assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", TIME]
-    facts = key_facts(made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
+    facts = _assessment.key_facts(made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
     assert facts[3].value == "0.80 px median"
     assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
     early = dataclasses.replace(projective_run(), reconstruction=None)
-    assert [fact.label for fact in key_facts(early, None)] == ["Images", "Pairs accepted", TIME]
+    assert [fact.label for fact in _assessment.key_facts(early, None)] == ["Images", "Pairs accepted", TIME]
 
 
 def test_pairs_that_leave_their_geometry_open_are_counted():
@@ -93,9 +84,9 @@ def test_pairs_that_leave_their_geometry_open_are_counted():
         dataclasses.replace(pair, degeneracy=unsure) if pair.accepted else pair for pair in run.pairs
     )
     early = dataclasses.replace(run, pairs=pairs)
-    note = key_facts(early, None)[1].note
+    note = _assessment.key_facts(early, None)[1].note
     assert f"; {sum(pair.accepted for pair in pairs)} pairs with degenerate epipolar geometry" in note
-    assert "degenerate" not in key_facts(run, None)[1].note
+    assert "degenerate" not in _assessment.key_facts(run, None)[1].note
 
 
 def test_refused_images_are_those_without_a_camera():

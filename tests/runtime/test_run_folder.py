@@ -13,7 +13,6 @@ import pytest
 from tests.conftest import refuses
 from tests.fake_stages import fake_config, photographs
 from thesisrecon import records
-from thesisrecon.cli.main import run_command
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import read_json, write_atomically
 from thesisrecon.pipeline.reconstruction import reconstruct
@@ -361,7 +360,7 @@ def test_the_results_of_a_whole_run_stay_until_they_are_replaced(whole, tmp_path
     assert different(outputs(out), whole[0]) == ()
 
 
-def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
+def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, refused):
     runs = SmallRuns(tmp_path, 2, 128, "features")
     wanted = runs.whole(tmp_path / "whole")
     refusal = refused_at(runs, 3, errno.ENOSPC, wanted)
@@ -372,8 +371,6 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
         raise OSError(errno.ENOSPC, "No space left on device", "kernels/index.nbi")
 
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", compile_kernels)
-    assert run_command(["reconstruct", str(runs.images), "-o", str(tmp_path / "other")]) == 2
-    said = capsys.readouterr().err
-    assert said == (
-        "thesisrecon: kernels/index.nbi cannot be written: No space left on device; free space there\n"
-    )
+    said = refused(["reconstruct", tmp_path / "images", "-o", tmp_path / "other"])
+    sentence = "kernels/index.nbi cannot be written: No space left on device; free space there"
+    assert said == f"thesisrecon: {sentence}\n"

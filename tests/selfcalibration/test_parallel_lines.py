@@ -5,13 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.selfcalibration.stratified_scenes import (
-    CENTRED,
-    NOTHING_BUT_CONSTANT,
-    prior_for,
-    setup,
-    true_plane,
-)
+from tests.selfcalibration import stratified_scenes as scenes
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._images import read_images
@@ -62,7 +56,7 @@ def drawn_segments(scene, *, sigma_px, stray, seed):
 @pytest.mark.parametrize("views", [[0, 1], [2, 5, 7]])
 def test_three_given_directions_fix_the_plane(seed, views):
     scene = make_scene(seed=seed)
-    found, plane = setup(scene, seed=seed)
+    found, plane = scenes.setup(scene, seed=seed)
     way = ParallelLines(vanishing_points(scene, TURN, views))
     located = way.locate(found, np.random.default_rng(0))
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
@@ -74,7 +68,7 @@ def test_more_directions_and_points_at_infinity_do_no_harm():
     level = np.array([R0[0], R0[1], R0[2], [0.3, -0.2, 0.9]])
     given = vanishing_points(scene, level, [0, 3, 6])
     assert abs(given.xyh[0, 2]) < 1e-12
-    found, plane = setup(scene, seed=1)
+    found, plane = scenes.setup(scene, seed=1)
     located = ParallelLines(given).locate(found, np.random.default_rng(0))
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
 
@@ -84,7 +78,7 @@ def test_directions_at_right_angles_give_the_calibration_too():
     scene = make_scene(seed=2, views=3, principal_shift=(50.0, -30.0), seen_share=1.0)
     way = ParallelLines(vanishing_points(scene, TURN, [0, 1]), orthogonal_directions=True)
     answer = Stratified(way, refine=False).calibrate(
-        projective_reconstruction(scene, seed=2), prior=prior_for(scene, NOTHING_BUT_CONSTANT),
+        projective_reconstruction(scene, seed=2), prior=scenes.prior_for(scene, scenes.NOTHING_BUT_CONSTANT),
         rng=np.random.default_rng(0),
     )  # fmt: skip
     np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-3)
@@ -92,7 +86,7 @@ def test_directions_at_right_angles_give_the_calibration_too():
 
 def test_directions_in_one_plane_are_refused():
     scene = make_scene(seed=3)
-    found, _ = setup(scene, seed=3)
+    found, _ = scenes.setup(scene, seed=3)
     flat = np.array([TURN[0], TURN[1], TURN[0] + TURN[1]])
     with pytest.raises(StageFailure, match="lie in one plane"):
         ParallelLines(vanishing_points(scene, flat, [0, 1])).locate(found, np.random.default_rng(0))
@@ -100,7 +94,7 @@ def test_directions_in_one_plane_are_refused():
 
 def test_two_directions_are_refused_with_their_number():
     scene = make_scene(seed=3)
-    found, _ = setup(scene, seed=3)
+    found, _ = scenes.setup(scene, seed=3)
     given = vanishing_points(scene, TURN, [0, 1])
     one_view = replace(given, view=np.where(given.direction == 2, 0, given.view))
     one_view = VanishingPoints(*(part[:5] for part in (one_view.view, one_view.direction, one_view.xyh)))
@@ -120,7 +114,7 @@ def test_triangulated_points_are_seen_where_they_were():
 @pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])
 def test_directions_are_found_among_strays(sigma, stray, limit):
     scene = make_scene(seed=5, views=6)
-    found, plane = setup(scene, seed=5)
+    found, plane = scenes.setup(scene, seed=5)
     frame = found.frame
     segments = _normalize_segments(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
     rng = np.random.default_rng(1)
@@ -194,11 +188,11 @@ def courtyard(views):
 def test_parallel_lines_are_found_in_photographs():
     scene, paths = courtyard([0, 3, 6, 9, 12])
     photographs = read_images(paths, max_size_px=1600).images
-    given, prior = projective_reconstruction(scene), prior_for(scene, CENTRED)
+    given, prior = projective_reconstruction(scene), scenes.prior_for(scene, scenes.CENTRED)
     variant = Stratified(ParallelLines(), refine=False).with_images(photographs)
     found = projective_scene(given, prior)
     located = variant.plane.locate(found, np.random.default_rng(0))
-    plane = true_plane(scene, found)
+    plane = scenes.true_plane(scene, found)
     assert np.linalg.norm(located.planes[0] - plane) < 0.02 * (1.0 + np.linalg.norm(plane))
     answer = variant.calibrate(given, prior=prior, rng=np.random.default_rng(0))
     np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[0, 0, 0], rtol=0.03)
@@ -210,5 +204,5 @@ def test_a_wall_of_nothing_is_refused_with_its_directions():
     flat = [replace(image, rgb=np.full_like(image.rgb, 90)) for image in photographs]
     with pytest.raises(StageFailure, match="0 directions"):
         Stratified(ParallelLines()).with_images(flat).calibrate(
-            projective_reconstruction(scene), prior=prior_for(scene), rng=np.random.default_rng(0)
+            projective_reconstruction(scene), prior=scenes.prior_for(scene), rng=np.random.default_rng(0)
         )
