@@ -5,44 +5,44 @@ import pytest
 from tests.hostile import files
 from tests.hostile.files import links, picture, pipe, sparse, writes
 
+
+def nothing(_):
+    """No preparation."""
+
+
+def locked_by_link(place):
+    (place / "out").mkdir()
+    (place / "out" / ".lock").symlink_to(place / "elsewhere")
+
+
 # Name, arguments (in a folder with images in ``in``), preparation, part of the message.
 OPTIONS = [
-    ("images too long", [files.TOO_LONG, "-o", "out"], lambda _: None, "File name too long"),
+    ("images too long", [files.TOO_LONG, "-o", "out"], nothing, "File name too long"),
     ("images round", ["round", "-o", "out"], lambda p: links("{here}/round")(p / "round"), "round"),
     ("images a pipe", ["pipe", "-o", "out"], lambda p: pipe(p / "pipe"), "is not a folder"),
-    ("images a device", ["/dev/zero", "-o", "out"], lambda _: None, "is not a folder"),
-    ("out too long", ["in", "-o", files.TOO_LONG], lambda _: None, "File name too long"),
-    ("out a device", ["in", "-o", "/dev/null"], lambda _: None, "cannot be written"),
-    ("out of the system", ["in", "-o", "/proc/thesisrecon"], lambda _: None, "cannot be written"),
+    ("images a device", ["/dev/zero", "-o", "out"], nothing, "is not a folder"),
+    ("out too long", ["in", "-o", files.TOO_LONG], nothing, "File name too long"),
+    ("out a device", ["in", "-o", "/dev/null"], nothing, "cannot be written"),
+    ("out of the system", ["in", "-o", "/proc/thesisrecon"], nothing, "cannot be written"),
     ("out round", ["in", "-o", "round"], lambda p: links("{here}/round")(p / "round"), "cannot be written"),
-    (
-        "lock a link",
-        ["in", "-o", "out"],
-        lambda p: ((p / "out").mkdir(), (p / "out" / ".lock").symlink_to(p / "elsewhere")),
-        "cannot be written: Too many levels",
-    ),
+    ("lock a link", ["in", "-o", "out"], locked_by_link, "cannot be written: Too many levels"),
     ("lock a folder", ["in", "-o", "out"], lambda p: (p / "out" / ".lock").mkdir(parents=True), "written"),
-    ("threads", ["in", "-o", "out", "--threads", "9" * 400], lambda _: None, "--threads"),
-    ("seed", ["in", "-o", "out", "--seed", "-1"], lambda _: None, "--seed"),
-    ("seed of digits", ["in", "-o", "out", "--seed", "9" * 5000], lambda _: None, "--seed"),
-    ("size of words", ["in", "-o", "out", "--max-size", "9 " * 5000], lambda _: None, "--max-size"),
-    ("executor", ["in", "-o", "out", "--executor", "dask://[::1"], lambda _: None, "dask"),
-    ("pairs too long", ["in", "-o", "out", "--pairs", files.TOO_LONG], lambda _: None, "File name too long"),
-    ("pairs a device", ["in", "-o", "out", "--pairs", "/dev/zero"], lambda _: None, "there is no file"),
+    ("threads", ["in", "-o", "out", "--threads", "9" * 400], nothing, "--threads"),
+    ("seed", ["in", "-o", "out", "--seed", "-1"], nothing, "--seed"),
+    ("seed of digits", ["in", "-o", "out", "--seed", "9" * 5000], nothing, "--seed"),
+    ("size of words", ["in", "-o", "out", "--max-size", "9 " * 5000], nothing, "--max-size"),
+    ("executor", ["in", "-o", "out", "--executor", "dask://[::1"], nothing, "dask"),
+    ("pairs too long", ["in", "-o", "out", "--pairs", files.TOO_LONG], nothing, "File name too long"),
+    ("pairs a device", ["in", "-o", "out", "--pairs", "/dev/zero"], nothing, "there is no file"),
     ("pairs a pipe", ["in", "-o", "out", "--pairs", "p"], lambda p: pipe(p / "p"), "there is no file"),
-    (
-        "config too long",
-        ["in", "-o", "out", "--config", files.TOO_LONG],
-        lambda _: None,
-        "File name too long",
-    ),
-    ("config a device", ["in", "-o", "out", "--config", "/dev/zero"], lambda _: None, "a device"),
+    ("config too long", ["in", "-o", "out", "--config", files.TOO_LONG], nothing, "File name too long"),
+    ("config a device", ["in", "-o", "out", "--config", "/dev/zero"], nothing, "a device"),
     ("config a pipe", ["in", "-o", "out", "--config", "p"], lambda p: pipe(p / "p"), "a pipe"),
-    ("config a folder", ["in", "-o", "out", "--config", "in"], lambda _: None, "Is a directory"),
+    ("config a folder", ["in", "-o", "out", "--config", "in"], nothing, "Is a directory"),
     ("config of 10 TiB", ["in", "-o", "out", "--config", "c"], lambda p: sparse(10**13)(p / "c"), "larger"),
-    ("set deep", ["in", "-o", "out", "--set", "a." * 9000 + "b=1"], lambda _: None, "--set takes"),
-    ("set a nest", ["in", "-o", "out", "--set", f"images.max_size_px={'[' * 9000}"], lambda _: None, "takes"),
-    ("set digits", ["in", "-o", "out", "--set", f"images.max_size_px={'9' * 4000}"], lambda _: None, "takes"),
+    ("set deep", ["in", "-o", "out", "--set", "a." * 9000 + "b=1"], nothing, "--set takes"),
+    ("set a nest", ["in", "-o", "out", "--set", f"images.max_size_px={'[' * 9000}"], nothing, "takes"),
+    ("set digits", ["in", "-o", "out", "--set", f"images.max_size_px={'9' * 4000}"], nothing, "takes"),
 ]
 
 

@@ -171,21 +171,13 @@ def test_inspect_lets_nothing_through_to_the_terminal(tmp_path, run_cli):
     warnings = ["\x1b]0;title\x07", "two\nlines", "\ud800", "\u202eturned"]
     (tmp_path / "summary.json").write_text(summary_of_run(warnings=warnings), encoding="utf-8")
     said = run_cli(["inspect", str(tmp_path)], 0).splitlines()
-    assert said[2:6] == [
-        "warning: \\x1b]0;title\\x07",
-        "warning: two\\x0alines",
-        "warning: \\ud800",
-        "warning: \\u202eturned",
-    ]
+    shown = ["\\x1b]0;title\\x07", "two\\x0alines", "\\ud800", "\\u202eturned"]
+    assert said[2:6] == [f"warning: {text}" for text in shown]
 
 
 @pytest.mark.parametrize(
     ("arguments", "code"),
-    [
-        (["reconstruct", "in", "-o", "out", "--until", "features"], 3),
-        (["inspect", "in"], 2),
-        (["render", "in"], 2),
-    ],
+    [("reconstruct in -o out --until features", 3), ("inspect in", 2), ("render in", 2)],
 )
 def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):
     """With an address space of 6 GiB, and another alphabet on the terminal."""
@@ -198,7 +190,7 @@ def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):
     for name in ("summary.json", "model.glb", "cameras.json", "run.json"):
         (folder / name).symlink_to("/dev/zero")
     done = subprocess.run(
-        [sys.executable, "-m", "thesisrecon", *arguments], cwd=tmp_path,
+        [sys.executable, "-m", "thesisrecon", *arguments.split()], cwd=tmp_path,
         env={**os.environ, "PYTHONIOENCODING": "latin-1", "PYTHONPATH": str(Path(__file__).parents[2])},
         capture_output=True, timeout=120, check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30)),

@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import PIL.Image
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.hostile.files import CAMERA, glb, require_sentence, triangle
+from tests.hostile.files import CAMERA, encoded, glb, require_sentence, triangle, writes
 from tests.hostile.files import SUMMARY as WHOLE
-from tests.io.test_images import picture
 from tests.io.test_meshes import roof
 from tests.runtime.test_run_folder import some_metric
 from thesisrecon._settings import config_from_tables, config_from_toml, toml_from_config
@@ -40,7 +38,7 @@ WORDS = (b"nan", b"1e999", b"-1", b"9" * 400, b"null", b"[[", b'"', b"\n", b"\xf
 
 @dataclass(frozen=True)
 class Reader:
-    """A file ``name`` that ``make`` puts into a folder with all that belongs to it, and how it is read."""
+    """A file of this name that ``make`` writes, and how it is read."""
 
     name: str
     make: Callable[[Path], Any]
@@ -50,12 +48,8 @@ class Reader:
 
 def saved(kind):
     """A photograph; one that is damaged is refused, and nothing is raised."""
-    name = f"a.{kind.lower()}"
-
-    def make(folder):
-        PIL.Image.fromarray(picture()).save(folder / name, kind)
-
-    return Reader(name, make, lambda path: read_images(path.parent, max_size_px=99))
+    name, content = f"a.{kind.lower()}", writes(encoded(kind))
+    return Reader(name, content, lambda path: read_images(path.parent, max_size_px=99))
 
 
 CAMERAS = {"cameras": [CAMERA]}
@@ -71,13 +65,15 @@ SUMMARY = {
 
 
 def text_file(name, text, read):
-    return Reader(
-        name, lambda folder: (folder / name).write_text(text, encoding="utf-8"), read, (UsageError,)
-    )
+    return Reader(name, writes(text), read, (UsageError,))
 
 
 def inspected(path):
     assert run_command(["inspect", str(path.parent)]) in (0, 2)
+
+
+def save_metric(path):
+    path.write_bytes(bytes_from_record(some_metric(), "key"))
 
 
 def as_written(path):
@@ -93,19 +89,9 @@ READERS = [
     text_file("manifest.json", json.dumps(MANIFEST), lambda p: StageFolder(p.parent).finished({"a": "1"})),
     text_file("summary.json", json.dumps(SUMMARY), inspected),
     text_file("run.json", json.dumps(MANIFEST), read_json),
-    Reader(
-        "a.npz",
-        lambda folder: (folder / "a.npz").write_bytes(bytes_from_record(some_metric(), "key")),
-        as_written,
-        (ChangedRecord,),
-    ),
-    Reader("model.glb", lambda folder: write_mesh(folder / "model.glb", roof()), read_mesh, (UsageError,)),
-    Reader(
-        "plain.glb",
-        lambda folder: (folder / "plain.glb").write_bytes(glb(*triangle())),
-        read_mesh,
-        (UsageError,),
-    ),
+    Reader("a.npz", save_metric, as_written, (ChangedRecord,)),
+    Reader("model.glb", lambda path: write_mesh(path, roof()), read_mesh, (UsageError,)),
+    Reader("plain.glb", writes(glb(*triangle())), read_mesh, (UsageError,)),
 ]
 
 
@@ -143,10 +129,11 @@ def read(reader, path, content):
 def place(request, tmp_path):
     """A reader, the file it reads and what that holds."""
     reader = request.param
-    reader.make(tmp_path)
-    whole = (tmp_path / reader.name).read_bytes()
-    reader.read(tmp_path / reader.name)
-    return reader, tmp_path / reader.name, whole
+    path = tmp_path / reader.name
+    reader.make(path)
+    whole = path.read_bytes()
+    reader.read(path)
+    return reader, path, whole
 
 
 each_reader = pytest.mark.parametrize("place", READERS, indirect=True, ids=[r.name for r in READERS])

@@ -9,6 +9,7 @@ import PIL.Image
 import pytest
 
 from tests.conftest import refuses
+from tests.hostile import files
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
@@ -17,9 +18,7 @@ from thesisrecon.io._images import MAX_DECODED_BYTES, list_images, read_images, 
 
 def picture(seed=0, size=(96, 80)):
     """A colourful (H, W, 3) picture without two equal corners."""
-    rng = np.random.default_rng(seed)
-    coarse = PIL.Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8))
-    return np.array(coarse.resize(size, PIL.Image.Resampling.BICUBIC))
+    return np.array(files.picture(seed, size))
 
 
 def read_one(path, max_size_px=1600):
