@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thesisrecon import __version__
-from thesisrecon.io._files import write_text
-from thesisrecon.report._page import plotly_script, render_page
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan
 from validation.ablation.run import Row
 from validation.ablation.study import Measure
 from validation.ablation.tables import comparison_text, mean_text, number, write_tables
-from validation.harness.page import HERE as HARNESS
-from validation.harness.rows import scatter
+from validation.harness.page import plot_at, write_page
+from validation.harness.records import Plot, slug
+from validation.harness.rows import plot, scatter
 
-HERE = Path(__file__).parent
 PAGE = "index.html"
 COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
 SYMBOLS = ("circle", "square", "diamond")
+LOGARITHMIC = {"type": "log"}
 GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
-_MARGIN = {"l": 70, "r": 20, "t": 10, "b": 50}
 MAX_LEVELS = 40
 """Maximum number of rows in an interval plot."""
 
@@ -38,32 +34,21 @@ def write_analysis(analysis: Analysis, out: str | Path) -> Path:
     Raises :class:`~thesisrecon.errors.OutputError` if the folder cannot be written.
     """
     out = Path(out)
-    tables = write_tables(analysis, out)
-    write_text(out / PAGE, _page(analysis, [t.name for t in tables]))
-    return out / PAGE
-
-
-def _page(analysis: Analysis, tables: Sequence[str]) -> str:
-    plan = analysis.plan
-    sections = [_section(analysis, measure) for measure in plan.measures]
-    figures = {p["id"]: p["figure"] for section in sections for p in section["plots"]}
-    scripts = [plotly_script(), (HARNESS / "page.js").read_text(encoding="utf-8")] if figures else []
-    failures = [r for r in analysis.rows if r.failure]
-    return render_page(
-        (HERE / "page.html.j2").read_text(encoding="utf-8"),
-        scripts,
+    tables, plan = write_tables(analysis, out), analysis.plan
+    write_page(
+        out / PAGE,
+        Path(__file__).parent / "page.html.j2",
+        [_section(analysis, measure) for measure in plan.measures],
         title=plan.study.title,
         words=plan.study.words,
         facts=_facts(analysis),
         findings=_findings(analysis),
         warnings=analysis.warnings,
-        sections=sections,
-        failures=_failures(failures),
+        failures=_failures([r for r in analysis.rows if r.failure]),
         versions=list(plan.versions.items()),
-        tables=tables,
-        figures=figures,
-        version=__version__,
+        tables=[t.name for t in tables],
     )
+    return out / PAGE
 
 
 def _facts(analysis: Analysis) -> list[tuple[str, str]]:
@@ -122,21 +107,21 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
     cells = [c for c in analysis.cells if c.measure == measure]
     comparisons = [c for c in analysis.comparisons if c.measure == measure]
     steps = [c for c in analysis.steps if c.measure == measure]
-    slug = re.sub(r"[^a-z0-9]+", "-", measure.name.lower()).strip("-")
-    plots = [
-        _over_conditions(plan, measure, cells, slug),
-        _forest(measure, comparisons, plan.baseline, slug),
-        _cost(measure, cells, slug),
-    ]
+    name = slug(measure.name.lower())
+    plots = {
+        "over": _over_conditions(plan, measure, cells),
+        "forest": _forest(measure, comparisons, plan.baseline),
+        "cost": _cost(measure, cells),
+    }
     return {
-        "id": slug,
+        "id": name,
         "measure": measure,
         "table": _table(plan, cells, comparisons, steps),
         "conditions": [c.name for c in plan.conditions],
         "baseline": plan.baseline,
         "steps": bool(steps),
         "about": _about({c.interval.unit for c in comparisons if c.interval.pairs}),
-        "plots": [p for p in plots if p is not None],
+        "plots": [plot_at(f"{name}-{kind}", p) for kind, p in plots.items() if p is not None],
     }
 
 
@@ -185,7 +170,7 @@ def _comparison_cells(found: Comparison | None) -> dict[str, str]:
 # ---------------------------------------------------------------- plots
 
 
-def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] | None:
+def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell]) -> Plot | None:
     """The means over a condition that is a number, a line for each variant, where there is but one such."""
     axes = list(dict.fromkeys(a for c in plan.conditions for a in c.levels))
     values = [next(iter(c.changes.values()), None) for c in plan.conditions]
@@ -199,19 +184,13 @@ def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell], slug: 
         line = {"color": COLOURS[k % len(COLOURS)], "dash": ("solid", "dash", "dot")[k // len(COLOURS) % 3]}
         traces.append(scatter(variant.name, values, y, "lines+markers", line=line))
     log = measure.ratio and all(v is None or v > 0 for t in traces for v in t["y"])
-    layout = {
-        "xaxis": {"title": {"text": axes[0].rpartition(".")[2]}},
-        "yaxis": _axis(measure, log=log),
-        "margin": _MARGIN,
-        "legend": {"orientation": "h", "y": -0.25},
-        "height": 420,
-    }
-    return _plot(f"plot-{slug}-over", f"{measure.name} over {axes[0]}", traces, layout)
+    title, x = f"{measure.name} over {axes[0]}", axes[0].rpartition(".")[2]
+    legend = {"orientation": "h", "y": -0.25}
+    yaxis = LOGARITHMIC if log else {}
+    return plot(title, traces, x, _with_unit(measure.name, measure), yaxis=yaxis, legend=legend, height=420)
 
 
-def _forest(
-    measure: Measure, comparisons: Sequence[Comparison], baseline: str, slug: str
-) -> dict[str, Any] | None:
+def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) -> Plot | None:
     """The differences from the baseline with their intervals, a row each."""
     shown = [c for c in comparisons if math.isfinite(c.interval.mean)]
     if not shown or len(shown) > MAX_LEVELS:
@@ -231,19 +210,17 @@ def _forest(
     trace = scatter("", means, names, error_x=errors, marker=marker, showlegend=False)
     stroke = {"color": "#1b2733", "width": 1}
     line = {"type": "line", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "line": stroke}
-    what = f"times {baseline}" if ratio else f"difference from {baseline}"
-    unit = f" ({measure.unit})" if measure.unit and not ratio else ""
-    layout = {
-        "xaxis": {"title": {"text": f"{what}{unit}"}} | ({"type": "log"} if ratio else {"zeroline": False}),
+    x = f"times {baseline}" if ratio else _with_unit(f"difference from {baseline}", measure)
+    layout: dict[str, Any] = {
+        "xaxis": LOGARITHMIC if ratio else {"zeroline": False},
         "yaxis": {"autorange": "reversed", "automargin": True},
         "shapes": [line | {"x0": int(ratio), "x1": int(ratio)}],
-        "margin": _MARGIN,
         "height": 140 + 28 * len(shown),
     }
-    return _plot(f"plot-{slug}-forest", f"{measure.name} against {baseline}", [trace], layout)
+    return plot(f"{measure.name} against {baseline}", [trace], x, "", **layout)
 
 
-def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] | None:
+def _cost(measure: Measure, cells: Sequence[Cell]) -> Plot | None:
     """Plot accuracy over processor time with the Pareto front."""
     if len({c.variant for c in cells}) < 2 or len({c.condition for c in cells}) > 1:
         return None
@@ -255,26 +232,19 @@ def _cost(measure: Measure, cells: Sequence[Cell], slug: str) -> dict[str, Any] 
         symbol = SYMBOLS[k // len(COLOURS) % len(SYMBOLS)] + ("" if c.on_front else "-open")
         marker = {"size": 11, "color": COLOURS[k % len(COLOURS)], "symbol": symbol}
         traces.append(scatter(c.variant, [c.cost_s], [c.mean], marker=marker))
-    layout = {
-        "xaxis": {"title": {"text": "processor time of a row (s)"}, "rangemode": "tozero"},
-        "yaxis": _axis(measure, log=measure.ratio and all(c.mean > 0 for c in known)),
-        "margin": _MARGIN,
+    layout: dict[str, Any] = {
+        "xaxis": {"rangemode": "tozero"},
+        "yaxis": LOGARITHMIC if measure.ratio and all(c.mean > 0 for c in known) else {},
         "legend": {"orientation": "h", "y": -0.2},
         "height": 420 + 10 * len(known),
     }
     words = "Filled: Pareto-optimal (no variant is both better and cheaper)."
-    return _plot(f"plot-{slug}-cost", f"{measure.name} against cost", traces, layout, words)
+    title, x = f"{measure.name} against cost", "processor time of a row (s)"
+    return plot(title, traces, x, _with_unit(measure.name, measure), words, **layout)
 
 
-def _axis(measure: Measure, *, log: bool) -> dict[str, Any]:
-    unit = f" ({measure.unit})" if measure.unit else ""
-    return {"title": {"text": f"{measure.name}{unit}"}} | ({"type": "log"} if log else {})
-
-
-def _plot(
-    place: str, title: str, traces: Sequence[Any], layout: Mapping[str, Any], words: str = ""
-) -> dict[str, Any]:
-    return {"id": place, "title": title, "figure": {"data": [*traces], "layout": layout}, "words": words}
+def _with_unit(text: str, measure: Measure) -> str:
+    return f"{text} ({measure.unit})" if measure.unit else text
 
 
 def _finite(value: float) -> float | None:

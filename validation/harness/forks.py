@@ -18,7 +18,6 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 
 from validation.harness.process import Process
@@ -43,14 +42,6 @@ class Template:
             text=True,
         )
 
-    def __enter__(self) -> Template:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """End the process, and the task that runs in it."""
         for pipe in (self._child.stdin, self._child.stdout):
@@ -66,21 +57,17 @@ class Template:
         """
         log.parent.mkdir(parents=True, exist_ok=True)
         assert self._child.stdin is not None
+        assert self._child.stdout is not None
         start = time.perf_counter()
         try:
             print(json.dumps([str(log), limit_s, *arguments]), file=self._child.stdin, flush=True)
-            line = self._read()
+            line = self._child.stdout.readline()
         except BrokenPipeError:
             line = ""
         if not line:
             raise RuntimeError(f"the template process of the tasks ended with {self._child.wait()}")
         code, peak_mb, cpu_s, timed_out = json.loads(line)
         return Process(code, time.perf_counter() - start, peak_mb, cpu_s, timed_out)
-
-    def _read(self) -> str:
-        source: IO[str] | None = self._child.stdout
-        assert source is not None
-        return source.readline()
 
 
 def serve(main: Callable[[list[str]], int], orders: IO[str], answers: IO[str]) -> None:
@@ -93,8 +80,7 @@ def serve(main: Callable[[list[str]], int], orders: IO[str], answers: IO[str]) -
         ended = _wait(child, limit_s, orders)
         if ended is None:
             return
-        code, peak_mb, cpu_s, timed_out = ended
-        print(json.dumps([code, peak_mb, cpu_s, timed_out]), file=answers, flush=True)
+        print(json.dumps(ended), file=answers, flush=True)
 
 
 def _wait(child: int, limit_s: float, orders: IO[str]) -> tuple[int, float, float, bool] | None:

@@ -19,6 +19,7 @@ from validation.harness.records import Judgement, Outcome, Picture, Plot, Report
 from validation.harness.results import Results, Row
 
 HERE = Path(__file__).parent
+TEMPLATE = HERE / "page.html.j2"
 WIDEST_PX = 1400
 JPEG_QUALITY = 88
 Judged = Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]]
@@ -51,45 +52,39 @@ def write_pages(
         rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         failures = [(k, why) for k, why in results.failures.items() if k.split("/")[1] == scene]
         missing = [k for k in results.missing if k.split("/")[1] == scene]
-        page = _page(scene, links, _verdict(rows, missing), sections, failures, None)
-        write_text(options.out / f"scene-{slug(scene)}.html", page)
+        write_page(
+            options.out / f"scene-{slug(scene)}.html",
+            TEMPLATE,
+            sections,
+            title=scene,
+            links=links,
+            verdict=_verdict(rows, missing),
+            several=False,
+            failures=failures,
+            environment=(),
+        )
     whole = [_section(stages[name], results, names) for name in options.stages]
-    page = _page(
-        "Ours beside the references",
-        links,
-        _verdict(results.rows, results.missing),
+    write_page(
+        options.out / "index.html",
+        TEMPLATE,
         [section for section in whole if section["rows"]],
-        list(results.failures.items()),
-        list(results.environment.items()),
+        title="Ours beside the references",
+        links=links,
+        verdict=_verdict(results.rows, results.missing),
+        several=True,
+        failures=list(results.failures.items()),
+        environment=list(results.environment.items()),
     )
-    write_text(options.out / "index.html", page)
     return options.out / "index.html"
 
 
-def _page(
-    title: str,
-    links: Sequence[tuple[str, str]],
-    verdict: _Verdict,
-    sections: Sequence[Mapping[str, Any]],
-    failures: Sequence[tuple[str, str]],
-    environment: Sequence[tuple[str, Any]] | None,
-) -> str:
+def write_page(path: Path, template: Path, sections: Sequence[Mapping[str, Any]], **values: Any) -> None:
+    """Write a page of ``sections``, whose plots plotly.js draws, with the other values of its template."""
     figures = {plot["id"]: plot["figure"] for section in sections for plot in section["plots"]}
     scripts = [plotly_script(), (HERE / "page.js").read_text(encoding="utf-8")] if figures else []
-    return render_page(
-        (HERE / "page.html.j2").read_text(encoding="utf-8"),
-        scripts,
-        filters={"short": short},
-        title=title,
-        links=links,
-        verdict=verdict,
-        sections=sections,
-        several=environment is not None,
-        failures=failures,
-        environment=environment,
-        figures=figures,
-        version=__version__,
-    )
+    values |= {"sections": sections, "figures": figures, "version": __version__}
+    text = template.read_text(encoding="utf-8")
+    write_text(path, render_page(text, scripts, filters={"short": short}, **values))
 
 
 def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
@@ -123,7 +118,7 @@ def _section(
     notes: tuple[str, ...] = ()
     if judgement is not None and options is not None and scene is not None:
         place = options.place(stage.name, scene)
-        plots = tuple(_plot(stage.name, n, plot) for n, plot in enumerate(judgement.plots))
+        plots = tuple(plot_at(f"{slug(stage.name)}-{n}", plot) for n, plot in enumerate(judgement.plots))
         pictures = tuple(_picture(place, picture) for picture in judgement.pictures)
         notes = tuple(judgement.notes)
     return {
@@ -157,15 +152,9 @@ def _ratio(row: Row) -> float | None:
     return row.value / best if best else None
 
 
-def _plot(stage: str, number: int, plot: Plot) -> dict[str, Any]:
-    solid = "scene" in plot.figure.get("layout", {})
-    return {
-        "id": f"plot-{slug(stage)}-{number}",
-        "title": plot.title,
-        "words": plot.words,
-        "figure": plot.figure,
-        "solid": solid,
-    }
+def plot_at(place: str, plot: Plot) -> dict[str, Any]:
+    """Return a plot as an entry of a section; ``place`` becomes part of its identifier."""
+    return {"id": f"plot-{place}", **vars(plot), "solid": "scene" in plot.figure.get("layout", {})}
 
 
 def _picture(place: Path, picture: Picture) -> dict[str, Any]:

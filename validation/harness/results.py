@@ -8,7 +8,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -118,14 +118,7 @@ def _version(package: str) -> str:
 
 def write_results(out: Path, results: Results) -> None:
     """Write ``results.json`` and ``tables/STAGE.csv``."""
-    record = {
-        "rows": [vars(row) | {"reference": dict(row.reference)} for row in results.rows],
-        "missing": list(results.missing),
-        "failures": dict(results.failures),
-        "environment": dict(results.environment),
-        "options": dict(results.options),
-    }
-    write_text(out / "results.json", json.dumps(record, indent=1, allow_nan=False))
+    write_text(out / "results.json", json.dumps(asdict(results), indent=1, allow_nan=False))
     for stage in dict.fromkeys(row.key.split("/")[0] for row in results.rows):
         _write_csv(
             out / "tables" / f"{stage}.csv", [r for r in results.rows if r.key.startswith(f"{stage}/")]
@@ -139,13 +132,7 @@ def read_results(out: Path) -> Results:
     """
     try:
         record = json.loads(read_bytes(out / "results.json").decode("utf-8"))
-        return Results(
-            [Row(**row) for row in record["rows"]],
-            record["missing"],
-            record["failures"],
-            record["environment"],
-            record["options"],
-        )
+        return Results(**{**record, "rows": [Row(**row) for row in record["rows"]]})
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{out} holds no results.json of a report: {error}") from None
 

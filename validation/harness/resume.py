@@ -15,7 +15,7 @@ from pathlib import Path
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import RUN_FILE
 from validation.harness.records import Outcome, ReportOptions, Stage, Task
-from validation.harness.worker import OUTCOMES
+from validation.harness.worker import OUTCOMES, read_outcomes
 
 OURS = "ours"
 OVER_OURS = ("between", "boards", "surface", "views")
@@ -44,7 +44,8 @@ def take_over(
         if _runs_again(task, options):
             _take_folders(other.place(task.stage, task.scene, task.method) / "run", options, task)
         elif task.method:
-            outcome = _outcome(other, task)
+            place = other.place(task.stage, task.scene)
+            outcome = read_outcomes(place).get(task.method) if (place / OUTCOMES).is_file() else None
             if outcome is not None and outcome.ok:
                 known[task] = _taken(other, options, task, outcome)
         _take_needed(other, options, task, stages)
@@ -63,14 +64,6 @@ def _options_of(folder: Path) -> ReportOptions:
         return replace(ReportOptions.from_json(record), out=folder)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{folder} holds no run to start from (options.json): {error}") from None
-
-
-def _outcome(other: ReportOptions, task: Task) -> Outcome | None:
-    file = other.place(task.stage, task.scene) / OUTCOMES
-    if not file.is_file():
-        return None
-    record = json.loads(file.read_text(encoding="utf-8")).get(task.method)
-    return None if record is None else Outcome(**{**record, "place": Path(record["place"])})
 
 
 def _taken(other: ReportOptions, options: ReportOptions, task: Task, outcome: Outcome) -> Outcome:

@@ -56,11 +56,9 @@ def scatter(
     return {"type": "scatter", "mode": mode, "name": name, "x": list(x), "y": list(y), **more}
 
 
-def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, words: str = "", **axes: Any) -> Plot:
-    """Return a plot with axis titles ``x`` and ``y``; ``axes`` adds to ``xaxis`` and ``yaxis``."""
-    layout = {
-        "xaxis": {"title": {"text": x}} | axes.get("xaxis", {}),
-        "yaxis": {"title": {"text": y}} | axes.get("yaxis", {}),
-        "margin": {"l": 70, "r": 10, "t": 10, "b": 50},
-    }
+def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, words: str = "", **layout: Any) -> Plot:
+    """Return a plot with axis titles ``x`` and ``y``; ``layout`` adds to that of plotly.js."""
+    for axis, text in (("xaxis", x), ("yaxis", y)):
+        layout[axis] = {"title": {"text": text}} | layout.get(axis, {})
+    layout["margin"] = {"l": 70, "r": 10, "t": 10, "b": 50}
     return Plot(title, {"data": traces, "layout": layout}, words)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import threading
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from thesisrecon.io._files import write_text
@@ -98,25 +98,25 @@ def tasks_behind(tasks: list[Task], stages: Mapping[str, Stage]) -> dict[Task, i
 
 
 class _Templates:
-    """Idle processes, one per core."""
+    """Idle processes, one per core; that of the core which has been idle longest comes first."""
 
     def __init__(self, cores: list[int], options: ReportOptions, stack: ExitStack) -> None:
         self._modules = ("validation.harness.worker", options.stages_from)
-        self._stack, self._lock = stack, threading.Lock()
-        self._free = [(core, self._start(core)) for core in cores]
-        self._over = False
+        self._stack, self._over = stack, False
+        self._free: SimpleQueue[tuple[int, Template]] = SimpleQueue()
+        for core in cores:
+            self._free.put((core, self._start(core)))
         stack.callback(self._end)
 
     def _end(self) -> None:
         self._over = True
 
     def _start(self, core: int) -> Template:
-        return self._stack.enter_context(Template(self._modules, core, ENVIRONMENT))
+        return self._stack.enter_context(closing(Template(self._modules, core, ENVIRONMENT)))
 
     def run(self, arguments: list[str], log: Path, limit_s: float) -> Process:
-        """Run one task on the core that has been idle longest."""
-        with self._lock:
-            core, template = self._free.pop(0)
+        """Run one task."""
+        core, template = self._free.get()
         try:
             return template.run(arguments, log=log, limit_s=limit_s)
         except RuntimeError as error:
@@ -126,8 +126,7 @@ class _Templates:
             template = self._start(core)
             return Process(1, 0.0, 0.0, 0.0)
         finally:
-            with self._lock:
-                self._free.append((core, template))
+            self._free.put((core, template))
 
 
 def _ready(

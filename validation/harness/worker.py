@@ -39,12 +39,17 @@ def main(arguments: list[str] | None = None) -> int:
 def _judge(options: ReportOptions, stage: Stage, scene: str) -> None:
     """Store the judgement with the messages of the methods that failed."""
     place = options.place(stage.name, scene)
-    record = json.loads((place / OUTCOMES).read_text(encoding="utf-8"))
-    outcomes = {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in record.items()}
+    outcomes = read_outcomes(place)
     judgement = stage.judge(scene, outcomes, options)
     failures = [f"{name}: {outcome.failure}." for name, outcome in outcomes.items() if not outcome.ok]
     judgement = replace(judgement, notes=[*judgement.notes, *failures])
     write_text(place / JUDGEMENT, json.dumps(asdict(judgement), default=_plain_number))
+
+
+def read_outcomes(place: Path) -> dict[str, Outcome]:
+    """Return the outcomes of a stage on a scene by method, those of its folder."""
+    record = json.loads((place / OUTCOMES).read_text(encoding="utf-8"))
+    return {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in record.items()}
 
 
 def _plain_number(value: Any) -> Any:

@@ -35,6 +35,11 @@ class CameraErrors:
     centre_error: float | None
     rotation_error_deg: float
 
+    @property
+    def centre_error_mm(self) -> float | None:
+        """``centre_error`` where the truth is in metres."""
+        return None if self.centre_error is None else 1000.0 * self.centre_error
+
 
 @dataclass(frozen=True)
 class Reprojection:

@@ -14,9 +14,9 @@ NONE_PX = 99.0
 def rms_epipolar_distance(F: F64 | None, truth: F64) -> float:
     """RMS distance, px, of right correspondences (M, 4) to their epipolar lines over both images (5.6).
 
-    At most ``NONE_PX``, which stands for no F too.
+    At most ``NONE_PX``, which stands for no F too: None, zeros or numbers that are not finite.
     """
-    if F is None:
+    if F is None or not (np.isfinite(F).all() and F.any()):
         return NONE_PX
     d = symmetric_residuals(F, truth[:, :2], truth[:, 2:])
     return float(min(np.sqrt(np.mean(d**2) / 2.0), NONE_PX))

@@ -34,10 +34,7 @@ def match_with_pycolmap(
     ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database and
     the times.
     """
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
-    pycolmap.set_random_seed(0)
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    _begin(out)
     database, seconds, start = out / "database.db", {}, time.perf_counter()
 
     mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
@@ -45,7 +42,7 @@ def match_with_pycolmap(
     pycolmap.extract_features(
         database, images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu
     )
-    forget_focal_priors(database)
+    _guess_focals(database, DEFAULT_FOCAL_REL)
     seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
@@ -55,7 +52,15 @@ def match_with_pycolmap(
     return seconds
 
 
-def forget_focal_priors(database: Path, focal_rel: float = DEFAULT_FOCAL_REL) -> None:
+def _begin(out: Path) -> None:
+    """Empty the folder and seed COLMAP, which then reports errors only."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    pycolmap.set_random_seed(0)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+
+
+def _guess_focals(database: Path, focal_rel: float) -> None:
     """Replace every focal length, including EXIF ones, by a guess."""
     store = pycolmap.Database.open(database)
     for camera in store.read_all_cameras():
@@ -102,22 +107,15 @@ def map_with_pycolmap(
     Raises :class:`StageFailure` if COLMAP makes no model.
     """
     start = start or Start()
-    pycolmap.set_random_seed(0)
     if not (matched / "seconds.json").is_file():
         raise StageFailure("COLMAP left no matches to start from")
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
+    _begin(out)
     for name in ("database.db", "seconds.json"):
         shutil.copy(matched / name, out / name)
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    options = mapper_options(threads, start.refine_principal_point)
-    forget_focal_priors(out / "database.db", start.focal_rel)
+    _guess_focals(out / "database.db", start.focal_rel)
     if start.K is not None:
         give_calibration(out / "database.db", start.K)
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    if mapper == "global":
-        return _map_globally(images, out, threads)
-    return map_incrementally(images, out, options)
+    return _map(images, out, start, threads=threads, mapper=mapper)
 
 
 def read_run(images: Path, out: Path) -> ReferenceRun:
@@ -131,42 +129,24 @@ def read_run(images: Path, out: Path) -> ReferenceRun:
     return ReferenceRun(names, max(models, key=lambda model: model.registered.sum()), seconds)
 
 
-def mapper_options(threads: int, refine_principal_point: bool = False) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's defaults for so many threads, optionally with the principal point."""
-    options = pycolmap.IncrementalPipelineOptions(
-        num_threads=threads, ba_refine_principal_point=refine_principal_point
-    )
-    options.mapper.num_threads = threads
-    return options
-
-
-def map_database(
-    database: Path, images: Path, out: Path, options: pycolmap.IncrementalPipelineOptions
-) -> int:
-    """Incremental mapping of a database into folders of models in ``out``; images in the largest."""
+def _map(
+    images: Path, out: Path, start: Start, *, threads: int, mapper: Literal["incremental", "global"]
+) -> ReferenceRun:
+    """Map the database in ``out``, whose folder "sparse" the models go to, with COLMAP's defaults."""
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
     pycolmap.set_random_seed(0)
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    models = pycolmap.incremental_mapping(database, images, out, options)
-    return max((model.num_reg_images() for model in models.values()), default=0)
-
-
-def map_incrementally(images: Path, out: Path, options: pycolmap.IncrementalPipelineOptions) -> ReferenceRun:
-    """Incremental mapping of the database in ``out``, whose folder "sparse" the models go to."""
-    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
-    start = time.perf_counter()
-    map_database(out / "database.db", images, out / "sparse", options)
-    seconds["map"] = time.perf_counter() - start
-    write_text(out / "seconds.json", json.dumps(seconds))
-    return read_run(images, out)
-
-
-def _map_globally(images: Path, out: Path, threads: int) -> ReferenceRun:
-    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
-    start = time.perf_counter()
-    options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0)
-    (out / "sparse").mkdir(exist_ok=True)
-    pycolmap.global_mapping(out / "database.db", images, out / "sparse", options)
-    seconds["map"] = time.perf_counter() - start
+    paths, begun = (out / "database.db", images, out / "sparse"), time.perf_counter()
+    if mapper == "global":
+        paths[2].mkdir(exist_ok=True)
+        pycolmap.global_mapping(*paths, pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0))
+    else:
+        options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
+        options.mapper.num_threads = threads
+        options.ba_refine_principal_point = start.refine_principal_point
+        # A calibration that is given is exact.
+        options.ba_refine_focal_length = options.ba_refine_extra_params = start.K is None
+        pycolmap.incremental_mapping(*paths, options)
+    seconds["map"] = time.perf_counter() - begun
     write_text(out / "seconds.json", json.dumps(seconds))
     return read_run(images, out)
 
@@ -185,20 +165,15 @@ def give_calibration(database: Path, K: Mapping[str, F64]) -> None:
 
 
 def reconstruct_with_pycolmap(
-    images: Path,
-    out: Path,
-    *,
-    shared_camera: bool = True,
-    refine_principal_point: bool = False,
-    threads: int = 2,
+    images: Path, out: Path, *, refine_principal_point: bool = False, threads: int = 2
 ) -> ReferenceRun:
     """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
 
     ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database, the
     models and the times. Raises ``StageFailure`` if COLMAP makes no model.
     """
-    match_with_pycolmap(images, out, shared_camera=shared_camera, threads=threads)
-    return map_incrementally(images, out, mapper_options(threads, refine_principal_point))
+    match_with_pycolmap(images, out, threads=threads)
+    return _map(images, out, Start(refine_principal_point), threads=threads, mapper="incremental")
 
 
 def main() -> None:

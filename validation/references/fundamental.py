@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,20 +41,18 @@ class Estimate:
 Solver = Callable[[F64, F64, float, int], Answer]
 
 
-def _ours(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+def _own(xy1: F64, xy2: F64, threshold_px: float, seed: int, *, thesis: bool) -> Answer:
     try:
-        fit = estimate_fundamental(xy1, xy2, threshold_px=threshold_px, seed=seed)
+        if thesis:
+            fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, np.random.default_rng(seed))
+        else:
+            fit = estimate_fundamental(xy1, xy2, threshold_px=threshold_px, seed=seed)
     except StageFailure:
         return None, None
     return fit.F, fit.inliers
 
 
-def _thesis(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
-    try:
-        fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, np.random.default_rng(seed))
-    except StageFailure:
-        return None, None
-    return fit.F, fit.inliers
+_ours, _thesis = partial(_own, thesis=False), partial(_own, thesis=True)
 
 
 def _eight_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
@@ -75,8 +74,7 @@ def _seven_points(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
 def _opencv(method: str) -> Solver:
     def solve(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
         kind = getattr(cv2, method)
-        F, mask = cv2.findFundamentalMat(xy1, xy2, kind, threshold_px, CONFIDENCE, ITERATIONS)
-        return F, mask
+        return cv2.findFundamentalMat(xy1, xy2, kind, threshold_px, CONFIDENCE, ITERATIONS)
 
     return solve
 

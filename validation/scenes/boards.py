@@ -18,8 +18,8 @@ from thesisrecon.geometry.camera_matrix import project_camera, undistort
 from thesisrecon.records import TexturedMesh
 from thesisrecon.views.render import render
 from validation.scenes.materials import Material
-from validation.scenes.pose import look_at
-from validation.scenes.raycast import Rays, Surface, World, build_world, trace
+from validation.scenes.pose import Pose, look_at
+from validation.scenes.raycast import Surface, World, build_world, trace
 from validation.scenes.sensor import Sensor, expose, integrate_pixels
 
 SIZE = (640, 480)
@@ -105,7 +105,7 @@ def _raycast(board: Board) -> list[NDArray[np.float32]]:
     world = _world()
     found = []
     for R, t in zip(board.R, board.t, strict=True):
-        light, _ = trace(world, Rays(K, R, -R.T @ t), SIZE, per_pixel=PER_PIXEL)
+        light, _ = trace(world, Pose(K, R, -R.T @ t), SIZE, per_pixel=PER_PIXEL)
         found.append(integrate_pixels(light, PER_PIXEL, SENSOR.blur_px))
     return found
 

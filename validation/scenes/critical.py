@@ -19,11 +19,10 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
-from validation.scenes.pose import look_at
+from validation.scenes.pose import UP, look_at, turntable
 
 SIZE = np.array([1536, 1024])
 HAND_TURN_DEG, HAND_SHIFT, WALL_RELIEF = 1.0, 0.01, 0.01
-UP = np.array([0.0, 0.0, 1.0])
 
 
 class Motion(Enum):
@@ -96,13 +95,7 @@ def _rotation(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
 
 
 def _turntable(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
-    """One camera at any height and roll that circles about an axis, by 40 to 360 degrees in all."""
-    height = np.radians(rng.uniform(-10.0, 45.0))
-    start = w.distance * np.array([np.cos(height), 0.0, np.sin(height)])
-    R = look_at(start, 0.2 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
-    angle = np.sort(rng.uniform(0.0, np.radians(rng.uniform(40.0, 360.0)), w.views))
-    turn = Rotation.from_rotvec(angle[:, None] * UP).as_matrix()
-    return R @ turn.swapaxes(1, 2), turn @ start
+    return turntable(rng, w.views, w.distance, highest_deg=45.0, widest_deg=360.0)
 
 
 def _planar(w: _Path, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64, F64]:
@@ -160,7 +153,7 @@ def make_sequence(
     X = rng.uniform(-1.0, 1.0, (int(rng.integers(150, 401)), 3)) * rng.uniform(0.5, 1.0, 3)
     if motion is Motion.PLANE:
         X[:, 0] = (WALL_RELIEF * rng.uniform(-1.0, 1.0, len(X)) if by_hand else 0.0) * np.ones(len(X))
-    focal = _focal(R, C, X, rng)
+    focal = np.clip(filling_focal(R, C, X) * rng.uniform(0.7, 1.1), 0.6, 2.5) * SIZE.max()
     centre = (SIZE - 1) / 2 + rng.normal(0.0, 0.005 / np.sqrt(2.0), 2) * SIZE.max()
     K = np.zeros((len(R), 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = focal * np.exp(rng.uniform(-zoom, zoom, len(R)))
@@ -169,11 +162,10 @@ def make_sequence(
     return Sequence(K, R, C, X, _observe(K, R, C, X, sigma, rng), np.tile(SIZE, (len(R), 1)), sigma)
 
 
-def _focal(R: F64, C: F64, X: F64, rng: np.random.Generator) -> float:
-    """A focal (px) that fills the image with the scene, give or take, within 0.6 and 2.5 long sides."""
+def filling_focal(R: F64, C: F64, X: F64) -> float:
+    """The focal length in long sides that fills the images with nine tenths of the scene."""
     Y = np.einsum("vab,vnb->vna", R, X[None] - C[:, None])
-    reach = np.quantile(np.abs(Y[..., 0] / np.maximum(Y[..., 2], 1e-3)), 0.9)
-    return float(np.clip(0.5 / reach * rng.uniform(0.7, 1.1), 0.6, 2.5) * SIZE.max())
+    return float(0.5 / np.quantile(np.abs(Y[..., 0] / np.maximum(Y[..., 2], 1e-3)), 0.9))
 
 
 def _observe(K: F64, R: F64, C: F64, X: F64, sigma: float, rng: np.random.Generator) -> Tracks:

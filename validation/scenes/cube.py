@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.camera_matrix import compose_camera
 from validation.scenes.pose import look_at
+from validation.scenes.two_views import TwoViews
 
 SIZE = (800, 600)
+K = np.array([[842.0, 0.0, 411.0], [0.0, 842.0, 290.0], [0.0, 0.0, 1.0]])
 POINTS_PER_FACE = 120
 HALF_SIDE = 1.0
 AZIMUTHS_DEG, ELEVATIONS_DEG, DISTANCES = (-6.0, 45.0, 96.0), (4.0, 32.0, 58.0), (4.6, 6.0, 7.4)
@@ -81,7 +83,6 @@ def make_cube() -> CubeSequence:
     faces, and six (low, at either side) a single one.
     """
     rng = np.random.Generator(np.random.PCG64(1900))
-    K = np.array([[842.0, 0.0, 411.0], [0.0, 842.0, 290.0], [0.0, 0.0, 1.0]])
     X, face = _points(rng)
     R, C = _cameras(rng)
     xy = np.stack([project_exactly(K, R[i], C[i], X) for i in range(len(C))])
@@ -95,25 +96,13 @@ OFF_FACE = 20
 """Minimum number of common points off the face that holds most of them."""
 
 
-@dataclass(frozen=True)
-class CubePair:
-    """Two cameras (3, 4) with calibration K, the common points X (N, 3) and their exact pixels."""
-
-    K: F64
-    P1: F64
-    P2: F64
-    X: F64
-    xy1: F64
-    xy2: F64
-
-
-def cube_pairs(cube: CubeSequence) -> list[CubePair]:
-    """Return the pairs whose common points do not lie on one face."""
+def cube_pairs(cube: CubeSequence) -> list[TwoViews]:
+    """Return the pairs of cameras whose common points do not lie on one face, with these points."""
     P = [compose_camera(cube.K, R, -R @ C) for R, C in zip(cube.R, cube.C, strict=True)]
     pairs = []
     for i, j in combinations(range(len(P)), 2):
         both = cube.visible[i] & cube.visible[j]
         on_face = np.bincount(cube.face[both], minlength=3)
         if on_face.sum() - on_face.max() >= OFF_FACE:
-            pairs.append(CubePair(cube.K, P[i], P[j], cube.X[both], cube.xy[i, both], cube.xy[j, both]))
+            pairs.append(TwoViews(P[i], P[j], cube.X[both], cube.xy[i, both], cube.xy[j, both]))
     return pairs

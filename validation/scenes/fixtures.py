@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from math import cos, pi, sin, tan
 from pathlib import Path
 
@@ -15,12 +14,12 @@ import PIL
 from PIL import Image as PillowImage
 from PIL import features
 
-from thesisrecon.arrays import F64, U16
+from thesisrecon.arrays import U16
 from thesisrecon.io._files import write_atomically, write_text
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import make_cube
-from validation.scenes.pose import look_at
-from validation.scenes.raycast import Rays, World, trace
+from validation.scenes.pose import Pose, look_at
+from validation.scenes.raycast import World, trace
 from validation.scenes.sensor import encode_jpeg, take_image
 
 SIZE = (1024, 768)
@@ -49,17 +48,6 @@ STANDPOINTS = (
 )
 
 
-@dataclass(frozen=True)
-class Pose:
-    """A true camera: ``K``, ``R`` (world-to-camera) (3, 3), ``C`` (3,) metres, and the ``exposure`` of its
-    image."""
-
-    K: F64
-    R: F64
-    C: F64
-    exposure: float = 1.0
-
-
 def courtyard_poses() -> list[Pose]:
     """The fourteen true cameras: a hand-held walk on an arc, with varied heights, distances and rolls."""
     K = np.array([[FOCAL, 0.0, PRINCIPAL[0]], [0.0, FOCAL, PRINCIPAL[1]], [0.0, 0.0, 1.0]])
@@ -75,11 +63,10 @@ def courtyard_poses() -> list[Pose]:
 
 def render_image(world: World, pose: Pose, view: int) -> tuple[bytes, U16]:
     """JPEG bytes and quantised depth (see README of the fixtures) of one view."""
-    rays = Rays(pose.K, pose.R, pose.C)
     red, green, blue = (0.82 * pose.exposure * g for g in GAINS[view % len(GAINS)])
     rng = np.random.Generator(np.random.PCG64([2000, view]))
-    rgb = take_image(world, rays, SIZE, gains=(red, green, blue), rng=rng)
-    depth = trace(world, rays, SIZE, shade=False)[1][::DEPTH_STRIDE, ::DEPTH_STRIDE]
+    rgb = take_image(world, pose, SIZE, gains=(red, green, blue), rng=rng)
+    depth = trace(world, pose, SIZE, shade=False)[1][::DEPTH_STRIDE, ::DEPTH_STRIDE]
     return encode_jpeg(rgb), np.asarray(np.floor(depth / DEPTH_UNIT_M + 0.5), dtype=np.uint16)
 
 

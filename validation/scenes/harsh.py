@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.records import Tracks
-from validation.scenes.pose import look_at
+from validation.scenes.critical import SIZE, filling_focal
+from validation.scenes.pose import look_at, turntable
 
-SIZE = np.array([1536, 1024])
-UP = np.array([0.0, 0.0, 1.0])
 SEEN = 0.85
 
 
@@ -93,22 +92,14 @@ def _path(rng: np.random.Generator, C: F64, turn_deg: float) -> tuple[F64, F64]:
 
 
 def _orbit(rng: np.random.Generator, views: int) -> tuple[F64, F64]:
-    """A turntable of 40 to 300 degrees."""
-    height = np.radians(rng.uniform(-10.0, 40.0))
-    start = 4.0 * np.array([np.cos(height), 0.0, np.sin(height)])
-    R = look_at(start, 0.2 * rng.normal(size=3), float(rng.uniform(-0.3, 0.3)))
-    angle = np.sort(rng.uniform(0.0, np.radians(rng.uniform(40.0, 300.0)), views))
-    turn = Rotation.from_rotvec(angle[:, None] * UP).as_matrix()
-    return R @ turn.swapaxes(1, 2), turn @ start
+    return turntable(rng, views, 4.0, highest_deg=40.0, widest_deg=300.0)
 
 
 def _set(poses: tuple[F64, F64], X: F64, rng: np.random.Generator) -> HarshSet:
     """One focal that fills the image with the scene, the principal point off by half a hundredth."""
     R, C = poses
-    Y = np.einsum("vab,vnb->vna", R, X[None] - C[:, None])
-    reach = np.quantile(np.abs(Y[..., 0] / np.maximum(Y[..., 2], 1e-3)), 0.9)
     K = np.zeros((len(R), 3, 3))
-    K[:, 0, 0] = K[:, 1, 1] = 0.5 / reach * rng.uniform(0.8, 1.1) * SIZE.max()
+    K[:, 0, 0] = K[:, 1, 1] = filling_focal(R, C, X) * rng.uniform(0.8, 1.1) * SIZE.max()
     K[:, :2, 2], K[:, 2, 2] = (SIZE - 1) / 2 + 0.0035 * SIZE.max() * rng.normal(size=2), 1.0
     return HarshSet(K, R, C, X, float(rng.uniform(0.3, 0.8)))
 

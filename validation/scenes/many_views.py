@@ -13,10 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from validation.scenes.courtyard import build_courtyard
-from validation.scenes.fixtures import Pose
 from validation.scenes.image_files import write_png
-from validation.scenes.pose import look_at
-from validation.scenes.raycast import Rays
+from validation.scenes.pose import Pose, look_at
 from validation.scenes.sensor import take_image
 
 FOCAL_REL = 0.9
@@ -65,7 +63,7 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
     def write(k: int) -> None:
         pose = poses[k]
         gain, rng = 0.82 * pose.exposure, np.random.default_rng([2001, k])
-        rgb = take_image(world, Rays(pose.K, pose.R, pose.C), size, gains=(gain, gain, gain), rng=rng)
+        rgb = take_image(world, pose, size, gains=(gain, gain, gain), rng=rng)
         write_png(folder / f"{k:04d}.png", rgb)
 
     with ThreadPoolExecutor(threads) as pool:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
@@ -16,7 +14,7 @@ from thesisrecon.stereo.semi_global import SemiGlobalMatching, match_both_sides
 from thesisrecon.views.trilinear import CalibratedPair, default_intrinsics
 from thesisrecon.views.trilinear_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
 from validation.scenes.image_files import read_rgb
-from validation.scenes.real import data_root
+from validation.scenes.stereo import read_disparity, stereo_folder
 
 ENDS = (2, 6)
 BETWEEN = (3, 4, 5)
@@ -39,13 +37,12 @@ class NineViews:
 
 def load_cones() -> NineViews | None:
     """The Cones of Scharstein and Szeliski (CVPR 2003); None if they are not on this machine."""
-    root = data_root()
-    folder = None if root is None else root / "stereo" / "Cones9"
-    if folder is None or not folder.is_dir():
+    folder = stereo_folder("Cones")
+    if folder is None:
         return None
     numbers = sorted({*ENDS, *BETWEEN, *BEYOND})
     images = {k: read_rgb(folder / f"im{k}.png") for k in numbers}
-    first, second = (_quarters(folder / f"disp{k}.png") for k in ENDS)
+    first, second = (read_disparity(folder / f"disp{k}.png", 4.0) for k in ENDS)
     return NineViews(images, (first, second))
 
 
@@ -85,9 +82,3 @@ def dissolved(first: U8, second: U8, share: float) -> U8:
     """Cross-dissolve of both images, the baseline of interpolation."""
     mixed = (1.0 - share) * first.astype(np.float64) + share * second
     return np.asarray(np.rint(mixed), dtype=np.uint8)
-
-
-def _quarters(path: Path) -> F32:
-    with Image.open(path) as image:
-        values = np.asarray(image, dtype=np.float32)
-    return np.where(values > 0.0, 0.25 * values, np.nan).astype(np.float32)

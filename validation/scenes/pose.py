@@ -1,10 +1,26 @@
-"""True poses of synthetic cameras, from operations that IEEE 754 rounds exactly (+ - * / sqrt)."""
+"""True poses of synthetic cameras; ``look_at`` uses + - * / sqrt only, which IEEE 754 rounds exactly."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A true camera: ``K``, ``R`` (world-to-camera) (3, 3), ``C`` (3,) metres, and the ``exposure`` of its
+    image."""
+
+    K: F64
+    R: F64
+    C: F64
+    exposure: float = 1.0
 
 
 def look_at(C: F64, target: F64, tan_half_roll: float) -> F64:
@@ -25,6 +41,19 @@ def look_at(C: F64, target: F64, tan_half_roll: float) -> F64:
     t = tan_half_roll
     c, s = (1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t)
     return np.stack([c * right + s * down, c * down - s * right, forward])
+
+
+def turntable(
+    rng: np.random.Generator, views: int, distance: float, *, highest_deg: float, widest_deg: float
+) -> tuple[F64, F64]:
+    """R (V, 3, 3) and C (V, 3) of a camera at any height and roll that circles about z, by 40 degrees at
+    least."""
+    height = np.radians(rng.uniform(-10.0, highest_deg))
+    start = distance * np.array([np.cos(height), 0.0, np.sin(height)])
+    R = look_at(start, 0.2 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
+    angle = np.sort(rng.uniform(0.0, np.radians(rng.uniform(40.0, widest_deg)), views))
+    turn = Rotation.from_rotvec(angle[:, None] * UP).as_matrix()
+    return R @ turn.swapaxes(1, 2), turn @ start
 
 
 def _unit(a: F64) -> F64:

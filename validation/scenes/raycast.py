@@ -18,6 +18,7 @@ import numpy as np
 from thesisrecon.arrays import F32, F64, I64
 from validation.scenes.kernels import BLOCK, CYLINDER, LEVELS, PLANE, trace_rows
 from validation.scenes.materials import Material, smooth
+from validation.scenes.pose import Pose
 
 
 @dataclass(frozen=True)
@@ -53,15 +54,6 @@ class World(NamedTuple):
     heights: F32
     highest: F32
     sun: F64
-
-
-@dataclass(frozen=True)
-class Rays:
-    """One ray per sample of a pinhole camera: ``K``, ``R`` (3, 3), ``centre`` (3,); see :func:`trace`."""
-
-    K: F64
-    R: F64
-    centre: F64
 
 
 def _baked(material: Material) -> F32:
@@ -191,9 +183,9 @@ def _group_bounds(objects: list[list[Surface]], numbers: F64) -> F64:
 
 
 def trace(
-    world: World, rays: Rays, size: tuple[int, int], *, per_pixel: int = 1, shade: bool = True
+    world: World, pose: Pose, size: tuple[int, int], *, per_pixel: int = 1, shade: bool = True
 ) -> tuple[F32, F64]:
-    """Linear colour and depth of one view.
+    """Linear colour and depth of one pinhole camera, whose exposure does not count here.
 
     Parameters
     ----------
@@ -207,7 +199,7 @@ def trace(
     """
     out = np.zeros((size[1] * per_pixel, size[0] * per_pixel, 3), np.float32)
     depth = np.zeros(out.shape[:2])
-    K = rays.K
-    camera = np.concatenate([[K[0, 0], K[0, 2], K[1, 2]], rays.centre, rays.R.ravel()])
+    K = pose.K
+    camera = np.concatenate([[K[0, 0], K[0, 2], K[1, 2]], pose.C, pose.R.ravel()])
     trace_rows((*world,), camera, (per_pixel, 0), out, depth, shade)
     return out, depth

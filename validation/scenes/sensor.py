@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F32, U8
-from validation.scenes.raycast import Rays, World, trace
+from validation.scenes.pose import Pose
+from validation.scenes.raycast import World, trace
 
 JPEG_QUALITY = 91
 PER_PIXEL = 2
@@ -65,7 +66,7 @@ def expose(light: F32, sensor: Sensor, *, gains: tuple[float, float, float], rng
 
 def take_image(
     world: World,
-    rays: Rays,
+    pose: Pose,
     size: tuple[int, int],
     *,
     gains: tuple[float, float, float],
@@ -73,7 +74,7 @@ def take_image(
 ) -> U8:
     """Return the image (H, W, 3) of one camera, ``PER_PIXEL`` samples a pixel along each axis."""
     sensor = Sensor()
-    light = integrate_pixels(trace(world, rays, size, per_pixel=PER_PIXEL)[0], PER_PIXEL, sensor.blur_px)
+    light = integrate_pixels(trace(world, pose, size, per_pixel=PER_PIXEL)[0], PER_PIXEL, sensor.blur_px)
     return expose(light, sensor, gains=gains, rng=rng)
 
 

@@ -52,10 +52,10 @@ def load_stereo_pair(name: str) -> StereoPair | None:
     if name == "Motorcycle":
         return _motorcycle(folder)
     if name == "Cones":
-        truth, other = (_truth(folder / f"disp{k}.png", 4.0) for k in (2, 6))
+        truth, other = (read_disparity(folder / f"disp{k}.png", 4.0) for k in (2, 6))
         judged = seen_by_both(truth, other)
         return StereoPair(name, read_rgb(folder / "im2.png"), read_rgb(folder / "im6.png"), truth, judged, 64)
-    truth = _truth(folder / "disparity.png", 16.0 if name == "Tsukuba" else 4.0)
+    truth = read_disparity(folder / "disparity.png", 16.0 if name == "Tsukuba" else 4.0)
     left, right = read_rgb(folder / "left.png"), read_rgb(folder / "right.png")
     return StereoPair(name, left, right, truth, seen_by_both(truth, None), 16 if name == "Tsukuba" else 64)
 
@@ -87,6 +87,7 @@ def _motorcycle(folder: Path) -> StereoPair:
     return StereoPair("Motorcycle", left, right, truth, seen_by_both(truth, None), 64)
 
 
-def _truth(path: Path, scale: float) -> F32:
+def read_disparity(path: Path, scale: float) -> F32:
+    """Disparities (H, W) of a grey image that holds them times ``scale``; 0 is unknown."""
     values = np.asarray(Image.open(path).convert("L")).astype(np.float32)
     return np.where(values > 0.0, values / np.float32(scale), np.float32(np.nan)).astype(np.float32)

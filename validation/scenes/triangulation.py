@@ -9,6 +9,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import Group
 from validation.scenes.rigs import Rig, make_cloud
 from validation.scenes.transforms import random_transform
@@ -79,6 +80,12 @@ class DrawnRig:
     xy: F64
     X: F64
     centre: F64
+
+    def errors_pct(self, X: F64) -> F64:
+        """Return distances (N,) of X (N, 4) from the true points, in % of theirs from the first camera."""
+        off = np.linalg.norm(dehomogenize(X @ np.linalg.inv(self.G).T) - self.X, axis=1)
+        share = off / np.linalg.norm(self.X - self.centre, axis=1)
+        return np.asarray(np.nan_to_num(100.0 * share, nan=np.inf), dtype=np.float64)
 
 
 def draw_rig(scene: str, sigma_px: float, frame: Group, rng: np.random.Generator, points: int) -> DrawnRig:

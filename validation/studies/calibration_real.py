@@ -36,7 +36,7 @@ from validation.studies.coverage import (
     add_intervals,
     named,
 )
-from validation.studies.main_job import COLMAP, COLMAP_PP, OURS, centre_mm_of
+from validation.studies.main_job import COLMAP, COLMAP_PP, OURS
 from validation.studies.runner import Part, Rows, scenes_here
 
 
@@ -47,7 +47,6 @@ class Bench:
     scene: Scene
     out: Path
     threads: int = 2
-    seed: int = 0
 
     def ours(self, cameras: Cameras) -> RunResult | None:
         """Run ours; the images are matched once for all runs. None if it fails."""
@@ -57,7 +56,7 @@ class Bench:
         try:
             return reconstruct(
                 images, self.out / "ours",
-                config=config, seed=self.seed, threads=self.threads, until="metric", overwrite=True,
+                config=config, threads=self.threads, until="metric", overwrite=True,
             )  # fmt: skip
         except StageFailure as failure:
             print(f"{self.scene.name}: {cameras}: {failure}", file=sys.stderr, flush=True)
@@ -118,15 +117,10 @@ class CameraRows(Rows):
         self.each(name, self.errors, read, unit, at_most=bound)
 
     def focals(self, median: float | None = None, worst: float | None = None) -> None:
-        errors = {m: self._focals(r) for m, r in self.models.items()}
+        errors = {m: self.all_focals(r) for m, r in self.models.items()}
         for name, reduce, bound in (("median", np.median, median), ("worst", np.max, worst)):
             values = {m: reduced(reduce, e) for m, e in errors.items()}
             self.add(f"focal error, {name}", values, "%", at_most=bound)
-
-    def _focals(self, model: Reconstruction | None) -> np.ndarray | None:
-        if model is None or model.K is None or not model.registered.any():
-            return None
-        return focal_errors_pct(model.K, self.K)[model.registered]
 
     def all_focals(self, model: Reconstruction | None) -> np.ndarray:
         """Return focal errors (V,) in percent of all views, infinite if a view is not registered."""
@@ -134,7 +128,7 @@ class CameraRows(Rows):
         return np.full(self.total, np.inf) if errors is None else np.nan_to_num(errors, nan=np.inf)
 
     def poses(self, centre_mm: float | None = None, rotation_deg: float | None = None) -> None:
-        self.error("camera centres, mean", "mm", centre_mm_of, centre_mm)
+        self.error("camera centres, mean", "mm", lambda e: e.centre_error_mm, centre_mm)
         self.error("camera rotations, median", "deg", lambda e: e.rotation_error_deg, rotation_deg)
 
     def principal_point(self, bound: float | None = None) -> None:
@@ -147,8 +141,10 @@ class CameraRows(Rows):
         self.add("trusted by the self-check", run.metric.trusted, at_least=1.0)
 
 
-def reduced(reduce: Callable[[np.ndarray], float], values: np.ndarray | None) -> float | None:
-    return None if values is None or not len(values) else float(reduce(values))
+def reduced(reduce: Callable[[np.ndarray], float], errors: np.ndarray) -> float | None:
+    """Return the median or the like of the finite errors, None without any."""
+    finite = errors[np.isfinite(errors)]
+    return float(reduce(finite)) if len(finite) else None
 
 
 WINDOW = 0.3, 0.45
@@ -166,9 +162,8 @@ def check_wide(bench: Bench) -> Iterator[list[Metric]]:
     rows.registered()
     errors = {m: rows.all_focals(model) for m, model in models.items()}
     for label, views in (("whole", np.setdiff1d(np.arange(rows.total), weak)), ("windowed", weak)):
-        there = {m: e[views][np.isfinite(e[views])] for m, e in errors.items()}
         for name, reduce in (("median", np.median), ("worst", np.max)):
-            values = {m: reduced(reduce, e) for m, e in there.items()}
+            values = {m: reduced(reduce, e[views]) for m, e in errors.items()}
             rows.add(f"focal error of the {label}, {name}", values, "%")
     if run is not None and run.metric is not None:
         marked = [named(run.metric, int(v)) for v in weak]

@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.io._images import read_images
 from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.records import Image, TwoView
-from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.metrics.epipolar import rms_epipolar_distance
 from validation.metrics.record import Metric
 from validation.references.sift import sift_front_end
 from validation.scenes.real import load_real_scene
@@ -120,12 +119,8 @@ def measure_pairs(
         for i, pair in enumerate(islice(camera_pairs(load_real_scene(scene_name), cache, (gap,)), most)):
             assert pair.truth is not None
             views = {name: prepared.relate(i, i + gap) for name, prepared in by.items()}
-            related = {name: Related(view, _error(view, pair.truth)) for name, view in views.items()}
+            related = {n: Related(v, rms_epipolar_distance(v.F, pair.truth)) for n, v in views.items()}
             yield MeasuredPair(f"{i}-{i + gap}", gap, related)
-
-
-def _error(view: TwoView, truth: F64) -> float:
-    return rms_epipolar_distance(view.F, truth) if view.F.any() else NONE_PX
 
 
 def check_pairs(scene: str, gap: int, pairs: list[MeasuredPair]) -> list[Metric]:

@@ -19,6 +19,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.records import MetricResult, Tracks, TwoView
+from validation.metrics.intervals import LEVEL
 from validation.scenes.dinosaur import pairs_from_tracks
 from validation.scenes.harsh import KINDS
 from validation.studies.runner import Part, Rows, text_table
@@ -26,7 +27,6 @@ from validation.studies.subsets import Matched, solve
 
 OURS = "ours"
 OFF = 0.03
-LEVEL = 1.96
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ import numpy as np
 from thesisrecon import match_pair
 from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.geometry.camera_matrix import camera_centre, camera_from_centre, decompose_camera
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.two_view import estimate_homography, homography_residuals
 from thesisrecon.records import Image
 from thesisrecon.view_interpolation import prepare_pair
 from thesisrecon.views._warping import sample
 from thesisrecon.views.interpolation import InterpolatedPair, original_from_rectified
 from validation.metrics.pictures import picture_metrics, psnr_db
-from validation.scenes.fixtures import Pose
 from validation.scenes.image_files import read_rgb
 from validation.scenes.nine_views import dissolved
 from validation.studies.runner import Part, Rows, load_scene
@@ -37,12 +37,6 @@ def camera_between(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
     scale = float(np.sum(first[1:] * second[1:]) / np.sum(second[1:] ** 2))
     P_s = (1.0 - s) * first + s * scale * second
     return np.asarray(original_from_rectified(pair.H, pair.size, s) @ P_s)
-
-
-def pose_of(P: F64) -> Pose:
-    """K, R, C of a camera."""
-    K, R, t = decompose_camera(P)
-    return Pose(K, R, -R.T @ t)
 
 
 def camera_centre_of(pair: InterpolatedPair, P: tuple[F64, F64], s: float) -> F64:
@@ -72,33 +66,26 @@ def turned(picture: U8, H: F64) -> tuple[U8, B8]:
     """The image through H (3, 3), black outside, and where it has pixels."""
     height, width = picture.shape[:2]
     y, x = np.indices((height, width), dtype=np.float64)
-    back: F64 = np.asarray(np.linalg.inv(H), dtype=np.float64)
-    source = through(back, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(height, width, 2)
+    source = dehomogenize(np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(H).T)
     rgb = sample(picture.astype(np.float32), source.astype(np.float32), threads=2)
     kept = np.isfinite(rgb[..., 0])
     return np.clip(np.rint(np.nan_to_num(rgb)), 0, 255).astype(np.uint8), kept
 
 
-def through(H: F64, xy: F64) -> F64:
-    """Points (N, 2) moved by H (3, 3)."""
-    xh = np.column_stack([xy, np.ones(len(xy))]) @ H.T
-    return np.asarray(xh[:, :2] / xh[:, 2:])
-
-
 def interpolation_study(out: Path) -> Iterator[Part]:
     """Compare an interpolated view of fountain-P11 with the true image, which OUT gets beside it."""
     scene = load_scene("fountain-P11")
-    if scene is None or scene.K is None or scene.R is None or scene.C is None:
+    if scene is None:
         return
+    K, R, C = scene.cameras
     first, wanted, second = (Image(str(k), read_rgb(scene.image_paths[k]), (0, 0)) for k in (4, 5, 6))
     pair = prepare_pair(first, second)
-    P4, P6 = (camera_from_centre(scene.K[k], scene.R[k], scene.C[k]) for k in (4, 6))
-    s = nearest_place(pair, (P4, P6), scene.C[5])
+    P4, P6 = (camera_from_centre(K[k], R[k], C[k]) for k in (4, 6))
+    s = nearest_place(pair, (P4, P6), C[5])
     view, (width, height) = pair.view(s, threads=2), pair.size
-    rays = scene.R[5].T @ np.linalg.inv(scene.K[5])
-    seen = pose_of(camera_between(pair, (P4, P6), s))
+    K_s, R_s, _ = decompose_camera(camera_between(pair, (P4, P6), s))
     # The infinite homography: it relates the images of two cameras at one place.
-    infinite = np.linalg.inv(seen.K @ seen.R @ rays)
+    infinite = np.linalg.inv(K_s @ R_s @ (R[5].T @ np.linalg.inv(K[5])))
     best = best_homography(*_matches(view, wanted.rgb))
     pictures = {
         "as it is": view,
@@ -113,9 +100,7 @@ def interpolation_study(out: Path) -> Iterator[Part]:
     inner[height // 8 : -height // 8, width // 8 : -width // 8] = True
     metrics = picture_metrics("fountain-P11, 5 from 4 and 6", pictures, wanted.rgb)
     values: dict[str, float | None] = {n: psnr_db(p, wanted.rgb, where=inner) for n, p in pictures.items()}
-    off = np.linalg.norm(camera_centre_of(pair, (P4, P6), s) - scene.C[5]) / np.linalg.norm(
-        scene.C[6] - scene.C[4]
-    )
+    off = np.linalg.norm(camera_centre_of(pair, (P4, P6), s) - C[5]) / np.linalg.norm(C[6] - C[4])
     rows = Rows(metrics[0].scene, "turned best")
     rows.add("PSNR of the inner nine sixteenths", values, "dB")
     rows.add("camera 5 off the baseline", {"as it is": float(off)}, "baselines")

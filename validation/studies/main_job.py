@@ -22,13 +22,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.records import Reconstruction
 from validation.harness.process import Process, own_cores, run_process
 from validation.harness.scenes import truth_of
-from validation.metrics.cameras import (
-    CameraErrors,
-    Reprojection,
-    TrueCameras,
-    measure_cameras,
-    measure_reprojection,
-)
+from validation.metrics.cameras import Reprojection, TrueCameras, measure_cameras, measure_reprojection
 from validation.metrics.record import Metric
 from validation.references.colmap import read_run
 from validation.references.colmap_reading import read_colmap_model
@@ -83,7 +77,7 @@ def check_reconstruction(
         errors = {name: None if m is None else measure_cameras(m, truth) for name, m in models.items()}
         rows.each("focal error", errors, lambda e: e.focal_error_pct, "%", at_most=focal)
         rows.each("principal point error", errors, lambda e: e.principal_point_error_px, "px")
-        rows.each("mean camera-centre error", errors, centre_mm_of, "mm", at_most=centre)
+        rows.each("mean camera-centre error", errors, lambda e: e.centre_error_mm, "mm", at_most=centre)
         rows.each("median rotation error", errors, lambda e: e.rotation_error_deg, "deg")
     rows.each("median reprojection", residuals, lambda r: r.median_px, "px", at_most=reprojection)
     rows.each("mean reprojection", residuals, lambda r: r.mean_px, "px")
@@ -95,10 +89,6 @@ def check_reconstruction(
     rows.each("processor time", outcomes, lambda o: o.cpu_s, "s")
     rows.each("peak memory", outcomes, lambda o: o.peak_mb, "MB")
     return rows
-
-
-def centre_mm_of(errors: CameraErrors) -> float | None:
-    return None if errors.centre_error is None else 1000.0 * errors.centre_error
 
 
 def _registered(scene: str, n_views: int, outcomes: Mapping[str, Outcome]) -> Metric:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +31,9 @@ from thesisrecon.runtime._run import stream
 from validation.metrics.record import Metric
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks
 from validation.scenes.real import Scene
-from validation.scenes.rigs import Rig, make_cloud, noisy_tracks
+from validation.scenes.rigs import noisy_tracks
 from validation.scenes.transforms import random_transform
+from validation.scenes.triangulation import beside
 from validation.studies.runner import Part, Rows, scenes_here
 
 PLAIN, ITERATED, AFFINE, GROWN = (
@@ -65,11 +66,6 @@ class Start:
         xh = np.einsum("vab,nb->vna", self.P, self.X)
         distance = np.linalg.norm(xh[..., :2] / xh[..., 2:] - xy, axis=2)
         return float(np.sqrt(np.mean(np.minimum(np.nan_to_num(distance, nan=np.inf), OUTLIER_PX) ** 2)))
-
-
-def complete_rig(rng: np.random.Generator) -> Rig:
-    rig = make_cloud(VIEWS, rng, points=POINTS)
-    return replace(rig, seen=np.ones_like(rig.seen))
 
 
 def starts(tracks: Tracks, xy: F64, sizes: NDArray[np.int64], seed: int) -> dict[str, Start]:
@@ -122,7 +118,7 @@ def check_noise(sigma_px: float, trials: int) -> list[Metric]:
     )
     for seed in range(trials):
         rng = np.random.default_rng(seed)
-        rig = complete_rig(rng)
+        rig = beside(rng, VIEWS, POINTS)
         tracks = noisy_tracks(rig, sigma_px, rng)
         xy, seen = complete_tracks(tracks)
         sizes = np.tile(np.array(rig.size, dtype=np.int64), (VIEWS, 1))

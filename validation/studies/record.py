@@ -18,16 +18,11 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.errors import UsageError
-from validation.studies.runner import Part, Rows, pick
+from validation.scenes.real import REAL_SCENES, Scene
+from validation.studies.runner import Part, Rows, load_scene, pick
 
-ROOT = Path(__file__).resolve().parents[2]
-DATA = ROOT.parent / "shared" / "data"
-IMAGE_SETS = {
-    "courtyard": (ROOT / "fixtures" / "courtyard" / "images", "model"),
-    "fountain-P11": (DATA / "strecha" / "fountain-P11", "metric"),
-    "Herz-Jesus-P8": (DATA / "strecha" / "Herz-Jesus-P8", "metric"),
-    "kermit": (DATA / "kermit", "metric"),
-}
+LAST_STAGE = {"courtyard": "model", **dict.fromkeys(REAL_SCENES, "metric")}
+"""Image sets and the last stage of their runs."""
 TRACKS = ("cube", "dinosaur")
 PRESETS = ("default", "thesis")
 VOLATILE = ("seconds", "memory", "version", "out", "path", "time", "threads")
@@ -92,16 +87,12 @@ def file_digests(out: Path) -> dict[str, str]:
     return {n: hashlib.sha256((out / n).read_bytes()).hexdigest()[:16] for n in names if (out / n).exists()}
 
 
-def record_images(name: str, preset: str, folder: Path) -> dict[str, Any]:
+def record_images(scene: Scene, preset: str, folder: Path) -> dict[str, Any]:
     from thesisrecon.cli.main import run_command
 
-    images, until = IMAGE_SETS[name]
-    if (images / "images").is_dir():
-        images = images / "images"
-    out = folder / f"{name}-{preset}"
-    code = run_command(
-        ["reconstruct", str(images), "-o", str(out), "--preset", preset, "--until", until, "--threads", "2"]
-    )
+    images, out = scene.image_paths[0].parent, folder / f"{scene.name}-{preset}"
+    command = ["reconstruct", str(images), "-o", str(out), "--preset", preset]
+    code = run_command([*command, "--until", LAST_STAGE[scene.name], "--threads", "2"])
     summary = json.loads((out / "summary.json").read_text()) if (out / "summary.json").exists() else {}
     return {
         "code": code,
@@ -119,11 +110,12 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
     from thesisrecon.intrinsics import prior_for
     from thesisrecon.records import Tracks
     from thesisrecon.runtime._run import stream
+    from validation.scenes.cube import make_cube
     from validation.scenes.dinosaur import load_dinosaur, pairs_from_tracks
 
     if name == "cube":
-        cube = np.load(ROOT / "fixtures" / "cube" / "cube.npz")
-        xy = cube["xy"] + np.random.default_rng(7).normal(scale=0.3, size=cube["xy"].shape)
+        exact = make_cube().xy
+        xy = exact + np.random.default_rng(7).normal(scale=0.3, size=exact.shape)
         point, view = np.nonzero(np.isfinite(xy).all(axis=2).T)
         tracks = Tracks(view.astype(np.int64), point.astype(np.int64), xy[view, point], len(xy), xy.shape[1])
         sizes = np.tile(np.array([800, 600], dtype=np.int64), (len(xy), 1))
@@ -172,8 +164,8 @@ def write(target: Path, folder: Path, sets: Sequence[str], presets: Sequence[str
         for preset in presets:
             if name in TRACKS:
                 record[f"{name} {preset}"] = record_tracks(name, preset)
-            elif IMAGE_SETS[name][0].is_dir():
-                record[f"{name} {preset}"] = record_images(name, preset, folder)
+            elif (scene := load_scene(name)) is not None:
+                record[f"{name} {preset}"] = record_images(scene, preset, folder)
             target.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n")
             yield f"{name} {preset}: recorded"
 
@@ -219,13 +211,13 @@ def summary_differences(a: dict[str, float], b: dict[str, float]) -> list[str]:
 def record_study(
     out: Path,
     write_to: Path | None = None,
-    sets: Sequence[str] = (*TRACKS, *IMAGE_SETS),
+    sets: Sequence[str] = (*TRACKS, *LAST_STAGE),
     presets: Sequence[str] = PRESETS,
     compare_with: Sequence[Path] = (),
 ) -> Iterator[Part]:
     """Record every number of some runs in a file, or compare two such files."""
     if write_to is not None:
-        yield from write(write_to, out, pick(sets, (*TRACKS, *IMAGE_SETS)), presets)
+        yield from write(write_to, out, pick(sets, (*TRACKS, *LAST_STAGE)), presets)
     elif len(compare_with) == 2:
         found = list(compare(*compare_with))
         yield from (text for text, _ in found)

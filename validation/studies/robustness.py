@@ -102,17 +102,18 @@ class Runs:
     def arguments(self, out: Path) -> list[str]:
         return ["reconstruct", str(self.images), "-o", str(out), *self.options]
 
+    def program(self, out: Path) -> list[str]:
+        return [sys.executable, "-m", "thesisrecon", *self.arguments(out)]
+
     def whole(self, out: Path) -> float:
         start = time.perf_counter()
-        program = [sys.executable, "-m", "thesisrecon", *self.arguments(out)]
-        subprocess.run(program, env=self.environment, check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(self.program(out), env=self.environment, check=True, stdout=subprocess.DEVNULL)
         return time.perf_counter() - start
 
     def killed(self, name: str, after_s: float) -> tuple[Path, bool]:
         """Kill a run after some seconds; return its folder and whether it was still running."""
         out = self.place / name
-        program = [sys.executable, "-m", "thesisrecon", *self.arguments(out)]
-        process = subprocess.Popen(program, env=self.environment, stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(self.program(out), env=self.environment, stdout=subprocess.DEVNULL)
         try:
             process.wait(after_s)
         except subprocess.TimeoutExpired:
@@ -127,9 +128,13 @@ class Runs:
         return out, ended.returncode == -signal.SIGKILL
 
     def resumed(self, when: str, out: Path, died: bool, wanted: dict[str, bytes]) -> Kill:
+        return Kill(when, died, *self.compared(out, wanted))
+
+    def compared(self, out: Path, wanted: dict[str, bytes]) -> tuple[int, tuple[str, ...]]:
+        """Resume a run; return the stage files that it had, and its outputs that differ."""
         kept = sum(1 for _ in out.glob("0*/*.npz"))
         self.whole(out)
-        return Kill(when, died, kept, different(outputs(out), wanted))
+        return kept, different(outputs(out), wanted)
 
 
 def kill_runs(runs: Runs, kills: int, writes: int) -> Iterator[Kill]:
@@ -190,12 +195,17 @@ class Stop:
             return f"differs: {', '.join(self.different)}" if self.different else ""
         found = {
             f"took {self.seconds:.1f} s": self.seconds > LIMIT_S,
-            f"exit code {self.code}": self.code != CODES[asked],
-            "not one sentence": self.said.count("\n") != 1 or "Traceback" in self.said,
+            **_faults_of_end(self, CODES[asked]),
             f"{self.left} processes left": self.left > 0,
             f"differs: {', '.join(self.different)}": bool(self.different),
         }
         return "; ".join(words for words, here in found.items() if here)
+
+
+def _faults_of_end(ended: Stop | Refusal, code: int) -> dict[str, bool]:
+    """Return the faults that the exit code and the error stream may have, and whether they are there."""
+    sentence = ended.said.count("\n") == 1 and "Traceback" not in ended.said
+    return {f"exit code {ended.code}": ended.code != code, "not one sentence": not sentence}
 
 
 def stopped(
@@ -269,12 +279,9 @@ def stop_runs(runs: Runs, moments: int, asked: signal.Signals, *, cold: bool) ->
         environment = {**runs.environment}
         if cold:
             environment["NUMBA_CACHE_DIR"] = str(runs.place / f"kernels-{k}")
-        program = [sys.executable, "-m", "thesisrecon", *runs.arguments(out)]
         end = time.perf_counter() + share * seconds
-        stop = stopped(program, partial(_is_past, end), asked, environment=environment)
-        kept = sum(1 for _ in out.glob("0*/*.npz"))
-        runs.whole(out)
-        changed = different(outputs(out), wanted)
+        stop = stopped(runs.program(out), partial(_is_past, end), asked, environment=environment)
+        kept, changed = runs.compared(out, wanted)
         yield replace(stop, when=f"{100 * share:.0f} % ({stop.when})", kept=kept, different=changed)
 
 
@@ -310,8 +317,7 @@ class Refusal:
     @property
     def wrong(self) -> str:
         found = {
-            f"exit code {self.code}": self.code != REFUSED,
-            "not one sentence": self.said.count("\n") != 1 or "Traceback" in self.said,
+            **_faults_of_end(self, REFUSED),
             "names no place": " cannot be written: " not in self.said,
             "does not say what to do": not any(words in self.said for words in REMEDIES.values()),
             f"strange files: {', '.join(self.strange)}": bool(self.strange),
@@ -346,8 +352,7 @@ class SmallRuns:
     """Runs of the same few images in this process."""
 
     def __init__(self, place: Path, views: int, size_px: int, until: str) -> None:
-        self.place = place
-        self.images = place / "images"
+        self.place, self.images = place, place / "images"
         self.images.mkdir()
         for path in sorted((COURTYARD / "images").iterdir())[:views]:
             (self.images / path.name).symlink_to(path)
@@ -371,14 +376,9 @@ def refused_at(runs: SmallRuns, write: int, number: int, wanted: dict[str, bytes
     out = runs.place / f"write-{write}"
     with disk_ends(write, number):
         ended = runs.run(out)
-    strange = _strange(outputs(out), wanted)
-    return Refusal(
-        f"file {write}: {os.strerror(number)}", *ended, strange, different(runs.whole(out), wanted)
-    )
-
-
-def _strange(there: dict[str, bytes], wanted: dict[str, bytes]) -> tuple[str, ...]:
-    return tuple(name for name, content in there.items() if wanted.get(name) != content)
+    strange = tuple(name for name, content in outputs(out).items() if wanted.get(name) != content)
+    changed = different(runs.whole(out), wanted)
+    return Refusal(f"file {write}: {os.strerror(number)}", *ended, strange, changed)
 
 
 def refuse_runs(runs: SmallRuns, every: int) -> Iterator[Refusal]:

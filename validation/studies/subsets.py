@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -27,11 +26,9 @@ from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from thesisrecon.runtime._run import stream
 from validation.scenes.real import REAL_SCENES, Scene
+from validation.studies.coverage import MODES, SUCCESS_PCT, Cameras
 from validation.studies.runner import SHIFTED, Part, Rows, scenes_here, text_table
 
-Mode = Literal["shared", "per-image"]
-MODES: tuple[Mode, ...] = ("shared", "per-image")
-SUCCESS_PCT = 3.0
 MIN_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8
 SHIFTED_REASONS = ("pure translation", "not determine the focal length", "at least 3 registered images")
@@ -180,7 +177,7 @@ def _quality(result: MetricResult) -> tuple[bool, int, int]:
 
 
 def run_trial(
-    matched: Matched, mode: str, number: int, *, views: tuple[int, int] = (MIN_VIEWS, MAX_VIEWS)
+    matched: Matched, mode: Cameras, number: int, *, views: tuple[int, int] = (MIN_VIEWS, MAX_VIEWS)
 ) -> Trial:
     """Draw one subset of as many ``views`` (fewest, most) and solve it."""
     rng = stream(number, "subsets")
@@ -191,7 +188,7 @@ def run_trial(
     subset = take_views(matched, chosen, kept)
     # Two images have a single pair.
     first = int(rng.integers(max(min(LATEST_START, sum(pair.accepted for pair in subset.pairs)), 1)))
-    options = IntrinsicsOptions(cameras="shared" if mode == "shared" else "per-image")
+    options = IntrinsicsOptions(cameras=mode)
     start, names = time.perf_counter(), tuple(int(view) for view in chosen)
     nothing = Trial(number, names, 0, np.nan, np.nan, (), 0, 0.0, reasons=matched.reasons)
     try:
@@ -236,7 +233,7 @@ HEAD = ["set", "cameras", "trials", *OUTCOMES, "median error, %", "worst camera 
 def subsets_study(
     out: Path,
     scenes: Sequence[str] = (*REAL_SCENES, "courtyard", SHIFTED),
-    modes: Sequence[Mode] = MODES,
+    modes: Sequence[Cameras] = MODES,
     trials: int = 100,
     views: Sequence[int] = (MIN_VIEWS, MAX_VIEWS),
     threads: int = 2,

@@ -32,9 +32,11 @@ from thesisrecon.views.trilinear_synthesis import AGREE_PX, prepare_synthesis
 from validation.metrics.pictures import picture_metrics, psnr_db, ssim
 from validation.metrics.record import Metric
 from validation.scenes.courtyard import build_courtyard
-from validation.scenes.fixtures import SIZE, Pose, courtyard_poses, render_image
+from validation.scenes.fixtures import SIZE, courtyard_poses, render_image
+from validation.scenes.image_files import read_rgb
 from validation.scenes.nine_views import dissolved
-from validation.scenes.raycast import Rays, World, trace
+from validation.scenes.pose import Pose
+from validation.scenes.raycast import World, trace
 from validation.scenes.real import load_real_scene
 from validation.studies.runner import Part, text_table
 
@@ -100,7 +102,7 @@ def courtyard() -> CourtyardTruth:
     one, two = (replace(courtyard_poses()[k], exposure=1.0) for k in VIEWS)
     places = []
     for here, there in ((one, two), (two, one)):
-        depth = trace(world, Rays(here.K, here.R, here.C), SIZE, shade=False)[1]
+        depth = trace(world, here, SIZE, shade=False)[1]
         y, x = np.indices(depth.shape)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(here.K).T
         X = rays * np.where(depth > 0.0, depth, np.nan)[..., None] @ here.R + here.C
@@ -188,15 +190,14 @@ def courtyard_table(rows: list[Measured]) -> str:
 def measure_fountain(out: Path) -> list[Metric]:
     """Render image 5 from 4 and 6 at its true place."""
     scene = load_real_scene("fountain-P11")
-    if scene is None or scene.K is None or scene.R is None or scene.C is None:
+    if scene is None:
         return []
-    (K1, K, K2), (R1, R, R2), (C1, C, C2) = scene.K[4:7], scene.R[4:7], scene.C[4:7]
+    (K1, K, K2), (R1, R, R2), (C1, C, C2) = (part[4:7] for part in scene.cameras)
     found = match_images(scene.image_paths[4], scene.image_paths[6])
     images = found.images
     size = images[0].size
     dense = found.dense.correspondences(0, size), found.dense.correspondences(1, size)
-    with PIL.Image.open(scene.image_paths[5]) as image:
-        wanted = np.asarray(image.convert("RGB"))
+    wanted = read_rgb(scene.image_paths[5])
     baseline = float(np.linalg.norm(C1 - C2))
     guess = default_intrinsics(size)
     matches = found.pair.xy1, found.pair.xy2

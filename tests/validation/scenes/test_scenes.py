@@ -14,8 +14,9 @@ from validation.scenes.cube import SIZE as CUBE_SIZE
 from validation.scenes.cube import make_cube
 from validation.scenes.fixtures import SIZE, courtyard_poses, encode_depth, render_image, versions, write_cube
 from validation.scenes.materials import Material, over, smooth
+from validation.scenes.pose import Pose
 from validation.scenes.procedural import courses, fractal
-from validation.scenes.raycast import Rays, Surface, build_world, trace
+from validation.scenes.raycast import Surface, build_world, trace
 from validation.scenes.real import (
     REAL_SCENES,
     ROOT,
@@ -316,7 +317,7 @@ def wall(height):
 
 
 def view(world, **options):
-    return trace(world, Rays(RAY_K, np.eye(3), np.zeros(3)), RAY_SIZE, **options)
+    return trace(world, Pose(RAY_K, np.eye(3), np.zeros(3)), RAY_SIZE, **options)
 
 
 def test_plane_depth_is_exact():

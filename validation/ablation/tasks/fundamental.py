@@ -15,7 +15,8 @@ from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
 from validation.ablation.study import Measure, Place, Task
 from validation.metrics.fundamental_precision import fundamental_bound
-from validation.scenes.cube import CubePair, cube_pairs, make_cube
+from validation.scenes.cube import K, cube_pairs, make_cube
+from validation.scenes.two_views import TwoViews
 from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHOLD_PX
 
 BY_METHOD = {m.name: m for m in METHODS}
@@ -83,7 +84,7 @@ class FundamentalOfCube(Task):
             numbers["over_bound"] = float(np.sqrt(np.mean((distance / bound) ** 2)))
         return numbers
 
-    def _matches(self, pair: CubePair, rng: np.random.Generator) -> tuple[F64, F64]:
+    def _matches(self, pair: TwoViews, rng: np.random.Generator) -> tuple[F64, F64]:
         xy1, xy2 = (xy + self.noise_px * rng.normal(size=xy.shape) for xy in (pair.xy1, pair.xy2))
         wrong = rng.random(len(xy2)) < self.outliers
         anywhere = rng.uniform(pair.xy2.min(axis=0), pair.xy2.max(axis=0), xy2.shape)
@@ -99,18 +100,18 @@ class FundamentalOfCube(Task):
         except StageFailure:
             return None
 
-    def _bound(self, pair: CubePair) -> float:
+    def _bound(self, pair: TwoViews) -> float:
         if self.noise_px == 0.0:
             return float("nan")
         return fundamental_bound(pair.P1, pair.P2, pair.X, sigma_px=self.noise_px).rms_distance_px
 
 
 @cache
-def _pairs() -> list[CubePair]:
+def _pairs() -> list[TwoViews]:
     return cube_pairs(make_cube())
 
 
-def measure_pair(F: F64 | None, pair: CubePair) -> tuple[float, float]:
+def measure_pair(F: F64 | None, pair: TwoViews) -> tuple[float, float]:
     """Return the RMS distance (px) of the exact points to their epipolar lines and the larger epipole error
     (degrees), NaN without F."""
     if F is None:
@@ -119,12 +120,12 @@ def measure_pair(F: F64 | None, pair: CubePair) -> tuple[float, float]:
     return distance, _epipole_error_deg(F, pair)
 
 
-def _epipole_error_deg(F: F64, pair: CubePair) -> float:
+def _epipole_error_deg(F: F64, pair: TwoViews) -> float:
     centres = [np.linalg.svd(P)[2][3] for P in (pair.P1, pair.P2)]
     truths = (pair.P1 @ centres[1], pair.P2 @ centres[0])
     angles = []
     for found, true in zip(epipoles(F), truths, strict=True):
-        a, b = (np.linalg.solve(pair.K, e) for e in (found, true))
+        a, b = (np.linalg.solve(K, e) for e in (found, true))
         sine, cosine = np.linalg.norm(np.cross(a, b)), abs(float(a @ b))
         angles.append(float(np.degrees(np.arctan2(sine, cosine))))
     return max(angles)

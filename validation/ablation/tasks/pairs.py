@@ -18,7 +18,7 @@ from thesisrecon.io._images import read_images
 from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place, Task
-from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.metrics.epipolar import rms_epipolar_distance
 from validation.scenes.real import load_real_scene
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs
 from validation.studies.front_end_pairs import MAX_SIZE_PX, Related
@@ -66,7 +66,7 @@ def numbers_of_pair(
     view = match_views(config, views[0], views[1], pair, seed)
     if not view.F.any():
         raise StageFailure("the pair has no F", view.reason)
-    found = Related(view, rms_epipolar_distance(view.F, truth) if view.F.any() else NONE_PX)
+    found = Related(view, rms_epipolar_distance(view.F, truth))
     return {
         "verified": float(found.verified),
         "right_pct": 100.0 * found.right,

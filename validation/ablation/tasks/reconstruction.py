@@ -151,7 +151,7 @@ def _measured(result: RunResult, scene: Scene) -> dict[str, float]:
     errors = measure_cameras(model, truth)
     found["focal_error_pct"] = errors.focal_error_pct
     found["rotation_error_deg"] = errors.rotation_error_deg
-    found["centre_error_mm"] = np.nan if errors.centre_error is None else 1000.0 * errors.centre_error
+    found["centre_error_mm"] = np.nan if errors.centre_error_mm is None else errors.centre_error_mm
     return found
 
 

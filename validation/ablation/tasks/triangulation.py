@@ -12,7 +12,6 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
@@ -69,11 +68,9 @@ class TriangulationOverNoise(Task):
         drawn = draw_rig(scene, self.noise_px, self.frame, rng, self.points)  # type: ignore[arg-type]
         X = METHODS[self.method](drawn.P, drawn.xy)
         squared = squared_distances(drawn.P, X, drawn.xy) / len(drawn.P)
-        back = dehomogenize(X @ np.linalg.inv(drawn.G).T)
-        off = np.linalg.norm(back - drawn.X, axis=1) / np.linalg.norm(drawn.X - drawn.centre, axis=1)
-        off = np.nan_to_num(off, nan=np.inf)
+        errors_pct = drawn.errors_pct(X)
         return {
             "image_px": float(np.sqrt(np.mean(squared))),
-            "space_pct": 100.0 * float(np.median(off)),
-            "worst_pct": 100.0 * float(np.quantile(off, 0.95)),
+            "space_pct": float(np.median(errors_pct)),
+            "worst_pct": float(np.quantile(errors_pct, 0.95)),
         }

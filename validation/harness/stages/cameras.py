@@ -138,7 +138,7 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
     numbers: tuple[tuple[str, str, Callable[[CameraErrors], float | None], str], ...] = (
         ("focal error", "%", lambda e: e.focal_error_pct, FOCAL),
         ("principal point error", "px", lambda e: e.principal_point_error_px, PRINCIPAL_POINT),
-        ("centre error", "mm", lambda e: None if e.centre_error is None else 1000.0 * e.centre_error, CENTRE),
+        ("centre error", "mm", lambda e: e.centre_error_mm, CENTRE),
         ("rotation error", "deg", lambda e: e.rotation_error_deg, ROTATION),
     )
     for name, unit, read, words in numbers:

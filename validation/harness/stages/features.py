@@ -19,7 +19,7 @@ from validation.harness.records import Judgement, Outcome, ReportOptions, Stage,
 from validation.harness.rows import OURS, Values, each, read_arrays, row
 from validation.harness.scenes import has_images, load_images
 from validation.harness.stages.fundamental import MATCHES
-from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.metrics.epipolar import rms_epipolar_distance
 from validation.metrics.record import Metric
 from validation.references.libraries import NoReference
 from validation.references.opencv import harris_corners, sift_corners
@@ -122,7 +122,8 @@ def _match_metrics(
     for name, arrays in found.items():
         if arrays is not None:
             F, inliers, noise = (arrays[f"{what}{gap}"] for what in ("F", "inliers", "sigma"))
-            good = np.array([_error(f, pair) < RIGHT_PX for f, pair in zip(F, pairs, strict=True)])
+            truths = [pair.truth for pair in pairs if pair.truth is not None]
+            good = np.array([rms_epipolar_distance(*both) < RIGHT_PX for both in zip(F, truths, strict=True)])
             verified[name] = float(inliers[good].sum() / len(pairs))
             right[name] = float(100.0 * good.mean())
             sigma[name] = float(np.median(noise[good])) if good.any() else None
@@ -134,11 +135,6 @@ def _match_metrics(
         row(scene, f"right F {where}", "%", right, "share of the pairs whose F is right", more=True),
         row(scene, f"noise {where}", "px", sigma, NOISE),
     ]
-
-
-def _error(F: F64, pair: RealPair) -> float:
-    assert pair.truth is not None
-    return rms_epipolar_distance(F, pair.truth) if F.any() else NONE_PX
 
 
 def _repeatability(scene: Scene, outcomes: Mapping[str, Outcome]) -> Metric:

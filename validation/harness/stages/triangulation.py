@@ -6,20 +6,21 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
 from validation.harness.rows import each, plot, read_arrays, row, scatter
 from validation.metrics.record import Metric
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
-from validation.scenes.rigs import Rig
-from validation.scenes.triangulation import SCENES, cameras_of, frame_of, squared_distances
+from validation.scenes.triangulation import SCENES, DrawnRig, draw_rig, squared_distances
 
 OURS = "ours (polynomial, optimal)"
 DESCENT = 40
@@ -37,17 +38,21 @@ Method = Callable[[F64, F64], F64]
 
 @dataclass(frozen=True)
 class Problem:
-    """Points ``xy`` (V, N, 2) of cameras ``P`` (V, 3, 4) in a frame of space that ``frame`` (4, 4) leads to
-    from the metric one."""
+    """A rig with noise, in a metric or in a projective frame of space."""
 
-    title: str
     sigma_px: float
     projective: bool
-    rig: Rig
-    seen: np.ndarray
-    P: F64
-    xy: F64
-    frame: F64
+    rig: DrawnRig
+
+    @property
+    def P(self) -> F64:
+        """(V, 3, 4) cameras."""
+        return self.rig.P
+
+    @property
+    def xy(self) -> F64:
+        """(V, N, 2) noisy pixels."""
+        return self.rig.xy
 
 
 class TriangulationStage(Stage):
@@ -106,7 +111,7 @@ def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
     rng, (views, points) = np.random.default_rng(seed), problem.xy.shape[:2]
     P = problem.P * (1.0 + MOVED * rng.normal(size=problem.P.shape))
     view, point = np.tile(np.arange(views), points), np.repeat(np.arange(points), views)
-    seen = problem.xy.swapaxes(0, 1).reshape(-1, 2)
+    seen = problem.xy[view, point]
     start = triangulate(P, problem.xy, method="linear")
     fit = refine_projective_bundle(P, start, view, point, seen, loss_px=1e3, max_iterations=DESCENT)
     return fit.P, fit.X
@@ -140,18 +145,10 @@ def _solver(method: str, views: int) -> Method | None:
 
 def _problems(options: ReportOptions) -> Iterator[Problem]:
     trials = 1 if options.quick else 4
-    for title, (make, views) in SCENES.items():
-        for sigma in NOISES_PX:
-            for projective in (False, True):
-                for trial in range(trials):
-                    rng = np.random.default_rng([options.seed, trial])
-                    rig = make(rng, views, POINTS)
-                    exact = rig.pixels()
-                    seen = np.asarray(np.isfinite(exact).all(axis=(0, 2)))
-                    xy = exact[:, seen] + sigma * rng.normal(size=(views, int(seen.sum()), 2))
-                    frame = frame_of("projective" if projective else "metric", rng)
-                    P = cameras_of(rig) @ np.linalg.inv(frame)
-                    yield Problem(title, sigma, projective, rig, seen, P, xy, frame)
+    for scene, sigma, projective, trial in product(SCENES, NOISES_PX, (False, True), range(trials)):
+        rng = np.random.default_rng([options.seed, trial])
+        frame: Group = "projective" if projective else "metric"
+        yield Problem(sigma, projective, draw_rig(scene, sigma, frame, rng, POINTS))
 
 
 def _metrics(
@@ -171,19 +168,13 @@ def _metrics(
         apart[name] = _median_space_error(problems, some)
     optimum = _median_space_error(problems, {n: _least_near_truth(p) for n, p in problems.items()})
     over = each(apart, lambda value: value / optimum)
+    optimal = f"the optimum, {where}"
     words = "of the median error in space over that of points found from the truth by descent"
     residual = "RMS distance to the measured points over that of the optimum, minus 1"
     distance = "median distance from the true point over its distance from the first camera"
     return [
         *(
-            row(
-                scene,
-                f"{title}error in space over the optimum, {where}",
-                "",
-                over.get(name),
-                words,
-                judged=name,
-            )
+            row(scene, f"{title}error in space over {optimal}", "", over.get(name), words, judged=name)
             for name, title in {OURS: "", LINEAR: f"{LINEAR}: ", MIDPOINT: f"{MIDPOINT}: "}.items()
         ),
         row(scene, f"residual above the optimum, {where}", "", above, residual, judged=OURS),
@@ -193,7 +184,7 @@ def _metrics(
 
 def _median_space_error(problems: Mapping[int, Problem], answers: Mapping[int, F64]) -> float:
     """Return the median over all points of all problems (%)."""
-    return float(np.median(np.concatenate([_space_errors(problems[n], X) for n, X in answers.items()])))
+    return float(np.median(np.concatenate([problems[n].rig.errors_pct(X) for n, X in answers.items()])))
 
 
 def _least_squared_distances(n: int, problem: Problem, kept: Mapping[str, Mapping[str, F64] | None]) -> F64:
@@ -208,7 +199,7 @@ def _least_near_truth(problem: Problem) -> F64:
 
     Levenberg-Marquardt in the metric frame, with a separate damping for every point.
     """
-    P, X = problem.P @ problem.frame, problem.rig.X[problem.seen]
+    P, X = problem.P @ problem.rig.G, problem.rig.X
     cost, damping = np.full(len(X), np.inf), np.full(len(X), 1e-3)
     trial = X
     for _ in range(DESCENT):
@@ -224,15 +215,7 @@ def _least_near_truth(problem: Problem) -> F64:
         g = np.einsum("vnia,vni->na", J, seen - problem.xy)
         N = N + damping[:, None, None] * np.einsum("naa->na", N)[:, :, None] * np.eye(3)
         trial = X - np.linalg.solve(N, g[:, :, None])[..., 0]
-    return np.asarray(homogenize(X) @ problem.frame.T)
-
-
-def _space_errors(problem: Problem, X: F64) -> F64:
-    """Return the error in percent of the distance from the first camera."""
-    back = dehomogenize(X @ np.linalg.inv(problem.frame).T)
-    true = problem.rig.X[problem.seen]
-    off = np.linalg.norm(back - true, axis=1) / np.linalg.norm(true - problem.rig.C[0], axis=1)
-    return np.asarray(100.0 * np.nan_to_num(off, nan=np.inf), dtype=np.float64)
+    return np.asarray(homogenize(X) @ problem.rig.G.T)
 
 
 def _plot(problems: list[Problem], found: Mapping[str, Mapping[str, F64] | None]) -> Plot:
@@ -244,7 +227,7 @@ def _plot(problems: list[Problem], found: Mapping[str, Mapping[str, F64] | None]
         y = []
         for sigma in NOISES_PX:
             errors = [
-                _space_errors(p, answers[f"{n}"])
+                p.rig.errors_pct(answers[f"{n}"])
                 for n, p in enumerate(problems)
                 if p.sigma_px == sigma and not p.projective and len(p.P) == 2 and f"{n}" in answers
             ]

@@ -66,6 +66,14 @@ def clean_environment(**more: str) -> Mapping[str, str]:
     return {**left, **more}
 
 
+def captured(
+    command: Sequence[object], folder: str, *, check: bool = False, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a program in ``folder`` in a clean environment with these variables, and keep what it prints."""
+    words, environment = [str(word) for word in command], clean_environment(**variables)
+    return subprocess.run(words, cwd=folder, env=environment, check=check, capture_output=True, text=True)
+
+
 TOOLS = ("pytest>=8.2", "hypothesis>=6.100", "pytest-benchmark>=4.0")
 QUICK = ("-m", "not slow and not real and not browser")
 

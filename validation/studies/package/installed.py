@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from validation.studies.package.environments import clean_environment
+from validation.studies.package.environments import captured
 from validation.studies.runner import text_table
 
 LIMIT_S = 0.6
@@ -22,6 +22,7 @@ TIMES_NUMBA = 2.5
 """Bound of functions that may run any stage, over the import time of numba, which they need."""
 DOORS = ("triangulate", "render", "PipelineConfig", "estimate_fundamental", "reconstruct", "match_pair")
 COMMANDS = ("--version", "--help", "reconstruct --help")
+REPEATS = 5
 EMPTY = "pass"
 TIMED = """
 import resource, sys
@@ -44,23 +45,18 @@ def statements() -> dict[str, str]:
     return {"Python alone": EMPTY, "import thesisrecon": "import thesisrecon", **commands, **doors, **others}
 
 
-def processor_seconds(interpreter: Path, code: str, repeats: int) -> float:
+def processor_seconds(interpreter: Path, code: str) -> float:
     """Return the least processor seconds of several new processes."""
     with tempfile.TemporaryDirectory() as empty:
-        command = [str(interpreter), "-c", TIMED.format(code=code)]
-        runs = [
-            subprocess.run(
-                command, cwd=empty, env=clean_environment(), check=True, capture_output=True, text=True
-            )
-            for _ in range(repeats + 1)
-        ]
+        command = [interpreter, "-c", TIMED.format(code=code)]
+        runs = [captured(command, empty, check=True) for _ in range(REPEATS + 1)]
     # The first one writes bytecode.
     return min(float(run.stderr.split()[-1]) for run in runs[1:])
 
 
-def check_imports(interpreter: Path, repeats: int = 5) -> list[str]:
+def check_imports(interpreter: Path) -> list[str]:
     """Print the import times; return those above their bounds."""
-    taken = {name: processor_seconds(interpreter, code, repeats) for name, code in statements().items()}
+    taken = {name: processor_seconds(interpreter, code) for name, code in statements().items()}
     print(text_table(["", "processor s"], ([name, f"{s:.2f}"] for name, s in taken.items())))
     bound = ["import thesisrecon", *(f"thesisrecon {words}" for words in COMMANDS)]
     faults = [f"{n} takes {taken[n]:.2f} s, at most {LIMIT_S}" for n in bound if taken[n] > LIMIT_S]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +18,7 @@ from pathlib import Path
 from thesisrecon.io._images import DEMO_IMAGES, demo_images
 from validation.studies.package.built import build, check_built, find_built
 from validation.studies.package.environments import (
-    clean_environment,
+    captured,
     dependencies,
     install,
     lowest_versions,
@@ -63,14 +62,7 @@ class Checks:
         with tempfile.TemporaryDirectory() as empty:
             client = shutil.copy(Path(__file__).with_name("client.py"), empty)
             command = [checker, "-m", "mypy", "--strict", "--python-executable", self.interpreter, client]
-            run = subprocess.run(
-                [str(word) for word in command],
-                cwd=empty,
-                env=clean_environment(),
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+            run = captured(command, empty)
         print(run.stdout.strip())
         return [] if run.returncode == 0 else [f"mypy: {run.stdout.strip()}"]
 
@@ -92,11 +84,8 @@ class Checks:
     def demo(self) -> list[str]:
         """Run the installed demo from an empty folder and compare it with the truth in the wheel."""
         with tempfile.TemporaryDirectory() as empty:
-            command = [str(self.interpreter.with_name("thesisrecon")), "demo"]
-            environment = clean_environment(HOME=empty, NUMBA_CACHE_DIR=str(self.out / "kernels"))
-            run = subprocess.run(
-                command, cwd=empty, env=environment, capture_output=True, text=True, check=False
-            )
+            command = [self.interpreter.with_name("thesisrecon"), "demo"]
+            run = captured(command, empty, HOME=empty, NUMBA_CACHE_DIR=str(self.out / "kernels"))
             if run.returncode != 0:
                 return [f"the demo ended with code {run.returncode}: {run.stderr.strip()}"]
             return self._demo_faults(Path(empty) / "out" / "demo")
