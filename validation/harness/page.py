@@ -17,6 +17,7 @@ from thesisrecon.io._files import write_text
 from thesisrecon.report._page import plotly_script, render_page
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, key_of, slug
 from validation.harness.results import Results, Row
+from validation.metrics.record import number
 
 HERE = Path(__file__).parent
 TEMPLATE = HERE / "page.html.j2"
@@ -43,13 +44,12 @@ def write_pages(
         key_of(stage, m): m.name for (stage, _), (judgement, _) in judged.items() for m in judgement.metrics
     }
     for scene in scenes:
+        rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         sections = [
-            _section(stage, results, names, scene, judgement, options)
+            _section(stages[name], rows, names) | _figures(options.place(name, scene), name, judgement)
             for (name, where), (judgement, _) in judged.items()
             if where == scene
-            for stage in [stages[name]]
         ]
-        rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         failures = [(k, why) for k, why in results.failures.items() if k.split("/")[1] == scene]
         missing = [k for k in results.missing if k.split("/")[1] == scene]
         write_page(
@@ -63,7 +63,7 @@ def write_pages(
             failures=failures,
             environment=(),
         )
-    whole = [_section(stages[name], results, names) for name in options.stages]
+    whole = [_section(stages[name], results.rows, names) for name in options.stages]
     write_page(
         options.out / "index.html",
         TEMPLATE,
@@ -84,7 +84,7 @@ def write_page(path: Path, template: Path, sections: Sequence[Mapping[str, Any]]
     scripts = [plotly_script(), (HERE / "page.js").read_text(encoding="utf-8")] if figures else []
     values |= {"sections": sections, "figures": figures, "version": __version__}
     text = template.read_text(encoding="utf-8")
-    write_text(path, render_page(text, scripts, filters={"short": short}, **values))
+    write_text(path, render_page(text, scripts, filters={"short": number}, **values))
 
 
 def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
@@ -95,41 +95,34 @@ def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
         words = f"{counted(len(rows), 'number')} reported, none with a limit."
         return _Verdict("open", "Nothing promised here", words)
     summary = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
-    reasons = tuple(f"{r.key}: {short(r.value)} {r.unit}, {r.direction} {short(r.limit)}" for r in broken)
+    reasons = tuple(f"{r.key}: {number(r.value)} {r.unit}, {r.direction} {number(r.limit)}" for r in broken)
     reasons += tuple(f"{key}: no method reported this number" for key in missing)
     if reasons:
         return _Verdict("bad", "Broken", f"{summary}.", reasons)
     return _Verdict("good", "Reached", f"{summary}; {counted(len(rows), 'number')} in all.")
 
 
-def _section(
-    stage: Stage,
-    results: Results,
-    names: Mapping[str, str],
-    scene: str | None = None,
-    judgement: Judgement | None = None,
-    options: ReportOptions | None = None,
-) -> dict[str, Any]:
-    rows = [r for r in results.rows if r.key.startswith(f"{stage.name}/")]
-    rows = [r for r in rows if scene is None or r.key.split("/")[1] == scene]
-    references = list(dict.fromkeys(name for row in rows for name in row.reference))
-    plots: tuple[Any, ...] = ()
-    pictures: tuple[Any, ...] = ()
-    notes: tuple[str, ...] = ()
-    if judgement is not None and options is not None and scene is not None:
-        place = options.place(stage.name, scene)
-        plots = tuple(plot_at(f"{slug(stage.name)}-{n}", plot) for n, plot in enumerate(judgement.plots))
-        pictures = tuple(_picture(place, picture) for picture in judgement.pictures)
-        notes = tuple(judgement.notes)
+def _section(stage: Stage, rows: Sequence[Row], names: Mapping[str, str]) -> dict[str, Any]:
+    """Return the numbers of a stage, without figures."""
+    rows = [r for r in rows if r.key.startswith(f"{stage.name}/")]
     return {
         "id": stage.name,
         "title": stage.title,
         "definition": stage.definition,
         "rows": [_row(row, names) for row in rows],
-        "references": references,
-        "plots": plots,
-        "pictures": pictures,
-        "notes": notes,
+        "references": list(dict.fromkeys(name for row in rows for name in row.reference)),
+        "plots": (),
+        "pictures": (),
+        "notes": (),
+    }
+
+
+def _figures(place: Path, stage: str, judgement: Judgement) -> dict[str, Any]:
+    """Return what the judgement in the folder ``place`` adds to the section of its stage."""
+    return {
+        "plots": [plot_at(f"{slug(stage)}-{n}", plot) for n, plot in enumerate(judgement.plots)],
+        "pictures": [_picture(place, picture) for picture in judgement.pictures],
+        "notes": judgement.notes,
     }
 
 
@@ -172,12 +165,3 @@ def _picture(place: Path, picture: Picture) -> dict[str, Any]:
         "width": rgb.width,
         "height": rgb.height,
     }
-
-
-def short(value: float | None) -> str:
-    """Format three significant digits, whole numbers in full."""
-    if value is None:
-        return "–"
-    if float(value).is_integer() and abs(value) < 1e9:
-        return f"{int(value)}"
-    return f"{value:.3g}"

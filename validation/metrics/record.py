@@ -43,9 +43,9 @@ def markdown_table(metrics: list[Metric]) -> str:
     methods = list(dict.fromkeys(method for metric in metrics for method in metric.values))
     lines = [f"| | {' | '.join(methods)} | target | verdict |", f"| --- |{' --- |' * (len(methods) + 2)}"]
     for metric in metrics:
-        numbers = " | ".join(_number(metric.values.get(method)) for method in methods)
+        numbers = " | ".join(number(metric.values.get(method)) for method in methods)
         target = (
-            "" if metric.target is None else f"{'<=' if metric.at_most else '>='} {_number(metric.target)}"
+            "" if metric.target is None else f"{'<=' if metric.at_most else '>='} {number(metric.target)}"
         )
         name = f"{metric.name}, {metric.unit}" if metric.unit else metric.name
         verdict = f"{metric.verdict} ({metric.note})" if metric.note else metric.verdict
@@ -53,7 +53,8 @@ def markdown_table(metrics: list[Metric]) -> str:
     return "\n".join(lines)
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
+    """Return three significant digits, whole numbers in full, "-" for none."""
     if value is None:
         return "-"
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e9 else f"{value:.3g}"

@@ -6,13 +6,13 @@ An independent calibration of them checks the ground truth.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from thesisrecon.arrays import F64, U8
+from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.camera_matrix import project_camera, undistort
 from thesisrecon.records import TexturedMesh
@@ -82,12 +82,13 @@ def make_board(way: str, views: int) -> Board:
 
 def board_images(way: str, board: Board) -> list[U8]:
     """(480, 640, 3) images, each of a camera of the board; the noise is that of the courtyard's sensor."""
-    light = {RAYCAST: _raycast, RENDERED: _rendered, LENS: _through_a_lens}[way](board)
+    views = {RAYCAST: _raycast, RENDERED: _rendered, LENS: _through_a_lens}[way](board)
+    light = (integrate_pixels(samples, PER_PIXEL, SENSOR.blur_px) for samples in views)
     rng = np.random.default_rng(7)
     return [expose(one, SENSOR, gains=(1.0, 1.0, 1.0), rng=rng) for one in light]
 
 
-def _pattern() -> NDArray[np.float32]:
+def _pattern() -> F32:
     """(H, W) light of the board by texels: the first inner corner is ``_FIRST`` texels from its edge."""
     columns, rows = (n + 1 for n in CORNERS)
     black = np.indices((rows, columns)).sum(axis=0) % 2 == 0
@@ -100,14 +101,11 @@ FIRST = (MARGIN + 1) * TEXELS - 0.5
 TEXEL_M = SQUARE_M / TEXELS
 
 
-def _raycast(board: Board) -> list[NDArray[np.float32]]:
+def _raycast(board: Board) -> Iterator[F32]:
     """Render with the tracer of the courtyard, lit frontally."""
     world = _world()
-    found = []
     for R, t in zip(board.R, board.t, strict=True):
-        light, _ = trace(world, Pose(K, R, -R.T @ t), SIZE, per_pixel=PER_PIXEL)
-        found.append(integrate_pixels(light, PER_PIXEL, SENSOR.blur_px))
-    return found
+        yield trace(world, Pose(K, R, -R.T @ t), SIZE, per_pixel=PER_PIXEL)[0]
 
 
 def _world() -> World:
@@ -121,7 +119,7 @@ def _world() -> World:
     return build_world([[plane]], [material], np.array([0.0, 0.0, -1.0]))
 
 
-def _rendered(board: Board) -> list[NDArray[np.float32]]:
+def _rendered(board: Board) -> Iterator[F32]:
     """Render two textured triangles with the library's renderer."""
     pattern = _pattern()
     height, width = pattern.shape
@@ -130,26 +128,20 @@ def _rendered(board: Board) -> list[NDArray[np.float32]]:
     faces = np.array([[0, 2, 1], [0, 3, 2]])
     texture = np.repeat(np.rint(255.0 * pattern).astype(np.uint8)[..., None], 3, axis=2)
     mesh = TexturedMesh(vertices, faces, uv=np.stack([u, v], axis=1)[faces], texture=texture)
-    found = []
     for R, t in zip(board.R, board.t, strict=True):
-        camera = Camera(K, R, t, SIZE)
-        fine = render(mesh, camera.scaled(PER_PIXEL), samples=1).color.astype(np.float32) / np.float32(255.0)
-        found.append(integrate_pixels(fine, PER_PIXEL, SENSOR.blur_px))
-    return found
+        camera = Camera(K, R, t, SIZE).scaled(PER_PIXEL)
+        yield render(mesh, camera, samples=1).color.astype(np.float32) / np.float32(255.0)
 
 
-def _through_a_lens(board: Board) -> list[NDArray[np.float32]]:
+def _through_a_lens(board: Board) -> Iterator[F32]:
     """Intersect the undistorted ray of each sample with the board."""
     y, x = (np.indices((SIZE[1] * PER_PIXEL, SIZE[0] * PER_PIXEL)) + 0.5) / PER_PIXEL - 0.5
     bent = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     rays = np.column_stack([undistort(bent, board.distortion), np.ones(len(bent))])
     pattern = _pattern()
-    found = []
     for R, t in zip(board.R, board.t, strict=True):
         centre, direction = -R.T @ t, rays @ R
         place = centre[:2] - direction[:, :2] * (centre[2] / direction[:, 2:])
         at = (place / TEXEL_M + FIRST).T[::-1]
         grey = map_coordinates(pattern, at, order=1, cval=0.0).astype(np.float32).reshape(x.shape)
-        light = np.repeat(grey[..., None], 3, axis=2)
-        found.append(integrate_pixels(light, PER_PIXEL, SENSOR.blur_px))
-    return found
+        yield np.repeat(grey[..., None], 3, axis=2)

@@ -7,7 +7,6 @@ all runs, which are not repeated.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,7 +36,7 @@ from validation.studies.coverage import (
     named,
 )
 from validation.studies.main_job import COLMAP, COLMAP_PP, OURS
-from validation.studies.runner import Part, Rows, scenes_here
+from validation.studies.runner import Part, Rows, report_progress, scenes_here
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Bench:
                 config=config, threads=self.threads, until="metric", overwrite=True,
             )  # fmt: skip
         except StageFailure as failure:
-            print(f"{self.scene.name}: {cameras}: {failure}", file=sys.stderr, flush=True)
+            report_progress(f"{self.scene.name}: {cameras}: {failure}")
             return None
 
     def colmap(self, cameras: Cameras, name: str, start: Start) -> Reconstruction | None:
@@ -76,7 +75,7 @@ class Bench:
                 images, place / "matched", place / name, start=start, threads=self.threads
             )
         except StageFailure as failure:
-            print(f"{self.scene.name}: COLMAP, {name}: {failure}", file=sys.stderr, flush=True)
+            report_progress(f"{self.scene.name}: COLMAP, {name}: {failure}")
             return None
         return run.reconstruction
 

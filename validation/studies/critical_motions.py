@@ -8,7 +8,6 @@ dinosaur on its turntable ends the list.
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -31,7 +30,7 @@ from validation.metrics.record import Metric
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 from validation.scenes.critical import Sequence as SyntheticSequence
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur
-from validation.studies.runner import Part, Rows, pick, text_table
+from validation.studies.runner import Part, Rows, pick, report_progress, text_table
 
 OURS = "ours"
 CALIBRATOR = HypothesesAndRefinement(search=None, camera_subsets=0, focal_steps=17)
@@ -173,7 +172,7 @@ def critical_motions_study(
                     block, line = check_motion(motion, done, by_hand=by_hand, zoom=factor)
                     judged.append(block)
                     lines.append(line)
-                    print(*line, sep=" | ", file=sys.stderr, flush=True)
+                    report_progress(" | ".join(map(str, line)))
     yield text_table(HEAD, lines)
     yield from judged
     dinosaur = load_dinosaur()

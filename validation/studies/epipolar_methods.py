@@ -8,7 +8,6 @@ our confidence 0.9999 and 20000 iterations, the others their defaults. Set OPENB
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from validation.metrics.record import Metric
 from validation.references.fundamental import OURS, SOLVERS, opencv_eight_point
 from validation.references.libraries import one_thread
 from validation.scenes.two_views import make_two_views
-from validation.studies.runner import Part, Rows, pick, text_table
+from validation.studies.runner import Part, Rows, pick, report_progress, text_table
 
 Estimate = Callable[[F64, F64, float, int], F64 | None]
 """F (3, 3) or None from matches (N, 2), (N, 2), a threshold in px and a seed."""
@@ -248,7 +247,7 @@ def run_methods(settings: Sequence[Setting], methods: Sequence[Method], trials: 
                 results.append(measure(method, data, setting))
                 if method.thresholded:
                     results.append(measure(method, data, setting, matched_threshold=True))
-        print(f"done: {setting}", file=sys.stderr, flush=True)
+        report_progress(f"done: {setting}")
     return results
 
 

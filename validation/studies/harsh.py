@@ -7,7 +7,6 @@ error.
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -22,7 +21,7 @@ from thesisrecon.records import MetricResult, Tracks, TwoView
 from validation.metrics.intervals import LEVEL
 from validation.scenes.dinosaur import pairs_from_tracks
 from validation.scenes.harsh import KINDS
-from validation.studies.runner import Part, Rows, text_table
+from validation.studies.runner import Part, Rows, report_progress, text_table
 from validation.studies.subsets import Matched, solve
 
 OURS = "ours"
@@ -109,7 +108,7 @@ def _report(found: Iterable[tuple[str, Sequence[Trial]]]) -> Iterator[Part]:
         lines.append(table_row(kind, trials))
         total += sum(t.said == "trusted" for t in trials)
         silent += [f"{kind}: {t}" for t in trials if t.is_silent_error]
-        print(kind, "done", file=sys.stderr, flush=True)
+        report_progress(f"{kind} done")
     yield text_table(HEAD, lines)
     yield "\n".join(silent)
     rows = Rows(f"{total} trusted", OURS)

@@ -27,7 +27,7 @@ from validation.metrics.record import Metric
 from validation.references.colmap import read_run
 from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import REAL_SCENES, Scene
-from validation.studies.runner import Part, Rows, scenes_here
+from validation.studies.runner import Part, Rows, report_progress, scenes_here
 
 OURS, THESIS = "ours (default)", "ours (thesis)"
 COLMAP, COLMAP_PP = "COLMAP", "COLMAP, principal point refined"
@@ -72,7 +72,7 @@ def check_reconstruction(
     residuals = {name: None if m is None else measure_reprojection(m) for name, m in models.items()}
     rows = Rows(scene, OURS)
 
-    rows.append(_registered(scene, n_views, outcomes))
+    _add_registered(rows, n_views, outcomes)
     if truth is not None:
         errors = {name: None if m is None else measure_cameras(m, truth) for name, m in models.items()}
         rows.each("focal error", errors, lambda e: e.focal_error_pct, "%", at_most=focal)
@@ -91,23 +91,19 @@ def check_reconstruction(
     return rows
 
 
-def _registered(scene: str, n_views: int, outcomes: Mapping[str, Outcome]) -> Metric:
+def _add_registered(rows: Rows, n_views: int, outcomes: Mapping[str, Outcome]) -> None:
     """Require all cameras of a scene with bounds; of kermit 9, or a reason for each missing one."""
     values = {
         name: 0.0 if o.reconstruction is None else float(o.reconstruction.registered.sum())
         for name, o in outcomes.items()
     }
-    if scene != "kermit":
-        target = float(n_views) if scene in TARGETS else None
-        return Metric(scene, f"cameras registered of {n_views}", "", values, OURS, target, at_most=False)
-    ours = outcomes[OURS]
-    missing = n_views - int(values[OURS])
-    explained = missing > n_views - KERMIT_REGISTERED and sum(map(bool, ours.reasons.values())) == missing
-    target = 0.0 if explained else float(KERMIT_REGISTERED)
-    note = f"{missing} missing, each with its reason" if explained else ""
-    return Metric(
-        scene, f"cameras registered of {n_views}", "", values, OURS, target, at_most=False, note=note
-    )
+    target, note = float(n_views) if rows.scene in TARGETS else None, ""
+    if rows.scene == "kermit":
+        missing, reasons = n_views - int(values[OURS]), outcomes[OURS].reasons.values()
+        explained = missing > n_views - KERMIT_REGISTERED and sum(map(bool, reasons)) == missing
+        target = 0.0 if explained else float(KERMIT_REGISTERED)
+        note = f"{missing} missing, each with its reason" if explained else ""
+    rows.add(f"cameras registered of {n_views}", values, at_least=target, note=note)
 
 
 def _claims(
@@ -195,11 +191,7 @@ def measure_scene(
         for method, folder in METHODS.items():
             place = out / scene.name / folder
             outcome = run_method(method, scene, place, threads=threads, environment=environment)
-            print(
-                f"{scene.name}: {method}: {outcome.wall_s:.1f} s {outcome.failure}",
-                file=sys.stderr,
-                flush=True,
-            )
+            report_progress(f"{scene.name}: {method}: {outcome.wall_s:.1f} s {outcome.failure}")
             if method not in outcomes or outcome.wall_s < outcomes[method].wall_s:
                 outcomes[method] = outcome
     rows = check_reconstruction(scene.name, len(scene.image_paths), truth_of(scene), outcomes)
@@ -211,7 +203,7 @@ def warm_up(scene: Scene, out: Path, *, threads: int, environment: dict[str, str
     shutil.rmtree(environment["NUMBA_CACHE_DIR"], ignore_errors=True)
     cold = run_method(OURS, scene, out / "cold" / "default", threads=threads, environment=environment)
     run_method(THESIS, scene, out / "cold" / "thesis", threads=threads, environment=environment)
-    print(f"{scene.name}: {OURS}, compiling: {cold.wall_s:.1f} s {cold.failure}", file=sys.stderr, flush=True)
+    report_progress(f"{scene.name}: {OURS}, compiling: {cold.wall_s:.1f} s {cold.failure}")
     return cold.wall_s
 
 

@@ -278,7 +278,8 @@ def to_metrics(found: Comparison) -> list[Metric]:
     """Return the table: all 36 cameras, and an RMS not above that of the published ones."""
     n = len(found.reconstruction.registered)
     registered = {OURS: float(found.reconstruction.registered.sum()), PUBLISHED: float(n)}
-    rows = [Metric("dinosaur", "cameras", "", registered, OURS, float(n), at_most=False)]
+    rows = Rows("dinosaur", OURS)
+    rows.add("cameras", registered, at_least=float(n))
     # Two descents into one flat valley differ in the fourth digit.
     for name, ours, published, slack in (
         ("as they are", found.ours, found.published, 1.0),
@@ -289,13 +290,11 @@ def to_metrics(found: Comparison) -> list[Metric]:
                 method: found.rms_px(residuals, all_observations=everything)
                 for method, residuals in ((OURS, ours), (PUBLISHED, published))
             }
-            label = f"RMS, {label}, {name}"
-            rows.append(Metric("dinosaur", label, "px", rms, OURS, slack * rms[PUBLISHED]))
+            rows.add(f"RMS, {label}, {name}", rms, "px", at_most=slack * rms[PUBLISHED])
         cost = {OURS: ours.cost, PUBLISHED: published.cost}
-        rows.append(Metric("dinosaur", f"robust cost, {name}", "px^2", cost, OURS, slack * published.cost))
-    used = {OURS: float(found.reconstruction.inlier.sum())}
-    rows.append(Metric("dinosaur", f"observations used of {len(found.ours.px)}", "", used, OURS))
-    rows.append(Metric("dinosaur", "time", "s", {OURS: found.seconds}, OURS))
+        rows.add(f"robust cost, {name}", cost, "px^2", at_most=slack * published.cost)
+    rows.add(f"observations used of {len(found.ours.px)}", found.reconstruction.inlier.sum())
+    rows.add("time", found.seconds, "s")
     return rows
 
 

@@ -32,7 +32,7 @@ from thesisrecon.cli.main import run_command
 from thesisrecon.errors import REMEDIES
 from thesisrecon.runtime._signals import CODES
 from validation.scenes.real import ROOT
-from validation.studies.runner import Part, Rows, text_table
+from validation.studies.runner import Part, Rows, report_progress, text_table
 
 COURTYARD = ROOT / "fixtures" / "courtyard"
 CLEAN = ("seconds", "elapsed_seconds", "resumed", "peak_memory_mb", "threads", "executor")
@@ -402,7 +402,7 @@ def _printed(rows: Iterable[Any]) -> list[Any]:
     found = []
     for row in rows:
         found.append(row)
-        print(row, file=sys.stderr, flush=True)
+        report_progress(row)
     return found
 
 

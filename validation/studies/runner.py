@@ -230,6 +230,11 @@ def write_json(path: Path, metrics: Sequence[Metric]) -> None:
 # ---------------------------------------------------------------- helpers of the studies
 
 
+def report_progress(text: object) -> None:
+    """Print a line on the error stream at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
 class Rows(list[Metric]):
     """Rows of one scene; the numbers of one ``judged`` method are held against the bounds."""
 
@@ -297,7 +302,7 @@ def scenes_here(names: Iterable[str]) -> list[Scene]:
     for name in names:
         scene = load_scene(name)
         if scene is None:
-            print(f"{name}: its images are not on this machine, left out", file=sys.stderr, flush=True)
+            report_progress(f"{name}: its images are not on this machine, left out")
         else:
             found.append(scene)
     return found

@@ -7,7 +7,6 @@ for a wrong user prior; right models lose some of their views and points.
 
 from __future__ import annotations
 
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,8 +23,9 @@ from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
 from thesisrecon.metric._shared_camera import check_shared_cameras, contradicted_focal_priors
 from thesisrecon.records import IntrinsicInterval, RunResult, SelfCalibration
+from validation.metrics.similarity import estimate_similarity
 from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
-from validation.studies.runner import Part, Rows, scenes_here, text_table
+from validation.studies.runner import Part, Rows, report_progress, scenes_here, text_table
 
 OURS = "ours"
 SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
@@ -57,16 +57,15 @@ def is_wrong(model: MetricEstimate, right: MetricEstimate) -> bool:
     """Return whether a focal errs by 3 %, or an aligned camera by 3 % of the path or by 1 degree."""
     v = model.registered & right.registered
     A, B = centres(right)[v], centres(model)[v]
-    a, b = A - A.mean(axis=0), B - B.mean(axis=0)
-    U, S, Vt = np.linalg.svd(a.T @ b)
-    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    Q = U @ D @ Vt
-    off = np.linalg.norm(a - float(S @ np.diag(D)) / np.sum(b**2) * b @ Q.T, axis=1)
-    turned = Rotation.from_matrix(model.cameras.R[v] @ Q.T @ right.cameras.R[v].swapaxes(1, 2)).magnitude()
+    move = estimate_similarity(B, A)
+    off, path = np.linalg.norm(A - move.apply(B), axis=1), np.linalg.norm(A - A.mean(axis=0), axis=1)
+    turned = Rotation.from_matrix(
+        model.cameras.R[v] @ move.R.T @ right.cameras.R[v].swapaxes(1, 2)
+    ).magnitude()
     focal, truth = (m.cameras.intrinsics[m.cameras.group[v], 0] for m in (model, right))
     return bool(
         np.abs(np.log(focal / truth)).max() > WRONG_FOCAL
-        or off.max() > WRONG_CENTRE * np.sqrt(np.mean(np.sum(a**2, axis=1)))
+        or off.max() > WRONG_CENTRE * np.sqrt(np.mean(path**2))
         or np.degrees(turned.max()) > WRONG_TURN_DEG
     )
 
@@ -156,7 +155,7 @@ def self_check_study(out: Path, scenes: Sequence[str] = SCENES, seeds: int = 5) 
             prior = prior_for(result.metric.reconstruction, options)
             for kind, outcomes in spoiled_outcomes(result, prior, seeds).items():
                 table[kind] += outcomes
-        print(scene.name, "done", file=sys.stderr, flush=True)
+        report_progress(f"{scene.name} done")
     lines = []
     for kind, outcomes in table.items():
         some = [o for o in outcomes if o is not None]

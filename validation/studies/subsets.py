@@ -9,7 +9,6 @@ rotation: a refusal that says so is the only right answer.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from thesisrecon.records import MetricResult, Tracks, TwoView
 from thesisrecon.runtime._run import stream
 from validation.scenes.real import REAL_SCENES, Scene
 from validation.studies.coverage import MODES, SUCCESS_PCT, Cameras
-from validation.studies.runner import SHIFTED, Part, Rows, scenes_here, text_table
+from validation.studies.runner import SHIFTED, Part, Rows, report_progress, scenes_here, text_table
 
 MIN_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8
@@ -245,7 +244,7 @@ def subsets_study(
         for mode in modes:
             done = [run_trial(matched, mode, number, views=(views[0], views[1])) for number in range(trials)]
             for trial in (t for t in done if t.outcome != "right"):
-                print(f"{matched.name}, {mode}: {trial.outcome}: {trial}", file=sys.stderr, flush=True)
+                report_progress(f"{matched.name}, {mode}: {trial.outcome}: {trial}")
             rows.append(table_row(matched.name, mode, done))
             wanted = "refused" if matched.reasons else "right"
             share = sum(trial.outcome == wanted for trial in done) / len(done)

@@ -124,7 +124,8 @@ class CalibrationOverNoise(Task):
         return () if self.noise_px else ("focal_error_over_bound",)
 
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
-        rig, projective = _drawn(Cell(scene, self.mode, self.noise_px, self.views), seed)
+        cell = Cell(scene, self.mode, self.noise_px, self.views)
+        rig, projective = draw_cell(cell, seed)
         prior, rng = assumptions(rig, self.mode), np.random.default_rng(seed)
         calibration = config.selfcalibration.calibrate(projective, prior=prior, rng=rng)
         K = calibration.K
@@ -135,7 +136,7 @@ class CalibrationOverNoise(Task):
         judged = projective.registered
         error = 100.0 * np.abs(K[judged, 0, 0] / rig.K[judged, 0, 0] - 1.0)
         median = float(np.median(error))
-        bound = _bound_pct(Cell(scene, self.mode, self.noise_px, self.views), seed)
+        bound = _bound_pct(cell, seed)
         return {
             "focal_error_pct": median,
             "focal_error_over_bound": median / bound if bound else float("nan"),
@@ -172,8 +173,12 @@ def assumptions(rig: Rig, mode: str) -> IntrinsicsPrior:
     return prior_from_options(options, [rig.size] * n, np.full(n, np.nan), np.ones(n))
 
 
+@lru_cache(maxsize=4)
 def draw_cell(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
-    """Return the true cameras and the projective reconstruction of noisy observations."""
+    """Return the true cameras and the projective reconstruction of noisy observations.
+
+    The rows of one draw are consecutive.
+    """
     place = (seed, SCENES.index(cell.scene), MODES.index(cell.mode), cell.views, round(100 * cell.sigma_px))
     rng = np.random.default_rng(place)
     rig = make_rig(cell, rng)
@@ -181,17 +186,11 @@ def draw_cell(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
 
 
 @lru_cache(maxsize=4)
-def _drawn(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
-    """Cache draws; the rows of one draw are consecutive."""
-    return draw_cell(cell, seed)
-
-
-@lru_cache(maxsize=4)
 def _bound_pct(cell: Cell, seed: int) -> float:
     """Median |error| of the focal lengths (%) at the Cramer-Rao bound; 0 without noise."""
     if cell.sigma_px == 0.0:
         return 0.0
-    rig, projective = _drawn(cell, seed)
+    rig, projective = draw_cell(cell, seed)
     principal_px = PRINCIPAL_STD * max(rig.size)
     std = focal_bound(rig, cell.sigma_px, zooming=cell.mode == "zooming", principal_std_px=principal_px)
     return MEDIAN_OF_NORMAL * float(np.median(std[projective.registered]))
