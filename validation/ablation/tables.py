@@ -12,6 +12,7 @@ from typing import Any
 from thesisrecon.io._files import write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.study import Measure
+from validation.studies.runner import text_table
 
 Record = Mapping[str, Any]
 
@@ -105,7 +106,7 @@ def _measure_text(analysis: Analysis, measure: Measure) -> str:
     head += [c.name for c in plan.conditions] if several else ["mean", f"against {plan.baseline}"]
     head += ["this step alone"] if steps and not several else []
     head.append("cost, s")
-    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    lines = []
     for name in (v.name for v in plan.variants):
         places = [(name, condition.name) for condition in plan.conditions]
         if several:
@@ -118,8 +119,8 @@ def _measure_text(analysis: Analysis, measure: Measure) -> str:
             entries = [name, mean_text(cells[places[0]]), comparison_text(found.get(places[0]))]
             entries += [comparison_text(steps.get(places[0]))] if steps else []
         cost = sum(cells[at].cost_s / len(places) for at in places)
-        lines.append(f"| {' | '.join([*entries, number(cost)])} |")
-    return "\n".join(lines)
+        lines.append([*entries, number(cost)])
+    return text_table(head, lines)
 
 
 def mean_text(cell: Cell) -> str:

@@ -47,7 +47,9 @@ def take_over(
             place = other.place(task.stage, task.scene)
             outcome = read_outcomes(place).get(task.method) if (place / OUTCOMES).is_file() else None
             if outcome is not None and outcome.ok:
-                known[task] = _taken(other, options, task, outcome)
+                kept = options.place(task.stage, task.scene, task.method)
+                shutil.copytree(other.place(task.stage, task.scene, task.method), kept, dirs_exist_ok=True)
+                known[task] = replace(outcome, place=kept)
         _take_needed(other, options, task, stages)
     return known
 
@@ -64,12 +66,6 @@ def _options_of(folder: Path) -> ReportOptions:
         return replace(ReportOptions.from_json(record), out=folder)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{folder} holds no run to start from (options.json): {error}") from None
-
-
-def _taken(other: ReportOptions, options: ReportOptions, task: Task, outcome: Outcome) -> Outcome:
-    place = options.place(task.stage, task.scene, task.method)
-    shutil.copytree(other.place(task.stage, task.scene, task.method), place, dirs_exist_ok=True)
-    return replace(outcome, place=place)
 
 
 def _take_folders(run: Path, options: ReportOptions, task: Task) -> None:

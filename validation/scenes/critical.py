@@ -20,6 +20,7 @@ from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.pose import UP, look_at, turntable
+from validation.scenes.rigs import observe
 
 SIZE = np.array([1536, 1024])
 HAND_TURN_DEG, HAND_SHIFT, WALL_RELIEF = 1.0, 0.01, 0.01
@@ -173,10 +174,7 @@ def _observe(K: F64, R: F64, C: F64, X: F64, sigma: float, rng: np.random.Genera
     xy = np.stack([project_camera(K[v], R[v], t[v], X) for v in range(len(K))])
     depth = np.einsum("va,vna->vn", R[:, 2], X[None] - C[:, None])
     seen = (depth > 0.1) & ((xy >= 0) & (xy <= SIZE - 1)).all(axis=2) & (rng.random(depth.shape) < 0.9)
-    seen &= seen.sum(axis=0) >= 2
-    point, view = np.nonzero(seen.T)
-    noisy = xy[view, point] + rng.normal(0.0, sigma, (len(view), 2))
-    return Tracks(view.astype(np.int64), point.astype(np.int64), noisy, len(K), len(X))
+    return observe(xy, seen, sigma, rng)
 
 
 def projective_estimate(scene: Sequence, rng: np.random.Generator) -> Reconstruction:

@@ -17,6 +17,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.records import Tracks
 from validation.scenes.critical import SIZE, filling_focal
 from validation.scenes.pose import look_at, turntable
+from validation.scenes.rigs import observe
 
 SEEN = 0.85
 
@@ -62,13 +63,10 @@ class HarshSet:
         whole = 1.0 + 3.0 * self.lens[0] * r2[..., 0] + 5.0 * self.lens[1] * r2[..., 0] ** 2 > 0.1
         xy = np.einsum("vab,vnb->vna", self.K[:, :2, :2], x) + self.K[:, None, :2, 2]
         seen = (Y[..., 2] > 0.1) & whole & ((xy >= 0) & (xy <= SIZE - 1)).all(axis=2)
-        seen &= rng.random(seen.shape) < SEEN
-        seen &= seen.sum(axis=0) >= 2
-        point, view = np.nonzero(seen.T)
-        noisy = xy[view, point] + rng.normal(0.0, self.sigma_px, (len(view), 2))
-        lost = rng.random(len(view)) < self.wrong
-        noisy[lost] = rng.uniform(0.0, SIZE - 1.0, (int(lost.sum()), 2))
-        return Tracks(view.astype(np.int64), point.astype(np.int64), noisy, len(self.K), len(self.X))
+        tracks = observe(xy, seen & (rng.random(seen.shape) < SEEN), self.sigma_px, rng)
+        lost = rng.random(len(tracks.xy)) < self.wrong
+        tracks.xy[lost] = rng.uniform(0.0, SIZE - 1.0, (int(lost.sum()), 2))
+        return tracks
 
 
 def _points(rng: np.random.Generator, n: int = 400) -> F64:

@@ -59,6 +59,15 @@ def _gap(s: F64, kind: int, ray: F64, t: float, pool: Pool) -> float:
 
 
 @compiled
+def _clipped(span: tuple[float, float], at: float, speed: float, size: float) -> tuple[float, float]:
+    """Part of a span of t in which at + t speed lies between 0 and ``size``; empty = (1, 0)."""
+    if abs(speed) < 1e-12:
+        return (1.0, 0.0) if at < 0.0 or at > size else span
+    one, two = -at / speed, (size - at) / speed
+    return max(span[0], min(one, two)), min(span[1], max(one, two))
+
+
+@compiled
 def _plane_interval(s: F64, ray: F64, any_side: bool) -> tuple[float, float, float]:
     """Part of the ray inside the slab and the rectangle, and its bound on the closing speed; empty = (1, 0,
     1)."""
@@ -77,13 +86,7 @@ def _plane_interval(s: F64, ray: F64, any_side: bool) -> tuple[float, float, flo
         speed = ray[3] * s[k] + ray[4] * s[k + 1] + ray[5] * s[k + 2]
         at = (ray[0] - s[0]) * s[k] + (ray[1] - s[1]) * s[k + 1] + (ray[2] - s[2]) * s[k + 2]
         lateral += speed * speed
-        size = s[12 + axis]
-        if abs(speed) < 1e-12:
-            if at < 0.0 or at > size:
-                return 1.0, 0.0, 1.0
-            continue
-        one, two = -at / speed, (size - at) / speed
-        enter, leave = max(enter, min(one, two)), min(leave, max(one, two))
+        enter, leave = _clipped((enter, leave), at, speed, s[12 + axis])
     return enter, leave, sqrt(lateral)
 
 
@@ -106,12 +109,7 @@ def _cylinder_interval(s: F64, ray: F64) -> tuple[float, float, float]:
     d = b * b - a * (oa * oa + ob * ob - inner * inner)
     if d > 0.0:
         leave = (-b - sqrt(d)) / a
-    if abs(dv) < 1e-12:
-        if ov < 0.0 or ov > s[13]:
-            return 1.0, 0.0, 1.0
-    else:
-        one, two = -ov / dv, (s[13] - ov) / dv
-        enter, leave = max(enter, min(one, two)), min(leave, max(one, two))
+    enter, leave = _clipped((enter, leave), ov, dv, s[13])
     return max(0.0, enter), leave, 1.0
 
 

@@ -185,17 +185,11 @@ def _group_bounds(objects: list[list[Surface]], numbers: F64) -> F64:
 def trace(
     world: World, pose: Pose, size: tuple[int, int], *, per_pixel: int = 1, shade: bool = True
 ) -> tuple[F32, F64]:
-    """Linear colour and depth of one pinhole camera, whose exposure does not count here.
+    """Return linear RGB (H n, W n, 3) and depth (H n, W n) of a pinhole camera, z in metres, 0 = sky.
 
-    Parameters
-    ----------
-    size : (width, height) in pixels.
-    per_pixel : samples per pixel along each axis; sample (r, c) looks at pixel ((c + 0.5) / n - 0.5, ...).
-    shade : False traces depth alone; the colours are then zero.
-
-    Returns
-    -------
-    (H n, W n, 3) float32 linear RGB and (H n, W n) float64 depth (z in the camera frame, metres; 0 = sky).
+    ``size`` is (width, height) in pixels, n = ``per_pixel`` samples along each axis; sample (r, c) looks at
+    pixel ((c + 0.5) / n - 0.5, ...). Without ``shade`` the colours are zero. The exposure of ``pose`` is not
+    used.
     """
     out = np.zeros((size[1] * per_pixel, size[0] * per_pixel, 3), np.float32)
     depth = np.zeros(out.shape[:2])

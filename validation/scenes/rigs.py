@@ -77,11 +77,15 @@ def zoomed(rig: Rig, factors: F64) -> Rig:
 def noisy_tracks(rig: Rig, sigma_px: float, rng: np.random.Generator) -> Tracks:
     """Observations of all points that two views or more see, with Gaussian noise of ``sigma_px``."""
     xy = rig.pixels()
-    seen = np.isfinite(xy[..., 0])
-    seen &= seen.sum(axis=0) >= 2
-    point, view = np.nonzero(seen.T)
-    observed = xy[view, point] + sigma_px * rng.normal(size=(len(view), 2))
-    return Tracks(view, point, observed, len(rig.K), len(rig.X))
+    return observe(xy, np.isfinite(xy[..., 0]), sigma_px, rng)
+
+
+def observe(xy: F64, seen: B8, sigma_px: float, rng: np.random.Generator) -> Tracks:
+    """Observations of pixels (V, N, 2) where ``seen`` (V, N), of points that two views or more see, with
+    Gaussian noise of ``sigma_px``."""
+    point, view = np.nonzero((seen & (seen.sum(axis=0) >= 2)).T)
+    noisy = xy[view, point] + sigma_px * rng.normal(size=(len(view), 2))
+    return Tracks(view, point, noisy, *seen.shape)
 
 
 def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) -> Reconstruction:

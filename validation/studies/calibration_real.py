@@ -20,7 +20,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Reconstruction, RunResult
 from validation.harness.scenes import truth_of
-from validation.metrics.cameras import CameraErrors, measure_cameras
+from validation.metrics.cameras import measure_cameras
 from validation.metrics.intervals import LEVEL, focal_errors_pct, interval_scores, join_scores
 from validation.metrics.record import Metric
 from validation.references.colmap import Start, map_with_pycolmap, match_with_pycolmap, read_run
@@ -110,11 +110,6 @@ class CameraRows(Rows):
         values = {m: 0.0 if r is None else float(r.registered.sum()) for m, r in self.models.items()}
         self.add(f"cameras registered of {self.total}", values, at_least=float(self.total))
 
-    def error(
-        self, name: str, unit: str, read: Callable[[CameraErrors], float | None], bound: float | None = None
-    ) -> None:
-        self.each(name, self.errors, read, unit, at_most=bound)
-
     def focals(self, median: float | None = None, worst: float | None = None) -> None:
         errors = {m: self.all_focals(r) for m, r in self.models.items()}
         for name, reduce, bound in (("median", np.median, median), ("worst", np.max, worst)):
@@ -127,11 +122,13 @@ class CameraRows(Rows):
         return np.full(self.total, np.inf) if errors is None else np.nan_to_num(errors, nan=np.inf)
 
     def poses(self, centre_mm: float | None = None, rotation_deg: float | None = None) -> None:
-        self.error("camera centres, mean", "mm", lambda e: e.centre_error_mm, centre_mm)
-        self.error("camera rotations, median", "deg", lambda e: e.rotation_error_deg, rotation_deg)
+        self.each("camera centres, mean", self.errors, lambda e: e.centre_error_mm, "mm", centre_mm)
+        self.each(
+            "camera rotations, median", self.errors, lambda e: e.rotation_error_deg, "deg", rotation_deg
+        )
 
     def principal_point(self, bound: float | None = None) -> None:
-        self.error("principal point error", "px", lambda e: e.principal_point_error_px, bound)
+        self.each("principal point error", self.errors, lambda e: e.principal_point_error_px, "px", bound)
 
     def intervals(self, run: RunResult | None, least: float | None = MIN_HOLDING) -> None:
         if run is None or run.metric is None:
@@ -242,7 +239,7 @@ def check_cameras(bench: Bench) -> Iterator[list[Metric]]:
         rows.registered()
         target = TARGETS[bench.scene.name] if cameras == "shared" else Targets()
         if cameras == "shared":
-            rows.error("focal error", "%", lambda e: e.focal_error_pct, target.focal_pct)
+            rows.each("focal error", rows.errors, lambda e: e.focal_error_pct, "%", target.focal_pct)
         else:
             rows.focals(PER_IMAGE_MEDIAN_PCT, PER_IMAGE_WORST_PCT)
         rows.principal_point(target.principal_point_px)

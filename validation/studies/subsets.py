@@ -137,10 +137,7 @@ def solve(
 ) -> tuple[MetricResult | None, tuple[str, ...], int]:
     """Go from tracks to metric cameras with the attempts of the pipeline.
 
-    Returns
-    -------
-    tuple
-        The first trusted result, else the one with most cameras; the failures; the number of attempts.
+    Return the first trusted result, else the one with most cameras; the failures; the number of attempts.
     """
     n = len(matched.sizes)
     sizes = [(int(width), int(height)) for width, height in matched.sizes]

@@ -16,9 +16,10 @@ from typing import Literal
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F32, U8
+from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.records import TwoView
 from thesisrecon.view_synthesis import match_images
 from thesisrecon.views.trilinear import (
     CalibratedPair,
@@ -127,13 +128,7 @@ def measure_courtyard(out: Path) -> list[Measured]:
     truth = courtyard()
     found = match_images(*truth.images, config=PipelineConfig())
     dense = found.dense.correspondences(0, SIZE), found.dense.correspondences(1, SIZE)
-    K, guess = truth.poses[0].K, default_intrinsics(SIZE)
-    matches = found.pair.xy1, found.pair.xy2
-    pairs = {
-        "all true": truth.pair(),
-        "true K": pair_from_fundamental(found.pair.F, *matches, K1=K, K2=K),
-        "guessed K": pair_from_fundamental(found.pair.F, *matches, K1=guess, K2=guess),
-    }
+    pairs = {"all true": truth.pair(), **_pairs_of(found.pair, truth.poses[0].K, truth.poses[1].K, SIZE)}
     ready = {
         name: prepare_synthesis(
             pair,
@@ -156,6 +151,15 @@ def measure_courtyard(out: Path) -> list[Measured]:
         name = f"courtyard-{place.direction}-{place.off if place.off else place.s:+.2f}.jpg"
         save_beside(out / name, [wanted, *shown])
     return rows
+
+
+def _pairs_of(pair: TwoView, K1: F64, K2: F64, size: tuple[int, int]) -> dict[str, CalibratedPair]:
+    """Return the cameras of F with true and with guessed intrinsics."""
+    guess = default_intrinsics(size)
+    return {
+        name: pair_from_fundamental(pair.F, pair.xy1, pair.xy2, K1=first, K2=second)
+        for name, first, second in (("true K", K1, K2), ("guessed K", guess, guess))
+    }
 
 
 def _displaced(truth: CourtyardTruth, place: Place, pair: CalibratedPair) -> tuple[float, float]:
@@ -199,17 +203,12 @@ def measure_fountain(out: Path) -> list[Metric]:
     dense = found.dense.correspondences(0, size), found.dense.correspondences(1, size)
     wanted = read_rgb(scene.image_paths[5])
     baseline = float(np.linalg.norm(C1 - C2))
-    guess = default_intrinsics(size)
-    matches = found.pair.xy1, found.pair.xy2
-    pairs = {
-        "true cameras": CalibratedPair(K1, K2, R2 @ R1.T, R2 @ (C1 - C2) / baseline),
-        "F, true K": pair_from_fundamental(found.pair.F, *matches, K1=K1, K2=K2),
-        "F, guessed K": pair_from_fundamental(found.pair.F, *matches, K1=guess, K2=guess),
-    }
+    pairs = {"true cameras": CalibratedPair(K1, K2, R2 @ R1.T, R2 @ (C1 - C2) / baseline)}
+    pairs |= {f"F, {name}": pair for name, pair in _pairs_of(found.pair, K1, K2, size).items()}
     pictures: dict[str, U8] = {}
     for name, pair in pairs.items():
         views = prepare_synthesis(pair, (images[0].rgb, images[1].rgb), dense, gain=found.dense.gain)
-        own = guess if "guessed" in name else K
+        own = default_intrinsics(size) if "guessed" in name else K
         camera = VirtualCamera(R @ R2.T, R @ (C2 - C) / baseline, own, size)
         pictures[name] = views.render(camera, threads=2)
     pictures["cross-dissolve"] = dissolved(images[0].rgb, images[1].rgb, 0.5)

@@ -14,7 +14,7 @@ from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, each, ratio, read_arrays, row
-from validation.metrics.depth import bad_pixels
+from validation.metrics.depth import bad_pixels, error_colours
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
@@ -122,11 +122,11 @@ def _match(method: str, pair: StereoPair) -> F32:
 
 def _picture(pair: StereoPair, maps: Mapping[str, F32], names: Sequence[str]) -> U8:
     """Draw truth and maps in colours; below each map the errors above 1 px (yellow) and 2 px (red)."""
-    top = [pair.left, _colors(pair.truth, pair.disparities)]
+    top = [pair.left, error_colours(pair.truth / np.float64(pair.disparities))]
     dark = (pair.left // 3 + 50).astype(np.uint8)
     low = [dark, np.where(pair.judged[..., None], np.uint8(200), dark)]
     for name in names:
-        top.append(_colors(maps[name], pair.disparities))
+        top.append(error_colours(maps[name] / np.float64(pair.disparities)))
         shown = dark.copy()
         filled = DisparityMap(maps[name], np.zeros_like(maps[name]), 0.0).filled()
         error = np.nan_to_num(np.abs(filled - pair.truth), nan=np.inf)
@@ -134,12 +134,3 @@ def _picture(pair: StereoPair, maps: Mapping[str, F32], names: Sequence[str]) ->
         shown[pair.judged & (error > 2.0)] = (255, 0, 0)
         low.append(shown)
     return np.concatenate([np.concatenate(top, axis=1), np.concatenate(low, axis=1)])
-
-
-def _colors(disparity: F32, largest: int) -> U8:
-    share = np.nan_to_num(np.clip(disparity / largest, 0.0, 1.0))
-    colors = np.stack(
-        [np.clip(2.0 * share - 0.5, 0, 1), np.sin(np.pi * share), np.clip(1.2 - 1.6 * share, 0, 1)]
-    )
-    colors[:, ~np.isfinite(disparity)] = 0.0
-    return np.asarray(255.0 * np.moveaxis(colors, 0, 2), dtype=np.uint8)

@@ -37,22 +37,11 @@ Method = Callable[[F64, F64], F64]
 
 
 @dataclass(frozen=True)
-class Problem:
-    """A rig with noise, in a metric or in a projective frame of space."""
+class Problem(DrawnRig):
+    """A rig with noise of ``sigma_px``, in a metric or in a projective frame of space."""
 
     sigma_px: float
     projective: bool
-    rig: DrawnRig
-
-    @property
-    def P(self) -> F64:
-        """(V, 3, 4) cameras."""
-        return self.rig.P
-
-    @property
-    def xy(self) -> F64:
-        """(V, N, 2) noisy pixels."""
-        return self.rig.xy
 
 
 class TriangulationStage(Stage):
@@ -148,7 +137,8 @@ def _problems(options: ReportOptions) -> Iterator[Problem]:
     for scene, sigma, projective, trial in product(SCENES, NOISES_PX, (False, True), range(trials)):
         rng = np.random.default_rng([options.seed, trial])
         frame: Group = "projective" if projective else "metric"
-        yield Problem(sigma, projective, draw_rig(scene, sigma, frame, rng, POINTS))
+        drawn = draw_rig(scene, sigma, frame, rng, POINTS)
+        yield Problem(**vars(drawn), sigma_px=sigma, projective=projective)
 
 
 def _metrics(
@@ -184,7 +174,7 @@ def _metrics(
 
 def _median_space_error(problems: Mapping[int, Problem], answers: Mapping[int, F64]) -> float:
     """Return the median over all points of all problems (%)."""
-    return float(np.median(np.concatenate([problems[n].rig.errors_pct(X) for n, X in answers.items()])))
+    return float(np.median(np.concatenate([problems[n].errors_pct(X) for n, X in answers.items()])))
 
 
 def _least_squared_distances(n: int, problem: Problem, kept: Mapping[str, Mapping[str, F64] | None]) -> F64:
@@ -199,7 +189,7 @@ def _least_near_truth(problem: Problem) -> F64:
 
     Levenberg-Marquardt in the metric frame, with a separate damping for every point.
     """
-    P, X = problem.P @ problem.rig.G, problem.rig.X
+    P, X = problem.P @ problem.G, problem.X
     cost, damping = np.full(len(X), np.inf), np.full(len(X), 1e-3)
     trial = X
     for _ in range(DESCENT):
@@ -215,7 +205,7 @@ def _least_near_truth(problem: Problem) -> F64:
         g = np.einsum("vnia,vni->na", J, seen - problem.xy)
         N = N + damping[:, None, None] * np.einsum("naa->na", N)[:, :, None] * np.eye(3)
         trial = X - np.linalg.solve(N, g[:, :, None])[..., 0]
-    return np.asarray(homogenize(X) @ problem.rig.G.T)
+    return np.asarray(homogenize(X) @ problem.G.T)
 
 
 def _plot(problems: list[Problem], found: Mapping[str, Mapping[str, F64] | None]) -> Plot:
@@ -227,7 +217,7 @@ def _plot(problems: list[Problem], found: Mapping[str, Mapping[str, F64] | None]
         y = []
         for sigma in NOISES_PX:
             errors = [
-                p.rig.errors_pct(answers[f"{n}"])
+                p.errors_pct(answers[f"{n}"])
                 for n, p in enumerate(problems)
                 if p.sigma_px == sigma and not p.projective and len(p.P) == 2 and f"{n}" in answers
             ]
