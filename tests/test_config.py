@@ -1,7 +1,7 @@
 """Settings, presets and priors of intrinsics."""
 
-import dataclasses
 import tomllib
+from dataclasses import is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -64,14 +64,14 @@ def test_every_kind_can_be_chosen_by_its_word(stage, kind):
     config = apply_settings(f"{stage}.kind={kind}")
     variant = getattr(config, stage)
     assert type(variant) is KINDS[stage][kind]
-    assert dataclasses.is_dataclass(variant)
+    assert is_dataclass(variant)
     assert type(variant).__dataclass_params__.frozen
 
 
 def test_the_file_names_its_preset_unless_the_command_did():
     text = 'preset = "thesis"\n[images]\nmax_size_px = 900\n'
-    assert config_from_toml(text) == dataclasses.replace(
-        preset("thesis"), images=dataclasses.replace(preset("thesis").images, max_size_px=900)
+    assert config_from_toml(text) == replace(
+        preset("thesis"), images=replace(preset("thesis").images, max_size_px=900)
     )
     assert config_from_toml(text, preset("default"), fixed_preset=True).features == preset("default").features
 

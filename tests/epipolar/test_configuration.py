@@ -21,14 +21,21 @@ from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 from validation.scenes.two_views import make_two_views
 
 
+def noisy_matches(kind, n, sigma, rng, *, wrong=0.0):
+    """Matches of a scene of this kind; this share of them is replaced by wrong ones."""
+    scene = make_two_views(kind, n, rng)
+    xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (scene.xy1, scene.xy2))
+    replaced = rng.random(n) < wrong
+    xy2[replaced] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(replaced.sum()), 2))
+    return xy1, xy2
+
+
 @pytest.mark.parametrize("kind", list(Configuration))
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
 def test_every_kind_is_named_at_every_noise(kind, sigma):
     right = 0
     for seed in range(25):
-        rng = np.random.default_rng(seed)
-        scene = make_two_views(kind, 100, rng)
-        xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (scene.xy1, scene.xy2))
+        xy1, xy2 = noisy_matches(kind, 100, sigma, np.random.default_rng(seed))
         found = classify_configuration(estimate_eight_point(xy1, xy2), xy1, xy2)
         right += found is kind
     assert right >= 24
@@ -39,11 +46,7 @@ def test_every_kind_is_named_at_every_noise(kind, sigma):
 def test_every_kind_is_named_with_wrong_matches_too(kind, sigma):
     right = 0
     for seed in range(15):
-        rng = np.random.default_rng(seed)
-        scene = make_two_views(kind, 200, rng)
-        xy1, xy2 = (xy + rng.normal(0.0, sigma, xy.shape) for xy in (scene.xy1, scene.xy2))
-        wrong = rng.random(200) < 0.3
-        xy2[wrong] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(wrong.sum()), 2))
+        xy1, xy2 = noisy_matches(kind, 200, sigma, np.random.default_rng(seed), wrong=0.3)
         fit = estimate_fundamental(xy1, xy2, threshold_px=max(1.0, 2.0 * sigma))
         found = classify_configuration(fit.F, xy1, xy2, inliers=fit.inliers)
         right += found is kind
@@ -61,11 +64,7 @@ def test_relief_of_the_size_of_the_noise_is_seen_in_many_matches():
 
 
 def test_wrong_matches_that_f_fits_do_not_hide_a_plane():
-    rng = np.random.default_rng(0)
-    scene = make_two_views(Configuration.PLANE, 200, rng)
-    xy1, xy2 = (xy + rng.normal(0.0, 0.3, xy.shape) for xy in (scene.xy1, scene.xy2))
-    wrong = rng.random(200) < 0.3
-    xy2[wrong] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(wrong.sum()), 2))
+    xy1, xy2 = noisy_matches(Configuration.PLANE, 200, 0.3, np.random.default_rng(0), wrong=0.3)
     fit = estimate_fundamental(xy1, xy2)
     found = classify_configuration(fit.F, xy1[fit.inliers], xy2[fit.inliers])
     assert found is Configuration.PLANE

@@ -62,9 +62,3 @@ def test_same_minimum_as_the_orthonormal_representation(criterion, parameters):
         start = estimate_eight_point(xy1, xy2)
         found = refine_fundamental(start, xy1, xy2, criterion, parameters=parameters)
         assert angle_between(found, refine_fundamental(start, xy1, xy2, criterion)) < 1e-6
-
-
-def test_a_start_without_rank_is_rejected():
-    pair = make_pair(10, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="rank 2"):
-        refine_fundamental(np.zeros((3, 3)), pair.xy1, pair.xy2)

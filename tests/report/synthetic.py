@@ -1,7 +1,7 @@
 """Runs made up for the report, a painted sphere with its model, and a page opened in a browser."""
 
-import dataclasses
 import io
+from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 
@@ -11,7 +11,7 @@ from PIL import ImageDraw
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
 from tests.surface.sphere import K as SPHERE_K
-from tests.synthetic import reconstruction_of
+from tests.synthetic import looking_along, reconstruction_of
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
@@ -45,13 +45,8 @@ def made_up_cameras(count):
     rotations, translations = [], []
     for angle in np.linspace(-0.45, 0.45, count):
         centre = np.array([6 * np.sin(angle), 0.2 * np.cos(9 * angle), 5.5 - 6 * np.cos(angle)])
-        z = np.array([0.0, 0.1, 5.5]) - centre
-        z /= np.linalg.norm(z)
-        x = np.cross([0.0, 1.0, 0.0], z)
-        x /= np.linalg.norm(x)
-        R = np.stack([x, np.cross(z, x), z])
-        rotations.append(R)
-        translations.append(-R @ centre)
+        rotations.append(looking_along(np.array([0.0, 0.1, 5.5]) - centre))
+        translations.append(-rotations[-1] @ centre)
     return np.stack(rotations), np.stack(translations)
 
 
@@ -115,7 +110,7 @@ def made_up_run(*, names=None, points=1500, seed=4):
         title="Courtyard wall", images=images, reports=_reports(), config_text=CONFIG,
         summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5}, version="0.1.0",
         unread={"notes.jpg": "it is no image that Pillow can read"}, pairs=pairs, metric=metric,
-        affine=dataclasses.replace(metric.reconstruction, stratum="affine"), colors=colors,
+        affine=replace(metric.reconstruction, stratum="affine"), colors=colors,
     )  # fmt: skip
 
 
@@ -123,8 +118,8 @@ def projective_run():
     """The same run as it is when the user asked to end after the projective reconstruction."""
     data = made_up_run()
     before = data.metric.reconstruction
-    undistorted = dataclasses.replace(before, stratum="projective", K=None, distortion=None)
-    return dataclasses.replace(data, metric=None, colors=None, reconstruction=undistorted, until="projective")
+    undistorted = replace(before, stratum="projective", K=None, distortion=None)
+    return replace(data, metric=None, colors=None, reconstruction=undistorted, until="projective")
 
 
 def _reconstruction(X, cameras, xy, seen, rng):

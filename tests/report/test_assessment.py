@@ -1,4 +1,4 @@
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +49,8 @@ def test_the_assessment_is_honest():
     data = made_up_run(points=100)
     assert data.metric is not None
     assert _assessment.assess(data).word == "Trusted, but incomplete"
-    doubt = dataclasses.replace(data.metric, trusted=False, failed_checks=("pure rotation",))
-    assessment = _assessment.assess(dataclasses.replace(data, metric=doubt))
+    doubt = replace(data.metric, trusted=False, failed_checks=("pure rotation",))
+    assessment = _assessment.assess(replace(data, metric=doubt))
     assert (assessment.level, assessment.reasons) == ("doubt", ("Pure rotation.",))
     early = _assessment.assess(projective_run())
     assert early.level == "open"
@@ -59,8 +59,8 @@ def test_the_assessment_is_honest():
 
 def test_a_failure_states_reason_evidence_and_advice():
     failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
-    data = dataclasses.replace(projective_run(), reconstruction=None, until=None, failure=failure)
-    assessment = _assessment.assess(dataclasses.replace(data, reports=data.reports[:2]))
+    data = replace(projective_run(), reconstruction=None, until=None, failure=failure)
+    assessment = _assessment.assess(replace(data, reports=data.reports[:2]))
     assert assessment.level == "bad"
     assert assessment.sentence == "No pair overlaps."
     assert assessment.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
@@ -73,17 +73,15 @@ def test_the_head_of_the_page_summarises_the_run():
     facts = _assessment.key_facts(made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
     assert facts[3].value == "0.80 px median"
     assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
-    early = dataclasses.replace(projective_run(), reconstruction=None)
+    early = replace(projective_run(), reconstruction=None)
     assert [fact.label for fact in _assessment.key_facts(early, None)] == ["Images", "Pairs accepted", TIME]
 
 
 def test_pairs_that_leave_their_geometry_open_are_counted():
-    run = dataclasses.replace(projective_run(), reconstruction=None)
+    run = replace(projective_run(), reconstruction=None)
     unsure = DegeneracyReport(False, ("one homography explains the matches (plane)",))
-    pairs = tuple(
-        dataclasses.replace(pair, degeneracy=unsure) if pair.accepted else pair for pair in run.pairs
-    )
-    early = dataclasses.replace(run, pairs=pairs)
+    pairs = tuple(replace(pair, degeneracy=unsure) if pair.accepted else pair for pair in run.pairs)
+    early = replace(run, pairs=pairs)
     note = _assessment.key_facts(early, None)[1].note
     assert f"; {sum(pair.accepted for pair in pairs)} pairs with degenerate epipolar geometry" in note
     assert "degenerate" not in _assessment.key_facts(run, None)[1].note
@@ -96,4 +94,4 @@ def test_refused_images_are_those_without_a_camera():
     assert result.refused[data.images[-1].name].startswith("only 14 matches")
     listed = summarize(result)["refused"]
     assert {entry["name"]: entry["reason"] for entry in listed} == result.refused
-    assert dataclasses.replace(result, metric=None).refused == data.unread
+    assert replace(result, metric=None).refused == data.unread

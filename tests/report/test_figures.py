@@ -1,9 +1,9 @@
 """Figures, drawings and the three-dimensional scene of the report."""
 
 import base64
-import dataclasses
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,9 +73,7 @@ def test_the_lines_pass_through_the_numbered_matches():
     data = made_up_run(points=400)
     pair = data.pairs[2]
     flat = [np.full((SIZE[1], SIZE[0], 3), 90, dtype=np.uint8)] * 2
-    first, second = (
-        dataclasses.replace(data.images[v], rgb=rgb) for v, rgb in zip((pair.i, pair.j), flat, strict=True)
-    )
+    first, second = (replace(data.images[v], rgb=rgb) for v, rgb in zip((pair.i, pair.j), flat, strict=True))
     drawn = drawing.draw_pair(pair, first, second)
     pixels = np.asarray(opened(drawn.uri)).astype(int)
     s = 640 / max(SIZE)
@@ -91,7 +89,7 @@ def test_the_lines_pass_through_the_numbered_matches():
 
 def test_a_pair_without_matches_is_no_error():
     data = made_up_run(points=100)
-    empty = dataclasses.replace(data.pairs[0], xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    empty = replace(data.pairs[0], xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
     assert figures.pair_matrix_figure([empty], ["a", "b"])["data"][0]["z"][0][1] == 0.0
     drawn = drawing.draw_pair(empty, data.images[0], data.images[1])
     assert opened(drawn.uri).size == (drawn.width, drawn.height)
@@ -119,7 +117,7 @@ def test_spread_matches_are_different_and_far_apart():
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
 def test_odd_pictures_have_thumbnails(shape):
-    image = dataclasses.replace(made_up_run(points=50).images[0], rgb=np.zeros(shape, dtype=np.uint8))
+    image = replace(made_up_run(points=50).images[0], rgb=np.zeros(shape, dtype=np.uint8))
     drawn = drawing.thumbnail(image, 3)
     assert opened(drawn.uri).size == (drawn.width, drawn.height)
     assert drawn.width >= drawn.height >= 1
@@ -226,7 +224,7 @@ def test_strays_are_left_out_and_many_points_are_thinned():
     before = data.metric.reconstruction
     X = before.X.copy()
     X[5, :3] = 1e5
-    scene = figures.build_scene(dataclasses.replace(before, X=X), max_points=200)
+    scene = figures.build_scene(replace(before, X=X), max_points=200)
     assert 150 <= len(scene.points) <= 200
     assert 5 not in scene.index
     assert (scene.high - scene.low).max() < 20
@@ -248,7 +246,7 @@ def test_a_scene_without_points_still_shows_its_cameras():
     data = made_up_run(points=50)
     reconstruction = data.metric.reconstruction
     nothing = {name: np.zeros_like(getattr(reconstruction, name)) for name in ("registered", "valid")}
-    assert figures.build_scene(dataclasses.replace(reconstruction, registered=nothing["registered"])) is None
-    scene = figures.build_scene(dataclasses.replace(reconstruction, valid=nothing["valid"]))
+    assert figures.build_scene(replace(reconstruction, registered=nothing["registered"])) is None
+    scene = figures.build_scene(replace(reconstruction, valid=nothing["valid"]))
     assert len(scene.points) == 0
     assert len(scene.centres) == 8

@@ -1,10 +1,10 @@
 """The page of a run, its data and figures of residuals, and the page of interpolated images."""
 
 import base64
-import dataclasses
 import hashlib
 import html
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_runs_that_stopped_early_say_how_far_they_got():
     assert "Stopped early" in page
     assert 'id="scene-figure"' not in page
     assert synthetic.Structure(page).count("svg") == 8
-    only_features = dataclasses.replace(early, reconstruction=None, pairs=(), until="features")
+    only_features = replace(early, reconstruction=None, pairs=(), until="features")
     page = render_report(only_features)
     assert "corners were detected" in page
     assert "plotly.js v" not in page  # nothing to draw, nothing to carry
@@ -72,7 +72,7 @@ def test_strata_are_told_apart(page):
     assert ">registered<" not in projective
     assert page.count('<span class="state good">registered</span>') == 8
     assert 'id="affine-figure"' in page
-    without = render_report(dataclasses.replace(synthetic.made_up_run(), affine=None))
+    without = render_report(replace(synthetic.made_up_run(), affine=None))
     assert 'id="affine-figure"' not in without
 
 
@@ -81,12 +81,8 @@ def test_the_caption_states_omitted_points():
     assert "All 200 points are shown." in render_report(data)
     X = data.metric.reconstruction.X.copy()
     X[0, :3] = 1e6
-    metric = dataclasses.replace(
-        data.metric, reconstruction=dataclasses.replace(data.metric.reconstruction, X=X)
-    )
-    assert "199 of 200 points are shown, without outliers." in render_report(
-        dataclasses.replace(data, metric=metric)
-    )
+    metric = replace(data.metric, reconstruction=replace(data.metric.reconstruction, X=X))
+    assert "199 of 200 points are shown, without outliers." in render_report(replace(data, metric=metric))
 
 
 def test_a_failed_run_without_anything_has_a_page():
@@ -97,12 +93,12 @@ def test_a_failed_run_without_anything_has_a_page():
 
 
 def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
-    data = dataclasses.replace(synthetic.projective_run(), reconstruction=None, until="matches")
-    nothing = dataclasses.replace(
+    data = replace(synthetic.projective_run(), reconstruction=None, until="matches")
+    nothing = replace(
         data.pairs[0], F=np.zeros((3, 3)), sigma_px=float("nan"), homography_inlier_ratio=float("nan"),
         xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)), accepted=False, reason="too few matches for an F",
     )  # fmt: skip
-    page = render_report(dataclasses.replace(data, pairs=[nothing]))
+    page = render_report(replace(data, pairs=[nothing]))
     assert "too few matches for an F" in page
     assert "<td>–</td><td>–</td>" in page
     assert synthetic.Structure(page).count("figure") == 1  # the matrix
@@ -112,7 +108,7 @@ def test_warnings_of_the_run_stand_beside_those_of_its_stages():
     data = synthetic.projective_run()
     stage_warning = data.reports[1].warnings[0]
     summary = {"warnings": [stage_warning, "2 initial pairs were tried"]}
-    page = render_report(dataclasses.replace(data, summary=summary))
+    page = render_report(replace(data, summary=summary))
     section = page[page.index('id="warnings"') : page.index('id="config"')]
     assert section.count("<li>") == 2
     assert "2 initial pairs were tried" in section
@@ -129,7 +125,7 @@ def test_three_hundred_photographs_stay_under_the_limit():
     noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
     images = tuple(Image(f"{n}.jpg", noise, (240, 160)) for n in range(300))
     template = synthetic.made_up_run(points=100).pairs[0]
-    pairs = [dataclasses.replace(template, i=i, j=j) for i in range(300) for j in range(i + 1, 300)]
+    pairs = [replace(template, i=i, j=j) for i in range(300) for j in range(i + 1, 300)]
     data = ReportData("many", images, (), "", {}, "0.1.0", pairs=pairs)
     assert len(render_report(data).encode()) < 10_000_000
 
@@ -163,7 +159,7 @@ def test_only_the_scripts_of_the_page_may_run():
         digests = [hashlib.sha256(body.encode()).digest() for body in bodies]
         assert len(allowed) == len(bodies) == scripts
         assert sorted(allowed) == sorted("sha256-" + base64.b64encode(d).decode() for d in digests)
-    nothing = render_report(dataclasses.replace(synthetic.projective_run(), reconstruction=None, pairs=()))
+    nothing = render_report(replace(synthetic.projective_run(), reconstruction=None, pairs=()))
     assert "script-src 'none'" in html.unescape(nothing)
     assert "<script" not in nothing
 
@@ -171,10 +167,8 @@ def test_only_the_scripts_of_the_page_may_run():
 def test_without_a_model_nothing_of_it_is_on_the_page(page):
     for trace in ('id="model', 'id="depth"', 'id="held-out"', "model.glb", "WebGL 2"):
         assert trace not in page
-    empty = dataclasses.replace(synthetic.sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
-    bare = render_report(
-        dataclasses.replace(synthetic.sphere_run(), model=empty, held_out=None, depth_maps={})
-    )
+    empty = replace(synthetic.sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
+    bare = render_report(replace(synthetic.sphere_run(), model=empty, held_out=None, depth_maps={}))
     for trace in ("model-data", 'id="model"', 'id="depth"', 'id="held-out"'):
         assert trace not in bare
 
@@ -193,8 +187,8 @@ def test_a_model_as_large_as_allowed_stays_within_its_share_of_the_page():
     data = synthetic.sphere_run()
     large = TexturedMesh(vertices, faces, uv=uv, texture=texture)
     assert 149_000 < len(faces) <= 151_000
-    grown = len(render_report(dataclasses.replace(data, model=large)))
-    assert grown - len(render_report(dataclasses.replace(data, model=None))) < 8_000_000
+    grown = len(render_report(replace(data, model=large)))
+    assert grown - len(render_report(replace(data, model=None))) < 8_000_000
 
 
 def test_the_table_of_cameras_has_a_column_for_every_estimate():
@@ -207,8 +201,8 @@ def test_the_table_of_cameras_has_a_column_for_every_estimate():
 
     def reported(more):
         views = tuple({**view, **more} if view else {} for view in data.metric.intrinsics)
-        metric = dataclasses.replace(data.metric, intrinsics=views)
-        return render_report(dataclasses.replace(data, metric=metric))
+        metric = replace(data.metric, intrinsics=views)
+        return render_report(replace(data, metric=metric))
 
     assert "Aspect (fy/fx)" not in reported(square)
     page = reported(own)
@@ -262,7 +256,7 @@ def test_intrinsics_are_reported_in_pixels_of_the_file():
     )
     assert original["k1"] == working["k1"]
     assert data.original_intrinsics[-1] == {}
-    assert dataclasses.replace(data, metric=None, colors=None).original_intrinsics == ({},) * 9
+    assert replace(data, metric=None, colors=None).original_intrinsics == ({},) * 9
 
 
 def test_the_residuals_are_the_noise_that_was_added():
@@ -283,12 +277,12 @@ def test_the_residuals_are_the_noise_that_was_added():
 def test_only_inliers_of_registered_views_and_valid_points_count():
     data = synthetic.made_up_run(points=200)
     before = data.metric.reconstruction
-    after = dataclasses.replace(before, valid=np.arange(200) < 100)
+    after = replace(before, valid=np.arange(200) < 100)
     used = used_observations(after)
     assert before.inlier[used].all()
     assert before.registered[before.tracks.view_index[used]].all()
     assert (before.tracks.point_index[used] < 100).all()
-    assert len(used_observations(dataclasses.replace(before, inlier=np.zeros_like(before.inlier)))) == 0
+    assert len(used_observations(replace(before, inlier=np.zeros_like(before.inlier)))) == 0
 
 
 def test_histogram_holds_every_distance():

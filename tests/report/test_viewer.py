@@ -1,7 +1,6 @@
 """The viewer of the model and the page as a browser shows them."""
 
 import base64
-import dataclasses
 import io
 import json
 from dataclasses import replace
@@ -143,7 +142,7 @@ EVIL = [
 def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "report.html"
     title = "<img src=x onerror=alert(9)>"
-    run = dataclasses.replace(synthetic.made_up_run(names=EVIL, points=3000), title=title)
+    run = replace(synthetic.made_up_run(names=EVIL, points=3000), title=title)
     path.write_text(render_report(run), "utf-8")
     return path
 

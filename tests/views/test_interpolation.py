@@ -329,6 +329,12 @@ def test_pixels_are_sampled_as_the_homography_maps_them():
     assert 0 < np.isnan(plain).sum() < plain.size
 
 
+def neighbours(at, shape, reach, step=1):
+    """Index of the pixels of a picture up to ``reach`` rows and columns away."""
+    offsets = range(-reach, reach + 1, step)
+    return np.ix_(*([a + k for k in offsets if 0 <= a + k < n] for a, n in zip(at, shape, strict=True)))
+
+
 def test_guesses_become_medians_of_pixels_of_their_colour():
     rng = np.random.default_rng(6)
     shape = (20, 31)
@@ -345,13 +351,7 @@ def test_guesses_become_medians_of_pixels_of_their_colour():
         if sure[y, x] > 0.0 or np.isnan(d[y, x]):
             np.testing.assert_array_equal(out[y, x], d[y, x])
             continue
-        rows = [
-            v for v in range(y - kernels.REACH, y + kernels.REACH + 1, kernels.SPARSE) if 0 <= v < shape[0]
-        ]
-        columns = [
-            u for u in range(x - kernels.REACH, x + kernels.REACH + 1, kernels.SPARSE) if 0 <= u < shape[1]
-        ]
-        part = np.ix_(rows, columns)
+        part = neighbours((y, x), shape, kernels.REACH, kernels.SPARSE)
         apart = np.abs(levels[part] - levels[y, x]).sum(axis=-1)
         weight = np.exp(-apart / 30.0) * np.where(sure[part] > 0.0, 1.0, 0.5)
         values, weight = d[part].ravel(), weight.ravel()
@@ -377,13 +377,11 @@ def test_a_guess_alone_goes_with_those_around():
     for rows in ((0, 5), (5, 14)):
         kernels.filter_extrapolated_by_median(d, sure, rows, out)
     for y, x in np.ndindex(d.shape):
-        around = d[
-            max(y - kernels.NEAR, 0) : y + kernels.NEAR + 1, max(x - kernels.NEAR, 0) : x + kernels.NEAR + 1
-        ].ravel()
-        around = np.sort(around[np.isfinite(around)])
+        part = d[neighbours((y, x), d.shape, kernels.NEAR)]
+        values = np.sort(part[np.isfinite(part)])
         expected = d[y, x]
-        if sure[y, x] == 0.0 and np.isfinite(expected) and np.ptp(around) > kernels.ONE_SURFACE_PX:
-            expected = around[len(around) // 2]
+        if sure[y, x] == 0.0 and np.isfinite(expected) and np.ptp(values) > kernels.ONE_SURFACE_PX:
+            expected = values[len(values) // 2]
         np.testing.assert_array_equal(out[y, x], expected)
     assert (out != d).sum() > 20
 
