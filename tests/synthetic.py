@@ -32,6 +32,14 @@ class TrueScene:
         return -np.einsum("vba,vb->va", self.R, self.t)
 
 
+def looking_along(direction):
+    """World-to-camera rotation (3, 3) of a level camera that looks along a direction, y down."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
 def make_scene(
     *,
     views=8,
@@ -50,17 +58,12 @@ def make_scene(
     X = rng.uniform([-2.0, -1.6, -1.5], [2.0, 1.6, 1.5], (points, 3))
     K, R, t = [], [], []
     for _ in range(views):
-        azimuth, height = rng.uniform(-0.7, 0.7), rng.uniform(-0.35, 0.35)
-        direction = np.array(
-            [np.sin(azimuth) * np.cos(height), np.sin(height), -np.cos(azimuth) * np.cos(height)]
-        )
+        # Azimuth and elevation.
+        a, e = rng.uniform(-0.7, 0.7), rng.uniform(-0.35, 0.35)
+        direction = np.array([np.sin(a) * np.cos(e), np.sin(e), -np.cos(a) * np.cos(e)])
         centre = rng.uniform(6.0, 9.0) * direction
-        z = rng.normal(0.0, 0.3, 3) - centre
-        z /= np.linalg.norm(z)
-        x = np.cross([0.0, 1.0, 0.0], z)
-        x /= np.linalg.norm(x)
-        roll = Rotation.from_euler("z", rng.uniform(-0.3, 0.3)).as_matrix()
-        rotation = roll @ np.array([x, np.cross(z, x), z])
+        level = looking_along(rng.normal(0.0, 0.3, 3) - centre)
+        rotation = Rotation.from_euler("z", rng.uniform(-0.3, 0.3)).as_matrix() @ level
         f = focal * np.exp(rng.uniform(-zoom, zoom))
         cx, cy = (size - 1) / 2 + np.array(principal_shift)
         K.append([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])

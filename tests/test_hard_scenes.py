@@ -15,64 +15,24 @@ import pytest
 import trimesh
 
 from tests.fake_stages import FakeMetric, fake_config
+from tests.stereo import hard_scenes as scenes
 from tests.stereo.depth_scenes import photograph_scene
-from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, tunnel
 from tests.synthetic import texture
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.reconstruction import reconstruct
 
-
-def abreast(baseline, views=3):
-    P = looking_ahead([[baseline * (k - (views - 1) / 2), 0.0, 0.0] for k in range(views)])
-    return photograph_scene(P, fence())
-
-
-def ahead():
-    return photograph_scene(looking_ahead([[0.0, 0.0, z] for z in (0.0, 0.4, 0.8)]), tunnel())
-
-
-def blank(rim):
-    P = looking_ahead([[x, 0.0, 0.0] for x in (-0.4, 0.0, 0.4)])
-    return photograph_scene(P, blank_wall(rim))
-
-
-def of_elsewhere():
-    """Three views and one that shares nothing with them."""
-    P = looking_ahead([[x, 0.0, 0.0] for x in (-0.4, 0.0, 0.4, 40.0)])
-    return photograph_scene(P, fence())
-
-
-def without_points():
-    scene = abreast(0.4)
-    r = scene.reconstruction
-    return replace(scene, reconstruction=replace(r, inlier=np.zeros_like(r.inlier)))
-
-
-def far_smaller():
-    P = looking_ahead([[x, 0.0, 0.0] for x in (-0.4, 0.0, 0.4, 0.8)])
-    P[3] = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]]) @ P[3]
-    return photograph_scene(P, fence()[:1], sizes=[(200, 150)] * 3 + [(100, 75)])
-
-
-def burnt_out():
-    scene = abreast(0.4)
-    for image in scene.images:
-        image.rgb[:60] = 255
-        image.rgb[100:, :80] = 0
-    return scene
-
-
 HOPELESS = {
-    "no baseline": lambda: abreast(0.0),
-    "hardly a baseline": lambda: abreast(5e-4),
-    "no texture": lambda: blank(0.0),
-    "no points": without_points,
+    "no baseline": lambda: scenes.fenced(0.0),
+    "hardly a baseline": lambda: scenes.fenced(5e-4),
+    "no texture": lambda: photograph_scene(scenes.abreast(0.4), scenes.blank_wall(0.0)),
+    "no points": scenes.without_points,
 }
 PARTLY = {
-    "forward": ahead, "tiny baseline": lambda: abreast(0.05), "a fence": lambda: abreast(0.4),
-    "a view of elsewhere": of_elsewhere, "a small photograph": far_smaller, "burnt out": burnt_out,
+    "forward": scenes.ahead, "tiny baseline": lambda: scenes.fenced(0.05), "a fence": scenes.fenced,
+    "a view of elsewhere": scenes.of_elsewhere, "a small photograph": lambda: scenes.far_smaller(0.5),
+    "burnt out": lambda: scenes.burnt_out(scenes.fenced()),
 }  # fmt: skip
 MADE = {}
 

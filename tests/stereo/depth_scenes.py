@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tests.synthetic import photograph, reconstruction_of, texture
+from tests.synthetic import looking_along, photograph, reconstruction_of, texture
 from thesisrecon.arrays import F64
 from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry.homogeneous import homogenize
@@ -42,10 +42,7 @@ def on_arc(angles_deg, *, distance=6.0):
     cameras = []
     for k, angle in enumerate(np.radians(angles_deg)):
         centre = distance * np.array([np.sin(angle), 0.06 * (-1) ** k, -np.cos(angle)])
-        z = -centre / np.linalg.norm(centre)
-        x = np.cross([0.0, 1.0, 0.0], z)
-        x /= np.linalg.norm(x)
-        cameras.append(matrix.camera_from_centre(K, np.array([x, np.cross(z, x), z]), centre))
+        cameras.append(matrix.camera_from_centre(K, looking_along(-centre), centre))
     return np.array(cameras)
 
 

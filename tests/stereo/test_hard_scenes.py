@@ -5,16 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.stereo import hard_scenes as scenes
 from tests.stereo.depth_scenes import photograph_scene
-from tests.stereo.hard_scenes import blank_wall, fence, looking_ahead, tunnel
 from thesisrecon.config import preset
 
 DEFAULT, THESIS = (preset(name).dense for name in ("default", "thesis"))
 BOTH = pytest.mark.parametrize("stereo", [DEFAULT, THESIS], ids=["default", "thesis"])
-
-
-def abreast(baseline, views=3):
-    return looking_ahead([[baseline * (k - (views - 1) / 2), 0.0, 0.0] for k in range(views)])
 
 
 def shares(scene, maps):
@@ -37,26 +33,20 @@ def solve(stereo, scene):
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_a_blank_wall_is_not_invented(stereo, noise):
     """The points of the rim give a range of disparities, and the wall would fit at any of them."""
-    known, wrong, _ = solve(stereo, photograph_scene(abreast(0.4), blank_wall(), noise=noise))
+    known, wrong, _ = solve(stereo, photograph_scene(scenes.abreast(0.4), scenes.blank_wall(), noise=noise))
     assert wrong < (0.001 if stereo is DEFAULT else 0.03)
     assert known < 0.1
 
 
-def observed(scene, keep):
-    """The scene with some of its observations."""
-    r = scene.reconstruction
-    return replace(scene, reconstruction=replace(r, inlier=np.asarray(keep(r))))
-
-
 # The baselines are a thousandth of the depth at most: less than a fifth of a pixel.
 HOPELESS = {
-    "no texture": lambda: photograph_scene(abreast(0.4), blank_wall(0.0)),
-    "no baseline": lambda: photograph_scene(abreast(0.0), fence()),
-    "a baseline of 0.0005": lambda: photograph_scene(abreast(5e-4), fence()),
-    "a baseline of 0.005": lambda: photograph_scene(abreast(5e-3), fence()),
-    "no points": lambda: observed(photograph_scene(abreast(0.4), fence()), lambda r: np.zeros_like(r.inlier)),
-    "no common points": lambda: observed(
-        photograph_scene(abreast(0.4), fence()), lambda r: r.tracks.view_index == r.tracks.point_index % 3
+    "no texture": lambda: photograph_scene(scenes.abreast(0.4), scenes.blank_wall(0.0)),
+    "no baseline": lambda: scenes.fenced(0.0),
+    "a baseline of 0.0005": lambda: scenes.fenced(5e-4),
+    "a baseline of 0.005": lambda: scenes.fenced(5e-3),
+    "no points": scenes.without_points,
+    "no common points": lambda: scenes.observed(
+        scenes.fenced(), lambda r: r.tracks.view_index == r.tracks.point_index % 3
     ),
 }
 
@@ -69,15 +59,14 @@ def test_nothing_is_known_of_hopeless_scenes(stereo, scene):
 
 @BOTH
 def test_a_tiny_baseline_gives_depths_that_say_how_vague_they_are(stereo):
-    known, _, beyond = solve(stereo, photograph_scene(abreast(5e-2), fence()))
+    known, _, beyond = solve(stereo, scenes.fenced(5e-2))
     assert known > 0.2
     assert beyond < 0.05
 
 
 @BOTH
 def test_forward_motion_with_the_epipole_inside(stereo):
-    scene = photograph_scene(looking_ahead([[0.0, 0.0, z] for z in (0.0, 0.4, 0.8)]), tunnel())
-    known, wrong, beyond = solve(stereo, scene)
+    known, wrong, beyond = solve(stereo, scenes.ahead())
     assert known > 0.4
     assert wrong < (0.04 if stereo is DEFAULT else 0.12)
     assert beyond < 0.02
@@ -86,7 +75,7 @@ def test_forward_motion_with_the_epipole_inside(stereo):
 @BOTH
 def test_occlusions_everywhere(stereo):
     """Behind a fence as much is hidden as is seen, and order along the rows does not hold."""
-    known, wrong, beyond = solve(stereo, photograph_scene(abreast(0.4), fence()))
+    known, wrong, beyond = solve(stereo, scenes.fenced())
     assert known > 0.35
     assert wrong < 0.015
     assert beyond < 0.1
@@ -95,16 +84,14 @@ def test_occlusions_everywhere(stereo):
 @BOTH
 def test_a_range_that_the_points_do_not_cover(stereo):
     """The fence has no points; few of its pixels get the depth of the wall."""
-    scene = observed(photograph_scene(abreast(0.4), fence()), lambda r: r.X[r.tracks.point_index, 2] > 5.0)
+    scene = scenes.observed(scenes.fenced(), lambda r: r.X[r.tracks.point_index, 2] > 5.0)
     _, wrong, _ = solve(stereo, scene)
     assert wrong < (0.01 if stereo is DEFAULT else 0.1)
 
 
 @BOTH
 def test_an_unrelated_view_stays_unregistered_and_does_no_harm(stereo):
-    P = abreast(0.4, 4)
-    P[3] = looking_ahead([[40.0, 0.0, 0.0]])[0]
-    scene = photograph_scene(P, fence())
+    scene = scenes.of_elsewhere()
     prepared = stereo.prepare(scene.images, scene.reconstruction)
     assert prepared.neighbours[3] == ()
     maps = stereo.map_all(scene.images, scene.reconstruction)
@@ -117,10 +104,7 @@ def test_an_unrelated_view_stays_unregistered_and_does_no_harm(stereo):
 
 @BOTH
 def test_a_photograph_far_smaller_than_the_others(stereo):
-    P = abreast(0.4, 4)
-    shrink = np.array([[0.15, 0.0, -0.425], [0.0, 0.15, -0.425], [0.0, 0.0, 1.0]])
-    P[3] = shrink @ P[3]
-    scene = photograph_scene(P, fence()[:1], sizes=[(200, 150)] * 3 + [(30, 22)])
+    scene = scenes.far_smaller(0.15)
     maps = stereo.map_all(scene.images, scene.reconstruction)
     known, wrong, _ = shares(scene, {i: maps[i] for i in range(3)})
     assert known > 0.6
@@ -130,18 +114,15 @@ def test_a_photograph_far_smaller_than_the_others(stereo):
 
 @BOTH
 def test_burnt_out_and_black_regions(stereo):
-    """A sky of 255 and a corner of 0 stay where they are from view to view, and mean nothing."""
-    scene = photograph_scene(abreast(0.4), fence()[:1])
-    for image in scene.images:
-        image.rgb[:60] = 255
-        image.rgb[100:, :80] = 0
-    _, wrong, beyond = solve(stereo, scene)
+    """They stay where they are from view to view, and mean nothing."""
+    scene = photograph_scene(scenes.abreast(0.4), scenes.fence()[:1])
+    _, wrong, beyond = solve(stereo, scenes.burnt_out(scene))
     assert wrong < 0.04
     assert beyond < 0.1
 
 
 def test_pixels_that_no_photograph_has_stay_without_depth():
-    scene = photograph_scene(abreast(0.4), fence()[:1])
+    scene = photograph_scene(scenes.abreast(0.4), scenes.fence()[:1])
     prepared = DEFAULT.prepare(scene.images, scene.reconstruction)
     views = dict(prepared.views)
     for i, view in views.items():

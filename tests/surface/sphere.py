@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tests.synthetic import looking_along
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
 
@@ -12,10 +13,7 @@ SHAPE = (120, 160)
 def looking_at_origin(angle, height, distance):
     """P of a camera that looks at the origin from ``angle`` (rad) about the vertical."""
     centre = np.array([np.sin(angle) * distance, height, -np.cos(angle) * distance])
-    forward = -centre / np.linalg.norm(centre)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    return camera_from_centre(K, np.stack([right, np.cross(forward, right), forward]), centre)
+    return camera_from_centre(K, looking_along(-centre), centre)
 
 
 def paint(X):
