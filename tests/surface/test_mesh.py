@@ -18,7 +18,7 @@ from thesisrecon.surface.fusion import VolumetricFusion
 
 @pytest.fixture(scope="module")
 def sphere():
-    return VolumetricFusion().fuse(ring_of())
+    return VolumetricFusion(tolerance=0.0).fuse(ring_of())
 
 
 def sheet(steps, height=0.0, *, flip=False):

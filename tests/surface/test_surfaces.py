@@ -33,7 +33,7 @@ def outward(mesh):
 
 
 def test_the_fused_sphere_is_round_closed_and_outward(ring):
-    mesh = VolumetricFusion().fuse(ring)
+    mesh = VolumetricFusion(tolerance=0.0).fuse(ring)
     footprint = 2.5 / 150.0
     radius = np.linalg.norm(mesh.vertices, axis=1)
     assert np.quantile(np.abs(radius - 1.0), 0.995) < footprint
@@ -74,7 +74,9 @@ def test_memory_is_kept_by_larger_voxels(ring):
     assert 0 < len(coarse.faces) < 0.5 * len(fine.faces)
 
 
-@pytest.mark.parametrize("setting", [{"voxel_px": 0.0}, {"voxel_px": np.nan}, {"max_blocks": 7}])
+@pytest.mark.parametrize(
+    "setting", [{"voxel_px": 0.0}, {"voxel_px": np.nan}, {"max_blocks": 7}, {"tolerance": -0.1}]
+)
 def test_settings_under_which_voxels_would_grow_for_ever_are_refused(setting):
     refuses(ValueError, "must be", VolumetricFusion, **setting)
 

@@ -21,7 +21,7 @@ GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
 
 @pytest.fixture(scope="module")
 def sphere():
-    return VolumetricFusion().fuse(ring_of())
+    return VolumetricFusion(tolerance=0.0).fuse(ring_of())
 
 
 def difference(mesh):

@@ -200,10 +200,15 @@ def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:
 def _split_seams(mesh: TexturedMesh) -> tuple[F64, I64, F64]:
     """Return vertices (N, 3), faces (M, 3) and texels (N, 2); vertices on seams are repeated."""
     assert mesh.uv is not None
-    corners = np.column_stack([mesh.faces.reshape(-1, 1), mesh.uv.reshape(-1, 2)])
-    unique, number = np.unique(corners, axis=0, return_inverse=True)
-    vertices = mesh.vertices[unique[:, 0].astype(np.int64)]
-    return vertices, number.reshape(-1, 3).astype(np.int64), np.asarray(unique[:, 1:], dtype=np.float64)
+    vertex, uv = mesh.faces.ravel(), mesh.uv.reshape(-1, 2)
+    # Three sorted columns are faster than np.unique of rows.
+    order = np.lexsort((uv[:, 1], uv[:, 0], vertex))
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (np.diff(vertex[order]) != 0) | (np.diff(uv[order], axis=0) != 0.0).any(axis=1)
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.cumsum(new) - 1
+    first = order[new]
+    return mesh.vertices[vertex[first]], number.reshape(-1, 3), uv[first]
 
 
 def _normalized(uv: F64, texture: np.ndarray) -> F64:

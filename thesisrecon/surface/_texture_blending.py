@@ -166,10 +166,13 @@ def paint_texture(
     normals = vertex_normals(mesh)
     texture = cut_out.copy()
     drawn = np.zeros(texture.shape[:2], dtype=bool)
+    top, bottom = uv[..., 1].min(axis=1) - RIM_TEXELS, uv[..., 1].max(axis=1) + RIM_TEXELS
 
     def work(first: int) -> None:
         rows = slice(first, min(first + STRIP_ROWS, len(texture)))
-        at, points, towards = _points_of_rows(mesh, normals, uv, rows, texture.shape[1])
+        # Comparisons with NaN are false: such faces are not seen.
+        some = np.flatnonzero((bottom >= rows.start) & (top <= rows.stop))
+        at, points, towards = _points_of_rows(mesh, normals, (some, uv[some]), rows, texture.shape[1])
         color, shown = blend_colors(prepared, points, towards)
         at = at[shown]
         texture[at[:, 0], at[:, 1]] = np.clip(np.rint(color[shown]), 0, 255)
@@ -214,13 +217,14 @@ def blend_colors(views: Sequence[ViewSurface], points: F64, normals: F64) -> tup
 
 
 def _points_of_rows(
-    mesh: TexturedMesh, normals: F64, uv: F64, rows: slice, width: int
+    mesh: TexturedMesh, normals: F64, faces: tuple[I64, F64], rows: slice, width: int
 ) -> tuple[I64, F64, F64]:
-    """Texels (N, 2) as row and column, points and normals (N, 3) of some rows of the texture."""
-    top, bottom = uv[..., 1].min(axis=1), uv[..., 1].max(axis=1)
-    # Comparisons with NaN are false: such faces are not seen.
-    some = np.flatnonzero((bottom >= rows.start - RIM_TEXELS) & (top <= rows.stop + RIM_TEXELS))
-    corners = np.concatenate([uv[some], np.ones((len(some), 3, 1))], axis=2)
+    """Texels (N, 2) as row and column, points and normals (N, 3) of some rows of the texture.
+
+    ``faces``: numbers (M',) and texels (M', 3, 2) of the faces there.
+    """
+    some, uv = faces
+    corners = np.concatenate([uv, np.ones((len(some), 3, 1))], axis=2)
     corners[..., 1] -= rows.start - RIM_TEXELS
     shape = (rows.stop - rows.start + 2 * RIM_TEXELS, width)
     raster = rasterize_corners(corners, 1e-3, shape)

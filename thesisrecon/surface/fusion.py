@@ -26,7 +26,8 @@ from thesisrecon.surface._fusion_kernels import (
     place_vertices,
     touched_blocks,
 )
-from thesisrecon.surface._mesh import remove_small_parts, remove_unused_vertices, select_faces
+from thesisrecon.surface._mesh import remove_small_parts, select_faces
+from thesisrecon.surface._simplification import simplify_surface
 from thesisrecon.surface.linear import GRAZING_DEG, max_depth_slope, surface_from_depth, triangulate_grid
 
 MIN_COSINE = 0.1
@@ -39,6 +40,10 @@ MAX_RELATIVE = 0.02
 """Relative depth difference, or three standard deviations, up to which a sheet already shows a point."""
 VOXEL_GROWTH = 1.15
 """Factor by which voxels are enlarged until the blocks fit into memory."""
+MAX_STD_VOXELS = 1.0
+"""Upper limit of the standard deviations that count for the simplification."""
+LONGEST_VOXELS = 16.0
+"""Longest side of a simplified face: a texture needs images that show a face completely."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +68,14 @@ class VolumetricFusion:
     voxel_px, max_blocks : float, int
         Voxel size in pixels of the depth maps at their median depth, and largest number of blocks of
         8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
+    tolerance : float
+        Root mean square distance by which the simplified surface may leave the faces it replaces, in standard
+        deviations of the fused depths there (of at most a voxel); 0: all faces stay.
     """
 
     voxel_px: float = 1.5
     max_blocks: int = 250_000
+    tolerance: float = 0.25
 
     def __post_init__(self) -> None:
         # A single depth may need eight blocks, however large the voxels are.
@@ -74,6 +83,8 @@ class VolumetricFusion:
             raise ValueError(
                 f"voxel_px must be positive and max_blocks >= 8; got {self.voxel_px} and {self.max_blocks}"
             )
+        if not 0.0 <= self.tolerance < np.inf:
+            raise ValueError(f"tolerance must be finite and not negative; got {self.tolerance}")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
         """Fuse depth maps to one surface.
@@ -93,6 +104,16 @@ class VolumetricFusion:
         StageFailure
             If the maps contain no depths.
         """
+        surface, std, voxel = self._fused(depth_maps, threads)
+        if not len(surface.faces):
+            raise _nothing_to_fuse()
+        if self.tolerance:
+            limit, longest = self.tolerance * np.minimum(std, MAX_STD_VOXELS * voxel), LONGEST_VOXELS * voxel
+            surface = simplify_surface(surface, limit, longest=longest, threads=threads)
+        return remove_small_parts(surface)
+
+    def _fused(self, depth_maps: Sequence[DepthMap], threads: int) -> tuple[TexturedMesh, F64, float]:
+        """The surface of all voxels, the standard deviation at its vertices, and the voxel size."""
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             measured = list(pool.map(_measured, depth_maps))
             grid, truncation, measured = self._lay_out(measured)
@@ -109,10 +130,7 @@ class VolumetricFusion:
 
             parts = np.array_split(np.arange(len(grid.blocks)), 4 * max(threads, 1))
             list(pool.map(integrate, filter(len, parts)))
-        mesh = _extract_surface(grid, value, weight)
-        if not len(mesh.faces):
-            raise _nothing_to_fuse()
-        return remove_small_parts(mesh)
+        return *_extract_surface(grid, value, weight), grid.voxel
 
     def _lay_out(self, measured: list[_FusionMap]) -> tuple[_Grid, float, list[_FusionMap]]:
         """Voxel grid, truncation distance, and the depths that are certain enough for it."""
@@ -237,8 +255,11 @@ def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid |
     return _Grid(origin, voxel, blocks, place)
 
 
-def _extract_surface(grid: _Grid, value: F32, weight: F32) -> TexturedMesh:
-    """Zero level of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a surface net."""
+def _extract_surface(grid: _Grid, value: F32, weight: F32) -> tuple[TexturedMesh, F64]:
+    """Zero level of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a surface net.
+
+    Also returns the standard deviation at each vertex; weights are inverse variances.
+    """
     vertex = np.empty(value.shape, dtype=np.int64)
     count = place_vertices(grid.blocks, grid.place, value, weight, vertex, np.zeros((0, 3)))
     points = np.zeros((count, 3))
@@ -247,7 +268,9 @@ def _extract_surface(grid: _Grid, value: F32, weight: F32) -> TexturedMesh:
     count = join_vertices(grid.blocks, grid.place, value, weight, vertex, points, nothing)
     faces = np.zeros((count, 3), dtype=np.int64)
     join_vertices(grid.blocks, grid.place, value, weight, vertex, points, faces)
-    return remove_unused_vertices(TexturedMesh(grid.origin + grid.voxel * points, faces))
+    # Vertices are numbered in the order of the voxels.
+    std = 1.0 / np.sqrt(weight[vertex >= 0].astype(np.float64))
+    return TexturedMesh(grid.origin + grid.voxel * points, faces), std
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,9 @@ from thesisrecon.surface._texture_blending import (
 CHART_MARGIN = 2
 """Pixels around each chart, so that reduced textures do not mix charts."""
 SWATCH = 3
-"""Texels per side of the patch of an unseen face."""
+"""Texels per side of the patch of unseen faces of similar colour."""
+COLOR_STEP = 16
+"""Grey levels of a channel that share a patch."""
 MIN_SCALE = 0.05
 """Smallest reduction of the images."""
 
@@ -169,21 +171,27 @@ def _fill(
 
 
 def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
-    """Append a patch of one colour for each unseen face: that of the nearest seen faces along the surface."""
+    """Append patches with the colours of unseen faces: those of the nearest seen faces along the surface.
+
+    Faces of similar colour share a patch, and neighbours among them their vertices.
+    """
     unseen = np.flatnonzero(label < 0)
     if not len(unseen):
         return uv, texture
-    columns = max(texture.shape[1] // SWATCH, 1)
-    rows = -(-len(unseen) // columns)
     color = _surroundings(neighbours, label, uv, texture)[unseen]
+    code, patch = np.unique(color // COLOR_STEP @ (1 << 16, 1 << 8, 1), return_inverse=True)
+    size = np.bincount(patch)
+    shades = np.stack([np.rint(np.bincount(patch, color[:, k]) / size) for k in range(3)], axis=1)
+    columns = max(texture.shape[1] // SWATCH, 1)
+    rows = -(-len(code) // columns)
     strip = np.full((rows * SWATCH, texture.shape[1], 3), 128, dtype=np.uint8)
-    row, column = np.divmod(np.arange(len(unseen)), columns)
+    row, column = np.divmod(np.arange(len(code)), columns)
     for dy in range(SWATCH):
         for dx in range(min(SWATCH, texture.shape[1])):
-            strip[row * SWATCH + dy, column * SWATCH + dx] = color
+            strip[row * SWATCH + dy, column * SWATCH + dx] = shades
     uv = uv.copy()
     middle = np.stack([column * SWATCH + SWATCH // 2, texture.shape[0] + row * SWATCH + SWATCH // 2], axis=1)
-    uv[unseen] = middle[:, None, :]
+    uv[unseen] = middle[patch][:, None, :]
     return uv, np.concatenate([texture, strip])
 
 
