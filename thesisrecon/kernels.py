@@ -14,6 +14,7 @@ import contextlib
 import fcntl
 import hashlib
 import logging
+import operator
 import os
 import pickle
 import sys
@@ -22,18 +23,23 @@ import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
-from typing import IO, TYPE_CHECKING, Any, TypeVar, overload
+from typing import IO, TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
 import numba
 import numpy as np
 from numba.core import cgutils, types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
+from numba.core.sigutils import normalize_signature
+from numba.core.typing.templates import AbstractTemplate, infer, infer_global, signature
+from numba.cpython.builtins import do_minmax
 from numba.extending import lower_builtin, type_callable
 from numba.np.arrayobj import _empty_nd_impl
+
+from thesisrecon._code_digest import code_digest
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -82,100 +88,105 @@ def kernel(function: Any = None, **options: Any) -> Any:
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher: Any = numba.njit(nogil=True, **options)(function)
+        settings: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True, **options}
+        dispatcher: Any = numba.njit(**settings)(function)
         if isinstance(dispatcher, Dispatcher):  # a plain function where NUMBA_DISABLE_JIT is set
-            stored = vars(dispatcher)["_cache"] = KernelCache(dispatcher)
-            vars(dispatcher)["compile"] = stored.releasing(dispatcher.compile)
-            vars(dispatcher)["get_call_template"] = _without_literals(dispatcher.get_call_template)
+            stages = _Stages(dispatcher)
+            vars(dispatcher).update(
+                _cache=stages.cache,
+                compile=stages.compile,
+                add_overload=stages.add_overload,
+                get_call_template=stages.get_call_template,
+            )
         return dispatcher
 
     return compiled if function is None else compiled(function)
 
 
-def _without_literals(template: Callable[..., Any]) -> Callable[..., Any]:
-    """Let kernels call kernels with plain types; numba would compile a version for each literal argument."""
+class _Stages:
+    """Compilation in two stages: to LLVM's code, and to machine code when Python calls the kernel.
 
-    def get_call_template(args: Any, kws: Any) -> Any:
-        plain = tuple(types.unliteral(a) for a in args)
-        return template(plain, {name: types.unliteral(a) for name, a in kws.items()})
-
-    return get_call_template
-
-
-def code_digest(*functions: Any) -> str:
-    """Digest of functions and of all that they refer to: constants, options and other functions.
+    Most kernels are called by kernels only. They become machine code as a part of their callers; numba would
+    make it for each of them too.
 
     Parameters
     ----------
-    *functions : callable
-        Kernels or plain Python functions.
-
-    Returns
-    -------
-    str
-        SHA-256 digest in hexadecimal digits. Comments, docstrings and line numbers do not enter.
+    dispatcher : numba dispatcher
     """
-    digest = hashlib.sha256()
-    for part in _parts(functions, set()):
-        digest.update(part.encode())
-        digest.update(b"\0")
-    return digest.hexdigest()
+
+    for_kernels = False
+    """Whether a kernel is compiled for others; changes under numba's lock."""
+
+    def __init__(self, dispatcher: Any) -> None:
+        self.cache = KernelCache(dispatcher)
+        self._dispatcher = dispatcher
+        self._compile = dispatcher.compile
+        self._get_call_template = dispatcher.get_call_template
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Type a call by a kernel; numba would compile a version for each literal argument."""
+        plain = tuple(types.unliteral(a) for a in args)
+        with global_compiler_lock:
+            before, _Stages.for_kernels = _Stages.for_kernels, True
+            try:
+                return self._get_call_template(plain, {name: types.unliteral(a) for name, a in kws.items()})
+            finally:
+                _Stages.for_kernels = before
+
+    def add_overload(self, compiled: Any) -> None:
+        self._dispatcher.overloads[tuple(compiled.signature.args)] = compiled
+
+    def compile(self, signature: Any) -> Any:
+        """Load or compile a signature and return its entry point, which is empty for other kernels."""
+        with global_compiler_lock:
+            codegen = self._dispatcher.targetctx.codegen()
+            with self.cache.releasing_locks(), _machine_code(codegen, False):
+                self._compile(signature)
+                arguments = tuple(normalize_signature(signature)[0])
+                if not _Stages.for_kernels:
+                    self._complete(signature, arguments)
+                elif arguments not in self.cache.kinds:
+                    self.cache.save(signature, self._dispatcher.overloads[arguments], "bitcode")
+            return self._dispatcher.overloads[arguments].entry_point
+
+    def _complete(self, signature: Any, arguments: tuple[Any, ...]) -> None:
+        """Make the machine code of a signature, unless it is there, and let Python find it."""
+        dispatcher, compiled = self._dispatcher, self._dispatcher.overloads[arguments]
+        context = dispatcher.targetctx
+        if self.cache.kinds.get(arguments) != "object":
+            library = compiled.library
+            environments = [*(compiled.referenced_envs or ()), *compiled._find_referenced_environments()]
+            with _machine_code(context.codegen(), True):
+                library.enable_object_caching()
+                context.codegen()._add_module(library._final_module)
+                entry = context.get_executable(library, compiled.fndesc, compiled.environment)
+                for environment in environments:
+                    context.codegen().set_env(environment.env_name, environment)
+            context.insert_user_function(entry, compiled.fndesc, [library])
+            compiled = dispatcher.overloads[arguments] = compiled._replace(entry_point=entry)
+            self.cache.save(signature, compiled, "object")
+        if arguments not in self.cache.callable:
+            dispatcher._insert([a._code for a in arguments], compiled.entry_point, compiled.objectmode)
+            self.cache.callable.add(arguments)
 
 
-def _parts(value: Any, seen: set[int]) -> Iterator[str]:
-    """Everything that the compiled meaning of a value depends on, as text."""
-    if isinstance(value, Dispatcher):
-        yield from _parts(sorted(value.targetoptions.items()), seen)
-        value = value.py_func
-    if isinstance(value, FunctionType):
-        yield f"{value.__module__}.{value.__qualname__}"
-        if id(value) in seen or not _has_source_here(value):
-            return
-        seen.add(id(value))
-        yield from _parts(value.__defaults__, seen)
-        cells = [cell.cell_contents for cell in value.__closure__ or ()]
-        yield from _parts(cells, seen)
-        yield from _code_parts(value.__code__, value, seen)
-    elif isinstance(value, (tuple, list, set, frozenset)):
-        yield f"{type(value).__name__} {len(value)}"
-        # The order of a set changes from process to process.
-        for item in sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value:
-            yield from _parts(item, seen)
-    elif isinstance(value, np.ndarray):
-        yield f"{value.dtype} {value.shape} {value.tobytes().hex()}"
-    elif isinstance(value, type):
-        yield f"{value.__module__}.{value.__qualname__} {getattr(value, '__annotations__', '')}"
-    elif isinstance(value, ModuleType):
-        yield value.__name__
-    else:
-        plain = isinstance(value, (int, float, complex, str, bytes, np.generic, type(None)))
-        yield repr(value) if plain else str(type(value))
+@contextlib.contextmanager
+def _machine_code(codegen: Any, made: bool) -> Iterator[None]:
+    """Let numba's code generator make machine code of what is compiled or loaded inside, or not."""
+    methods = ("_add_module", "set_env")
+    before = {name: vars(codegen).pop(name) for name in methods if name in vars(codegen)}
+    if not made:
+        vars(codegen).update(dict.fromkeys(methods, _nothing))
+    try:
+        yield
+    finally:
+        for name in methods:
+            vars(codegen).pop(name, None)
+        vars(codegen).update(before)
 
 
-def _code_parts(code: CodeType, function: FunctionType, seen: set[int]) -> Iterator[str]:
-    yield code.co_code.hex()
-    yield f"{code.co_names} {code.co_varnames}"
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _code_parts(constant, function, seen)
-        elif constant != function.__doc__:
-            yield from _parts(constant, seen)
-    modules = []
-    for name in code.co_names:
-        if name in function.__globals__:
-            value = function.__globals__[name]
-            modules += [value] if isinstance(value, ModuleType) else []
-            yield name
-            yield from _parts(value, seen)
-    for module in modules:
-        if module.__name__.partition(".")[0] == __package__:
-            for name in code.co_names:
-                yield from _parts(getattr(module, name, None), seen)
-
-
-def _has_source_here(function: FunctionType) -> bool:
-    """Functions of installed libraries are known by the version of the library."""
-    return function.__module__.partition(".")[0] not in {"numpy", "numba", "math", "scipy"}
+def _nothing(*_: Any) -> None:
+    pass
 
 
 def cache_folder() -> Path:
@@ -209,6 +220,10 @@ class KernelCache(NullCache):
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
+        self.kinds: dict[tuple[Any, ...], str] = {}
+        """What is stored of each signature: LLVM's code ("bitcode"), or also the machine code ("object")."""
+        self.callable: set[tuple[Any, ...]] = set()
+        """Signatures that Python can call."""
         self._digest = ""
         self._locks: dict[Path, IO[bytes]] = {}
 
@@ -219,19 +234,36 @@ class KernelCache(NullCache):
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         target_context.refresh()  # it must know all types before machine code is loaded
         path = self._path(sig, target_context.codegen())
-        found = _read(path, target_context)
+        found = _read(path)
         if found is None and path not in self._locks:
             self._lock(path)
-            found = _read(path, target_context)
-        return found
+            found = _read(path)
+        if found is None:
+            return None
+        kind = found[0][1]
+        rebuild: Callable[..., Any] = CompileResult._rebuild
+        with _machine_code(target_context.codegen(), kind == "object"):
+            compiled = rebuild(target_context, *found)
+        self.kinds[tuple(compiled.signature.args)] = kind
+        return compiled  # type: ignore[no-any-return]
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        path = self._path(sig, data.codegen)
+        """Nothing: `save` is called when it is known what there is to store."""
+
+    def save(self, sig: Any, compiled: Any, kind: str) -> None:
+        """Store a signature as LLVM's code ("bitcode") or also as machine code ("object")."""
+        self.kinds[tuple(compiled.signature.args)] = kind
+        path = self._path(sig, compiled.codegen)
+        library = vars(compiled.library)
+        if kind == "bitcode":
+            library["serialize_using_object_code"] = compiled.library.serialize_using_bitcode
         # A full disk or a read-only folder costs the cache, not the result.
         try:
-            _write(path, _pickled(data._reduce()))
+            _write(path, _pickled(compiled._reduce()))
         except OSError as error:
             _warn_once(path.parent, error.strerror or type(error).__name__)
+        finally:
+            library.pop("serialize_using_object_code", None)
 
     def _path(self, sig: Any, codegen: Any) -> Path:
         function = self._dispatcher.py_func
@@ -248,18 +280,15 @@ class KernelCache(NullCache):
         name = f"{function.__module__.removeprefix('thesisrecon.')}.{function.__name__}"
         return cache_folder() / f"{name}-{key}"
 
-    def releasing(self, compile_signature: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """Release the lock of a compilation however it ends; loading and saving happen inside it."""
-
-        def compile_and_release(signature: Any) -> Any:
-            before = set(self._locks)
-            try:
-                return compile_signature(signature)
-            finally:
-                for path in set(self._locks) - before:
-                    self._unlock(path)
-
-        return compile_and_release
+    @contextlib.contextmanager
+    def releasing_locks(self) -> Iterator[None]:
+        """Release the locks of a compilation however it ends; loading and saving happen inside it."""
+        before = set(self._locks)
+        try:
+            yield
+        finally:
+            for path in set(self._locks) - before:
+                self._unlock(path)
 
     def _lock(self, path: Path) -> None:
         """Lock an entry; wait at most MAX_WAIT_S for another process that compiles it."""
@@ -300,8 +329,8 @@ def _warn_once(folder: Path, reason: str) -> None:
     )
 
 
-def _read(path: Path, target_context: Any) -> CompileResult | None:
-    """The stored result; None if there is none or it is damaged."""
+def _read(path: Path) -> tuple[Any, ...] | None:
+    """The stored parts of a result; None if there is none or it is damaged."""
     try:
         stored = path.read_bytes()
     except OSError:
@@ -310,11 +339,10 @@ def _read(path: Path, target_context: Any) -> CompileResult | None:
     if hashlib.sha256(content).digest() != digest:
         return None
     try:
-        payload = pickle.loads(content)
+        parts: tuple[Any, ...] = pickle.loads(content)
     except (ImportError, AttributeError):  # a record of the kernel has moved to another module
         return None
-    rebuild: Callable[..., CompileResult] = CompileResult._rebuild
-    return rebuild(target_context, *payload)
+    return parts
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -390,6 +418,46 @@ def _allocate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any
     kinds = list(kind) if is_tuple else [kind]
     shape = [context.cast(builder, part, of, types.intp) for part, of in zip(parts, kinds, strict=True)]
     return _empty_nd_impl(context, builder, signature.return_type, shape)
+
+
+class _NumberTemplate(AbstractTemplate):
+    """Types of `max` and `min` of numbers and of `int` in kernels.
+
+    numba's own versions are Python code, which it compiles again for each kernel and each literal argument.
+    """
+
+    key: Any
+    metadata: ClassVar = {"target": "cpu"}  # type: ignore[misc]  # preferred to numba's
+
+    def generic(self, args: Any, kws: Any) -> Any:
+        if kws or not args or not all(isinstance(a, (types.Integer, types.Float)) for a in args):
+            return None
+        plain = [types.unliteral(a) for a in args]
+        if self.key is not int:
+            return signature(self.context.unify_types(*plain), *plain) if len(plain) > 1 else None
+        return signature(plain[0] if isinstance(plain[0], types.Integer) else types.intp, *plain)
+
+
+def _register(function: Any, lower: Any) -> None:
+    template = type(f"_{function.__name__.title()}", (_NumberTemplate,), {"key": function})
+    infer_global(function, types.Function(infer(template)))
+    lower_builtin(function, types.VarArg(types.Number))(lower)
+
+
+def _lower_int(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return context.cast(builder, arguments[0], signature.args[0], signature.return_type)
+
+
+def _lower_choice(compare: Any) -> Any:
+    def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return do_minmax(context, builder, list(signature.args), arguments, compare)
+
+    return lower
+
+
+_register(int, _lower_int)
+_register(max, _lower_choice(operator.gt))
+_register(min, _lower_choice(operator.lt))
 
 
 @kernel

@@ -1,10 +1,8 @@
 """The run folder, its record files, and a disk that is full."""
 
 import errno
-import importlib
 import json
 import shutil
-import sys
 import zipfile
 
 import numpy as np
@@ -22,7 +20,6 @@ from thesisrecon.runtime._run_folder import (
     StageFolder,
     _seal,
     bytes_from_record,
-    code_key,
     key_of,
     read_record,
 )
@@ -214,20 +211,6 @@ def test_damaged_records_are_taken_from_the_other_place(tmp_path):
     write_atomically(own, b"damaged")
     with pytest.raises(ChangedRecord):
         two.load("0", "key")
-
-
-def test_code_of_the_caller_counts_by_its_file(tmp_path, monkeypatch):
-    keys = []
-    for name, text in (("callers_one", "x = 1"), ("callers_two", "x = 1"), ("callers_one", "x = 2")):
-        (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
-        monkeypatch.syspath_prepend(tmp_path)
-        monkeypatch.delitem(sys.modules, name, raising=False)
-        importlib.invalidate_caches()
-        importlib.import_module(name)
-        code_key.cache_clear()
-        keys.append(code_key(name))
-    assert len(set(keys)) == 3
-    assert code_key("typed_into_a_prompt") == code_key("typed_into_a_prompt")
 
 
 def saved(path, record, *, packed=False, **arrays):

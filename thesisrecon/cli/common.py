@@ -24,6 +24,7 @@ from thesisrecon.runtime._signals import CODES, REASONS, with_resume_advice
 DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
 _STAGE_LABELS = {
+    "kernels": "compiling (first run)",
     "features": "corners",
     "pairs": "pair selection",
     "matches": "image pairs",

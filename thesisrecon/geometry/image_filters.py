@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import empty, kernel
+from thesisrecon.kernels import empty, kernel, zeros
 
 # Sums may be reordered; the flag "nnan" would remove the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -22,7 +22,7 @@ def _convolve_separable(image: F32, taps: F32) -> F32:
     """Convolve (H, W) with symmetric taps (2 r + 1,) along both axes, the border repeated."""
     height, width = image.shape
     radius = taps.size // 2
-    out = np.zeros_like(image)
+    out = zeros(image.shape, np.float32)
     row = empty(width + 2 * radius, np.float32)
     for y in range(height):
         row[:] = np.float32(0.0)

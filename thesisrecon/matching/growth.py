@@ -84,25 +84,28 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
             distance2[m] = dx * dx + dy * dy
             residual2[m] = 0.0
             mean2 += distance2[m] / k
-            a0 += prior[i] / k
+            for p in range(2):
+                for q in range(2):
+                    a0[p, q] += prior[i, p, q] / k
         mean2 = mean2 + 1e-9
         for m in range(k):
             i, dx, dy = neighbours[n, m], offset[m, 0], offset[m, 1]
             rest[m, 0] = xy2[i, 0] - (a0[0, 0] * dx + a0[0, 1] * dy)
             rest[m, 1] = xy2[i, 1] - (a0[1, 0] * dx + a0[1, 1] * dy)
         scale2 = np.inf
-        a, z = a0, zeros((3, 2))
+        a, z = affine[n], zeros((3, 2))
         for _ in range(ROUNDS):
             z = _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2))
-            a = a0 + z[:2].T
+            for p in range(2):
+                for q in range(2):
+                    a[p, q] = a0[p, q] + z[q, p]
             for m in range(k):
                 i, dx, dy = neighbours[n, m], offset[m, 0], offset[m, 1]
                 ex = xy2[i, 0] - (a[0, 0] * dx + a[0, 1] * dy + z[2, 0])
                 ey = xy2[i, 1] - (a[1, 0] * dx + a[1, 1] * dy + z[2, 1])
                 residual2[m] = ex * ex + ey * ey
             scale2 = _median(residual2, ordered)
-        affine[n] = a
-        position[n] = z[2]
+        position[n, 0], position[n, 1] = z[2, 0], z[2, 1]
         spread[n] = np.sqrt(scale2)
     return affine, position, spread
 

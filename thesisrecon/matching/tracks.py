@@ -84,8 +84,10 @@ def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle:
     for e in range(len(edges)):
         start[edges[e, 0] + 1] += 1
         start[edges[e, 1] + 1] += 1
-    start = np.cumsum(start)
-    fill = start[:-1].copy()
+    fill = empty(count, np.int64)
+    for k in range(count):
+        fill[k] = start[k]
+        start[k + 1] += start[k]
     incident = empty(2 * len(edges), np.int64)
     for e in range(len(edges)):
         for side in range(2):

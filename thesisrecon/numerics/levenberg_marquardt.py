@@ -130,7 +130,6 @@ class DenseSystem:
         return step, 0.5 * float(step @ (diagonal * step - self.gradient))
 
 
-
 def invert_information(information: F64) -> F64:
     """Invert an information matrix, eigenvalues floored relative to the largest.
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon._code_digest import code_digest
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig, with_images
 from thesisrecon.errors import StageFailure, counted
@@ -31,7 +32,6 @@ from thesisrecon.records import (
     TwoView,
 )
 from thesisrecon.runtime._run import Batch, stream
-from thesisrecon.runtime._run_folder import code_key
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
@@ -41,8 +41,6 @@ ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""
 MIN_VIEWS = 3
 """With fewer views, others may not see the surface of the held-out one."""
-RENDERER = "thesisrecon.views.render"
-"""Module whose code the held-out comparison depends on, besides that of the model."""
 
 
 def find_features(state: PipelineState) -> None:
@@ -340,7 +338,7 @@ def build_model(state: PipelineState) -> None:
     run.progress("model", 0, 1)
     build = partial(state.config.model.build, result.depth_maps, result.views, threads=run.workers.threads)
     mesh: TexturedMesh = run.cached("model", "model", key, build)
-    held_out_key = run.key("model", key, "held-out", code_key(RENDERER))
+    held_out_key = run.key("model", key, "held-out", code_digest(_compare_held_out))
     held_out = run.cached("model", "held-out", held_out_key, lambda: _compare_held_out(state, mesh))
     state.result = replace(state.result, mesh=mesh, held_out=held_out)
     without_texture = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())

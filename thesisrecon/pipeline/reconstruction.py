@@ -27,6 +27,7 @@ from thesisrecon.pipeline._stages import (
 )
 from thesisrecon.pipeline._state import PipelineState, name_images
 from thesisrecon.records import RunResult
+from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
 
 STEPS = {
@@ -113,6 +114,7 @@ def reconstruct(
         run.directory.adopt(_identity(run, inputs), overwrite=overwrite, results=RESULT_FILES)
         try:
             state.require_images()
+            precompile(until, run.workers.threads, run.progress)
             _run_steps(state, surface_required=options.get("until") is not None)
         except StageFailure as error:
             parts = (error.reason, error.evidence, error.advice)

@@ -13,12 +13,13 @@ from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 
+from thesisrecon._code_digest import code_digest
 from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import OutputError, UsageError, WorkersLost, unknown_word
 from thesisrecon.records import StageReport
 from thesisrecon.runtime._executors import Workers, available_threads
-from thesisrecon.runtime._run_folder import ChangedRecord, RunDirectory, code_key, key_of
+from thesisrecon.runtime._run_folder import ChangedRecord, RunDirectory, key_of
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
@@ -101,7 +102,7 @@ class Run:
         """The part of a key that identifies the method of a stage: class, parameters and code."""
         variant = getattr(self.config, stage)
         module = type(variant).__module__
-        return [module, type(variant).__qualname__, table_from_dataclass(variant), code_key(module)]
+        return [module, type(variant).__qualname__, table_from_dataclass(variant), code_digest(variant)]
 
     def cached(self, stage: str, item: str, key: str, compute: Callable[[], Any]) -> Any:
         """Return the record of one item, from the cache or computed."""

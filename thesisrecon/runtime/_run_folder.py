@@ -12,12 +12,10 @@ import hashlib
 import io
 import json
 import os
-import sys
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,8 +28,6 @@ from thesisrecon.records import StageReport
 
 FORMAT = 2
 RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
-_FOUNDATIONS = ("arrays.py", "camera.py", "errors.py", "intrinsics.py", "records.py", "geometry", "numerics")
-"""Code that every stage may use."""
 _DESCRIPTION = "description"
 
 
@@ -144,25 +140,6 @@ def _json_value(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"a key consists of plain values and arrays; got {type(value).__name__}")
-
-
-@cache
-def code_key(module: str) -> str:
-    """Digest of the code behind a method, so that results of other code are not reused.
-
-    In this package the stage folder of the module and the foundations count; elsewhere its file.
-    """
-    package = Path(__file__).parent.parent
-    parts = module.split(".")
-    file = getattr(sys.modules.get(module), "__file__", None)
-    own = [Path(file)] if file is not None and Path(file).is_file() else []
-    if parts[0] == package.name and len(parts) > 1:
-        own = [package / parts[1]]
-    content = hashlib.sha256(f"{module} {FORMAT}".encode())
-    for root in [*own, *(package / part for part in _FOUNDATIONS)]:
-        for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
-            content.update(path.read_bytes())
-    return content.hexdigest()[:32]
 
 
 @dataclass(frozen=True)

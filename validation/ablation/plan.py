@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import thesisrecon
+from thesisrecon._code_digest import code_digest
 from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.runtime._executors import package_key
-from thesisrecon.runtime._run_folder import code_key, key_of
+from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.changes import STAGES, TASK, Setting, apply_changes, level_name
 from validation.ablation.own import PREFIX
 from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode, Study
@@ -291,7 +292,7 @@ def _config_identity(config: PipelineConfig) -> dict[str, Any]:
     tables: dict[str, Any] = tables_from_config(config)
     for stage in KINDS:
         kind = type(getattr(config, stage))
-        tables[stage] = [kind.__module__, kind.__qualname__, _own_code(kind.__module__), tables[stage]]
+        tables[stage] = [kind.__module__, kind.__qualname__, _own_code(getattr(config, stage)), tables[stage]]
     return tables
 
 
@@ -299,13 +300,14 @@ def _task_identity(task: Any) -> list[Any]:
     subject = task.function if isinstance(task, FunctionTask) else type(task)
     table = table_from_dataclass(task) if dataclasses.is_dataclass(task) and subject is type(task) else {}
     name = getattr(subject, "__qualname__", type(subject).__qualname__)
-    return [subject.__module__, name, _own_code(subject.__module__), table]
+    return [subject.__module__, name, _own_code(subject), table]
 
 
-def _own_code(module: str) -> str:
-    """Return a key of the code of a user module."""
+def _own_code(subject: Any) -> str:
+    """Return a digest of the code of a user."""
+    module = getattr(subject, "__module__", type(subject).__module__)
     ours = module.split(".")[0] in ("thesisrecon", "validation")
-    return "" if ours or module.startswith(PREFIX) else code_key(module)
+    return "" if ours or module.startswith(PREFIX) else code_digest(subject)
 
 
 @cache

@@ -11,12 +11,13 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 
 import thesisrecon
+from thesisrecon._code_digest import code_digest
 from thesisrecon._settings import tables_from_config
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.records import RunResult
 from thesisrecon.runtime._run import Until
-from thesisrecon.runtime._run_folder import code_key, key_of
+from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task
 from validation.harness.records import ReportOptions
 from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of
@@ -90,8 +91,9 @@ class Reconstruction(Task):
         tables, settings, found = tables_from_config(config), dict[str, Any](), []
         for step, stages in SETTINGS_OF.items():
             for stage in stages:
-                module = type(getattr(config, stage)).__module__
-                settings[stage] = [module, code_key(module) if stage in KINDS else "", tables[stage]]
+                variant = getattr(config, stage)
+                code = code_digest(variant) if stage in KINDS else ""
+                settings[stage] = [type(variant).__module__, code, tables[stage]]
             drawn = [] if step == "features" else [seed]
             found.append((step, key_of("step", step, scene, settings, drawn)))
             if step == self.until:

@@ -1,0 +1,177 @@
+"""Digest of code and of all that it reaches: the key of stored machine code and of stored results."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import dis
+import functools
+import hashlib
+import importlib
+import sys
+import sysconfig
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from types import CodeType, FunctionType, MappingProxyType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+
+OWN = __name__.partition(".")[0]
+_IMPORT = dis.opmap["IMPORT_NAME"]
+_LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")]
+_NOT_CODE = {
+    "__abstractmethods__", "__annotations__", "__dataclass_fields__", "__dataclass_params__", "__dict__",
+    "__doc__", "__firstlineno__", "__match_args__", "__module__", "__parameters__", "__static_attributes__",
+    "__weakref__", "_abc_impl", "_is_protocol",
+}  # fmt: skip
+"""Attributes of a class that say nothing that its methods and annotations do not say."""
+
+
+def code_digest(*values: Any) -> str:
+    """Digest of functions, classes or objects and of all code that they refer to.
+
+    Followed are constants, defaults, closures, base classes, methods, fields and imports inside functions.
+    Code of installed libraries counts by its name only, unless a value belongs to it. Comments, docstrings
+    and line numbers do not enter.
+
+    Parameters
+    ----------
+    *values : callable, type or object
+        Kernels, functions, classes, or instances with their fields.
+
+    Returns
+    -------
+    str
+        SHA-256 digest in hexadecimal digits.
+    """
+    walk = _Walk({OWN, *(_package_of(value) for value in values)})
+    digest = hashlib.sha256()
+    for part in walk.parts(values):
+        digest.update(part.encode())
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def _package_of(value: Any) -> str:
+    module = getattr(value, "__module__", None) or type(value).__module__
+    return str(module).partition(".")[0]
+
+
+@cache
+def _is_library(package: str) -> bool:
+    file = getattr(sys.modules.get(package), "__file__", None)
+    if package in sys.builtin_module_names or package == "builtins":
+        return True
+    place = Path(file).resolve() if file else None
+    return place is not None and any(place.is_relative_to(folder) for folder in _LIBRARIES)
+
+
+class _Walk:
+    """Collects what the meaning of a value depends on, as text."""
+
+    def __init__(self, packages: set[str]) -> None:
+        self._packages = packages
+        self._seen: dict[int, Any] = {}  # keeps the objects, so that no identity is used twice
+
+    def _followed(self, module: str) -> bool:
+        package = str(module).partition(".")[0]
+        return package in self._packages or not _is_library(package)
+
+    def parts(self, value: Any) -> Iterator[str]:
+        if hasattr(value, "targetoptions") and hasattr(value, "py_func"):  # a kernel
+            yield from self.parts(sorted(value.targetoptions.items()))
+            value = value.py_func
+        if isinstance(value, (staticmethod, classmethod, MethodType)):
+            value = value.__func__
+        if isinstance(value, FunctionType):
+            yield from self._function(value)
+        elif isinstance(value, type):
+            yield from self._class(value)
+        elif isinstance(value, property):
+            yield from self.parts((value.fget, value.fset))
+        elif isinstance(value, functools.cached_property):
+            yield from self.parts(value.func)
+        elif isinstance(value, functools.partial):
+            yield from self.parts((value.func, value.args, value.keywords))
+        elif hasattr(value, "__wrapped__"):
+            yield from self.parts(value.__wrapped__)
+        else:
+            yield from self._plain(value)
+
+    def _plain(self, value: Any) -> Iterator[str]:
+        if type(value) in (tuple, list, set, frozenset):
+            yield f"{type(value).__name__} {len(value)}"
+            # The order of a set changes from process to process.
+            for item in sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value:
+                yield from self.parts(item)
+        elif type(value) in (dict, MappingProxyType):
+            yield f"mapping {len(value)}"
+            for key, item in value.items():
+                yield from self.parts((key, item))
+        elif isinstance(value, np.ndarray):
+            yield f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+        elif isinstance(value, ModuleType):
+            yield value.__name__
+        elif isinstance(value, (int, float, complex, str, bytes, np.generic, np.dtype, Path, type(None))):
+            yield repr(value)
+        else:
+            yield from self._class(type(value))
+            if dataclasses.is_dataclass(value) and id(value) not in self._seen:
+                self._seen[id(value)] = value
+                for field in dataclasses.fields(value):
+                    yield from self.parts((field.name, getattr(value, field.name, None)))
+
+    def _function(self, function: FunctionType) -> Iterator[str]:
+        yield f"{function.__module__}.{function.__qualname__}"
+        if id(function) in self._seen or not self._followed(function.__module__):
+            return
+        self._seen[id(function)] = function
+        yield from self.parts((function.__defaults__, function.__kwdefaults__))
+        for cell in function.__closure__ or ():
+            try:
+                yield from self.parts(cell.cell_contents)
+            except ValueError:  # not yet filled
+                yield "empty"
+        yield from self._code(function.__code__, function)
+
+    def _class(self, kind: type) -> Iterator[str]:
+        yield f"{kind.__module__}.{kind.__qualname__}"
+        if id(kind) in self._seen or not self._followed(kind.__module__):
+            return
+        self._seen[id(kind)] = kind
+        yield str(vars(kind).get("__annotations__", ""))
+        yield from self.parts(kind.__bases__)
+        for name, member in vars(kind).items():
+            if name not in _NOT_CODE:
+                yield name
+                yield from self.parts(member)
+
+    def _code(self, code: CodeType, function: FunctionType) -> Iterator[str]:
+        yield code.co_code.hex()
+        yield f"{code.co_names} {code.co_varnames} {code.co_freevars} {code.co_exceptiontable.hex()}"
+        for constant in code.co_consts:
+            if isinstance(constant, CodeType):
+                yield from self._code(constant, function)
+            elif constant != function.__doc__:
+                yield from self.parts(constant)
+        modules = []
+        for name in code.co_names:
+            if name in function.__globals__:
+                value = function.__globals__[name]
+                modules += [value] if isinstance(value, ModuleType) else []
+                yield name
+                yield from self.parts(value)
+        for operation, argument in zip(code.co_code[::2], code.co_code[1::2], strict=True):
+            if operation == _IMPORT and argument < len(code.co_names):
+                name = code.co_names[argument]
+                with contextlib.suppress(ImportError):
+                    modules += [importlib.import_module(name)] if self._followed(name) else []
+        for module in modules:
+            if self._followed(module.__name__):
+                for name in code.co_names:
+                    value = getattr(module, name, None)
+                    if isinstance(value, ModuleType) and value not in modules:
+                        modules.append(value)
+                    yield from self.parts(value)

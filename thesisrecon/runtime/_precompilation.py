@@ -1,0 +1,162 @@
+"""Compile the kernels of a run on all cores before its first stage, once for each version of the code.
+
+``kernels.txt`` lists them by stage, with the types of their arguments: ``float64[:, ::1]`` is an array in C
+order, ``tuple_of("module.Class", ...)`` a named tuple. A kernel that it lacks is compiled when it is called.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import platform
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import types
+
+from thesisrecon.kernels import cache_folder
+from thesisrecon.runtime._signals import kill_on_exit, starting_processes
+
+PACKAGE = Path(__file__).parent.parent
+LIST = PACKAGE / "kernels.txt"
+WORKER = f"from {__name__} import compile_requested; compile_requested()"
+POLL_S = 0.1
+
+
+def listed_kernels(until: str) -> list[str]:
+    """Lines of ``kernels.txt`` up to a stage: ``module.function(types of the arguments)``."""
+    lines: list[str] = []
+    stage = ""
+    for line in LIST.read_text(encoding="utf-8").splitlines():
+        if line.startswith("["):
+            if stage == until:
+                break
+            stage = line.strip("[]")
+        elif line:
+            lines.append(line)
+    return lines
+
+
+def kernel_and_types(line: str) -> tuple[Any, tuple[Any, ...]]:
+    """Kernel of a line of the list, and the types of its arguments."""
+    name, _, arguments = line.partition("(")
+    names = vars(types) | {"tuple_of": _tuple_of, "__builtins__": {}}
+    return _named(name), eval(f"({arguments}", names)
+
+
+def _named(name: str) -> Any:
+    module, _, attribute = name.rpartition(".")
+    return getattr(importlib.import_module(f"{PACKAGE.name}.{module}"), attribute)
+
+
+def _tuple_of(kind: str, *parts: Any) -> Any:
+    return types.BaseTuple.from_types(  # type: ignore[no-untyped-call]
+        parts, _named(kind) if kind else None
+    )
+
+
+def precompile(until: str, workers: int, progress: Callable[[str, int, int], None]) -> None:
+    """Compile the kernels of the stages up to one with several processes, unless that was done before.
+
+    Parameters
+    ----------
+    until : str
+        The last stage.
+    workers : int
+        Number of processes.
+    progress : callable
+        Called with ("kernels", done, total).
+    """
+    lines = listed_kernels(until)
+    done = cache_folder() / f"complete-{_code_and_machine(lines)}"
+    if done.exists() or not lines or vars(numba.config)["DISABLE_JIT"]:
+        return
+    progress("kernels", 0, len(lines))
+    finished = _compile_in_processes(lines, workers, progress)
+    # An unwritable folder or a failing worker costs time only: each kernel is compiled when it is called.
+    if finished == len(lines):
+        with suppress(OSError):
+            done.touch()
+
+
+def _code_and_machine(lines: Sequence[str]) -> str:
+    machine = vars(numba.config)["CPU_NAME"], platform.machine(), platform.node()
+    digest = hashlib.sha256(repr((lines, machine, sys.version, numba.__version__)).encode())
+    for file in sorted(PACKAGE.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[str, int, int], None]) -> int:
+    waiting = iter(lines)
+    taking = threading.Lock()
+    finished: list[str] = []
+
+    def next_line() -> str | None:
+        with taking:
+            return next(waiting, None)
+
+    def feed(worker: subprocess.Popen[str]) -> None:
+        assert worker.stdin is not None
+        assert worker.stdout is not None
+        with suppress(OSError):
+            while (line := next_line()) is not None:
+                worker.stdin.write(line + "\n")
+                worker.stdin.flush()
+                if not worker.stdout.readline():
+                    return
+                finished.append(line)
+            worker.stdin.close()
+
+    with starting_processes():
+        workers = [_started() for _ in range(min(count, len(lines)))]
+
+    def kill() -> None:
+        for worker in workers:
+            worker.kill()
+
+    with kill_on_exit(kill):
+        feeding = [threading.Thread(target=feed, args=(worker,), daemon=True) for worker in workers]
+        for thread in feeding:
+            thread.start()
+        try:
+            while any(thread.is_alive() for thread in feeding):
+                feeding[0].join(POLL_S) if feeding[0].is_alive() else feeding[-1].join(POLL_S)
+                progress("kernels", len(finished), len(lines))
+        finally:
+            for worker in workers:
+                worker.kill()
+                with suppress(OSError), worker:  # closes its pipes
+                    pass
+    return len(finished)
+
+
+def _started() -> subprocess.Popen[str]:
+    # In a session of its own it does not get the Ctrl-C of the terminal; without its input it ends.
+    return subprocess.Popen(
+        [sys.executable, "-c", WORKER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def compile_requested() -> None:
+    """In a worker: compile the kernels that are named on standard input, and answer with one line each."""
+    for line in _input_lines():
+        kernel, arguments = kernel_and_types(line)
+        kernel.compile(arguments)
+        print("compiled", flush=True)
+
+
+def _input_lines() -> Iterator[str]:
+    for line in sys.stdin:
+        yield line.strip()
