@@ -18,7 +18,17 @@ STAGES = {
     "features", "matching", "epipolar", "projective", "selfcalibration", "metric", "stereo", "surface",
     "views",
 }  # fmt: skip
-FOUNDATIONS = {"arrays", "camera", "errors", "intrinsics", "kernels", "records", "geometry", "numerics"}
+FOUNDATIONS = {
+    "_code_digest",
+    "arrays",
+    "camera",
+    "errors",
+    "intrinsics",
+    "kernels",
+    "records",
+    "geometry",
+    "numerics",
+}
 COMPOSERS = {"__init__", "config", "api", "pipeline", "view_interpolation", "view_synthesis"}
 """Only these may import several stages: they pass to a stage what it needs of another one."""
 CORE = {"numpy", "scipy", "numba", "PIL", "trimesh", "jinja2", "plotly", "rich", "typer"}

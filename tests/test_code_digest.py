@@ -1,6 +1,7 @@
 """The digest changes with all code that is reached, and with nothing else."""
 
 import importlib
+import pickle
 import re
 import subprocess
 import sys
@@ -107,6 +108,12 @@ def test_a_kernel_counts_by_its_code_and_options():
     plain, fast = kernel(doubled), kernel(fastmath=True)(doubled)
     assert code_digest(plain) != code_digest(fast)
     assert code_digest(np.linalg.svd) == code_digest(np.linalg.svd)
+
+
+def test_use_does_not_change_it():
+    before = code_digest(Inner()), code_digest(PipelineConfig().matching)
+    pickle.loads(pickle.dumps((Inner(), PipelineConfig())))  # notes names in the classes
+    assert (code_digest(Inner()), code_digest(PipelineConfig().matching)) == before
 
 
 def test_every_process_computes_the_same_digest():

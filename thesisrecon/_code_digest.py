@@ -21,12 +21,8 @@ import numpy as np
 OWN = __name__.partition(".")[0]
 _IMPORT = dis.opmap["IMPORT_NAME"]
 _LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")]
-_NOT_CODE = {
-    "__abstractmethods__", "__annotations__", "__dataclass_fields__", "__dataclass_params__", "__dict__",
-    "__doc__", "__firstlineno__", "__match_args__", "__module__", "__parameters__", "__static_attributes__",
-    "__weakref__", "_abc_impl", "_is_protocol",
-}  # fmt: skip
-"""Attributes of a class that say nothing that its methods and annotations do not say."""
+
+_NOTED = {"_abc_impl", "_is_protocol", "_is_runtime_protocol"}
 
 
 def code_digest(*values: Any) -> str:
@@ -144,7 +140,9 @@ class _Walk:
         yield str(vars(kind).get("__annotations__", ""))
         yield from self.parts(kind.__bases__)
         for name, member in vars(kind).items():
-            if name not in _NOT_CODE:
+            # Python and its libraries note other things there, some of them when an instance is pickled.
+            noted = name.startswith("__") and not hasattr(member, "__get__")
+            if not noted and name not in _NOTED:
                 yield name
                 yield from self.parts(member)
 
