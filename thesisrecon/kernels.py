@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import hashlib
 import logging
 import operator
@@ -138,7 +139,7 @@ class _Stages:
 
     def compile(self, signature: Any) -> Any:
         """Load or compile a signature and return its entry point, which is empty for other kernels."""
-        with global_compiler_lock:
+        with global_compiler_lock, _without_garbage_collection():
             codegen = self._dispatcher.targetctx.codegen()
             with self.cache.releasing_locks(), _machine_code(codegen, False):
                 self._compile(signature)
@@ -168,6 +169,18 @@ class _Stages:
         if arguments not in self.cache.callable:
             dispatcher._insert([a._code for a in arguments], compiled.entry_point, compiled.objectmode)
             self.cache.callable.add(arguments)
+
+
+@contextlib.contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Pause Python's garbage collection: it would search all of numba's objects several times a second."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @contextlib.contextmanager
