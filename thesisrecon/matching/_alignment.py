@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import empty, kernel, zeros
+from thesisrecon.kernels import copy_to, empty, kernel, zeros
 from thesisrecon.matching._prepared import (
     FAST,
     SAMPLES,
@@ -100,7 +100,9 @@ def _align_windows(
         # Variance of the position: that of a sample times the trace of the inverse normal matrix.
         variance = (1.0 - value * value) / SAMPLES * ((normal[0, 0] + normal[1, 1]) / d)
         if value == 0.0 or variance > largest_std * largest_std:
-            xy2[n], affine[n] = start[n], affine_start[n]
+            copy_to(xy2[n], start[n])
+            for row in range(2):
+                copy_to(affine[n, row], affine_start[n, row])
         else:
             score[n] = value
     return xy2, affine, score
