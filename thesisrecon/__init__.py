@@ -19,6 +19,17 @@ __all__ = [  # noqa: F405
     "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
+_HOMES = {
+    "Camera": "camera",
+    "Reconstruction": "records",
+    "StageFailure": "errors",
+    "Tracks": "records",
+    "UsageError": "errors",
+    "estimate_fundamental": "epipolar.locally_optimised",
+    "triangulate": "geometry.triangulation",
+}
+"""Modules of what needs no configuration, whose import takes longest; the others are in `api`."""
+
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
@@ -26,7 +37,7 @@ def __getattr__(name: str) -> Any:
     # Imported on first use, so that `import thesisrecon` takes no time.
     from importlib import import_module
 
-    return getattr(import_module("thesisrecon.api"), name)
+    return getattr(import_module(f"thesisrecon.{_HOMES.get(name, 'api')}"), name)
 
 
 def __dir__() -> list[str]:

@@ -31,10 +31,9 @@ import numpy as np
 from numba.core import cgutils, types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
-from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
-from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import AbstractTemplate, infer, infer_global, signature
 from numba.cpython.builtins import do_minmax
 from numba.extending import lower_builtin, type_callable
@@ -92,83 +91,22 @@ def kernel(function: Any = None, **options: Any) -> Any:
         settings: dict[str, Any] = {"nogil": True, "no_cfunc_wrapper": True, **options}
         dispatcher: Any = numba.njit(**settings)(function)
         if isinstance(dispatcher, Dispatcher):  # a plain function where NUMBA_DISABLE_JIT is set
-            stages = _Stages(dispatcher)
-            vars(dispatcher).update(
-                _cache=stages.cache,
-                compile=stages.compile,
-                add_overload=stages.add_overload,
-                get_call_template=stages.get_call_template,
-            )
+            stored = vars(dispatcher)["_cache"] = KernelCache(dispatcher)
+            vars(dispatcher)["compile"] = stored.releasing(dispatcher.compile)
+            vars(dispatcher)["get_call_template"] = _without_literals(dispatcher.get_call_template)
         return dispatcher
 
     return compiled if function is None else compiled(function)
 
 
-class _Stages:
-    """Compilation in two stages: to LLVM's code, and to machine code when Python calls the kernel.
+def _without_literals(template: Callable[..., Any]) -> Callable[..., Any]:
+    """Let kernels call kernels with plain types; numba would compile a version for each literal argument."""
 
-    Most kernels are called by kernels only. They become machine code as a part of their callers; numba would
-    make it for each of them too.
-
-    Parameters
-    ----------
-    dispatcher : numba dispatcher
-    """
-
-    for_kernels = False
-    """Whether a kernel is compiled for others; changes under numba's lock."""
-
-    def __init__(self, dispatcher: Any) -> None:
-        self.cache = KernelCache(dispatcher)
-        self._dispatcher = dispatcher
-        self._compile = dispatcher.compile
-        self._get_call_template = dispatcher.get_call_template
-
-    def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Type a call by a kernel; numba would compile a version for each literal argument."""
+    def get_call_template(args: Any, kws: Any) -> Any:
         plain = tuple(types.unliteral(a) for a in args)
-        with global_compiler_lock:
-            before, _Stages.for_kernels = _Stages.for_kernels, True
-            try:
-                return self._get_call_template(plain, {name: types.unliteral(a) for name, a in kws.items()})
-            finally:
-                _Stages.for_kernels = before
+        return template(plain, {name: types.unliteral(a) for name, a in kws.items()})
 
-    def add_overload(self, compiled: Any) -> None:
-        self._dispatcher.overloads[tuple(compiled.signature.args)] = compiled
-
-    def compile(self, signature: Any) -> Any:
-        """Load or compile a signature and return its entry point, which is empty for other kernels."""
-        with global_compiler_lock, _without_garbage_collection():
-            codegen = self._dispatcher.targetctx.codegen()
-            with self.cache.releasing_locks(), _machine_code(codegen, False):
-                self._compile(signature)
-                arguments = tuple(normalize_signature(signature)[0])
-                if not _Stages.for_kernels:
-                    self._complete(signature, arguments)
-                elif arguments not in self.cache.kinds:
-                    self.cache.save(signature, self._dispatcher.overloads[arguments], "bitcode")
-            return self._dispatcher.overloads[arguments].entry_point
-
-    def _complete(self, signature: Any, arguments: tuple[Any, ...]) -> None:
-        """Make the machine code of a signature, unless it is there, and let Python find it."""
-        dispatcher, compiled = self._dispatcher, self._dispatcher.overloads[arguments]
-        context = dispatcher.targetctx
-        if self.cache.kinds.get(arguments) != "object":
-            library = compiled.library
-            environments = [*(compiled.referenced_envs or ()), *compiled._find_referenced_environments()]
-            with _machine_code(context.codegen(), True):
-                library.enable_object_caching()
-                context.codegen()._add_module(library._final_module)
-                entry = context.get_executable(library, compiled.fndesc, compiled.environment)
-                for environment in environments:
-                    context.codegen().set_env(environment.env_name, environment)
-            context.insert_user_function(entry, compiled.fndesc, [library])
-            compiled = dispatcher.overloads[arguments] = compiled._replace(entry_point=entry)
-            self.cache.save(signature, compiled, "object")
-        if arguments not in self.cache.callable:
-            dispatcher._insert([a._code for a in arguments], compiled.entry_point, compiled.objectmode)
-            self.cache.callable.add(arguments)
+    return get_call_template
 
 
 @contextlib.contextmanager
@@ -181,25 +119,6 @@ def _without_garbage_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-@contextlib.contextmanager
-def _machine_code(codegen: Any, made: bool) -> Iterator[None]:
-    """Let numba's code generator make machine code of what is compiled or loaded inside, or not."""
-    methods = ("_add_module", "set_env")
-    before = {name: vars(codegen).pop(name) for name in methods if name in vars(codegen)}
-    if not made:
-        vars(codegen).update(dict.fromkeys(methods, _nothing))
-    try:
-        yield
-    finally:
-        for name in methods:
-            vars(codegen).pop(name, None)
-        vars(codegen).update(before)
-
-
-def _nothing(*_: Any) -> None:
-    pass
 
 
 def cache_folder() -> Path:
@@ -233,10 +152,6 @@ class KernelCache(NullCache):
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
-        self.kinds: dict[tuple[Any, ...], str] = {}
-        """What is stored of each signature: LLVM's code ("bitcode"), or also the machine code ("object")."""
-        self.callable: set[tuple[Any, ...]] = set()
-        """Signatures that Python can call."""
         self._digest = ""
         self._locks: dict[Path, IO[bytes]] = {}
 
@@ -245,38 +160,21 @@ class KernelCache(NullCache):
         return str(cache_folder())
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        target_context.refresh()  # it must know all types before machine code is loaded
+        rtsys.initialize(target_context)  # machine code that is loaded calls numba's runtime
         path = self._path(sig, target_context.codegen())
-        found = _read(path)
+        found = _read(path, target_context)
         if found is None and path not in self._locks:
             self._lock(path)
-            found = _read(path)
-        if found is None:
-            return None
-        kind = found[0][1]
-        rebuild: Callable[..., Any] = CompileResult._rebuild
-        with _machine_code(target_context.codegen(), kind == "object"):
-            compiled = rebuild(target_context, *found)
-        self.kinds[tuple(compiled.signature.args)] = kind
-        return compiled  # type: ignore[no-any-return]
+            found = _read(path, target_context)
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Nothing: `save` is called when it is known what there is to store."""
-
-    def save(self, sig: Any, compiled: Any, kind: str) -> None:
-        """Store a signature as LLVM's code ("bitcode") or also as machine code ("object")."""
-        self.kinds[tuple(compiled.signature.args)] = kind
-        path = self._path(sig, compiled.codegen)
-        library = vars(compiled.library)
-        if kind == "bitcode":
-            library["serialize_using_object_code"] = compiled.library.serialize_using_bitcode
+        path = self._path(sig, data.codegen)
         # A full disk or a read-only folder costs the cache, not the result.
         try:
-            _write(path, _pickled(compiled._reduce()))
+            _write(path, _pickled(data._reduce()))
         except OSError as error:
             _warn_once(path.parent, error.strerror or type(error).__name__)
-        finally:
-            library.pop("serialize_using_object_code", None)
 
     def _path(self, sig: Any, codegen: Any) -> Path:
         function = self._dispatcher.py_func
@@ -293,15 +191,19 @@ class KernelCache(NullCache):
         name = f"{function.__module__.removeprefix('thesisrecon.')}.{function.__name__}"
         return cache_folder() / f"{name}-{key}"
 
-    @contextlib.contextmanager
-    def releasing_locks(self) -> Iterator[None]:
-        """Release the locks of a compilation however it ends; loading and saving happen inside it."""
-        before = set(self._locks)
-        try:
-            yield
-        finally:
-            for path in set(self._locks) - before:
-                self._unlock(path)
+    def releasing(self, compile_signature: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Release the lock of a compilation however it ends; loading and saving happen inside it."""
+
+        def compile_and_release(signature: Any) -> Any:
+            before = set(self._locks)
+            try:
+                with _without_garbage_collection():
+                    return compile_signature(signature)
+            finally:
+                for path in set(self._locks) - before:
+                    self._unlock(path)
+
+        return compile_and_release
 
     def _lock(self, path: Path) -> None:
         """Lock an entry; wait at most MAX_WAIT_S for another process that compiles it."""
@@ -342,8 +244,8 @@ def _warn_once(folder: Path, reason: str) -> None:
     )
 
 
-def _read(path: Path) -> tuple[Any, ...] | None:
-    """The stored parts of a result; None if there is none or it is damaged."""
+def _read(path: Path, target_context: Any) -> CompileResult | None:
+    """The stored result; None if there is none or it is damaged."""
     try:
         stored = path.read_bytes()
     except OSError:
@@ -352,10 +254,11 @@ def _read(path: Path) -> tuple[Any, ...] | None:
     if hashlib.sha256(content).digest() != digest:
         return None
     try:
-        parts: tuple[Any, ...] = pickle.loads(content)
+        payload = pickle.loads(content)
     except (ImportError, AttributeError):  # a record of the kernel has moved to another module
         return None
-    return parts
+    rebuild: Callable[..., CompileResult] = CompileResult._rebuild
+    return rebuild(target_context, *payload)
 
 
 def _write(path: Path, content: bytes) -> None:
