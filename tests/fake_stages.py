@@ -176,7 +176,7 @@ class FakeDense:
 
     confirmed: bool = True
 
-    def prepare(self, images, reconstruction):
+    def prepare(self, images, reconstruction, *, threads=1):
         CALLS.append("prepare dense")
         P = reconstruction.P
         views = {

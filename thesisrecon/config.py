@@ -324,7 +324,9 @@ class DepthEstimator(Protocol):
             Rectified images and disparities of both.
         """
 
-    def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
+    def prepare(
+        self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
+    ) -> MultiViewScene:
         """Undistort the images of a metric reconstruction and select the neighbours of each.
 
         Returns

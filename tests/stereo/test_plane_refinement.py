@@ -100,8 +100,29 @@ def test_a_pass_equals_that_of_plain_numpy(scene, backward):
     kernels.begin_planes(*given, planes, cost)
     wanted, wanted_cost = planes.copy(), cost.copy()
     setting.sweep(wanted, wanted_cost, step_px=0.4, converged_cost=0.02, backward=backward)
-    kernels.sweep_planes(*given, 0.4, 0.02, backward, planes, cost)
+    before, active = cost.copy(), np.ones(SHAPE, np.uint8)
+    kernels.sweep_planes(*given, 0.4, 0.02, backward, planes, cost, active)
+    visited = np.isfinite(setting.gray) & (before > 0.02)
+    np.testing.assert_array_equal(active > 0, visited & (before - cost >= kernels.MIN_GAIN))
     # Sums in single precision may turn a choice between planes of one cost.
     assert np.mean(np.isclose(cost, wanted_cost, atol=5e-4)) > 0.97
     same = np.isclose(planes, wanted, atol=1e-4, equal_nan=True).all(axis=-1)
     assert same.mean() > 0.95
+
+
+def test_converged_planes_rest_until_a_neighbour_changes(scene):
+    _, given, places = scene
+    planes = planes_about(places, 0.5)
+    cost = np.empty(SHAPE, np.float32)
+    kernels.begin_planes(*given, planes, cost)
+    kept, kept_cost = planes.copy(), cost.copy()
+    kernels.sweep_planes(*given, 0.4, 0.02, False, planes, cost, np.zeros(SHAPE, np.uint8))
+    np.testing.assert_array_equal(planes, kept)
+    np.testing.assert_array_equal(cost, kept_cost)
+    active = np.zeros(SHAPE, np.uint8)
+    active[SHAPE[0] // 2, SHAPE[1] // 2] = 1
+    kernels.sweep_planes(*given, 0.4, 0.02, False, planes, cost, active)
+    y, x = np.nonzero(cost != kept_cost)
+    assert 0 < len(y) < cost.size / 2
+    assert y.min() >= SHAPE[0] // 2
+    assert x.min() >= SHAPE[1] // 2

@@ -292,7 +292,7 @@ def estimate_depth_maps(state: PipelineState) -> None:
     assert result.metric is not None
     reconstruction = result.metric.reconstruction
     with run.clock("dense"):
-        scene = state.config.dense.prepare(result.images, reconstruction)
+        scene = state.config.dense.prepare(result.images, reconstruction, threads=run.workers.threads)
     order = sorted(scene.views)
     r, pixels = reconstruction, [image.rgb for image in result.images]
     given = [r.P, r.K, r.distortion, r.X, r.registered, r.valid, r.inlier, pixels]

@@ -19,6 +19,8 @@ MIN_WINDOW_COVERAGE = 0.7
 """Share of the window's weight that must lie in a neighbour's image."""
 SAME_PLANE = 0.1
 """Planes closer than this, in search steps over the window, are not tried again."""
+MIN_GAIN = 0.002
+"""Fall of the cost in one pass below which a plane has converged."""
 SUMS = {"reassoc", "contract", "arcp", "nsz"}
 """Floating-point rules for sums over a window that allow vectorisation; NaN is preserved."""
 
@@ -306,13 +308,15 @@ def sweep_planes(
     backward: bool,
     planes: F32,
     cost: F32,
+    active: U8,
 ) -> None:
     """Propagate and perturb the planes (H, W, 3) of all pixels in one pass (PatchMatch stereo).
 
     Each pixel tries the planes of the two neighbours visited before and perturbations of its own plane by
     ``step_px`` in the neighbours: shifted, and tilted by as much at the border of the window. Planes of a
-    cost up to ``converged_cost`` are not changed. ``planes`` (inverse depth and its gradient) and ``cost``
-    are updated.
+    cost up to ``converged_cost`` are not changed, nor those that are not ``active`` (H, W) if neither
+    neighbour is. ``planes`` (inverse depth and its gradient) and ``cost`` are updated; pixels whose cost
+    falls by ``MIN_GAIN`` remain active.
     """
     gray, H, e, offsets = views.gray, views.H, views.e, window.offsets
     height, width = gray.shape
@@ -325,6 +329,10 @@ def sweep_planes(
         for column in range(width):
             u = width - 1 - column if backward else column
             if not np.isfinite(gray[v, u]) or cost[v, u] <= converged_cost:
+                active[v, u] = 0
+                continue
+            a, b = min(max(u - back, 0), width - 1), min(max(v - back, 0), height - 1)
+            if not (active[v, u] or active[v, a] or active[b, u]):
                 continue
             variance = _window_samples(gray, u, v, window, samples)
             for d in range(3):
@@ -354,6 +362,7 @@ def sweep_planes(
                         plane[d] = trial[d]
             for d in range(3):
                 planes[v, u, d] = plane[d]
+            active[v, u] = cost[v, u] - least >= MIN_GAIN
             cost[v, u] = least
 
 

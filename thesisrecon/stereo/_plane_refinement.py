@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F32, U8
 from thesisrecon.records import PinholeView
@@ -86,7 +87,9 @@ def search_planes(
     accepted.
     """
     search, unknown = _search_arguments(reference, others), np.float32(np.nan)
-    planes = _planes(rho)
+    # Planes start and arrive from pixels at most one away.
+    near = scipy.ndimage.binary_dilation(wanted, np.ones((3, 3)), RADIUS + 1)
+    planes = _planes(np.where(near, rho, unknown))
     # Cost 0 excludes the other pixels from the search.
     begun = _begin_cost(search, np.where(wanted[..., None], planes, unknown))
     _sweep(search, planes, np.where(wanted, begun, np.float32(0.0)), sweeps)
@@ -149,8 +152,9 @@ def _begin_cost(search: _Search, planes: F32) -> F32:
 
 def _sweep(search: _Search, planes: F32, cost: F32, sweeps: int) -> None:
     """Propagate and perturb planes (H, W, 3) of cost (H, W) in place."""
+    active = np.ones(cost.shape, dtype=np.uint8)
     for k in range(sweeps):
-        sweep_planes(*search, FIRST_STEP_PX * 0.5**k, CONVERGED_COST, k % 2 == 1, planes, cost)
+        sweep_planes(*search, FIRST_STEP_PX * 0.5**k, CONVERGED_COST, k % 2 == 1, planes, cost, active)
 
 
 def _rate(search: _Search, planes: F32, max_cost: float) -> tuple[F32, U8, F32]:

@@ -318,16 +318,22 @@ class MultiViewStereo:
         """See `thesisrecon.config.DepthEstimator.match_two_views`."""
         return self.pairs.match_two_views(image1, image2, F, xy1, xy2, planar=planar)
 
-    def prepare(self, images: Sequence[Image], reconstruction: Reconstruction) -> MultiViewScene:
+    def prepare(
+        self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
+    ) -> MultiViewScene:
         """See `thesisrecon.config.DepthEstimator.prepare`."""
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
         points = _sparse_points(reconstruction)
         registered = np.flatnonzero(reconstruction.registered).tolist()
-        views, matched = (
-            {i: _pinhole_view(images[i], reconstruction, i, max_side=side) for i in registered}
-            for side in (self.max_side, min(self.match_side, self.max_side))
-        )
+
+        def undistorted(view: int) -> list[PinholeView]:
+            sides = self.max_side, min(self.match_side, self.max_side)
+            return [_pinhole_view(images[view], reconstruction, view, max_side=side) for side in sides]
+
+        with ThreadPoolExecutor(max(threads, 1)) as pool:
+            made = dict(zip(registered, pool.map(undistorted, registered), strict=True))
+        views, matched = ({i: pair[k] for i, pair in made.items()} for k in (0, 1))
         chosen = {i: _select_neighbours(points, views, i, self.max_neighbours) for i in views}
         return MultiViewScene(views, points, chosen, matched)
 
@@ -402,7 +408,7 @@ class MultiViewStereo:
         -------
         dict of int to DepthMap
         """
-        scene = self.prepare(images, reconstruction)
+        scene = self.prepare(images, reconstruction, threads=threads)
         order = sorted(scene.views)
         with ThreadPoolExecutor(threads) as pool:
             found = dict(zip(order, pool.map(lambda i: self.depth_map(scene, i), order), strict=True))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesisrecon.arrays import F32, F64, I64, U8
+from thesisrecon.arrays import F32, F64, I32, I64, U8
 from thesisrecon.kernels import empty, kernel, zeros
 
 SIDE = 8
@@ -146,16 +146,19 @@ def _find(place: I64, i: int, j: int, k: int) -> int:
 
 
 @kernel
-def place_vertices(blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64) -> int:
+def place_vertices(
+    rows: tuple[int, int], blocks: I64, place: I64, value: F32, weight: F32, vertex: I32, points: F64
+) -> int:
     """Place one vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
 
-    ``place`` (X, Y, Z): block numbers or -1; ``vertex`` (B, 8, 8, 8) receives the vertex number of each cell
-    or -1; ``points`` (N, 3) receives the first N vertices in voxels, each the mean of the zero crossings of
-    the cell edges. Returns the number of vertices.
+    ``rows``: first and last + 1 block; ``place`` (X, Y, Z): block numbers or -1; ``vertex`` (B, 8, 8, 8)
+    receives the vertex number of each cell or -1, counted from the first block; ``points`` (N, 3) receives
+    the first N vertices in voxels, each the mean of the zero crossings of the cell edges. Returns the number
+    of vertices.
     """
     count = 0
     corner = empty(8)
-    for b in range(blocks.shape[0]):
+    for b in range(rows[0], rows[1]):
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):
@@ -204,16 +207,24 @@ def _mean_crossing(corner: F64, point: F64) -> None:
 
 @kernel
 def join_vertices(
-    blocks: I64, place: I64, value: F32, weight: F32, vertex: I64, points: F64, faces: I64
+    rows: tuple[int, int],
+    blocks: I64,
+    place: I64,
+    value: F32,
+    weight: F32,
+    vertex: I32,
+    points: F64,
+    faces: I64,
 ) -> int:
     """Create two triangles across each voxel edge that the surface crosses, anticlockwise from outside.
 
-    ``faces`` (M, 3) receives the first M faces; the shorter diagonal is used. Returns the number of faces.
+    ``rows``: first and last + 1 block; ``faces`` (M, 3) receives the first M faces; the shorter diagonal is
+    used. Returns the number of faces.
     """
     count = 0
     step = zeros(3, np.int64)
     ring = empty(4, np.int64)
-    for b in range(blocks.shape[0]):
+    for b in range(rows[0], rows[1]):
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):
@@ -255,7 +266,7 @@ def _squared(points: F64, a: int, b: int) -> float:
 
 
 @kernel
-def _ring(place: I64, vertex: I64, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
+def _ring(place: I64, vertex: I32, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
     """Vertices of the four cells around an edge from voxel ``at``; False if one is missing."""
     second, third = (axis + 1) % 3, (axis + 2) % 3
     for t in range(4):

@@ -10,6 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy
@@ -40,6 +43,8 @@ MAX_RELATIVE = 0.02
 """Relative depth difference, or three standard deviations, up to which a sheet already shows a point."""
 VOXEL_GROWTH = 1.15
 """Factor by which voxels are enlarged until the blocks fit into memory."""
+EXTRACTED_BLOCKS = 4096
+"""Blocks whose surface is extracted at a time."""
 MAX_STD_VOXELS = 1.0
 """Upper limit of the standard deviations that count for the simplification."""
 LONGEST_VOXELS = 16.0
@@ -130,7 +135,7 @@ class VolumetricFusion:
 
             parts = np.array_split(np.arange(len(grid.blocks)), 4 * max(threads, 1))
             list(pool.map(integrate, filter(len, parts)))
-        return *_extract_surface(grid, value, weight), grid.voxel
+        return *_extract_surface(grid, value, weight, threads), grid.voxel
 
     def _lay_out(self, measured: list[_FusionMap]) -> tuple[_Grid, float, list[_FusionMap]]:
         """Voxel grid, truncation distance, and the depths that are certain enough for it."""
@@ -255,22 +260,48 @@ def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid |
     return _Grid(origin, voxel, blocks, place)
 
 
-def _extract_surface(grid: _Grid, value: F32, weight: F32) -> tuple[TexturedMesh, F64]:
+def _extract_surface(grid: _Grid, value: F32, weight: F32, threads: int) -> tuple[TexturedMesh, F64]:
     """Zero level of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a surface net.
 
     Also returns the standard deviation at each vertex; weights are inverse variances.
     """
-    vertex = np.empty(value.shape, dtype=np.int64)
-    count = place_vertices(grid.blocks, grid.place, value, weight, vertex, np.zeros((0, 3)))
-    points = np.zeros((count, 3))
-    place_vertices(grid.blocks, grid.place, value, weight, vertex, points)
-    nothing = np.zeros((0, 3), dtype=np.int64)
-    count = join_vertices(grid.blocks, grid.place, value, weight, vertex, points, nothing)
-    faces = np.zeros((count, 3), dtype=np.int64)
-    join_vertices(grid.blocks, grid.place, value, weight, vertex, points, faces)
+    vertex = np.empty(value.shape, dtype=np.int32)
+    cells = grid.blocks, grid.place, value, weight, vertex
+    parts = list(pairwise([*range(0, len(vertex), EXTRACTED_BLOCKS), len(vertex)]))
+
+    def placed(rows: tuple[int, int]) -> F64:
+        place = partial(place_vertices, rows, *cells)
+        return np.asarray(_filled(place, 128 * (rows[1] - rows[0]), np.float64))
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        found = list(pool.map(placed, parts))
+        starts = np.cumsum([0, *map(len, found)])
+
+        def number(part: int) -> None:
+            own = vertex[slice(*parts[part])]
+            np.add(own, int(starts[part]), out=own, where=own >= 0)
+
+        list(pool.map(number, range(len(parts))))
+        points = np.concatenate([np.zeros((0, 3)), *found])
+
+        def joined(part: int) -> I64:
+            join = partial(join_vertices, parts[part], *cells, points)
+            return np.asarray(_filled(join, 3 * len(found[part]), np.int64))
+
+        faces = np.concatenate([np.zeros((0, 3), np.int64), *pool.map(joined, range(len(parts)))])
     # Vertices are numbered in the order of the voxels.
     std = 1.0 / np.sqrt(weight[vertex >= 0].astype(np.float64))
     return TexturedMesh(grid.origin + grid.voxel * points, faces), std
+
+
+def _filled(fill: Callable[[Any], int], guess: int, kind: type[Any]) -> Any:
+    """Rows (N, 3) that a kernel fills in and counts; it runs again if the guess of N was too low."""
+    rows = np.empty((guess, 3), dtype=kind)
+    count = fill(rows)
+    if count > guess:
+        rows = np.empty((count, 3), dtype=kind)
+        fill(rows)
+    return rows[:count]
 
 
 @dataclass(frozen=True)
