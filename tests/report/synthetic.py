@@ -1,6 +1,9 @@
 """Runs made up for the report, a painted sphere with its model, and a page opened in a browser."""
 
+import base64
+import gzip
 import io
+import re
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
@@ -155,6 +158,12 @@ ARGUMENTS = [
     "--disable-background-networking", "--disable-component-update", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 ]  # fmt: skip
+
+
+def unpacked(page, name):
+    """Compressed text of a page by the id of its element."""
+    packed = re.search(f'<script type="application/octet-stream" id="{name}">(.*?)</script>', page, re.S)
+    return gzip.decompress(base64.b64decode(packed.group(1))).decode("utf-8")
 
 
 class Witness:

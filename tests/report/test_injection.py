@@ -8,7 +8,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from tests.report.synthetic import Structure, Witness
+from tests.report.synthetic import Structure, Witness, unpacked
 from thesisrecon.cli.main import run_command
 from thesisrecon.report._page import strip_page
 
@@ -62,8 +62,9 @@ def pages(tmp_path_factory):
 
 
 def scripts(page):
-    """The programs on a page; data are none."""
-    return re.findall(r"<script>(.*?)</script>", page, re.S)
+    """The programs on a page, unpacked; data are none."""
+    library = [unpacked(page, "plotly")] if 'id="plotly"' in page else []
+    return re.findall(r"<script>(.*?)</script>", page, re.S) + library
 
 
 def test_names_add_no_element_and_no_attribute(pages):

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from tests.surface.sphere import ring_of, sphere_map
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface import _simplification
-from thesisrecon.surface._mesh import face_areas
-from thesisrecon.surface._simplification import simplify_surface
+from thesisrecon.surface._mesh import face_areas, simplify_mesh
+from thesisrecon.surface._simplification import reduce_faces, simplify_surface
 from thesisrecon.surface.fusion import VolumetricFusion
 
 
@@ -129,3 +129,18 @@ def test_fused_noise_costs_no_faces_and_the_error_stays_below_it():
     errors = [np.abs(np.linalg.norm(points_on(mesh), axis=1) - 1.0) for mesh in (fine, small)]
     assert np.median(errors[1]) < 1.05 * np.median(errors[0])
     assert np.quantile(errors[1], 0.99) < 1.1 * np.quantile(errors[0], 0.99)
+
+
+@pytest.mark.parametrize("most", [3_000, 1_000])
+def test_a_number_of_faces_goes_to_the_details(most):
+    def height(x, y):
+        return 0.01 * np.sin(40 * x) * np.cos(40 * y) * (x + y < 0.7)
+
+    relief = grid(height, 90)
+    off = []
+    for mesh in (reduce_faces(relief, most), simplify_mesh(relief, most)):
+        x, y, z = points_on(mesh).T
+        off.append(np.sqrt(np.mean((z - height(x, y)) ** 2)))
+        assert len(mesh.faces) <= most
+    assert off[0] < off[1]
+    assert reduce_faces(relief, len(relief.faces)) is relief

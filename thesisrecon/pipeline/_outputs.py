@@ -26,11 +26,11 @@ from thesisrecon.report._page import render_report
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
-from thesisrecon.surface._mesh import simplify_mesh
+from thesisrecon.surface._simplification import reduce_faces
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 DEPTH_PX = 400
-PAGE_FACES, PAGE_TEXELS = 150_000, 2048 * 2048
+PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
 SUMMARY, PAGE = "summary.json", "report.html"
 COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
 MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", "model.glb")
@@ -207,8 +207,9 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
 def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
     if result.mesh is None:
         return None
-    coarse = simplify_mesh(result.mesh, PAGE_FACES)
-    return TextureAtlas(max_texels=PAGE_TEXELS).texture(coarse, result.views, threads=run.workers.threads)
+    threads = run.workers.threads
+    coarse = reduce_faces(result.mesh, PAGE_FACES, threads=threads)
+    return TextureAtlas(max_texels=PAGE_TEXELS).texture(coarse, result.views, threads=threads)
 
 
 def _thinned(depth: F32) -> F32:

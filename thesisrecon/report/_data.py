@@ -44,7 +44,7 @@ class ReportData:
     metric: MetricResult | None = None
     colors: U8 | None = None  # (N, 3) of the metric points, valid or not
     affine: Reconstruction | None = None  # with the same points
-    model: TexturedMesh | None = None  # 150,000 faces with 2048 x 2048 texels add about 6 MB
+    model: TexturedMesh | None = None  # 45,000 faces with 2048 x 2048 texels add about 2 MB
     depth_maps: Mapping[int, F32] = field(default_factory=dict)  # a long side of 400 px is enough
     held_out: HeldOut | None = None
     until: str | None = None  # last stage that was requested, None = all

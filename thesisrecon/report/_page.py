@@ -8,6 +8,7 @@ hashes and forbids every address but ``data:``.
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -131,11 +132,13 @@ def render_report(data: ReportData) -> str:
         names = [image.name for image in data.images]
         model = viewer_data(data.model, data.metric.reconstruction, names)
     depths, side = sorted(data.depth_maps.items()), depth_side(len(data.depth_maps))
-    figure_scripts = [plotly_script(), page_resource("page.js")] if figures else []
+    library = plotly_script() if figures else ""
+    figure_scripts = [page_resource("unpack.js"), page_resource("page.js")] if figures else []
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     return render_page(
         page_resource("template.html.j2"),
-        [*figure_scripts, *model_scripts],
+        # page.js adds the unpacked library as a script, which the policy of the page must list too.
+        [*figure_scripts, *model_scripts, *([library] if library else [])],
         filters={"grouped": grouped, "decimals": decimals, "significant": significant},
         count_of=count_of,
         data=data,
@@ -163,6 +166,7 @@ def render_report(data: ReportData) -> str:
         self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
         summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
         figure_scripts=figure_scripts,
+        plotly=base64.b64encode(gzip.compress(library.encode("utf-8"), mtime=0)).decode("ascii"),
         model_scripts=model_scripts,
         histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
     )

@@ -20,7 +20,7 @@ from thesisrecon.report._figures import upright_rotation
 LEVELS = 65535
 """Quantization levels along each axis of the bounding box and of the texture."""
 MAX_TEXELS = 2100 * 2100
-"""Larger textures are reduced: with 150,000 faces they then add less than 8 MB to the page."""
+"""Larger textures are reduced: with 45,000 faces they then add less than 3 MB to the page."""
 _OUTLIER = 8.0
 """Largest distance of a face from the median, relative to the 95 % quantile."""
 _PLAIN = (200, 200, 200)

@@ -1,6 +1,14 @@
 "use strict";
 // Draws the figures from the JSON of the page.
-(function () {
+(async function () {
+  try {
+    const library = document.createElement("script");
+    library.textContent = await unpacked("plotly");
+    document.body.append(library);
+  } catch (error) {
+    document.querySelectorAll(".plot:not(#model-figure)").forEach(function (element) { fail(element, error); });
+    return;
+  }
   const figures = JSON.parse(document.getElementById("figures").textContent);
   const bar = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["resetCameraLastSave3d", "hoverClosest3d", "pan2d", "select2d", "lasso2d", "zoom2d", "zoomIn2d", "zoomOut2d", "autoScale2d", "resetScale2d"] };
 

@@ -16,7 +16,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I32, I64, U8
 from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.records import TexturedMesh
-from thesisrecon.surface._mesh import remove_unused_vertices
+from thesisrecon.surface._mesh import face_areas, remove_unused_vertices, simplify_mesh
 
 BLOCK_FACES = 150_000
 """Faces that are simplified as one block; vertices between blocks stay for the next round."""
@@ -32,6 +32,8 @@ MAX_TURN = 0.5
 """Cosine of the largest change of a face's normal in one collapse."""
 MIN_ROUNDNESS = 0.05
 """Smallest height of a face over its longest side, unless it was flatter before."""
+SHARES, LONGEST = (0.04, 0.08, 0.16, 0.32), 8.0
+"""Limits tried for a number of faces, and longest new side; unit: side of a square of a face's mean area."""
 MAX_FAN = 24
 """Largest number of faces around a vertex."""
 
@@ -358,3 +360,30 @@ def _in_blocks(state: MeshState, axis: int) -> tuple[MeshState, I64]:
     for corner in faces.T:
         block[corner[block[corner] != slab]] = -1
     return _linked(state._replace(faces=faces, block=block)), starts
+
+
+def reduce_faces(mesh: TexturedMesh, max_faces: int, *, threads: int = 1) -> TexturedMesh:
+    """Simplify a mesh to a number of faces, first by collapsing edges, then by clustering vertices.
+
+    Parameters
+    ----------
+    mesh, max_faces : TexturedMesh, int
+        Any mesh, and the largest number of faces.
+    threads : int
+        Number of threads; the result does not depend on it.
+
+    Returns
+    -------
+    TexturedMesh
+        The simplified mesh without colours and texture; the mesh itself if it has no more faces.
+    """
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    mesh = replace(mesh, colors=None, uv=None, texture=None, untextured=None)
+    cell = float(np.sqrt(face_areas(mesh.vertices, mesh.faces).sum() / max_faces))
+    for share in SHARES:
+        limit = np.full(len(mesh.vertices), share * cell)
+        mesh = simplify_surface(mesh, limit, longest=LONGEST * cell, threads=threads)
+        if len(mesh.faces) <= max_faces:
+            break
+    return simplify_mesh(mesh, max_faces)
