@@ -25,7 +25,11 @@ from thesisrecon.runtime._signals import kill_on_exit, starting_processes
 
 PACKAGE = Path(__file__).parent.parent
 LIST = PACKAGE / "kernels.txt"
-WORKER = f"from {__name__} import compile_requested; compile_requested()"
+WORKER = f"""import sys
+sys.path.insert(0, {str(PACKAGE.parent)!r})
+from {__name__} import compile_requested
+compile_requested()
+"""
 POLL_S = 0.1
 
 
@@ -140,7 +144,7 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
 def _started() -> subprocess.Popen[str]:
     # In a session of its own it does not get the Ctrl-C of the terminal; without its input it ends.
     return subprocess.Popen(
-        [sys.executable, "-c", WORKER],
+        [sys.executable, "-P", "-c", WORKER],  # -P: not what lies in the current folder
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

