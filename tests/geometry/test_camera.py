@@ -78,6 +78,8 @@ def test_3_5_1_normalised_cameras_have_a_centre_with_last_entry_one(rng):
 def test_3_5_1_cameras_at_infinity_cannot_be_normalised():
     with pytest.raises(ValueError, match="singular"):
         matrix.normalize_camera(np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]))
+    _, R = matrix.rq(np.diag([2.0, 1.0, 0.0]))
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     for refuse in (matrix.normalize_camera, matrix.decompose_camera):
         with pytest.raises(ValueError, match="finite"):
             refuse(np.full((3, 4), np.nan))

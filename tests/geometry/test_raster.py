@@ -98,6 +98,15 @@ def test_visible_points_are_those_that_rays_meet(seed, distance):
     np.testing.assert_allclose(raster.depth[seen], depth[seen], rtol=1e-5)
 
 
+def test_a_face_with_one_corner_behind_is_drawn_in_any_order():
+    vertices = np.array([[0.0, 3.0, -2.0], [-2.0, -1.0, 4.0], [2.0, -1.0, 4.0]])
+    camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
+    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        faces = np.array([order, [2, 2, 2]])
+        agree = rasterize(vertices, faces, camera).face == cast_rays(vertices, faces, camera)[1]
+        assert agree.mean() > 0.99
+
+
 @pytest.mark.parametrize("unit", [2.0**-30, 2.0**30])
 def test_the_unit_of_length_changes_nothing(unit):
     vertices, faces = soup(np.random.default_rng(6))

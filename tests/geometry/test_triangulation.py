@@ -154,6 +154,10 @@ def test_6_3_3_matches_on_epipoles_are_exact():
     # Both on epipoles: some point of the baseline, seen where it should be.
     found = triangulate_polynomial(P, xy)
     np.testing.assert_allclose(images(P, found[1:2]), xy[:, 1:2], atol=1e-6)
+    # Without rounding: motion along the axis, the epipoles at 0 in the middle of the points.
+    xy = np.array([[0.0, 0.0], [0.0, 0.0], [2.0, 2.0], [-2.0, 2.0], [2.0, -2.0], [-2.0, -2.0]])
+    for a, b in ((xy, xy[[0, 2, 1, 3, 4, 5]]), (xy[[0, 2, 1, 3, 4, 5]], xy)):
+        np.testing.assert_allclose(correct_matches(np.cross(np.eye(3), [0.0, 0.0, 1.0]), a, b), (a, b))
 
 
 @holds_for_every(st.sampled_from(["general", "forward", "near the epipoles", "rectified"]))
@@ -177,7 +181,7 @@ def several_views(rng, sigma_px, n=12):
     return P, xy
 
 
-@holds_for_every(st.sampled_from([0.0, 1.0, 10.0]))
+@holds_for_every(st.sampled_from([0.0, 1.0, 10.0, 100.0]))
 def test_the_compiled_methods_are_their_plain_twins(rng, sigma_px):
     P, xy = several_views(rng, sigma_px)
     scale = twins.view_scales(P, xy)
@@ -293,6 +297,8 @@ def test_every_method_rejects_invalid_input(method):
 def test_single_methods_reject_their_own_failures():
     P, X = two_views("general", np.random.default_rng(0))
     xy = images(P, X)
+    # One centre: some points on the rays.
+    assert np.isfinite(triangulate(P * [1.0, 1.0, 1.0, 0.0], xy, method="optimal")).all()
     with pytest.raises(ValueError, match="different centres"):
         triangulate_polynomial(np.stack([P[0], np.diag([1.0, 2.0, 3.0]) @ P[0]]), xy)
     refuses(ValueError, "rank 3", triangulate_polynomial, np.stack([P[0], P[1] * [[1.0], [1.0], [0.0]]]), xy)
@@ -340,9 +346,11 @@ def test_orientation_makes_every_depth_positive():
     scene = make_scene()
     reconstruction = projective_reconstruction(scene, seed=3)
     t = scene.tracks
-    views, points, share = orient_signs(reconstruction.P, reconstruction.X, t.view_index, t.point_index)
+    seen = np.append(reconstruction.X, np.ones((1, 4)), axis=0), t.view_index, t.point_index
+    views, points, share = orient_signs(reconstruction.P, *seen)
+    assert points[-1] == 1.0  # without observations
     P = reconstruction.P * views[:, None, None]
-    X = reconstruction.X * points[:, None]
+    X = reconstruction.X * points[:-1, None]
     w = np.einsum("kj,kj->k", P[t.view_index, 2], X[t.point_index])
     assert share == 1.0
     assert (w > 0).all() or (w < 0).all()

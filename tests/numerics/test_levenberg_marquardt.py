@@ -105,6 +105,8 @@ def test_states_outside_the_domain_are_refused_not_raised():
     np.testing.assert_allclose(answer.x, np.exp(2.0), rtol=1e-6)
     with pytest.raises(ValueError, match="finite"):
         minimize_residuals(residual, np.array([-1.0]))
+    with pytest.raises(ValueError, match="finite"):
+        minimize_residuals(lambda x: x[:1], np.array([1.0, np.nan]))
 
 
 def test_guards_of_the_linear_algebra():
