@@ -7,6 +7,7 @@ from tests.conftest import refuses
 from tests.epipolar.facade import FacadeMaker
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar import _planes
+from thesisrecon.epipolar import degeneracy as assessment
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar.degeneracy import NEIGHBOURS, _contradicted_ratios, assess_degeneracy
@@ -102,6 +103,12 @@ def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_competing_model():
     assert any("another F" in reason for reason in degeneracy.reasons)
 
 
+def test_a_model_far_from_the_estimate_must_also_explain_much_more():
+    for error, gained, differs in [(2.0, 100.0, True), (0.5, 100.0, False), (2.0, 0.0, False)]:
+        other = assessment._CompetingModel(np.ones(9), lost=20.0, gained=gained, error=error, apart=0.1)
+        assert other.differs(1.0) == differs
+
+
 def test_a_wide_covariance_is_a_reason():
     pair = make_pair(300, np.random.default_rng(0))
     xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.3, outliers=0.0)
@@ -167,11 +174,11 @@ def test_normal_equations_of_a_plane_match_their_numpy_twin():
         w = one @ h[6:]
         J = np.hstack([(h[:6].reshape(2, 3) - np.outer(two, h[6:]))[:, :2], -w * np.eye(2)])
         inverse = np.linalg.inv(J @ J.T)
-        share = min((A @ h) @ inverse @ (A @ h) / 0.08**2, 1.0)
+        share = min((A @ h) @ inverse @ (A @ h) / 0.05**2, 1.0)
         total += share
         expected += (1.0 - share) ** 2 * A.T @ inverse @ A
     G = np.empty((9, 9))
-    assert _planes._plane_normal_equations(h, np.hstack([xy1, xy2]), 0.08, G) == pytest.approx(
+    assert _planes._plane_normal_equations(h, np.hstack([xy1, xy2]), 0.05, G) == pytest.approx(
         total, rel=1e-9
     )
     assert 1.0 < total < 29.0

@@ -516,5 +516,7 @@ def test_searches_that_disagree_are_repeated():
     hopeless = rng.uniform(0.0, 1000.0, (2, 60, 2))
     fit = LocallyOptimisedRansac(max_starts=8).estimate(*hopeless, np.random.default_rng(0))
     assert fit.inliers.mean() < 0.5
-    # Eight searches at the threshold and eight with the wider gate, of a share of the samples each.
     assert 3 * 1024 < fit.iterations <= 2 * FAST.max_samples
+    # Searches at a threshold below the noise and with the wider gate.
+    narrow = LocallyOptimisedRansac(threshold_px=0.02, max_samples=6000)
+    assert 6000 < narrow.estimate(xy1, xy2, np.random.default_rng(0)).iterations <= 12000

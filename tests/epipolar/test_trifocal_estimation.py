@@ -111,13 +111,14 @@ def test_the_least_error_does_not_hang_on_the_signs_of_singular_vectors():
 
 @pytest.mark.parametrize(("n", "m"), [(50, 0), (0, 50), (30, 30)])
 def test_each_step_approaches_the_truth_and_reports_the_noise(n, m):
-    errors, sigmas = [], []
+    errors, sigmas, levels = [], [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         P = three_cameras(rng)
         points, segments = matches(P, rng, n, m, 0.5)
         exact, _ = matches(P, rng, 100, 0, 0.0)
         equations = _tensor_equations(points, segments)
+        levels.append(equations.noise_levels_px()[0])
         algebraic = _minimize_algebraic_error(equations, equations.solve())
         np.testing.assert_allclose(
             abs(np.sum(algebraic * tensor_from_cameras(*cameras_from_tensor(algebraic)))), 1.0, atol=1e-9
@@ -130,6 +131,8 @@ def test_each_step_approaches_the_truth_and_reports_the_noise(n, m):
     assert refined < 1.05 * constrained < 0.6 * linear
     assert refined < 1.0
     assert 0.44 < np.mean(sigmas) < 0.56
+    # 26 of the 3 n + 2 m independent equations can be met.
+    assert np.mean(levels) == pytest.approx(0.5 * np.sqrt(1.0 - 26.0 / (3 * n + 2 * m)), rel=0.1)
 
 
 @pytest.mark.parametrize(("n", "m"), [(40, 0), (20, 20)])

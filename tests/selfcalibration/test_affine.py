@@ -16,7 +16,7 @@ from thesisrecon.pipeline._outputs import write_affine
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
-from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
+from thesisrecon.selfcalibration.stratified import Stratified, _facing, upgrade_to_affine
 
 
 def affine_map(source, target):
@@ -71,6 +71,10 @@ def test_images_stay_what_they_are_and_depths_are_positive():
     t = scene.tracks
     before, after = (np.einsum("kij,kj->ki", r.P[t.view_index], r.X[t.point_index]) for r in (given, affine))
     np.testing.assert_allclose(before[:, :2] / before[:, 2:], after[:, :2] / after[:, 2:], rtol=1e-9)
+    # Outliers behind a camera do not turn it, even if they are more than the inliers.
+    away, X = np.arange(len(affine.X)) % 3 > 0, affine.X.copy()
+    X[away, :3] = -2.0 * np.linalg.solve(affine.P[0, :, :3], affine.P[0, :, 3]) - X[away, :3]
+    assert (_facing(replace(affine, X=X, inlier=~away[t.point_index]))[0] == affine.P[0]).all()
     true = thesisrecon.upgrade_affine(given, config=PipelineConfig(intrinsics=CENTRED))
     depth = np.einsum("kj,kj->k", true.P[t.view_index, 2], true.X[t.point_index])
     assert (depth > 0).all()

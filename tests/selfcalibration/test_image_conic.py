@@ -1,5 +1,7 @@
 """The image conic from exact infinite homographies, constant and zooming, and the equations' properties."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,8 @@ def test_the_score_of_the_right_plane_is_zero_and_grows_away_from_it():
     found, plane = scenes.setup(scene, seed=1)
     planes = plane + np.array([0.0, 0.01, 0.05])[:, None] * [1.0, -0.5, 0.3]
     H = infinite_homographies(found.frame, planes)
+    small = replace(found.frame, A=1e-8 * found.frame.A, a=1e-8 * found.frame.a)
+    np.testing.assert_allclose(infinite_homographies(small, planes), H, atol=1e-9)
     f2, residuals = solve_conic_batch(H, square_pixel_constraints(found.frame))
     score = np.linalg.norm(residuals, axis=1)
     assert score[0] < 1e-7

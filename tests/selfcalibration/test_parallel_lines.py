@@ -19,6 +19,7 @@ from thesisrecon.selfcalibration.parallel_lines import (
     _normalize_segments,
     _propose_vanishing_points,
     _refine_plane,
+    _refined_point,
     _triangulate_directions,
 )
 from thesisrecon.selfcalibration.stratified import Stratified
@@ -125,6 +126,9 @@ def test_directions_are_found_among_strays(sigma, stray, limit):
         for k in range(6)
     ]
     X, direction = _find_parallel_directions(frame, segments, proposals, max_directions=3, tolerance_px=1.5)
+    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
+    again = _refined_point(P, segments, X[0] + [1e-3, -1e-3, 1e-3, 0.0], 1.5)
+    np.testing.assert_allclose(again, X[0], atol=2e-4)
     truth = np.tile(np.concatenate([np.repeat([0, 1, 2], 40), np.full(stray, -1)]), 6)
     for d in range(3):
         mine = truth[direction == d]

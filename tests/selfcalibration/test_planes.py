@@ -9,7 +9,7 @@ from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CO
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
-from thesisrecon.selfcalibration._cheirality import CheiralityRegion
+from thesisrecon.selfcalibration._cheirality import CheiralityRegion, _plane_box
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, _local_minima
@@ -70,6 +70,8 @@ def test_the_cheirality_bounds_hold_the_true_plane(seed):
 
 
 def test_samples_of_the_bounds_are_inside_them():
+    rows = np.column_stack([np.vstack([np.eye(3), -np.eye(3)]), [1.0] * 3 + [2.0] * 3])
+    np.testing.assert_allclose(_plane_box(rows), [[-1.0, 2.0]] * 3)
     found, _ = setup(make_scene(seed=2))
     region = CheiralityRegion.of(
         found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)

@@ -9,26 +9,31 @@ from hypothesis import strategies as st
 
 from tests.selfcalibration.test_direct_methods import adjusted, at_distance, prior_for, reprojected
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.selfcalibration import _refinement
 from thesisrecon.selfcalibration._candidates import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
 from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals, refine_hypotheses
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from thesisrecon.selfcalibration.kruppa import _plane_for_focals
+from thesisrecon.selfcalibration.kruppa import _overlapping_pairs, _pair_residuals, _plane_for_focals
 
 FREE = RotationCriterion(focal_weight=0.0)
 
 
 @settings(max_examples=25, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_both_criteria_vanish_at_the_truth_in_every_frame(seed):
+def test_all_criteria_vanish_at_the_truth_in_every_frame(seed):
     scene = make_scene(views=4, points=40, seed=seed % 30)
-    frame = normalized_frame(projective_reconstruction(scene, seed=seed), prior_for(scene))
+    given = projective_reconstruction(scene, seed=seed)
+    frame = normalized_frame(given, prior_for(scene))
     log_f = np.log(scene.K[:1, 0, 0] / 1536.0)
     plane, cost = _plane_for_focals(frame, FREE, log_f)
     assert cost < 1e-20
     K = square_pixel_calibrations(np.full((1, 4), log_f[0]))
     residuals = dual_image_residuals(frame.A, frame.a, K, K[:, 0], plane[None])
     assert np.abs(residuals).max() < 1e-9
+    pairs = _overlapping_pairs(frame, given, 8)
+    assert len(pairs.i) == 6
+    assert np.abs(_pair_residuals(pairs, K)).max() < 1e-7
 
 
 @settings(max_examples=15, derandomize=True, deadline=None)
@@ -42,6 +47,15 @@ def test_refinement_never_raises_the_cost(seed):
     refined, after = refine_hypotheses(FREE, frame, theta)
     assert (after <= before).all()
     np.testing.assert_allclose(FREE.cost(frame, refined[:, :3], refined[:, 3:]), after)
+
+
+def test_the_std_of_the_focals_is_that_of_the_normal_equations():
+    scene = make_scene(views=5, seed=1)
+    frame = normalized_frame(projective_reconstruction(scene, seed=1), prior_for(scene))
+    theta = np.array([0.3, -0.2, 0.1, 0.0])
+    r, J = (part[0] for part in FREE._linearized(frame, theta[None]))
+    variance = r @ r / (5 * 5 - 4) * np.linalg.inv(J.T @ J)[3, 3]
+    assert _refinement.focal_std(FREE, frame, theta) == pytest.approx(np.sqrt(variance), rel=1e-6)
 
 
 def test_planes_alone_leave_the_focals():
