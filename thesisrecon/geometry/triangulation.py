@@ -269,9 +269,10 @@ def _checked(P: F64, xy: F64) -> tuple[F64, F64]:
 
 def _listed(xy: F64) -> _SortedPixels:
     """List the observations of xy (V, N, 2) that are not NaN, point by point."""
-    point, view = np.nonzero(~np.isnan(xy).any(axis=2).T)
-    start = np.searchsorted(point, np.arange(xy.shape[1] + 1))
-    return start, np.ascontiguousarray(view), xy[view, point]
+    n_points = xy.shape[1]
+    point, view = np.nonzero(~np.isnan(xy[:, :, 0] + xy[:, :, 1]).T)
+    start = np.searchsorted(point, np.arange(n_points + 1))
+    return start, np.ascontiguousarray(view), xy.reshape(-1, 2).take(view * n_points + point, axis=0)
 
 
 def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
