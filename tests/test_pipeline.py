@@ -1,4 +1,4 @@
-"""The composer around fake stages: resuming, determinism, second attempts, and what it leaves behind."""
+"""The pipeline with fake stages: resuming, determinism, second attempts, and the files of a run."""
 
 import json
 import struct

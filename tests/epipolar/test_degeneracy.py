@@ -144,8 +144,8 @@ def test_wrong_and_hopeless_calls():
     rng = np.random.default_rng(0)
     refuses(ValueError, "39", assess_degeneracy, fit, pair.xy1, pair.xy2, rng=rng)
     refuses(StageFailure, "needed at least 8", assess_degeneracy, fit, pair.xy1[:7], pair.xy2[:7], rng=rng)
-    nobody = FundamentalFit(pair.F, np.zeros(40, bool), 0.3, np.eye(9))
-    assert not assess_degeneracy(nobody, pair.xy1, pair.xy2, rng=rng).determined
+    without_inliers = FundamentalFit(pair.F, np.zeros(40, bool), 0.3, np.eye(9))
+    assert not assess_degeneracy(without_inliers, pair.xy1, pair.xy2, rng=rng).determined
 
 
 # ---------------------------------------------------------------- the pieces

@@ -6,13 +6,12 @@ order, ``tuple_of("module.Class", ...)`` a named tuple. A kernel that it lacks i
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import platform
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,8 @@ import numba
 from numba.core import types
 
 from thesisrecon.kernels import cache_folder
+from thesisrecon.runtime._executors import package_key
+from thesisrecon.runtime._run_folder import key_of
 from thesisrecon.runtime._signals import kill_on_exit, starting_processes
 
 PACKAGE = Path(__file__).parent.parent
@@ -91,10 +92,7 @@ def precompile(until: str, workers: int, progress: Callable[[str, int, int], Non
 
 def _code_and_machine(lines: Sequence[str]) -> str:
     machine = vars(numba.config)["CPU_NAME"], platform.machine(), platform.node()
-    digest = hashlib.sha256(repr((lines, machine, sys.version, numba.__version__)).encode())
-    for file in sorted(PACKAGE.rglob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:32]
+    return key_of(lines, machine, sys.version, numba.__version__, package_key())
 
 
 def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[str, int, int], None]) -> int:
@@ -130,9 +128,10 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
         for thread in feeding:
             thread.start()
         try:
-            while any(thread.is_alive() for thread in feeding):
-                feeding[0].join(POLL_S) if feeding[0].is_alive() else feeding[-1].join(POLL_S)
-                progress("kernels", len(finished), len(lines))
+            for thread in feeding:
+                while thread.is_alive():
+                    thread.join(POLL_S)
+                    progress("kernels", len(finished), len(lines))
         finally:
             for worker in workers:
                 worker.kill()
@@ -142,7 +141,8 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
 
 
 def _started() -> subprocess.Popen[str]:
-    # In a session of its own it does not get the Ctrl-C of the terminal; without its input it ends.
+    # multiprocessing would import the script of the user again. In a session of its own the process does not
+    # get the Ctrl-C of the terminal; without its input it ends.
     return subprocess.Popen(
         [sys.executable, "-P", "-c", WORKER],  # -P: not what lies in the current folder
         stdin=subprocess.PIPE,
@@ -155,12 +155,7 @@ def _started() -> subprocess.Popen[str]:
 
 def compile_requested() -> None:
     """In a worker: compile the kernels that are named on standard input, and answer with one line each."""
-    for line in _input_lines():
-        kernel, arguments = kernel_and_types(line)
+    for line in sys.stdin:
+        kernel, arguments = kernel_and_types(line.strip())
         kernel.compile(arguments)
         print("compiled", flush=True)
-
-
-def _input_lines() -> Iterator[str]:
-    for line in sys.stdin:
-        yield line.strip()
