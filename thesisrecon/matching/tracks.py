@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.numerics.observations import morton_pair_order
-from thesisrecon.records import Tracks, TwoView
+from thesisrecon.records import Matches, Tracks, TwoView
+
+MERGE_PX = 1.0
+"""Default distance of positions that are one corner: the noise of positions that differ from pair to pair."""
+Pair = TypeVar("Pair", Matches, TwoView)
 
 
 @kernel
@@ -189,14 +195,30 @@ def _affines_from_middle_view(chains: _Chains, pairs: Sequence[TwoView]) -> tupl
 
 @dataclass(frozen=True)
 class PlainTracks:
-    """Tracks with every observation at its corner."""
+    """Tracks with every observation at its corner.
 
-    def build(
-        self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
-    ) -> Tracks:
+    Parameters
+    ----------
+    merge_px : float
+        Distance of positions of one view that are one corner (matches without corners only), px at working
+        size.
+    """
+
+    merge_px: float = MERGE_PX
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.merge_px) and self.merge_px >= 0.0):
+            raise ValueError(f"merge_px must be at least 0; got {self.merge_px}")
+
+    def build(self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
         """See `thesisrecon.config.TrackBuilder.build`."""
         del rng
-        chains = _link_matches([p.features.xy for p in prepared], _best_first(pairs))
+        accepted = _best_first(pairs)
+        if any((p.index1 < 0).any() or (p.index2 < 0).any() for p in accepted):
+            corners, accepted = corners_from_matches(accepted, len(prepared), self.merge_px)
+        else:
+            corners = [p.features.xy for p in prepared]
+        chains = _link_matches(corners, accepted)
         return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(prepared))
 
 
@@ -223,6 +245,103 @@ class AlignedTracks:
             found, _, score = align_corners(view1, prepared[j], matches, affine_std=AFFINE_STD)
             xy[group], kept[group] = found, score >= MIN_CORRELATION
         return _tracks(chains, xy, kept, len(prepared))
+
+
+def corners_from_matches(
+    pairs: Sequence[Pair], n_views: int, merge_px: float = MERGE_PX
+) -> tuple[list[F64], list[Pair]]:
+    """Number the positions of matches that have no corners, as matchers without a detector give them.
+
+    Positions of one view that are equal or within ``merge_px`` of a common centre become one corner, at their
+    mean. Centres are at least ``merge_px`` apart, positions of many matches first, so that chains of near
+    positions do not join.
+
+    Parameters
+    ----------
+    pairs : sequence of Matches or TwoView
+        Matched pairs; only their positions are used.
+    n_views, merge_px : int, float
+        Number of views, and the radius in px; 0 joins equal positions only.
+
+    Returns
+    -------
+    corners : list of ndarray (N_i, 2)
+        Corners of every view, possibly none; their order does not depend on the order of the pairs.
+    pairs : list of Matches or TwoView
+        The same pairs and positions with ``index1`` and ``index2``. A corner is at most once in a pair: only
+        its match with the least distances from the corners stays.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.matching._prepared import empty_matches
+    >>> from dataclasses import replace
+    >>> one = dict(index1=np.array([-1]), index2=np.array([-1]), score=np.ones(1), affine=np.eye(2)[None])
+    >>> first = replace(empty_matches((0, 1)), xy1=np.array([[5.0, 5.0]]), xy2=np.array([[9.0, 5.0]]), **one)
+    >>> second = replace(empty_matches((1, 2)), xy1=np.array([[9.5, 5.0]]), xy2=np.array([[3.0, 5.0]]), **one)
+    >>> corners, pairs = corners_from_matches([first, second], 3)
+    >>> corners[1].tolist(), pairs[0].index2.tolist(), pairs[1].index1.tolist()
+    ([[9.25, 5.0]], [0], [0])
+    """
+    ends = [end for p in pairs for end in ((p.i, p.xy1), (p.j, p.xy2))]
+    corners, index = _number_positions(ends, n_views, merge_px)
+    return corners, [
+        _numbered_pair(pair, corners, index[2 * n], index[2 * n + 1]) for n, pair in enumerate(pairs)
+    ]
+
+
+def _number_positions(
+    ends: Sequence[tuple[int, F64]], n_views: int, merge_px: float
+) -> tuple[list[F64], list[I64]]:
+    """Corners of every view, and the corner (M,) of each position of the ``ends`` (view, xy)."""
+    index, corners = [np.empty(0, np.int64)] * len(ends), []
+    for view in range(n_views):
+        here = [n for n, end in enumerate(ends) if end[0] == view]
+        xy = np.concatenate([np.empty((0, 2)), *(ends[n][1] for n in here)])
+        found, number = _merge_positions(xy, merge_px)
+        corners.append(found)
+        parts = np.split(number, np.cumsum([len(ends[n][1]) for n in here]))
+        for n, part in zip(here, parts, strict=False):
+            index[n] = part
+    return corners, index
+
+
+def _numbered_pair(pair: Pair, corners: Sequence[F64], index1: I64, index2: I64) -> Pair:
+    """The pair with the corners of its matches; among matches of one corner the nearest one stays."""
+    off1, off2 = pair.xy1 - corners[pair.i][index1], pair.xy2 - corners[pair.j][index2]
+    rows = np.argsort((off1**2 + off2**2).sum(axis=1), kind="stable")
+    for index in (index1, index2):
+        rows = rows[np.sort(np.unique(index[rows], return_index=True)[1])]
+    rows = np.sort(rows)
+    names = ["xy1", "xy2", "affine"] + ["score"] * isinstance(pair, Matches)
+    kept = {name: getattr(pair, name)[rows] for name in names}
+    return replace(pair, index1=index1[rows], index2=index2[rows], **kept)
+
+
+def _merge_positions(xy: F64, merge_px: float) -> tuple[F64, I64]:
+    """Corners (C, 2) of the positions (N, 2) of one view, and the corner (N,) of each."""
+    if not len(xy):
+        return xy, np.empty(0, np.int64)
+    places, place_of, count = np.unique(xy, axis=0, return_inverse=True, return_counts=True)
+    rank = np.empty(len(places), np.int64)
+    rank[np.argsort(-count, kind="stable")] = np.arange(len(places))
+    near = scipy.spatial.cKDTree(places).query_pairs(merge_px, output_type="ndarray")
+    is_centre, open_ = np.zeros(len(places), np.bool_), np.ones(len(places), np.bool_)
+    # Rounds of one vectorised step each give the centres of a greedy selection in the order of the ranks.
+    while len(near):
+        lowest = np.full(len(places), len(places))
+        np.minimum.at(lowest, near, rank[near[:, ::-1]])
+        new = open_ & (rank < lowest)
+        is_centre |= new
+        open_ &= ~new
+        open_[near[new[near[:, ::-1]]]] = False
+        near = near[open_[near].all(axis=1)]
+    centres = places[is_centre | open_]
+    _, nearest = scipy.spatial.cKDTree(centres).query(places)
+    offset = (places - centres[nearest]) * count[:, None]
+    total = np.bincount(nearest, weights=count)
+    mean = np.stack([np.bincount(nearest, weights=offset[:, a]) for a in (0, 1)], axis=1) / total[:, None]
+    return centres + mean, nearest[place_of.reshape(-1)]
 
 
 def _best_first(pairs: Sequence[TwoView]) -> list[TwoView]:
