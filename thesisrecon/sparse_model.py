@@ -19,7 +19,7 @@ class SparseView:
     t: F64  #: (3,) translation -R centre
     K: F64 | None = None  #: (3, 3); None for a trajectory without intrinsics
     size: tuple[int, int] | None = None  #: width, height
-    distortion: F64 | None = None  #: (3,) k1, k2, k3; None if there is none or it is of another kind
+    distortion: F64 | None = None  #: (3,) k1, k2, k3, zeros for a pinhole; None if unknown or of another kind
     camera: int = 0  #: number of the camera; views of one number have the same intrinsics in the file
 
     @property

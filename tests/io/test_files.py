@@ -13,7 +13,7 @@ from tests.conftest import refuses
 from tests.io.test_colmap import export, scene
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
 from thesisrecon.io import _files as files
-from thesisrecon.io._exports import read_cameras
+from thesisrecon.io._models import read_cameras
 from validation.studies.robustness import disk_ends
 
 
@@ -155,7 +155,7 @@ def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
     ("content", "words"),
     [
         ({"cameras": []}, "holds no camera"),
-        ({"cameras": [{**ONE, "K": [[1.0, 0], [0, 1.0]]}]}, "does not hold cameras written by thesisrecon"),
+        ({"cameras": [{**ONE, "K": [[1.0, 0], [0, 1.0]]}]}, "does not hold cameras; it must list"),
         ({"cameras": [{**ONE, "t": [None, 0, 0]}]}, "does not hold cameras"),
         ({"cameras": [{"name": "a.jpg"}]}, "does not hold cameras"),
         ({"cameras": {"0000.jpg": {}}}, "does not hold cameras"),

@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 
 from tests.hostile.files import CAMERA, encoded, glb, require_sentence, triangle, writes
 from tests.hostile.files import SUMMARY as WHOLE
+from tests.io.test_colmap import export, scene
 from tests.io.test_meshes import roof
 from tests.runtime.test_run_folder import some_metric
 from thesisrecon._settings import config_from_tables, config_from_toml, toml_from_config
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
-from thesisrecon.io._exports import read_cameras
 from thesisrecon.io._files import read_json, read_pairs, read_text
 from thesisrecon.io._images import read_images
 from thesisrecon.io._meshes import read_mesh, write_mesh
+from thesisrecon.io._models import read_cameras, read_model
 from thesisrecon.runtime._run_folder import ChangedRecord, StageFolder, bytes_from_record, read_record
 
 few = settings(
@@ -81,7 +82,15 @@ def as_written(path):
     assert record is None or bytes_from_record(record, "key") == bytes_from_record(some_metric(), "key")
 
 
+def part_of_model(name):
+    return Reader(
+        name, lambda path: export(path.parent, scene()), lambda p: read_model(p.parent), (UsageError,)
+    )
+
+
 READERS = [
+    *(part_of_model(f"{name}.bin") for name in ("cameras", "images", "points3D")),
+    text_file("poses.txt", "# time\n0 1 2 3 0 0 0.6 0.8\n1 1 2 4 0 0 0 1\n", read_model),
     *(saved(kind) for kind in ("JPEG", "PNG", "TIFF", "GIF", "WEBP", "BMP", "PPM")),
     text_file("cameras.json", json.dumps(CAMERAS), read_cameras),
     text_file("config.toml", toml_from_config(PipelineConfig()), lambda p: config_from_toml(read_text(p))),

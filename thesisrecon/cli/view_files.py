@@ -14,10 +14,11 @@ from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import OutputError, UsageError, counted
-from thesisrecon.io._exports import animation_suffix, frame_name, read_cameras, write_animation, write_frame
+from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io._images import read_image
 from thesisrecon.io._meshes import read_mesh
+from thesisrecon.io._models import read_cameras
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers

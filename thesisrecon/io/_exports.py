@@ -12,15 +12,11 @@ import PIL.features
 import PIL.Image
 
 from thesisrecon.arrays import F64, U8
-from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError
-from thesisrecon.io._files import read_json, write_atomically
+from thesisrecon.io._files import write_atomically
 from thesisrecon.records import Image, Reconstruction
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-_MAX_SIDE_PX = 2**24
-_ROUNDING = 1e-4
-"""Tolerance for numbers that were rounded in the file."""
 _WEBP_QUALITY = 85
 """Lossy (38 dB on textured frames): an eighth of the size of APNG, a quarter of GIF with all colours."""
 _WEBP_METHOD = 2
@@ -74,36 +70,6 @@ def _original_from_working(scale: float) -> F64:
     """Return the (3, 3) map from working to original pixels, (x + 0.5) / scale - 0.5."""
     offset = 0.5 / scale - 0.5
     return np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]])
-
-
-def read_cameras(path: Path) -> dict[str, Camera]:
-    """Read the cameras of a run by file name, in original pixels and without lens distortion.
-
-    UsageError if the file is absent, damaged or empty, or a K or R is invalid.
-    """
-    if not path.is_file():
-        raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
-    content = read_json(path)
-    try:
-        cameras = {str(entry["name"]): _camera(entry) for entry in content["cameras"]}
-    except (TypeError, KeyError, ValueError, OverflowError):
-        raise UsageError(f"{path} does not hold cameras written by thesisrecon") from None
-    if not cameras:
-        raise UsageError(f"{path} holds no camera; no image of this run was registered")
-    return cameras
-
-
-def _camera(entry: Any) -> Camera:
-    K, R, t = (np.array(entry[name], dtype=np.float64) for name in ("K", "R", "t"))
-    camera = Camera(K, R, t, (int(entry["width"]), int(entry["height"])))
-    if max(camera.size) > _MAX_SIDE_PX:
-        raise ValueError(f"an image side must be at most {_MAX_SIDE_PX} px")
-    lower = np.abs(np.tril(K, -1)).max()
-    if (np.diag(K) <= 0).any() or max(lower, abs(K[2, 2] - 1.0)) > _ROUNDING:
-        raise ValueError("K must be upper triangular with positive focal lengths")
-    if not np.allclose(R @ R.T, np.eye(3), atol=_ROUNDING) or np.linalg.det(R) < 0:
-        raise ValueError("R must be a rotation")
-    return camera
 
 
 def frame_name(number: int) -> str:

@@ -1,4 +1,4 @@
-"""Export of reconstructions as COLMAP sparse models: the only place with COLMAP's conventions.
+"""Export of reconstructions as COLMAP sparse models and COLMAP's conventions; see ``_colmap_reading.py``.
 
 COLMAP puts the centre of the top-left pixel at (0.5, 0.5), numbers from 1, separates cameras from images and
 stores quaternions as (w, x, y, z). Its SIMPLE_RADIAL distortion is the one used here, x (1 + k1 r^2) on

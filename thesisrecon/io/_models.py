@@ -1,0 +1,145 @@
+"""Models of any kind as one record: runs, ``cameras.json``, COLMAP models, TUM and KITTI trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from thesisrecon.arrays import F64
+from thesisrecon.camera import Camera
+from thesisrecon.errors import UsageError, in_words
+from thesisrecon.io._colmap_reading import is_colmap_model, read_colmap_model
+from thesisrecon.io._files import read_json, read_text
+from thesisrecon.sparse_model import SparseModel, SparseView
+
+_MAX_SIDE_PX = 2**24
+_ROUNDING = 1e-3
+"""Deviation from a rotation that the printed digits of a pose may leave."""
+
+
+def read_model(path: str | Path) -> SparseModel:
+    """Read a model and recognise its format.
+
+    A path is the folder of a run or of a COLMAP model (itself or the parent of ``sparse/0``), a
+    ``cameras.json`` or a trajectory, camera-to-world: TUM (time, centre and quaternion x, y, z, w per line,
+    named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000). UsageError for anything
+    else.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise UsageError(f"there is no {path}; give {_KNOWN}")
+    if path.is_dir():
+        model = _read_folder(path)
+    else:
+        model = SparseModel(_read_views(path) if path.suffix == ".json" else _read_trajectory(path))
+    names = model.names
+    if len(set(names)) < len(names):
+        twice = next(name for i, name in enumerate(names) if name in names[:i])
+        raise UsageError(f"{path} holds {twice!r} twice; each view needs a name of its own")
+    return model
+
+
+_KNOWN = (
+    "the folder of a run, a COLMAP model (cameras, images and points3D as .bin or .txt), a cameras.json, or "
+    "a trajectory as text with 8 (TUM) or 12 (KITTI) numbers per line"
+)
+
+
+def _read_folder(folder: Path) -> SparseModel:
+    places = (folder, folder / "sparse" / "0", folder / "sparse")
+    colmap = next((place for place in places if is_colmap_model(place)), None)
+    if (folder / "cameras.json").is_file():
+        views = _read_views(folder / "cameras.json")
+        return SparseModel(views) if colmap is None else _with_views(read_colmap_model(colmap), views)
+    if colmap is None:
+        raise UsageError(f"{folder} holds no model; give {_KNOWN}")
+    return read_colmap_model(colmap)
+
+
+def _with_views(model: SparseModel, views: list[SparseView]) -> SparseModel:
+    """The points of a model, seen by these views of equal names."""
+    index = {view.name: i for i, view in enumerate(views)}
+    place = np.array([index.get(name, -1) for name in model.names], np.int64)[model.view_index]
+    kept = place >= 0
+    point, xy = model.point_index[kept], model.xy[kept]
+    return replace(model, views=views, view_index=place[kept], point_index=point, xy=xy)
+
+
+def read_cameras(path: Path) -> dict[str, Camera]:
+    """Read the cameras of a run by file name, in original pixels and without lens distortion.
+
+    UsageError if the file is absent, damaged or empty, or a K or R is invalid.
+    """
+    if not path.is_file():
+        raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
+    cameras = {}
+    for view in _read_views(path):
+        if view.K is None or view.size is None:
+            raise UsageError(f"{path} gives {view.name} no width and height; a run is needed")
+        cameras[view.name] = Camera(view.K, view.R, view.t, view.size)
+    return cameras
+
+
+def _read_views(path: Path) -> list[SparseView]:
+    """Views of a ``cameras.json``: a list with names, or a table by name, as some data sets have it."""
+    content = read_json(path)
+    try:
+        cameras = content["cameras"]
+        entries = cameras.items() if isinstance(cameras, dict) else [(item["name"], item) for item in cameras]
+        views = [_view(str(name), entry, i) for i, (name, entry) in enumerate(entries)]
+    except (TypeError, KeyError, ValueError, OverflowError):
+        rule = "it must list them with name, K, R and t or C, and width and height"
+        raise UsageError(f"{path} does not hold cameras; {rule}") from None
+    if not views:
+        raise UsageError(f"{path} holds no camera; no image of this run was registered")
+    return views
+
+
+def _view(name: str, entry: Any, camera: int) -> SparseView:
+    entry = {"distortion": (0.0, 0.0, 0.0)} | entry
+    keys = ("K", "R", "distortion", "t" if "t" in entry else "C")
+    K, R, k, t = (np.array(entry[key], dtype=np.float64) for key in keys)
+    if "t" not in entry:
+        t = -R @ t
+    size = (int(entry["width"]), int(entry["height"])) if "width" in entry else None
+    # The record checks shapes and values; its tolerance for R is that of four digits.
+    Camera(K, R, t, size or (1, 1), k)
+    if k.shape != (3,) or np.linalg.det(R) < 0 or max(size or (1, 1)) > _MAX_SIDE_PX:
+        raise ValueError("three coefficients, a rotation and possible sides are needed")
+    return SparseView(name, R, t, K, size, k, camera)
+
+
+def _read_trajectory(path: Path) -> list[SparseView]:
+    lines = enumerate(read_text(path).splitlines(), start=1)
+    rows = [(number, line.split()) for number, line in lines if line.strip() and line.lstrip()[0] != "#"]
+    if not rows:
+        raise UsageError(f"{path} holds no pose; give {_KNOWN}")
+    views, expected = [], len(rows[0][1])
+    for i, (number, words) in enumerate(rows):
+        try:
+            if len(words) != expected or expected not in (8, 12):
+                raise ValueError("numbers are missing")
+            R, centre = (_tum_pose if expected == 8 else _kitti_pose)(np.array(words, dtype=np.float64))
+        except ValueError:
+            rule = "each line needs a pose of 8 (TUM) or 12 (KITTI) numbers"
+            raise UsageError(f"line {number} of {path} is {in_words(' '.join(words))}; {rule}") from None
+        views.append(SparseView(words[0] if expected == 8 else f"{i:06d}", R, -R @ centre))
+    return views
+
+
+def _tum_pose(row: F64) -> tuple[F64, F64]:
+    if not np.isfinite(row).all():
+        raise ValueError("a number is not finite")
+    # A quaternion of zeros is a ValueError too.
+    return scipy.spatial.transform.Rotation.from_quat(row[4:]).as_matrix().T, row[1:4]
+
+
+def _kitti_pose(row: F64) -> tuple[F64, F64]:
+    M = row.reshape(3, 4)
+    if not (np.isfinite(M).all() and np.allclose(M[:, :3] @ M[:, :3].T, np.eye(3), atol=_ROUNDING)):
+        raise ValueError("it is not a rotation")
+    return scipy.spatial.transform.Rotation.from_matrix(M[:, :3]).as_matrix().T, M[:, 3]
