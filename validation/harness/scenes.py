@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-
-import numpy as np
 
 from validation.harness.records import ReportOptions
 from validation.metrics.cameras import TrueCameras
-from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import (
     SUFFIXES,
     Scene,
@@ -18,6 +14,7 @@ from validation.scenes.real import (
     load_real_scene,
     read_scene,
     real_folder,
+    with_truth,
 )
 from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 
@@ -72,13 +69,4 @@ def _own_scene(folder: Path, name: str) -> Scene:
             raise ValueError(f"there are no images in {folder}")
         scene = Scene(name, paths)
     model = folder / "sparse" / "0"
-    if scene.has_truth or not model.is_dir():
-        return scene
-    names = [path.name for path in scene.image_paths]
-    truth = read_colmap_model(model, names)
-    assert truth.K is not None
-    if not truth.registered.all():
-        return scene
-    Rt = np.linalg.solve(truth.K, truth.P)
-    R = np.asarray(Rt[:, :, :3], dtype=np.float64)
-    return dataclasses.replace(scene, K=truth.K, R=R, C=-np.einsum("vji,vj->vi", R, Rt[:, :, 3]))
+    return scene if scene.has_truth or not model.is_dir() else with_truth(scene, model, complete=False)

@@ -93,16 +93,33 @@ def write_courtyard(folder: Path, *, threads: int = 2) -> None:
         for k, (jpeg, depth) in enumerate(views):
             write_atomically(folder / "images" / f"{k:04d}.jpg", jpeg)
             write_atomically(folder / "depth" / f"{k:04d}.png", encode_depth(depth))
-    size = {"width": SIZE[0], "height": SIZE[1]}
-    numbers = [{name: getattr(pose, name).tolist() for name in ("K", "R", "C")} for pose in poses]
+    write_text(folder / "cameras.json", courtyard_cameras(versions()))
+
+
+def courtyard_cameras(made_with: dict[str, str]) -> str:
+    """Content of ``cameras.json``: the cameras as a run writes them, and the scale of the depth maps."""
+    cameras = []
+    for k, pose in enumerate(courtyard_poses()):
+        cameras.append(
+            {
+                "name": f"{k:04d}.jpg",
+                "width": SIZE[0],
+                "height": SIZE[1],
+                "K": pose.K.tolist(),
+                "distortion": [0.0, 0.0, 0.0],
+                "R": pose.R.tolist(),
+                "t": (-pose.R @ pose.C).tolist(),
+                "centre": pose.C.tolist(),
+            }
+        )
     content = {
         "scene": "courtyard",
-        "convention": "x ~ K R (X - C); pixel (0,0) is the centre of the top-left pixel; metres",
+        "convention": "x ~ K (R X + t); (0, 0) is the centre of the top-left pixel; metres",
         "depth": {"unit_m": DEPTH_UNIT_M, "stride": DEPTH_STRIDE, "none": 0},
-        "made_with": versions(),
-        "cameras": {f"{k:04d}.jpg": size | camera for k, camera in enumerate(numbers)},
+        "made_with": made_with,
+        "cameras": cameras,
     }
-    write_text(folder / "cameras.json", json.dumps(content, indent=1) + "\n")
+    return json.dumps(content, indent=1) + "\n"
 
 
 def write_cube(folder: Path) -> None:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.io._files import read_json
+from thesisrecon.io._models import read_model
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL_SCENES = {
@@ -72,26 +70,24 @@ def read_scene(folder: Path, name: str) -> Scene:
     truth = folder / "cameras.json"
     if not truth.is_file():
         return Scene(name, paths)
-    record = read_json(truth)
-    cameras = record.get("cameras") if isinstance(record, dict) else None
-    if not isinstance(cameras, dict):
-        raise ValueError(f"{truth} must hold cameras, a table of images by their names")
-    missing = [p.name for p in paths if p.name not in cameras]
+    return with_truth(Scene(name, paths), truth)
+
+
+def with_truth(scene: Scene, model: Path, *, complete: bool = True) -> Scene:
+    """The scene with the cameras of a model as its truth.
+
+    ``ValueError`` if an image has no camera there; if the truth need not be ``complete``, the scene then has
+    none, unless the model is one of other images.
+    """
+    views = {view.name: view for view in read_model(model).views if view.K is not None}
+    missing = [path.name for path in scene.image_paths if path.name not in views]
+    if missing and (complete or len(missing) == len(scene.image_paths)):
+        raise ValueError(f"{model} must have a camera with K for every image; it lacks {missing[:3]}")
     if missing:
-        raise ValueError(f"cameras.json must name every image; it lacks {missing} of {folder}")
-    return Scene(name, paths, *(_numbers(truth, cameras, paths, key) for key in ("K", "R", "C")))
-
-
-def _numbers(truth: Path, cameras: dict[str, Any], paths: Sequence[Path], key: str) -> F64:
-    """K, R (V, 3, 3) or C (V, 3) of the images."""
-    shape = (len(paths), 3) if key == "C" else (len(paths), 3, 3)
-    try:
-        numbers = np.array([cameras[path.name][key] for path in paths], dtype=np.float64)
-    except (TypeError, KeyError, ValueError, OverflowError):
-        numbers = np.zeros(0)
-    if numbers.shape != shape or not np.isfinite(numbers).all():
-        raise ValueError(f"{truth} must give every image a finite {key} {shape[1:]}")
-    return numbers
+        return scene
+    cameras = [views[path.name] for path in scene.image_paths]
+    K, R, C = (np.array([getattr(view, name) for view in cameras]) for name in ("K", "R", "centre"))
+    return replace(scene, K=K, R=R, C=C)
 
 
 def real_folder(name: str) -> Path | None:

@@ -12,7 +12,15 @@ from thesisrecon.geometry.camera_matrix import compose_camera, project
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import SIZE as CUBE_SIZE
 from validation.scenes.cube import make_cube
-from validation.scenes.fixtures import SIZE, courtyard_poses, encode_depth, render_image, versions, write_cube
+from validation.scenes.fixtures import (
+    SIZE,
+    courtyard_cameras,
+    courtyard_poses,
+    encode_depth,
+    render_image,
+    versions,
+    write_cube,
+)
 from validation.scenes.materials import Material, over, smooth
 from validation.scenes.pose import Pose
 from validation.scenes.procedural import courses, fractal
@@ -144,7 +152,9 @@ def test_a_view_is_made_again_byte_for_byte():
     view = 4
     jpeg, depth = render_image(build_courtyard(), courtyard_poses()[view], view)
     kept = (FOLDER / "images" / f"{view:04d}.jpg").read_bytes()
-    made_with = json.loads((FOLDER / "cameras.json").read_text(encoding="utf-8"))["made_with"]
+    cameras = (FOLDER / "cameras.json").read_text(encoding="utf-8")
+    made_with = json.loads(cameras)["made_with"]
+    assert courtyard_cameras(made_with) == cameras
     if made_with == versions():
         assert jpeg == kept
         assert encode_depth(depth) == (FOLDER / "depth" / f"{view:04d}.png").read_bytes()
@@ -215,7 +225,8 @@ def test_an_image_without_its_truth_is_named(tmp_path):
     for name in ("a.jpg", "b.JPG", "notes.txt"):
         (tmp_path / "images" / name).touch()
     assert [p.name for p in read_scene(tmp_path, "x").image_paths] == ["a.jpg", "b.JPG"]
-    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": {"a.jpg": {}}}))
+    camera = {"name": "a.jpg", "K": np.eye(3).tolist(), "R": np.eye(3).tolist(), "t": [0, 0, 0]}
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [camera]}))
     with pytest.raises(ValueError, match=r"b\.JPG"):
         read_scene(tmp_path, "x")
 

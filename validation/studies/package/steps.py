@@ -94,6 +94,7 @@ class Checks:
         summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
         package = next((self.out / "environment").glob("lib/python*/site-packages/thesisrecon"))
         truth = json.loads((package / "courtyard" / "cameras.json").read_text(encoding="utf-8"))
+        true = {camera["name"]: camera for camera in truth["cameras"]}
         print(json.dumps({k: summary[k] for k in ("registered", "points", "reprojection_rms_px", "seconds")}))
         faults = [
             f"{n} is missing" for n in ("model.glb", "report.html", "points.ply") if not (out / n).is_file()
@@ -101,7 +102,7 @@ class Checks:
         if summary["registered"] != DEMO_IMAGES:
             faults.append(f"{summary['registered']} of {DEMO_IMAGES} images have a camera")
         found = json.loads((out / "cameras.json").read_text(encoding="utf-8"))["cameras"]
-        off = max(abs(c["K"][0][0] / truth["cameras"][c["name"]]["K"][0][0] - 1.0) for c in found)
+        off = max(abs(c["K"][0][0] / true[c["name"]]["K"][0][0] - 1.0) for c in found)
         print(f"{len(found)} cameras, focal lengths within {100 * off:.2f} % of the truth")
         return faults + ([f"a focal length is off by {100 * off:.2f} %"] if off > FOCAL_WITHIN else [])
 
