@@ -5,6 +5,7 @@ import pickle
 import re
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from functools import partial
 
@@ -124,3 +125,30 @@ def test_every_process_computes_the_same_digest():
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.split() == [code_digest(v) for v in (config.matching, config.metric, config.model)]
+
+
+class State:
+    """An object that is no dataclass."""
+
+    def __init__(self, ratio, function=None):
+        self.ratio, self.function = ratio, function
+
+
+def test_an_object_counts_with_its_state_and_one_that_cannot_be_pickled_never_twice():
+    values = (
+        State(0.8),
+        State(0.5),
+        State(0.8, doubled),
+        State(0.8, lambda x: x),
+        np.add,
+        np.maximum,
+        len,
+        abs,
+    )
+    assert len({code_digest(Outer(value)) for value in values}) == len(values)
+    assert code_digest(Outer(State(0.8, doubled))) == code_digest(Outer(State(0.8, doubled)))
+    texts = ("lambda x: x + 1", "lambda x: x + 2")
+    one, two = (code_digest(State(0.8, defined(f"chosen = {text}"))) for text in texts)
+    assert one != two
+    lock = threading.Lock()
+    assert code_digest(Outer(lock)) != code_digest(Outer(lock))

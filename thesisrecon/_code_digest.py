@@ -8,8 +8,11 @@ import dis
 import functools
 import hashlib
 import importlib
+import io
+import pickle
 import sys
 import sysconfig
+import uuid
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -22,6 +25,8 @@ OWN = __name__.partition(".")[0]
 _IMPORT = dis.opmap["IMPORT_NAME"]
 _LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")]
 
+# Libraries that count by name, even as the value itself.
+_BY_NAME = {*sys.stdlib_module_names, "numpy", "scipy", "numba"}
 _NOTED = {"_abc_impl", "_is_protocol", "_is_runtime_protocol"}
 
 
@@ -30,7 +35,8 @@ def code_digest(*values: Any) -> str:
 
     Followed are constants, defaults, closures, base classes, methods, fields and imports inside functions.
     Code of installed libraries counts by its name only, unless a value belongs to it. Comments, docstrings
-    and line numbers do not enter.
+    and line numbers do not enter. Objects count by their pickled state; one that cannot be pickled, as an
+    object of a C++ library, gives another digest each time, so that nothing stored is used for it.
 
     Parameters
     ----------
@@ -42,7 +48,7 @@ def code_digest(*values: Any) -> str:
     str
         SHA-256 digest in hexadecimal digits.
     """
-    walk = _Walk({OWN, *(_package_of(value) for value in values)})
+    walk = _Walk({OWN, *(_package_of(value) for value in values)} - _BY_NAME)
     digest = hashlib.sha256()
     for part in walk.parts(values):
         digest.update(part.encode())
@@ -61,7 +67,26 @@ def _is_library(package: str) -> bool:
     if package in sys.builtin_module_names or package == "builtins":
         return True
     place = Path(file).resolve() if file else None
-    return place is not None and any(place.is_relative_to(folder) for folder in _LIBRARIES)
+    # What is defined at a prompt belongs to __main__, whose file may be that of an installed command.
+    return (
+        package != "__main__"
+        and place is not None
+        and any(place.is_relative_to(folder) for folder in _LIBRARIES)
+    )
+
+
+class _Pickler(pickle.Pickler):
+    """Collects the functions and classes that an object refers to; pickle notes their names only."""
+
+    def __init__(self, stream: io.BytesIO) -> None:
+        super().__init__(stream, 5)
+        self.code: list[Any] = []
+
+    def persistent_id(self, value: Any) -> str | None:
+        if isinstance(value, (FunctionType, type, ModuleType)) or hasattr(value, "py_func"):
+            self.code.append(value)
+            return str(value.__name__)
+        return None
 
 
 class _Walk:
@@ -97,12 +122,13 @@ class _Walk:
             yield from self._plain(value)
 
     def _plain(self, value: Any) -> Iterator[str]:
-        if type(value) in (tuple, list, set, frozenset):
+        library = not self._followed(type(value).__module__)
+        if type(value) in (list, set, frozenset) or isinstance(value, tuple):
             yield f"{type(value).__name__} {len(value)}"
             # The order of a set changes from process to process.
             for item in sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value:
                 yield from self.parts(item)
-        elif type(value) in (dict, MappingProxyType):
+        elif type(value) is MappingProxyType or (isinstance(value, dict) and library):
             yield f"mapping {len(value)}"
             for key, item in value.items():
                 yield from self.parts((key, item))
@@ -114,10 +140,29 @@ class _Walk:
             yield repr(value)
         else:
             yield from self._class(type(value))
-            if dataclasses.is_dataclass(value) and id(value) not in self._seen:
-                self._seen[id(value)] = value
+            if id(value) in self._seen:
+                return
+            self._seen[id(value)] = value
+            if dataclasses.is_dataclass(value):
                 for field in dataclasses.fields(value):
                     yield from self.parts((field.name, getattr(value, field.name, None)))
+            elif library and isinstance(name := getattr(value, "__qualname__", None), str):
+                owner = getattr(value, "__self__", None)
+                yield from (name, *self.parts(None if isinstance(owner, type) else owner))
+            else:
+                yield from self._state(value)
+
+    def _state(self, value: Any) -> Iterator[str]:
+        """The pickled state of an object, and the functions and classes in it."""
+        stream = io.BytesIO()
+        pickler = _Pickler(stream)
+        try:
+            pickler.dump(value)
+            yield hashlib.sha256(stream.getvalue()).hexdigest()
+        except Exception:
+            # Any class may raise anything here.
+            yield uuid.uuid4().hex
+        yield from self.parts(pickler.code)
 
     def _function(self, function: FunctionType) -> Iterator[str]:
         yield f"{function.__module__}.{function.__qualname__}"
@@ -139,7 +184,7 @@ class _Walk:
         self._seen[id(kind)] = kind
         yield str(vars(kind).get("__annotations__", ""))
         yield from self.parts(kind.__bases__)
-        for name, member in vars(kind).items():
+        for name, member in list(vars(kind).items()):
             # Python and its libraries note other things there, some of them when an instance is pickled.
             noted = name.startswith("__") and not hasattr(member, "__get__")
             if not noted and name not in _NOTED:
