@@ -22,7 +22,7 @@ from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_poi
 from thesisrecon.geometry.camera_matrix import distort, project_camera, undistort
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.geometry.triangulation import triangulate
-from thesisrecon.geometry.two_view import estimate_homography
+from thesisrecon.geometry.two_view import homography_linear
 from validation.metrics.similarity import estimate_similarity
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
 from validation.references.triangulation import colmap_points
@@ -40,7 +40,7 @@ RADIAL = np.array([-0.1, 0.02, 0.001])
         ("eight-point method, 1000 matches", "OpenCV", opencv_eight_point, 1000),
         ("seven-point method", "ours", estimate_seven_point, 7),
         ("seven-point method", "OpenCV", opencv_seven_point, 7),
-        ("homography, 1000 matches", "ours", estimate_homography, 1000),
+        ("homography, 1000 matches", "ours", homography_linear, 1000),
         ("homography, 1000 matches", "OpenCV", opencv_homography, 1000),
     ],
 )

@@ -15,8 +15,9 @@ __version__ = "0.1.0"
 __all__ = [  # noqa: F405
     "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
     "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__",
-    "estimate_fundamental", "interpolate_view", "match_pair", "match_rectified", "reconstruct", "render",
-    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view", "match_pair",
+    "match_rectified", "reconstruct", "render", "self_calibrate", "synthesize_view", "triangulate",
+    "upgrade_affine",
 ]  # fmt: skip
 
 _HOMES = {
@@ -25,7 +26,9 @@ _HOMES = {
     "StageFailure": "errors",
     "Tracks": "records",
     "UsageError": "errors",
-    "estimate_fundamental": "epipolar.locally_optimised",
+    "estimate_fundamental": "epipolar.estimation",
+    "estimate_homography": "epipolar.homography",
+    "estimate_trifocal": "epipolar.trifocal_estimation",
     "triangulate": "geometry.triangulation",
 }
 """Modules of what needs no configuration, whose import takes longest; the others are in `api`."""

@@ -9,7 +9,9 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig, with_images
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
+from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.homography import estimate_homography
+from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
@@ -36,8 +38,9 @@ from thesisrecon.views.render import render
 __all__ = [
     "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
     "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError",
-    "estimate_fundamental", "interpolate_view", "match_pair", "match_rectified", "reconstruct", "render",
-    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view", "match_pair",
+    "match_rectified", "reconstruct", "render", "self_calibrate", "synthesize_view", "triangulate",
+    "upgrade_affine",
 ]  # fmt: skip
 
 

@@ -11,8 +11,8 @@ from thesisrecon.epipolar.configuration import (
     _rotation_test,
     classify_configuration,
 )
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize

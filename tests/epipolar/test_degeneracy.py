@@ -11,11 +11,11 @@ from thesisrecon.epipolar import degeneracy as assessment
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar.degeneracy import NEIGHBOURS, _contradicted_ratios, assess_degeneracy
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import (
     epipoles,
-    estimate_homography,
+    homography_linear,
     homography_residuals,
     homography_sampson_residuals,
     sampson_residuals,
@@ -87,7 +87,7 @@ def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_competing_model():
     away1, away2 = (Xh @ P.T for P in (flat.P1, flat.P2))
     xy1 = np.r_[flat.xy1, away1[:, :2] / away1[:, 2:]] + rng.normal(0.0, 0.3, (330, 2))
     xy2 = np.r_[flat.xy2, away2[:, :2] / away2[:, 2:]] + rng.normal(0.0, 0.3, (330, 2))
-    H = estimate_homography(flat.xy1, flat.xy2)
+    H = homography_linear(flat.xy1, flat.xy2)
     _, e2 = epipoles(flat.F)
     wrong_pole = e2 + np.array([0.0, 0.4, 0.0]) * np.linalg.norm(e2)
     cross = np.cross(np.eye(3), wrong_pole) * -1.0
@@ -154,7 +154,7 @@ def test_wrong_and_hopeless_calls():
 def test_plane_distances_match_their_numpy_twin():
     pair = make_pair(50, np.random.default_rng(2), planar=True)
     xy1, xy2, _ = spoil(pair, np.random.default_rng(2), sigma=2.0, outliers=0.1)
-    H = estimate_homography(pair.xy1, pair.xy2)
+    H = homography_linear(pair.xy1, pair.xy2)
     expected = np.sum(homography_sampson_residuals(H, xy1, xy2) ** 2, axis=1)
     np.testing.assert_allclose(
         _planes._plane_distances(H.ravel(), np.hstack([xy1, xy2])), expected, rtol=1e-6
@@ -205,7 +205,7 @@ def test_contradicted_ratios_match_their_numpy_twin():
 
 def test_transfers_are_counted_as_by_numpy():
     pair = make_pair(60, np.random.default_rng(3))
-    H = np.stack([estimate_homography(pair.xy1[k : k + 12], pair.xy2[k : k + 12]) for k in (0, 12, 24)])
+    H = np.stack([homography_linear(pair.xy1[k : k + 12], pair.xy2[k : k + 12]) for k in (0, 12, 24)])
     expected = [int(np.sum(homography_residuals(h, pair.xy1, pair.xy2) < 30.0)) for h in H]
     np.testing.assert_array_equal(_planes.count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
 
@@ -215,7 +215,7 @@ def test_fundamentals_of_a_plane_keep_the_plane_and_the_two_matches():
     flat = make_pair(40, rng, planar=True)
     frame = PairFrame.of(flat.xy1, flat.xy2)
     points = frame.points(flat.xy1, flat.xy2)
-    h = estimate_homography(points[:, :2], points[:, 2:]).ravel()
+    h = homography_linear(points[:, :2], points[:, 2:]).ravel()
     away = points[:6].copy()
     away[:, 2:] += rng.uniform(0.2, 0.5, (6, 2))
     F, agree, sums = _planes.fundamentals_of_plane(h, away, np.ones((1, 6)), np.array([[0, 1], [2, 5]]), 1e-6)
@@ -254,7 +254,7 @@ def test_the_covariance_of_a_homography_is_that_of_trials():
     pair = make_pair(60, rng, planar=True)
     frame = PairFrame.of(pair.xy1, pair.xy2)
     exact, found = frame.points(pair.xy1, pair.xy2), []
-    truth = estimate_homography(exact[:, :2], exact[:, 2:]).ravel()
+    truth = homography_linear(exact[:, :2], exact[:, 2:]).ravel()
     for _ in range(300):
         h = truth.copy()
         _planes.refine_plane(h, exact + rng.normal(0.0, 1e-3, exact.shape), 1e3, 5)

@@ -11,9 +11,10 @@ from tests.geometry.properties import holds_for_every
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.configuration import Configuration, _refine_translation, classify_configuration
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac, estimate_fundamental
-from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, ThesisRansac, _discard_outliers
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, ThesisRansac, discard_outliers
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
@@ -417,7 +418,7 @@ def test_the_share_of_right_matches_that_pass(test, share):
     pair = make_pair(4000, rng)
     F = two_view.fundamental_from_cameras(pair.P1, pair.P2)
     xy1, xy2 = (xy + rng.normal(0.0, 0.5, xy.shape) for xy in (pair.xy1, pair.xy2))
-    sigma, inliers = _discard_outliers(F, xy1, xy2, test=test)
+    sigma, inliers = discard_outliers(F, xy1, xy2, test=test)
     assert sigma == pytest.approx(0.5, rel=0.1)
     assert inliers.mean() == pytest.approx(share, abs=0.035)
 

@@ -7,8 +7,8 @@ import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.configuration import classify_configuration
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.errors import StageFailure

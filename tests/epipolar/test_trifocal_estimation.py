@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from thesisrecon.epipolar.trifocal_estimation import (
-    NO_POINTS,
     NO_SEGMENTS,
     _minimize_algebraic_error,
     _minimize_reprojection_error,
@@ -74,7 +73,7 @@ def test_exact_matches_give_the_tensor_of_their_cameras(n, m):
     rng = np.random.default_rng(n + m)
     P = three_cameras(rng)
     points, segments = matches(P, rng, n, m, 0.0)
-    fit = estimate_trifocal(points, segments)
+    fit = estimate_trifocal(*points, segments=segments)
     T = tensor_from_cameras(*P)
     assert min(np.linalg.norm(fit.T - T), np.linalg.norm(fit.T + T)) < 1e-6
     assert fit.point_residuals_px.shape == (3, n)
@@ -123,7 +122,7 @@ def test_each_step_approaches_the_truth_and_reports_the_noise(n, m):
         np.testing.assert_allclose(
             abs(np.sum(algebraic * tensor_from_cameras(*cameras_from_tensor(algebraic)))), 1.0, atol=1e-9
         )
-        fit = estimate_trifocal(points, segments, loss_px=5.0)
+        fit = estimate_trifocal(*points, segments=segments, loss_px=5.0)
         sigmas.append(fit.sigma_px)
         steps = (*map(equations.in_pixels, (equations.solve(), algebraic)), fit.T)
         errors.append([np.median(point_transfer_px(T, exact)) for T in steps])
@@ -146,7 +145,8 @@ def test_the_covariance_is_that_of_the_errors(n, m):
     l2 = unit_normals(np.cross(x2, rng.normal(size=x2.shape)))
     ratios = []
     for _ in range(40):
-        fit = estimate_trifocal(*(a + rng.normal(0.0, 0.3, a.shape) for a in (points, segments)), loss_px=5.0)
+        moved, ends = (a + rng.normal(0.0, 0.3, a.shape) for a in (points, segments))
+        fit = estimate_trifocal(*moved, segments=ends, loss_px=5.0)
         x3 = np.einsum("ni,nj,ijk->nk", x1, l2, fit.T)
         by_T = np.einsum("ni,nj,kl->nlijk", x1, l2, np.eye(3)).reshape(30, 3, 27) / x3[:, 2, None, None]
         by_T = by_T[:, :2] - (x3[:, :2] / x3[:, 2:])[:, :, None] * by_T[:, 2:]
@@ -162,7 +162,7 @@ def test_the_covariance_reflects_points_near_a_plane():
         P = three_cameras(rng)
         X = rng.uniform(-2.0, 2.0, (60, 3)) * [1.0, 1.0, depth]
         points = np.stack([project(camera, X) for camera in P])
-        fit = estimate_trifocal(points + rng.normal(0.0, 0.2, points.shape))
+        fit = estimate_trifocal(*(points + rng.normal(0.0, 0.2, points.shape)))
         spreads.append(np.sqrt(np.trace(fit.covariance)))
         weaknesses.append(fit.relative_std)
     assert spreads[1] > 10.0 * spreads[0]
@@ -187,7 +187,7 @@ def test_noisy_matches_that_cannot_work_are_named(kind, sigma):
         if kind == "chance":
             points = rng.uniform(0.0, 1000.0, points.shape)
         with pytest.raises(StageFailure, match="do not determine"):
-            estimate_trifocal(points + rng.normal(0.0, sigma, points.shape))
+            estimate_trifocal(*(points + rng.normal(0.0, sigma, points.shape)))
 
 
 def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():
@@ -216,30 +216,43 @@ def test_a_few_wrong_matches_do_not_spoil_the_tensor():
     points, segments = matches(P, rng, 100, 40, 0.3)
     points[2, :5] += rng.uniform(5.0, 15.0, (5, 2))
     exact, _ = matches(P, rng, 100, 0, 0.0)
-    robust = estimate_trifocal(points, segments, loss_px=1.0)
+    robust = estimate_trifocal(*points, segments=segments, threshold_px=None)
     assert np.median(point_transfer_px(robust.T, exact)) < 0.5
     assert robust.point_residuals_px[:, :5].max(axis=0).min() > 1.0
+
+
+def test_many_wrong_matches_are_left_out():
+    rng = np.random.default_rng(6)
+    P = three_cameras(rng)
+    points, _ = matches(P, rng, 120, 0, 0.3)
+    points[2, :40] = rng.uniform(0.0, 1000.0, (40, 2))
+    exact, _ = matches(P, rng, 100, 0, 0.0)
+    fit = estimate_trifocal(*points)
+    assert fit.inliers[40:].mean() > 0.95
+    assert fit.inliers[:40].sum() <= 2
+    assert np.isnan(fit.point_residuals_px[:, ~fit.inliers]).all()
+    assert np.median(point_transfer_px(fit.T, exact)) < 0.3
 
 
 def test_matches_that_cannot_work_are_named():
     rng = np.random.default_rng(0)
     points, segments = matches(three_cameras(rng), rng, 6, 0, 0.0)
-    refuses(StageFailure, "too few matches", estimate_trifocal, points, segments)
-    refuses(StageFailure, "too few matches", estimate_trifocal, NO_POINTS, NO_SEGMENTS)
+    refuses(StageFailure, "too few matches", estimate_trifocal, *points, segments=segments)
+    refuses(StageFailure, "too few matches", estimate_trifocal)
     flat = np.column_stack([rng.uniform(-2.0, 2.0, (20, 2)), np.zeros(20)])
     line = np.outer(np.linspace(-1.0, 1.0, 20), [1.0, 0.5, 0.2])
     twice = np.tile(rng.uniform(-1.0, 1.0, (5, 3)), (4, 1))
     for special in (flat, line, twice):
         with pytest.raises(StageFailure, match="do not determine"):
-            estimate_trifocal(np.stack([project(camera, special) for camera in three_cameras(rng)]))
+            estimate_trifocal(*(project(camera, special) for camera in three_cameras(rng)))
     for wrong, text in (
         (np.ones((3, 8, 2)), "equal points"),
         (np.full((3, 8, 2), np.nan), "finite"),
-        (np.ones((8, 2)), "needs points"),
-        (np.ones(5), "needs points"),
+        (np.ones((3, 8, 3)), "needs xy1"),
+        (np.ones((3, 5)), "needs xy1"),
     ):
-        refuses(ValueError, text, estimate_trifocal, wrong)
-    refuses(ValueError, "loss_px", estimate_trifocal, points, segments, loss_px=0.0)
+        refuses(ValueError, text, estimate_trifocal, *wrong)
+    refuses(ValueError, "loss_px", estimate_trifocal, *points, loss_px=0.0)
 
 
 def _read(kind):
@@ -260,8 +273,8 @@ def test_merton_college_is_transferred_into_the_third_view(source):
         p, s = (np.arange(a.shape[1]) % 2 == fold for a in (points, segments))
         # Estimated from one half, measured on the other.
         fit = estimate_trifocal(
-            NO_POINTS if source == "lines" else points[:, p],
-            NO_SEGMENTS if source == "points" else segments[:, s],
+            *(() if source == "lines" else points[:, p]),
+            segments=NO_SEGMENTS if source == "points" else segments[:, s],
         )
         of_points.append(point_transfer_px(fit.T, points[:, ~p]))
         of_lines.append(line_transfer_px(fit.T, segments[:, ~s]))

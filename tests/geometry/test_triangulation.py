@@ -302,7 +302,13 @@ def test_single_methods_reject_their_own_failures():
     with pytest.raises(ValueError, match="different centres"):
         triangulate_polynomial(np.stack([P[0], np.diag([1.0, 2.0, 3.0]) @ P[0]]), xy)
     refuses(ValueError, "rank 3", triangulate_polynomial, np.stack([P[0], P[1] * [[1.0], [1.0], [0.0]]]), xy)
-    refuses(ValueError, "exactly two", triangulate, np.concatenate([P, P]), np.concatenate([xy, xy]))
+    refuses(
+        ValueError, "exactly two", triangulate, np.concatenate([P, P]), np.concatenate([xy, xy]),
+        method="polynomial",
+    )  # fmt: skip
+    np.testing.assert_array_equal(triangulate(P, xy), triangulate(P, xy, method="polynomial"))
+    three, xy3 = np.concatenate([P, P[:1]]), np.concatenate([xy, xy[:1]])
+    np.testing.assert_array_equal(triangulate(three, xy3), triangulate(three, xy3, method="optimal"))
     with pytest.raises(ValueError, match="finite cameras"):
         triangulate(
             np.stack([P[0], np.eye(3, 4) * [[1.0], [1.0], [0.0]] + [0, 0, 0, 1.0]]), xy, method="midpoint"

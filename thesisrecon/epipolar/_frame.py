@@ -92,6 +92,12 @@ class PairFrame:
         T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
         return np.asarray(np.kron(T2.T, T1.T), dtype=np.float64)
 
+    @property
+    def homography_to_pixels(self) -> F64:
+        """Matrix (9, 9) that converts vec(H) of a homography from the frame to pixels."""
+        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        return np.asarray(np.kron(np.linalg.inv(T2), T1.T))
+
     def matrix_in_pixels(self, f: F64) -> F64:
         """F (3, 3) in pixels, unit norm, of F (9,) in the frame."""
         T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)

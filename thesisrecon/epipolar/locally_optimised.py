@@ -6,14 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import NoiseMixture, noise_scale, noise_width
 from thesisrecon.epipolar._refinement import SAMPSON, fundamental_covariance, refine
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
-from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.errors import StageFailure
 from thesisrecon.numerics.noise import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit
@@ -265,54 +263,3 @@ def _noise_exceeds_gate(r: F64, noise: NoiseMixture, gate: float) -> bool:
     expected = float(np.sqrt(2.0 / np.pi)) * beyond * RING * gate / SPREAD
     needed = inside * max(0.05, EXCESS * (1.0 - 3.0 * PARAMETERS / max(inside, 1)))
     return ring - expected > max(2.0 * float(np.sqrt(expected)), needed)
-
-
-def estimate_fundamental(
-    xy1: NDArray[np.float64],
-    xy2: NDArray[np.float64],
-    *,
-    threshold_px: float = 1.0,
-    seed: int | Generator = 0,
-    check_degeneracy: bool = False,
-) -> FundamentalFit:
-    """Estimate the fundamental matrix of matches with outliers by :class:`LocallyOptimisedRansac`.
-
-    Parameters
-    ----------
-    xy1, xy2 : array_like (N, 2)
-        Matched points, N >= 8, px.
-    threshold_px : float
-        Sampson distance of an inlier during the search.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from; the same seed gives the same result.
-    check_degeneracy : bool
-        Also test whether the matches determine F
-        (:func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`); many inliers alone do not show it.
-
-    Returns
-    -------
-    FundamentalFit
-        F with x2' F x1 = 0, inliers, noise, covariance and, on request, the degeneracy report.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ or coordinates are not finite.
-    StageFailure
-        If there are too few or collinear matches, or no F has 8 matches within the threshold.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import thesisrecon
-    >>> rng = np.random.default_rng(0)
-    >>> xy1 = rng.uniform(0, 500, (60, 2))
-    >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
-    >>> xy2[:20] = rng.uniform(0, 500, (20, 2))
-    >>> fit = thesisrecon.estimate_fundamental(xy1, xy2, check_degeneracy=True)
-    >>> bool(fit.inliers[20:].all()), fit.degeneracy.determined
-    (True, True)
-    """
-    rng = np.random.default_rng(seed)
-    fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
-    return replace(fit, degeneracy=assess_degeneracy(fit, xy1, xy2, rng=rng)) if check_degeneracy else fit

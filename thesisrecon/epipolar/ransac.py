@@ -55,7 +55,7 @@ INLIER_TESTS = {
 }
 
 
-def _discard_outliers(
+def discard_outliers(
     F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest = "sampson"
 ) -> tuple[float, B8]:
     """Noise from the median distance within ``limit_px`` (of at least 8 matches), and the matches that pass.
@@ -235,10 +235,10 @@ def _search_and_refine(
             "check that the images overlap and that the matches are correct",
         )
     F = frame.matrix_in_pixels(found[0])
-    sigma, inliers = _discard_outliers(F, xy1, xy2, limit_px=limit_px or np.inf, test=test)
+    sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or np.inf, test=test)
     for _ in range(rounds):
         F = refine_fundamental(F, xy1[inliers], xy2[inliers], criterion)
-        sigma, inliers = _discard_outliers(F, xy1, xy2, limit_px=limit_px or NEAR_SIGMAS * sigma, test=test)
+        sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or NEAR_SIGMAS * sigma, test=test)
     f = frame.matrix_in_frame(F)
     covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
     return FundamentalFit(F, inliers, sigma, covariance, found[2])

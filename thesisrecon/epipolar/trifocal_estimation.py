@@ -6,12 +6,14 @@ Linear equations; least algebraic error (HZ, algorithm 16.2); least reprojection
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.random import Generator
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._frame import MAX_PX
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import (
     homogenize,
@@ -43,7 +45,9 @@ WEAK = 0.4
 # lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls at most 5, which the
 # constraints of the cameras resolve.
 SAME_NOISE, FAMILY = 1.25, 6
-NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
+# Points below which no wrong ones are searched for.
+_SEARCHED = 12
+NO_POINTS, NO_SEGMENTS = np.zeros((0, 2)), np.zeros((3, 0, 2, 2))
 UNDETERMINED = "the matches do not determine the trifocal tensor"
 REMEDY = "use matches off one plane from three different positions, and check for wrong matches"
 _State = tuple[F64, F64]
@@ -66,6 +70,8 @@ class TrifocalFit:
     relative_std : float
         Largest standard deviation of T in conditioned coordinates, times the root of the number of matches.
         Near 1 a change of T by its own size moves the images no more than their noise.
+    inliers : ndarray (N,) of bool
+        Points that were used; the residuals of the others are NaN.
     """
 
     T: F64
@@ -74,30 +80,42 @@ class TrifocalFit:
     sigma_px: float
     covariance: F64
     relative_std: float
+    inliers: B8
 
 
 def estimate_trifocal(
-    points: F64 = NO_POINTS, segments: F64 = NO_SEGMENTS, *, loss_px: float = 1.0
+    xy1: F64 = NO_POINTS,
+    xy2: F64 = NO_POINTS,
+    xy3: F64 = NO_POINTS,
+    *,
+    segments: F64 = NO_SEGMENTS,
+    threshold_px: float | None = 1.0,
+    loss_px: float = 1.0,
+    seed: int | Generator = 0,
 ) -> TrifocalFit:
     """Estimate the trifocal tensor from points and lines of three views.
 
     Minimises Huber's loss of the distances of points to their reprojections and of segment ends to their
-    reprojected lines: the maximum likelihood for Gaussian noise, tolerant of a few wrong matches. The ends of
-    a segment need not match between views.
+    reprojected lines: the maximum likelihood for Gaussian noise, tolerant of a few wrong matches. Points that
+    contradict the epipolar geometry of a pair of views are left out first.
 
     Parameters
     ----------
-    points : ndarray (3, N, 2)
-        Matched points, px.
-    segments : ndarray (3, M, 2, 2)
-        Ends of matched line segments, px; 4 N + 2 M >= 26.
+    xy1, xy2, xy3 : array_like (N, 2)
+        Matched points of the three views, px.
+    segments : ndarray (3, M, 2, 2), optional
+        Ends of matched line segments, px, which need not match between views; 4 N + 2 M >= 26.
+    threshold_px : float or None
+        Threshold of the fundamental matrices that find wrong points among 12 or more; None: no search.
     loss_px : float
         Turning point of Huber's loss.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
 
     Returns
     -------
     TrifocalFit
-        Tensor, residuals, noise and covariance.
+        Tensor, residuals, inliers, noise and covariance.
 
     Raises
     ------
@@ -114,13 +132,21 @@ def estimate_trifocal(
     >>> X = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + [0, 0, 5]
     >>> K, views = np.diag([800.0, 800.0, 1.0]), ([0, 0, 0], [-1, 0.2, 0], [0.3, -1, 0.4])
     >>> points = np.stack([project(K @ np.c_[np.eye(3), t], X) for t in views])
-    >>> bool(estimate_trifocal(points).point_residuals_px.max() < 1e-6)
+    >>> bool(estimate_trifocal(*points).point_residuals_px.max() < 1e-6)
     True
     """
     if not loss_px > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
-    points, segments = _check_triplets(points, segments)
+    require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
+    every, segments = _check_triplets(np.stack([xy1, xy2, xy3]), segments)
+    inliers = np.ones(every.shape[1], dtype=bool)
+    if threshold_px is not None and len(inliers) >= _SEARCHED:
+        inliers = _epipolar_inliers(every, threshold_px, np.random.default_rng(seed))
+    points = every[:, inliers]
     n, m = points.shape[1], segments.shape[1]
+    if 4 * n + 2 * m < NEEDED_EQUATIONS and n < len(inliers):
+        evidence = f"only {n} of {len(inliers)} points agree with the epipolar geometry of all pairs of views"
+        raise StageFailure(UNDETERMINED, evidence, REMEDY)
     if 4 * n + 2 * m < NEEDED_EQUATIONS:
         raise StageFailure(
             "too few matches for the trifocal tensor",
@@ -135,7 +161,22 @@ def estimate_trifocal(
     problem = _ReprojectionProblem(T, points, segments, equations.transforms, loss_px)
     fit = _minimize_reprojection_error(problem, equations)
     _require_determined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
-    return fit
+    residuals = np.full((3, len(inliers)), np.nan)
+    residuals[:, inliers] = fit.point_residuals_px
+    return replace(fit, point_residuals_px=residuals, inliers=inliers)
+
+
+def _epipolar_inliers(points: F64, threshold_px: float, rng: Generator) -> B8:
+    """Points (N,) that agree with the fundamental matrices of all three pairs of views; all if one fails."""
+    inliers = np.ones(points.shape[1], dtype=bool)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        try:
+            fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(points[i], points[j], rng)
+        except StageFailure:
+            # Points of a line or chance matches: the test of the tensor names them.
+            return np.ones(points.shape[1], dtype=bool)
+        inliers &= fit.inliers
+    return inliers
 
 
 def _minimize_algebraic_error(equations: _TensorEquations, start: F64) -> F64:
@@ -257,6 +298,7 @@ def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: _Tens
         sigma_px=sigma,
         covariance=J_px @ of_cameras @ J_px.T,
         relative_std=float(np.sqrt((n + m) * np.linalg.norm(J @ of_cameras @ J.T, ord=2))),
+        inliers=np.ones(n, dtype=bool),
     )
 
 
@@ -269,14 +311,25 @@ def _require_determined(fit: TrifocalFit, equations: _TensorEquations, xy: F64) 
     family = int(np.sum(equations.noise_levels_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
-    if not (family < FAMILY and fit.relative_std <= WEAK and narrowest > 3.0 * fit.sigma_px):
-        raise StageFailure(
-            UNDETERMINED,
-            f"noise {fit.sigma_px:.2g} px explains {family} independent tensors (at most {FAMILY - 1}); "
-            f"narrowest spread of the matches {narrowest:.3g} px; relative standard deviation "
-            f"{fit.relative_std:.2g} (at most {WEAK:.2g})",
-            REMEDY,
+    sigma, found = fit.sigma_px, []
+    if family >= FAMILY:
+        found.append(
+            f"{family} independent tensors satisfy the linear equations of the matches to within their noise "
+            f"of {sigma:.2g} px, so that the matches cannot decide between them (matches of a scene with "
+            f"depth, from three positions, leave at most {FAMILY - 1})"
         )
+    if not fit.relative_std <= WEAK:
+        found.append(
+            f"noise of {sigma:.2g} px changes the tensor by {fit.relative_std:.0%} of its size (at most "
+            f"{WEAK:.0%})"
+        )
+    if not narrowest > 3.0 * sigma:
+        found.append(
+            f"the matches of one image deviate from a line by only {narrowest:.2g} px, less than three times "
+            f"the noise of {sigma:.2g} px"
+        )
+    if found:
+        raise StageFailure(UNDETERMINED, "; ".join(found), REMEDY)
 
 
 @dataclass(frozen=True)

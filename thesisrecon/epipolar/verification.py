@@ -11,7 +11,7 @@ from thesisrecon.epipolar._planes import SUBSET, count_transferred, induced_homo
 from thesisrecon.epipolar.configuration import MINIMUM, Configuration, classify_configuration
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_residuals, unit_norm
+from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_residuals, unit_norm
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
 # 99 % of a plane's matches: sqrt(chi-square(2)) = 3.03, times sqrt(2) for noise in both images.
@@ -147,7 +147,7 @@ def homography_inlier_ratio(
         points1, points2 = xy1[inside], xy2[inside]
         if len(points1) < 5 or not (np.ptp(points1, axis=0).any() and np.ptp(points2, axis=0).any()):
             break
-        again = homography_residuals(estimate_homography(points1, points2), xy1, xy2) < tolerance_px
+        again = homography_residuals(homography_linear(points1, points2), xy1, xy2) < tolerance_px
         if again.sum() <= inside.sum():
             break
         inside = again

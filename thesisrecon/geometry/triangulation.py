@@ -166,16 +166,17 @@ _SortedPixels = tuple[I64, I64, F64]
 """Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
 
 
-def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
+def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
     """Triangulate space points by one of the methods of section 6.3.
 
     Parameters
     ----------
     P, xy : ndarray (V, 3, 4) and (V, N, 2)
         V >= 2 cameras of any scale, and pixels; NaN for not observed.
-    method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}
+    method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}, optional
         "polynomial": optimal for exactly two views; "linear" and "iterated": algebraic; "midpoint": metric
-        frames only; "optimal": least reprojection error from any number of views.
+        frames only; "optimal": least reprojection error from any number of views. None: "polynomial" for two
+        views, else "optimal".
 
     Returns
     -------
@@ -194,9 +195,10 @@ def triangulate(P: F64, xy: F64, *, method: Method = "polynomial") -> F64:
     >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
     True
     """
-    if method not in get_args(Method):
+    if method is not None and method not in get_args(Method):
         raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}")
     P, xy = _checked(P, xy)
+    method = method or ("polynomial" if len(P) == 2 else "optimal")
     if method == "polynomial":
         return triangulate_polynomial(P, xy)
     listed = _listed(xy)

@@ -240,7 +240,7 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
     return unit_norm(np.asarray(H, dtype=np.float64))
 
 
-def estimate_homography(xy1: F64, xy2: F64) -> F64:
+def homography_linear(xy1: F64, xy2: F64) -> F64:
     """Estimate the homography x2 ~ H x1 of unit norm by normalised DLT (HZ algorithm 4.2).
 
     Parameters
@@ -255,13 +255,13 @@ def estimate_homography(xy1: F64, xy2: F64) -> F64:
     Examples
     --------
     >>> xy = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    >>> H = estimate_homography(xy, 2.0 * xy + 1.0)
+    >>> H = homography_linear(xy, 2.0 * xy + 1.0)
     >>> np.allclose(H / H[2, 2], [[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [0.0, 0.0, 1.0]])
     True
     """
-    require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    require_shapes("homography_linear", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     if len(xy1) < 4:
-        raise ValueError(f"estimate_homography needs at least 4 matches; got {len(xy1)}")
+        raise ValueError(f"homography_linear needs at least 4 matches; got {len(xy1)}")
     T1, T2 = normalizing_transform(xy1), normalizing_transform(xy2)
     x1, (u, v) = homogenize(xy1) @ T1.T, (xy2 @ T2[:2, :2].T + T2[:2, 2]).T
     zero = np.zeros_like(x1)
@@ -419,7 +419,7 @@ def _homography_residuals(xy1: F64, xy2: F64) -> F64:
     """Residuals of the homography of most matches: least squares, repeated twice without the worst tenth."""
     inliers, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
     for _ in range(3):
-        H = estimate_homography(xy1[inliers], xy2[inliers])
+        H = homography_linear(xy1[inliers], xy2[inliers])
         residuals = homography_residuals(H, xy1, xy2)
         inliers = residuals <= np.quantile(residuals, 0.9)
     return residuals

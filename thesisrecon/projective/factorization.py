@@ -16,7 +16,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import orient_signs
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
-from thesisrecon.geometry.two_view import epipoles, estimate_homography, homography_sampson_residuals
+from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_sampson_residuals
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.projective._model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
 from thesisrecon.projective._track_selection import (
@@ -257,7 +257,7 @@ def _is_planar(xy: F64, edges: Sequence[Edge], threshold_px: float) -> bool:
     for i, j in edges:
         within = np.ones(xy.shape[1], dtype=bool)
         for _ in range(3):
-            H = estimate_homography(xy[i, within], xy[j, within])
+            H = homography_linear(xy[i, within], xy[j, within])
             distance = np.linalg.norm(homography_sampson_residuals(H, xy[i], xy[j]), axis=1)
             within = distance <= max(threshold_px, 2.0 * float(np.median(distance)))
         shares.append(np.mean(distance <= threshold_px))

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import StageFailure
 from validation.references.libraries import cv2, poselib, pycolmap

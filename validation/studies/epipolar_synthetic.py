@@ -10,8 +10,8 @@ from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point
-from thesisrecon.epipolar.locally_optimised import estimate_fundamental
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import epipolar_lines, epipoles, sampson_residuals, symmetric_residuals

@@ -14,7 +14,7 @@ from thesisrecon import match_pair
 from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.geometry.camera_matrix import camera_centre, camera_from_centre, decompose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.two_view import estimate_homography, homography_residuals
+from thesisrecon.geometry.two_view import homography_linear, homography_residuals
 from thesisrecon.records import Image
 from thesisrecon.view_interpolation import prepare_pair
 from thesisrecon.views._warping import sample
@@ -54,11 +54,11 @@ def nearest_place(pair: InterpolatedPair, P: tuple[F64, F64], C: F64) -> float:
 def best_homography(xy1: F64, xy2: F64) -> F64:
     """Least squares over the nine tenths of the points that fit best."""
     kept = np.ones(len(xy1), dtype=bool)
-    H = estimate_homography(xy1, xy2)
+    H = homography_linear(xy1, xy2)
     for _ in range(3):
         off = homography_residuals(H, xy1, xy2)
         kept = off <= np.quantile(off, 0.9)
-        H = estimate_homography(xy1[kept], xy2[kept])
+        H = homography_linear(xy1[kept], xy2[kept])
     return H
 
 

@@ -1,0 +1,126 @@
+"""The fundamental matrix by any method of chapter 5, with its inliers, noise and covariance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from thesisrecon.epipolar._frame import PairFrame, check_matches
+from thesisrecon.epipolar._refinement import fundamental_covariance
+from thesisrecon.epipolar.degeneracy import assess_degeneracy
+from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.errors import StageFailure, unknown_word
+from thesisrecon.records import FundamentalFit
+
+Method = Literal[
+    "locally-optimised", "ransac", "least-median", "gold-standard", "eight-point", "seven-point"
+]  # fmt: skip
+
+
+def estimate_fundamental(
+    xy1: NDArray[np.float64],
+    xy2: NDArray[np.float64],
+    *,
+    method: Method = "locally-optimised",
+    threshold_px: float = 1.0,
+    seed: int | Generator = 0,
+    check_degeneracy: bool = False,
+) -> FundamentalFit:
+    """Estimate the fundamental matrix of matches by one of the methods of chapter 5.
+
+    Parameters
+    ----------
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 8 (N = 7 for "seven-point"), px.
+    method : str
+        With wrong matches: "locally-optimised"
+        (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
+        the thesis) or "least-median". Of all matches: "gold-standard" (least reprojection error, HZ 11.3),
+        "eight-point" (normalised) or "seven-point" (up to three solutions).
+    threshold_px : float
+        Sampson distance of an inlier during the search of the first two methods.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from; the same seed gives the same result.
+    check_degeneracy : bool
+        Also test whether the matches determine F
+        (:func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`); many inliers alone do not show it.
+
+    Returns
+    -------
+    FundamentalFit
+        F with x2' F x1 = 0, inliers, noise, covariance and, on request, the degeneracy report. The covariance
+        is that of the least Sampson distance at F; that of the linear methods is not smaller. Seven matches
+        leave no residuals: their noise and covariance are NaN, the other solutions are ``competing_models``.
+
+    Raises
+    ------
+    ValueError
+        If the method is unknown, the shapes differ or coordinates are not finite.
+    StageFailure
+        If there are too few or collinear matches, or no F has 8 matches within the threshold.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import thesisrecon
+    >>> rng = np.random.default_rng(0)
+    >>> xy1 = rng.uniform(0, 500, (60, 2))
+    >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+    >>> xy2[:20] = rng.uniform(0, 500, (20, 2))
+    >>> fit = thesisrecon.estimate_fundamental(xy1, xy2, check_degeneracy=True)
+    >>> bool(fit.inliers[20:].all()), fit.degeneracy.determined
+    (True, True)
+    >>> thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point").covariance.shape
+    (9, 9)
+    """
+    rng = np.random.default_rng(seed)
+    if method == "locally-optimised":
+        fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
+    elif method == "seven-point":
+        fit = _fit_seven(xy1, xy2)
+    elif method not in get_args(Method):
+        raise ValueError(unknown_word("method", method, get_args(Method)))
+    else:
+        # Imported on use: the default needs none of it.
+        from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
+
+        if method == "ransac":
+            fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
+        elif method == "least-median":
+            fit = LeastMedianOfSquares().estimate(xy1, xy2, rng)
+        else:
+            fit = _fit_all(xy1, xy2, refined=method == "gold-standard")
+    return replace(fit, degeneracy=assess_degeneracy(fit, xy1, xy2, rng=rng)) if check_degeneracy else fit
+
+
+def _fit_all(xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, refined: bool) -> FundamentalFit:
+    """Estimate F from all matches; the noise by the median residual, as for the robust methods."""
+    from thesisrecon.epipolar.ransac import discard_outliers
+    from thesisrecon.epipolar.refinement import refine_fundamental
+
+    xy1, xy2 = check_matches(xy1, xy2, needed=8)
+    F = estimate_eight_point(xy1, xy2)
+    F = refine_fundamental(F, xy1, xy2, "reprojection") if refined else F
+    sigma, inliers = discard_outliers(F, xy1, xy2)
+    frame = PairFrame.of(xy1, xy2)
+    points = frame.points(xy1[inliers], xy2[inliers])
+    covariance = fundamental_covariance(frame, frame.matrix_in_frame(F), points, sigma * frame.scale)
+    return FundamentalFit(F, inliers, sigma, covariance)
+
+
+def _fit_seven(xy1: NDArray[np.float64], xy2: NDArray[np.float64]) -> FundamentalFit:
+    solutions = estimate_seven_point(xy1, xy2)
+    if not len(solutions):
+        raise StageFailure(
+            "the seven matches do not determine the fundamental matrix",
+            "their equations are dependent",
+            "choose seven matches in general position, no four of them in one plane of the scene",
+        )
+    nan = float("nan")
+    every = np.ones(len(xy1), dtype=bool)
+    return FundamentalFit(solutions[0], every, nan, np.full((9, 9), nan), 0, solutions[1:])
