@@ -86,7 +86,7 @@ def estimate_homography(
     >>> xy2 = 2.0 * xy1 + [30.0, 10.0]
     >>> xy2[:10] += [[70.0, -50.0]] * np.arange(1, 11)[:, None]
     >>> fit = estimate_homography(xy1, xy2)
-    >>> int(fit.inliers.sum()), (fit.H / fit.H[2, 2]).round(6).tolist()
+    >>> int(fit.inliers.sum()), np.abs(fit.H / fit.H[2, 2]).round(6).tolist()
     (30, [[2.0, 0.0, 30.0], [0.0, 2.0, 10.0], [0.0, 0.0, 1.0]])
     """
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
