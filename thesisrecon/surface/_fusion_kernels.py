@@ -28,6 +28,21 @@ class MapSamples(NamedTuple):
     slope: float
 
 
+class Window(NamedTuple):
+    """Blocks of a voxel grid from number ``first`` on, of which the values are in memory.
+
+    ``blocks`` (B, 3): grid positions of all blocks; ``place`` (X, Y, Z): block number at each position or -1.
+    ``value``, ``weight``, ``vertex`` (W, 8, 8, 8): signed distance, its weight, and vertex number or -1.
+    """
+
+    first: int
+    blocks: I64
+    place: I32
+    value: F32
+    weight: F32
+    vertex: I32
+
+
 @kernel
 def touched_blocks(
     samples: MapSamples, rays: F64, centre: F64, reach: float, edge: float, marked: U8
@@ -135,39 +150,39 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
 
 
 @kernel
-def _find(place: I64, i: int, j: int, k: int) -> int:
-    """Number of the block at grid voxel (i, j, k), -1 if there is none."""
+def _find(window: Window, i: int, j: int, k: int) -> int:
+    """Row of the block at grid voxel (i, j, k) in the window, -1 if there is no block."""
+    place = window.place
     if i < 0 or j < 0 or k < 0:
         return -1
     bi, bj, bk = i // SIDE, j // SIDE, k // SIDE
     if bi >= place.shape[0] or bj >= place.shape[1] or bk >= place.shape[2]:
         return -1
-    return int(place[bi, bj, bk])
+    return max(int(place[bi, bj, bk]) - window.first, -1)
 
 
 @kernel
-def place_vertices(
-    rows: tuple[int, int], blocks: I64, place: I64, value: F32, weight: F32, vertex: I32, points: F64
-) -> int:
+def place_vertices(rows: tuple[int, int], window: Window, points: F64) -> int:
     """Place one vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
 
-    ``rows``: first and last + 1 block; ``place`` (X, Y, Z): block numbers or -1; ``vertex`` (B, 8, 8, 8)
-    receives the vertex number of each cell or -1, counted from the first block; ``points`` (N, 3) receives
-    the first N vertices in voxels, each the mean of the zero crossings of the cell edges. Returns the number
-    of vertices.
+    ``rows``: first and last + 1 block; their cells in ``window.vertex`` receive their vertex number or -1,
+    counted from the first block; ``points`` (N, 3) receives the first N vertices in voxels, each the mean of
+    the zero crossings of the cell edges. Returns the number of vertices.
     """
     count = 0
     corner = empty(8)
+    blocks, value, weight = window.blocks, window.value, window.weight
     for b in range(rows[0], rows[1]):
+        own = b - window.first
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):
-                    vertex[b, i, j, k] = -1
+                    window.vertex[own, i, j, k] = -1
                     x, y, z = blocks[b, 0] * SIDE + i, blocks[b, 1] * SIDE + j, blocks[b, 2] * SIDE + k
                     inside, known = 0, True
                     for c in range(8):
                         X, Y, Z = x + (c & 1), y + ((c >> 1) & 1), z + (c >> 2)
-                        n = _find(place, X, Y, Z)
+                        n = _find(window, X, Y, Z)
                         if n < 0 or not weight[n, X % SIDE, Y % SIDE, Z % SIDE] > 0.0:
                             known = False
                             break
@@ -180,7 +195,7 @@ def place_vertices(
                         points[count, 0] += x
                         points[count, 1] += y
                         points[count, 2] += z
-                    vertex[b, i, j, k] = count
+                    window.vertex[own, i, j, k] = count
                     count += 1
     return count
 
@@ -206,47 +221,42 @@ def _mean_crossing(corner: F64, point: F64) -> None:
 
 
 @kernel
-def join_vertices(
-    rows: tuple[int, int],
-    blocks: I64,
-    place: I64,
-    value: F32,
-    weight: F32,
-    vertex: I32,
-    points: F64,
-    faces: I64,
-) -> int:
+def join_vertices(rows: tuple[int, int], window: Window, points: F64, known: int, faces: I32) -> int:
     """Create two triangles across each voxel edge that the surface crosses, anticlockwise from outside.
 
-    ``rows``: first and last + 1 block; ``faces`` (M, 3) receives the first M faces; the shorter diagonal is
-    used. Returns the number of faces.
+    ``rows``: first and last + 1 block; ``points`` of the vertices from number ``known`` on; ``faces`` (M, 3)
+    receives the first M faces; the shorter diagonal is used. Returns the number of faces.
     """
     count = 0
     step = zeros(3, np.int64)
     ring = empty(4, np.int64)
+    blocks, value, weight = window.blocks, window.value, window.weight
     for b in range(rows[0], rows[1]):
+        own = b - window.first
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):
-                    if not weight[b, i, j, k] > 0.0:
+                    if not weight[own, i, j, k] > 0.0:
                         continue
-                    start = value[b, i, j, k]
+                    start = value[own, i, j, k]
                     x, y, z = blocks[b, 0] * SIDE + i, blocks[b, 1] * SIDE + j, blocks[b, 2] * SIDE + k
                     for axis in range(3):
                         step[:] = 0
                         step[axis] = 1
                         X, Y, Z = x + step[0], y + step[1], z + step[2]
-                        n = _find(place, X, Y, Z)
+                        n = _find(window, X, Y, Z)
                         if n < 0 or not weight[n, X % SIDE, Y % SIDE, Z % SIDE] > 0.0:
                             continue
                         stop = value[n, X % SIDE, Y % SIDE, Z % SIDE]
                         if (start < 0.0) == (stop < 0.0):
                             continue
-                        if not _ring(place, vertex, (x, y, z), axis, ring):
+                        if not _ring(window, (x, y, z), axis, ring):
                             continue
                         if stop < 0.0:
                             ring[1], ring[3] = ring[3], ring[1]
-                        first = _squared(points, ring[0], ring[2]) <= _squared(points, ring[1], ring[3])
+                        first = _squared(points, ring[0] - known, ring[2] - known) <= _squared(
+                            points, ring[1] - known, ring[3] - known
+                        )
                         if count + 2 <= faces.shape[0]:
                             for t in range(3):
                                 faces[count, t] = ring[t] if first else ring[(t + 1) % 4]
@@ -259,14 +269,13 @@ def join_vertices(
 @kernel
 def _squared(points: F64, a: int, b: int) -> float:
     total = 0.0
-    if max(a, b) < points.shape[0]:
-        for d in range(3):
-            total += (points[a, d] - points[b, d]) ** 2
+    for d in range(3):
+        total += (points[a, d] - points[b, d]) ** 2
     return total
 
 
 @kernel
-def _ring(place: I64, vertex: I32, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
+def _ring(window: Window, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
     """Vertices of the four cells around an edge from voxel ``at``; False if one is missing."""
     second, third = (axis + 1) % 3, (axis + 2) % 3
     for t in range(4):
@@ -275,10 +284,10 @@ def _ring(place: I64, vertex: I32, at: tuple[int, int, int], axis: int, ring: I6
         X = at[0] - (back_second if second == 0 else 0) - (back_third if third == 0 else 0)
         Y = at[1] - (back_second if second == 1 else 0) - (back_third if third == 1 else 0)
         Z = at[2] - (back_second if second == 2 else 0) - (back_third if third == 2 else 0)
-        n = _find(place, X, Y, Z)
+        n = _find(window, X, Y, Z)
         if n < 0:
             return False
-        ring[t] = vertex[n, X % SIDE, Y % SIDE, Z % SIDE]
+        ring[t] = window.vertex[n, X % SIDE, Y % SIDE, Z % SIDE]
         if ring[t] < 0:
             return False
     return True

@@ -51,7 +51,7 @@ class MeshState(NamedTuple):
     planes: F64
     limit: F64
     border: U8
-    faces: I64
+    faces: I32
     first: I32
     following: I32
     block: I32
@@ -298,7 +298,9 @@ def _merge(mesh: MeshState, v: int, w: int, planes: F64, point: F64) -> None:
         mesh.following[last] = -1
 
 
-def simplify_surface(mesh: TexturedMesh, limit: F64, *, longest: float, threads: int = 1) -> TexturedMesh:
+def simplify_surface(
+    mesh: TexturedMesh, limit: F64, *, longest: float, threads: int = 1, overwrite: bool = False
+) -> TexturedMesh:
     """Collapse edges while the planes of the original faces stay near.
 
     Parameters
@@ -311,27 +313,32 @@ def simplify_surface(mesh: TexturedMesh, limit: F64, *, longest: float, threads:
         Longest new side of a face.
     threads : int
         Number of threads; the result does not depend on it.
+    overwrite : bool
+        Whether the arrays of the mesh may be used for the computation, which saves memory.
 
     Returns
     -------
     TexturedMesh
     """
-    centre = mesh.vertices.mean(axis=0)
-    faces, size = mesh.faces.copy(), len(mesh.vertices)
+    size, centre = len(mesh.vertices), mesh.vertices.mean(axis=0)
+    points = np.subtract(mesh.vertices, centre, out=mesh.vertices if overwrite else None)
     state = _linked(MeshState(
-        mesh.vertices - centre, np.zeros((size, 11)), limit**2, np.zeros(size, np.uint8),
-        faces, np.empty(size, np.int32), np.empty(0, np.int32), np.full(size, -1, np.int32),
+        points, np.zeros((size, 11)), limit**2, np.zeros(size, np.uint8),
+        mesh.faces.astype(np.int32, copy=not overwrite), np.empty(size, np.int32), np.empty(0, np.int32),
+        np.full(size, -1, np.int32),
     ))  # fmt: skip
     sum_planes(state)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for axis in np.argsort(-np.ptp(state.points, axis=0), kind="stable")[:ROUNDS]:
-            state, starts = _in_blocks(state, int(axis))
+        for axis in np.argsort(-np.ptp(points, axis=0), kind="stable")[:ROUNDS]:
+            starts = _sort_into_blocks(state, int(axis))
+            state = _linked(state)
             blocks = enumerate(pairwise(starts.tolist()))
             list(pool.map(lambda one: collapse_edges(state, one[1], one[0], longest), blocks))  # noqa: B023
             state = state._replace(faces=state.faces[state.faces[:, 0] >= 0])
             if len(starts) == 2:
                 break
-    return remove_unused_vertices(replace(mesh, vertices=state.points + centre, faces=state.faces))
+    made = remove_unused_vertices(replace(mesh, vertices=points, faces=state.faces.astype(np.int64)))
+    return replace(made, vertices=made.vertices + centre)
 
 
 def _linked(state: MeshState) -> MeshState:
@@ -340,26 +347,25 @@ def _linked(state: MeshState) -> MeshState:
     return state
 
 
-def _in_blocks(state: MeshState, axis: int) -> tuple[MeshState, I64]:
+def _sort_into_blocks(state: MeshState, axis: int) -> I64:
     """Sort the faces into slabs across an axis; returns the first face of each, and the number of faces."""
-    count = max(1, -(-len(state.faces) // BLOCK_FACES))
-    starts = np.linspace(0, len(state.faces), count + 1).astype(np.int64)
-    faces = state.faces
+    faces, block = state.faces, state.block
+    count = max(1, -(-len(faces) // BLOCK_FACES))
+    starts = np.linspace(0, len(faces), count + 1).astype(np.int64)
+    slab = np.zeros(len(faces), np.int16)
     if count > 1:
         place = state.points[faces[:, 0], axis]
         ends = np.partition(place, starts[1:-1])[starts[1:-1]]
-        slab = np.searchsorted(ends, place, side="right").astype(np.int16)
+        slab[:] = np.searchsorted(ends, place, side="right")
         order = np.argsort(slab, kind="stable")
-        faces, slab = faces[order], slab[order]
+        faces[:], slab = faces[order], slab[order]
         starts = np.searchsorted(slab, np.arange(count + 1))
-    else:
-        slab = np.zeros(len(faces), np.int16)
-    block = np.full(len(state.points), -1, np.int32)
+    block[:] = -1
     for corner in faces.T:
         block[corner] = slab
     for corner in faces.T:
         block[corner[block[corner] != slab]] = -1
-    return _linked(state._replace(faces=faces, block=block)), starts
+    return starts
 
 
 def reduce_faces(mesh: TexturedMesh, max_faces: int, *, threads: int = 1) -> TexturedMesh:

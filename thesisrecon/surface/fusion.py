@@ -7,6 +7,7 @@ vertex per cell, which avoids the slivers of marching cubes. :class:`DepthSheets
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,13 +18,14 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.arrays import B8, F32, F64, I32, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import decompose_camera, project
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface._fusion_kernels import (
     SIDE,
     MapSamples,
+    Window,
     integrate_view,
     join_vertices,
     place_vertices,
@@ -43,8 +45,8 @@ MAX_RELATIVE = 0.02
 """Relative depth difference, or three standard deviations, up to which a sheet already shows a point."""
 VOXEL_GROWTH = 1.15
 """Factor by which voxels are enlarged until the blocks fit into memory."""
-EXTRACTED_BLOCKS = 4096
-"""Blocks whose surface is extracted at a time."""
+SLAB_BLOCKS, TASK_BLOCKS = 8192, 512
+"""Blocks in memory at a time, besides a layer before and after them, and blocks of one task."""
 MAX_STD_VOXELS = 1.0
 """Upper limit of the standard deviations that count for the simplification."""
 LONGEST_VOXELS = 16.0
@@ -55,13 +57,13 @@ LONGEST_VOXELS = 16.0
 class _Grid:
     """Sparse voxel grid: ``origin`` (3,) of the first voxel centre and ``voxel`` size.
 
-    ``blocks`` (B, 3): grid positions; ``place`` (X, Y, Z): block number at each position or -1.
+    ``blocks`` (B, 3): grid positions, in order; ``place`` (X, Y, Z): block number at each position or -1.
     """
 
     origin: F64
     voxel: float
     blocks: I64
-    place: I64
+    place: I32
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ class VolumetricFusion:
             raise _nothing_to_fuse()
         if self.tolerance:
             limit, longest = self.tolerance * np.minimum(std, MAX_STD_VOXELS * voxel), LONGEST_VOXELS * voxel
-            surface = simplify_surface(surface, limit, longest=longest, threads=threads)
+            surface = simplify_surface(surface, limit, longest=longest, threads=threads, overwrite=True)
         return remove_small_parts(surface)
 
     def _fused(self, depth_maps: Sequence[DepthMap], threads: int) -> tuple[TexturedMesh, F64, float]:
@@ -122,20 +124,7 @@ class VolumetricFusion:
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             measured = list(pool.map(_measured, depth_maps))
             grid, truncation, measured = self._lay_out(measured)
-            value = np.zeros((len(grid.blocks), SIDE, SIDE, SIDE), dtype=np.float32)
-            weight = np.zeros_like(value)
-            poses = [decompose_camera(one.P) for one in measured]
-            cameras = [K @ np.column_stack([R, t + R @ grid.origin]) for K, R, t in poses]
-
-            def integrate(part: I64) -> None:
-                some = slice(int(part[0]), int(part[-1]) + 1)
-                blocks, values, weights = grid.blocks[some], value[some], weight[some]
-                for one, P in zip(measured, cameras, strict=True):
-                    integrate_view(blocks, grid.voxel, P, one.samples, truncation, values, weights)
-
-            parts = np.array_split(np.arange(len(grid.blocks)), 4 * max(threads, 1))
-            list(pool.map(integrate, filter(len, parts)))
-        return *_extract_surface(grid, value, weight, threads), grid.voxel
+            return *_Extraction(grid, truncation, measured, pool).surface(), grid.voxel
 
     def _lay_out(self, measured: list[_FusionMap]) -> tuple[_Grid, float, list[_FusionMap]]:
         """Voxel grid, truncation distance, and the depths that are certain enough for it."""
@@ -255,43 +244,89 @@ def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid |
         directions, centre = one.rays
         touched_blocks(one.samples, directions, centre - origin, reach, edge, marked)
     blocks = np.argwhere(marked).astype(np.int64)
-    place = np.full(marked.shape, -1, dtype=np.int64)
+    place = np.full(marked.shape, -1, dtype=np.int32)
     place[tuple(blocks.T)] = np.arange(len(blocks))
     return _Grid(origin, voxel, blocks, place)
 
 
-def _extract_surface(grid: _Grid, value: F32, weight: F32, threads: int) -> tuple[TexturedMesh, F64]:
-    """Zero level of ``value`` (B, 8, 8, 8) where ``weight`` is positive, as a surface net.
+class _Extraction:
+    """Zero level of the fused distances as a surface net, computed slab by slab.
 
-    Also returns the standard deviation at each vertex; weights are inverse variances.
+    A slab is a range of layers of blocks across the first axis. The layers before and after it are in memory,
+    too: its faces use vertices of the former, and its cells voxels of the latter.
     """
-    vertex = np.empty(value.shape, dtype=np.int32)
-    cells = grid.blocks, grid.place, value, weight, vertex
-    parts = list(pairwise([*range(0, len(vertex), EXTRACTED_BLOCKS), len(vertex)]))
 
-    def placed(rows: tuple[int, int]) -> F64:
-        place = partial(place_vertices, rows, *cells)
-        return np.asarray(_filled(place, 128 * (rows[1] - rows[0]), np.float64))
+    def __init__(
+        self, grid: _Grid, truncation: float, measured: Sequence[_FusionMap], pool: ThreadPoolExecutor
+    ) -> None:
+        poses = [decompose_camera(one.P) for one in measured]
+        cameras = [K @ np.column_stack([R, t + R @ grid.origin]) for K, R, t in poses]
+        self.views = [(one.samples, P) for one, P in zip(measured, cameras, strict=True)]
+        self.grid, self.truncation, self.pool = grid, truncation, pool
 
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        found = list(pool.map(placed, parts))
-        starts = np.cumsum([0, *map(len, found)])
+    def surface(self) -> tuple[TexturedMesh, F64]:
+        """Return the surface and the standard deviation at each vertex: weights are inverse variances."""
+        grid = self.grid
+        # The first block of each layer, with an empty layer before the first and after the last one.
+        layers = np.searchsorted(grid.blocks[:, 0], np.arange(-1, grid.place.shape[0] + 2)).tolist()
+        none = np.empty((0, SIDE, SIDE, SIDE), np.float32)
+        window = Window(0, grid.blocks, grid.place, none, none, none.astype(np.int32))
+        points, faces, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int32)], [none[:, 0, 0, 0]]
+        first, known = 1, 0
+        while first < len(layers) - 2:
+            last = max(first + 1, min(bisect_right(layers, layers[first] + SLAB_BLOCKS), len(layers) - 1) - 1)
+            window = self._moved(window, layers[first - 1], layers[last + 1])
+            rows = [*range(layers[first], layers[last], TASK_BLOCKS), layers[last]]
+            found = list(self.pool.map(partial(_placed, window), pairwise(rows)))
+            starts = np.cumsum([known + len(points[-1]), *map(len, found)]).tolist()
+            near = np.concatenate([points[-1], *found])
+            for start, (begin, end) in zip(starts[:-1], pairwise(rows), strict=True):
+                own = window.vertex[begin - window.first : end - window.first]
+                own[own >= 0] += start
+                weights.append(window.weight[begin - window.first : end - window.first][own >= 0])
+            join = partial(_joined, window, near, known)
+            faces += self.pool.map(join, pairwise(rows), map(len, found))
+            known += len(points[-1])
+            points.append(near[len(points[-1]) :])
+            first = last
+        vertices = np.concatenate(points)
+        vertices *= grid.voxel
+        vertices += grid.origin
+        return TexturedMesh(vertices, np.concatenate(faces)), 1.0 / np.sqrt(
+            np.concatenate(weights, dtype=float)
+        )
 
-        def number(part: int) -> None:
-            own = vertex[slice(*parts[part])]
-            np.add(own, int(starts[part]), out=own, where=own >= 0)
+    def _moved(self, old: Window, begin: int, end: int) -> Window:
+        """The window of blocks ``begin`` to ``end``; those after the old one's are computed."""
+        kept = slice(begin - old.first, None)
+        done, size = len(old.value) - kept.start, end - begin
+        value, weight, vertex = (
+            np.concatenate([array[kept], np.zeros((size - done, *array.shape[1:]), array.dtype)])
+            for array in (old.value, old.weight, old.vertex)
+        )
 
-        list(pool.map(number, range(len(parts))))
-        points = np.concatenate([np.zeros((0, 3)), *found])
+        def integrate(part: tuple[int, int]) -> None:
+            rows = slice(*part)
+            blocks = self.grid.blocks[begin + part[0] : begin + part[1]]
+            for samples, P in self.views:
+                integrate_view(
+                    blocks, self.grid.voxel, P, samples, self.truncation, value[rows], weight[rows]
+                )
 
-        def joined(part: int) -> I64:
-            join = partial(join_vertices, parts[part], *cells, points)
-            return np.asarray(_filled(join, 3 * len(found[part]), np.int64))
+        list(self.pool.map(integrate, pairwise([*range(done, size, TASK_BLOCKS), size])))
+        return old._replace(first=begin, value=value, weight=weight, vertex=vertex)
 
-        faces = np.concatenate([np.zeros((0, 3), np.int64), *pool.map(joined, range(len(parts)))])
-    # Vertices are numbered in the order of the voxels.
-    std = 1.0 / np.sqrt(weight[vertex >= 0].astype(np.float64))
-    return TexturedMesh(grid.origin + grid.voxel * points, faces), std
+
+def _placed(window: Window, rows: tuple[int, int]) -> F64:
+    """The vertices (N, 3) of some blocks."""
+    place = partial(place_vertices, rows, window)
+    return np.asarray(_filled(place, 128 * (rows[1] - rows[0]), np.float64))
+
+
+def _joined(window: Window, points: F64, known: int, rows: tuple[int, int], vertices: int) -> I32:
+    """The faces (M, 3) of some blocks with a number of vertices."""
+    join = partial(join_vertices, rows, window, points, known)
+    return np.asarray(_filled(join, 3 * vertices, np.int32))
 
 
 def _filled(fill: Callable[[Any], int], guess: int, kind: type[Any]) -> Any:
