@@ -29,7 +29,7 @@ class MapSamples(NamedTuple):
 
 
 class Window(NamedTuple):
-    """Blocks of a voxel grid from number ``first`` on, of which the values are in memory.
+    """The blocks of a voxel grid whose values are in memory, from number ``first`` on.
 
     ``blocks`` (B, 3): grid positions of all blocks; ``place`` (X, Y, Z): block number at each position or -1.
     ``value``, ``weight``, ``vertex`` (W, 8, 8, 8): signed distance, its weight, and vertex number or -1.
