@@ -16,7 +16,7 @@ __all__ = [  # noqa: F405
     "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
     "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__",
     "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view", "match_pair",
-    "match_rectified", "reconstruct", "render", "self_calibrate", "synthesize_view", "triangulate",
+    "match_rectified", "reconstruct", "render", "resect", "self_calibrate", "synthesize_view", "triangulate",
     "upgrade_affine",
 ]  # fmt: skip
 
@@ -29,6 +29,7 @@ _HOMES = {
     "estimate_fundamental": "epipolar.estimation",
     "estimate_homography": "epipolar.homography",
     "estimate_trifocal": "epipolar.trifocal_estimation",
+    "resect": "geometry.robust_resection",
     "triangulate": "geometry.triangulation",
 }
 """Modules of what needs no configuration, whose import takes longest; the others are in `api`."""

@@ -13,6 +13,7 @@ from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
 from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.robust_resection import resect
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.io._images import read_image
@@ -39,7 +40,7 @@ __all__ = [
     "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
     "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError",
     "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view", "match_pair",
-    "match_rectified", "reconstruct", "render", "self_calibrate", "synthesize_view", "triangulate",
+    "match_rectified", "reconstruct", "render", "resect", "self_calibrate", "synthesize_view", "triangulate",
     "upgrade_affine",
 ]  # fmt: skip
 

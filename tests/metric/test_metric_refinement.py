@@ -8,8 +8,8 @@ import pytest
 from tests.metric.test_population import refine
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
+from thesisrecon.geometry.robust_resection import resect_calibrated
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric._resection import resect_calibrated
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.metrics.similarity import estimate_similarity

@@ -10,6 +10,7 @@ from tests.synthetic import make_scene, true_pairs
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project, project_camera
 from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry.robust_resection import resect_projective
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.projective._model import ProjectiveModel, consistent_observations, retriangulate_points
 from thesisrecon.projective._track_selection import (
@@ -23,7 +24,6 @@ from thesisrecon.projective.incremental import (
     IncrementalProjective,
     _find_inconsistent_view,
     _projection_std_px,
-    _resect_ransac,
 )
 from thesisrecon.projective.sequential import SequentialProjective
 from thesisrecon.records import DegeneracyReport, Tracks
@@ -138,7 +138,7 @@ def test_robust_resection_finds_the_camera_among_wrong_points():
     xy = project(scene.P[1], Xh)
     wrong = np.arange(len(xy)) < 90
     xy[wrong] += rng.uniform(30, 300, (90, 2))
-    P, inlier = _resect_ransac(Xh, xy, threshold_px=2.0, rng=rng)
+    P, inlier = resect_projective(Xh, xy, threshold_px=2.0, rng=rng)
     assert P is not None
     np.testing.assert_array_equal(inlier, ~wrong)
     np.testing.assert_allclose(project(P, Xh[~wrong]), xy[~wrong], atol=1e-3)

@@ -110,7 +110,9 @@ def estimate_homography(
             if k == 0:
                 limit = max(noise_width(np.abs(r[:, 0]), gate, parameters=_PARAMETERS), gate)
             else:
-                limit = _INLIER_SIGMAS * noise_from_distances(distance[inliers])
+                # The median of the inliers alone would be too small, since their limit cuts off the noise.
+                near = distance <= max(2.0 * limit, float(np.median(distance[inliers])))
+                limit = _INLIER_SIGMAS * noise_from_distances(distance[near])
             inliers = distance <= max(limit, _EXACT)
             if inliers.sum() < _SAMPLE:
                 raise _undetermined(f"{inliers.sum()} of {len(points)} are within {threshold_px:g} px")

@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import counted
-from thesisrecon.geometry.resection import pose_from_three_points
+from thesisrecon.geometry.robust_resection import resect_calibrated
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
@@ -26,43 +26,12 @@ ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 """Factors tried on the focal length of a camera that shares it with no registered view."""
 WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
 """k1 is free from the start: without it gates would have to admit wrong points."""
-SAMPLES = 300
-"""Three-point samples of one camera."""
 MIN_POINTS = 15
 """Points of the model that a missing camera must see."""
 MAX_ROUNDS = 6
 MIN_GAIN = 0.003
 """Increase of the inlier ratio below which the rounds end."""
 MIN_INLIER_RATIO = 0.5
-
-
-def resect_calibrated(
-    X: F64, normalized: F64, *, threshold: float, rng: np.random.Generator
-) -> tuple[F64, F64, B8] | None:
-    """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score.
-
-    ``normalized`` (M, 2) are the image points of ``X`` (M, 3), ``threshold`` is in their unit. Returns R, t
-    and inliers (M,), or None below four points or if no sample has a pose.
-    """
-    if len(X) < 4:
-        return None
-    chosen = rng.random((SAMPLES, len(X))).argpartition(2, axis=1)[:, :3]
-    rays = np.column_stack([normalized, np.ones(len(X))])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    R, t, _ = pose_from_three_points(X[chosen], rays[chosen])
-    if len(R) == 0:
-        return None
-    scored = rng.choice(len(X), 500, replace=False) if len(X) > 500 else np.arange(len(X))
-    cost = np.minimum(_squared(R, t, X[scored], normalized[scored]) / threshold**2, 1.0).sum(axis=1)
-    best = int(cost.argmin())
-    return R[best], t[best], _squared(R[best : best + 1], t[best : best + 1], X, normalized)[0] < threshold**2
-
-
-def _squared(R: F64, t: F64, X: F64, xy: F64) -> F64:
-    Y = np.einsum("cij,mj->cmi", R, X) + t[:, None]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        squared = np.sum((Y[..., :2] / Y[..., 2:] - xy) ** 2, axis=-1)
-    return np.where((Y[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
 
 
 def _pose_and_focal(

@@ -14,8 +14,7 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import whitening_transform
-from thesisrecon.geometry.resection import resect_linear
+from thesisrecon.geometry.robust_resection import resect_projective
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.numerics.partial_bundle import refine_camera
 from thesisrecon.projective._model import (
@@ -35,66 +34,6 @@ from thesisrecon.projective._track_selection import (
     working_tracks,
 )
 from thesisrecon.records import Reconstruction, Tracks, TwoView
-
-_SAMPLE = 6
-_BATCH, _MAX_BATCHES = 64, 12
-
-
-def _resect_ransac(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -> tuple[F64 | None, B8]:
-    """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
-
-    Samples are drawn in batches until one without outliers was drawn with probability 0.999. Points X (M, 4)
-    are signed so that depths have one sign; those of the other sign are outliers. Returns the camera of the
-    inliers with positive depths, None below six of them, and the inliers (M,).
-    """
-    none = np.zeros(len(X), dtype=bool)
-    if len(X) < _SAMPLE:
-        return None, none
-    # The points of one view may fill a corner of the frame: whitening keeps all digits.
-    M = whitening_transform(X)
-    Y = X @ M.T
-    Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
-    best_cost, best, drawn = np.inf, None, 0
-    scored = rng.choice(len(Y), 1000, replace=False) if len(Y) > 1000 else np.arange(len(Y))
-    for _ in range(_MAX_BATCHES):
-        samples = rng.random((_BATCH, len(Y))).argpartition(_SAMPLE - 1, axis=1)[:, :_SAMPLE]
-        P = resect_linear(Y[samples], xy[samples])
-        P = np.concatenate([P, -P])
-        squared = _squared_residuals(P, Y[scored], xy[scored]) / threshold_px**2
-        cost = np.minimum(squared, 1.0).sum(axis=1)
-        drawn += _BATCH
-        if cost.min() < best_cost:
-            best_cost, best = float(cost.min()), P[cost.argmin()]
-        share = 1.0 - best_cost / len(scored)
-        if drawn * np.log1p(-min(share**_SAMPLE, 1 - 1e-9)) < np.log(1e-3):
-            break
-    if best is None:
-        return None, none
-    found, inlier = _refit(best, Y, xy, threshold_px)
-    return (None if found is None else found @ M), inlier
-
-
-def _refit(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:
-    """Estimate the camera again from its inliers, twice."""
-    inlier = _squared_residuals(P[None], X, xy)[0] < threshold_px**2
-    for _ in range(2):
-        if inlier.sum() < _SAMPLE:
-            return None, inlier
-        candidate = resect_linear(X[inlier], xy[inlier])
-        candidate *= np.sign(np.median(X[inlier] @ candidate[2])) or 1.0
-        support = _squared_residuals(candidate[None], X, xy)[0] < threshold_px**2
-        if support.sum() < inlier.sum():
-            break
-        P, inlier = candidate, support
-    return P, inlier
-
-
-def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
-    """Return squared reprojection residuals (B, M), inf on or behind the principal plane."""
-    xh = np.einsum("bij,mj->bmi", P, X)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=-1)
-    return np.where((xh[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
 
 
 def _projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
@@ -309,7 +248,7 @@ class IncrementalProjective:
         t, early = model.tracks, self.outlier_sigmas[0]
         k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
         X, xy = model.X[t.point_index[k]], t.xy[k]
-        P, inlier = _resect_ransac(X, xy, threshold_px=early * model.sigma_px, rng=rng)
+        P, inlier = resect_projective(X, xy, threshold_px=early * model.sigma_px, rng=rng)
         if P is None or inlier.sum() < self.min_points or inlier.mean() < _MIN_INLIER_RATIO:
             model.reasons[view] = (
                 f"only {int(inlier.sum())} of {len(k)} points of the model are inliers of its resection"

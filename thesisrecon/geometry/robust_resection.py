@@ -1,0 +1,258 @@
+"""Section 6.4: cameras from points of which some are wrong: RANSAC, refinement, noise and covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import Generator
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, depth, project
+from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes, whitening_transform
+from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
+from thesisrecon.numerics.noise import noise_from_distances
+from thesisrecon.numerics.partial_bundle import refine_camera, refine_pose
+
+_SAMPLE = 6
+_BATCH, _MAX_BATCHES = 64, 12
+# Three-point samples of one camera.
+_SAMPLES = 300
+# Search threshold if all points are inliers.
+_ANY_PX = 1e4
+# Residual of an inlier in standard deviations, the variance of residuals within it, and rounds to find it.
+_INLIER_SIGMAS, _TRIMMED_VARIANCE, _ROUNDS = 3.0, 0.9494, 6
+# Residuals below this are rounding errors, not noise.
+_EXACT_PX = 1e-6
+# Ratio of extents below which points lie in one plane.
+_FLAT = 1e-6
+
+
+@dataclass(frozen=True)
+class Resection:
+    """A camera from space points and their pixels.
+
+    Parameters
+    ----------
+    P, K, R, t : ndarray (3, 4), (3, 3), (3, 3) and (3,)
+        Camera P = K [R t], with K as given or estimated.
+    inliers, sigma_px : ndarray (N,) of bool, float
+        Inliers, and the standard deviation of one image coordinate; NaN if no residuals are left.
+    covariance : ndarray (12, 12) or (6, 6)
+        Covariance of the entries of P (row-major, rank 11) or, with a given K, of the pose: rotation vector w
+        (rad) and translation d of x -> exp(w) x + d in the camera frame.
+    """
+
+    P: F64
+    K: F64
+    R: F64
+    t: F64
+    inliers: B8
+    sigma_px: float
+    covariance: F64
+
+
+def resect(
+    X: F64, xy: F64, K: F64 | None = None, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
+) -> Resection:
+    """Estimate a camera from space points and their pixels, some of them wrong (section 6.4).
+
+    RANSAC over samples of six points (DLT), or with K of three (P3P), then the least reprojection error of
+    the inliers.
+
+    Parameters
+    ----------
+    X, xy : array_like (N, 3) and (N, 2)
+        Points, N >= 6 (N >= 4 with K), and their pixels.
+    K : ndarray (3, 3), optional
+        Calibration matrix; None: estimated, which needs points off one plane.
+    threshold_px : float or None
+        Reprojection error of an inlier during the search; None: all points are inliers.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
+
+    Returns
+    -------
+    Resection
+        Camera, inliers, noise and covariance.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are wrong or numbers are not finite.
+    StageFailure
+        If there are too few points or inliers, or all points lie in one plane and K is not given.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Camera, resect
+    >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    >>> camera = Camera(K, np.eye(3), np.array([0.2, -0.1, 4.0]), (640, 480))
+    >>> X = np.random.default_rng(0).uniform(-1, 1, (30, 3))
+    >>> found = resect(X, camera.project(X))
+    >>> float(found.K[0, 0].round(6)), found.t.round(6).tolist()
+    (500.0, [0.2, -0.1, 4.0])
+    """
+    X, xy = np.asarray(X, dtype=np.float64), np.asarray(xy, dtype=np.float64)
+    require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
+    if K is not None:
+        K = np.asarray(K, dtype=np.float64)
+        require_shapes("resect", K=(K, (3, 3)))
+        require_finite("resect", K)
+    require_finite("resect", X, xy)
+    if threshold_px is not None and not threshold_px > 0.0:
+        raise ValueError(f"threshold_px must be positive, or None for no search; got {threshold_px}")
+    needed, unknown = (6, 11) if K is None else (4, 6)
+    if len(X) < needed:
+        raise StageFailure("too few points for resection", f"{counted(len(X), 'point')}, {needed} are needed")
+    extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
+    if not extent[2 if K is None else 1] > _FLAT * extent[0]:
+        raise StageFailure(
+            f"the points do not determine the camera: they lie in one {'plane' if K is None else 'line'}",
+            "",
+            "add points off it" + (", or give the calibration matrix K" if K is None else ""),
+        )
+    fit = _search(X, xy, K, threshold_px or _ANY_PX, np.random.default_rng(seed))
+    inliers = np.ones(len(X), dtype=bool) if threshold_px is None else fit.inliers
+    limit = threshold_px or _ANY_PX
+    for _ in range(_ROUNDS):
+        if inliers.sum() < needed:
+            raise StageFailure(
+                "no camera explains the points",
+                f"{inliers.sum()} of {len(X)} are within {threshold_px:g} px, {needed} are needed",
+                "check that points and pixels correspond",
+            )
+        fit = _refine(fit, X, xy, inliers, calibrated=K is not None)
+        distance = np.linalg.norm(project(fit.P, X) - xy, axis=1)
+        distance[depth(fit.P, homogenize(X)) <= 0.0] = np.inf
+        used = inliers
+        if threshold_px is None:
+            break
+        # The median of the inliers alone would be too small, since their limit cuts off the noise.
+        sigma = noise_from_distances(distance[distance <= max(2.0 * limit, np.median(distance[used]))])
+        limit = max(_INLIER_SIGMAS * sigma, _EXACT_PX)
+        inliers = distance <= limit
+        if np.array_equal(inliers, used):
+            break
+    left = (2 * int(used.sum()) - unknown) * (1.0 if threshold_px is None else _TRIMMED_VARIANCE)
+    sigma = float(np.sqrt(np.sum(distance[used] ** 2) / left)) if left > 0 else float("nan")
+    return replace(fit, inliers=used, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
+
+
+def _search(X: F64, xy: F64, K: F64 | None, threshold_px: float, rng: Generator) -> Resection:
+    """The best camera of samples and its inliers."""
+    empty, none = np.empty((0, 0)), np.zeros(len(X), dtype=bool)
+    nowhere = Resection(np.eye(3, 4), np.eye(3), np.eye(3), np.zeros(3), none, 0.0, empty)
+    if K is None:
+        P, inliers = resect_projective(homogenize(X), xy, threshold_px=threshold_px, rng=rng)
+        return nowhere if P is None else replace(nowhere, P=P, inliers=inliers)
+    rays = homogenize(xy) @ np.linalg.inv(K).T
+    pose = resect_calibrated(X, rays[:, :2] / rays[:, 2:], threshold=threshold_px / K[0, 0], rng=rng)
+    return nowhere if pose is None else replace(nowhere, K=K, R=pose[0], t=pose[1], inliers=pose[2])
+
+
+def _refine(fit: Resection, X: F64, xy: F64, inliers: B8, *, calibrated: bool) -> Resection:
+    """The camera of least reprojection error of the inliers, with its covariance for noise of 1 px."""
+    if calibrated:
+        K = fit.K
+        row = np.array([K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2], 0.0])
+        held = np.zeros(6, dtype=bool)
+        pose = refine_pose(fit.R, fit.t, row, X[inliers], xy[inliers], free=held, loss_px=np.inf)
+        P = compose_camera(K, pose.R, pose.t)
+        return replace(fit, P=P, R=pose.R, t=pose.t, covariance=pose.covariance)
+    P, covariance = refine_camera(fit.P, homogenize(X[inliers]), xy[inliers], loss_px=np.inf)
+    K, R, t = decompose_camera(P)
+    scale = float(np.sum(compose_camera(K, R, t) * P) / np.sum(P**2))
+    return replace(fit, P=P * scale, K=K, R=R, t=t, covariance=covariance * scale**2)
+
+
+def resect_projective(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -> tuple[F64 | None, B8]:
+    """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
+
+    Samples are drawn in batches until one without outliers was drawn with probability 0.999. Points X (M, 4)
+    are signed so that depths have one sign; those of the other sign are outliers. Returns the camera of the
+    inliers with positive depths, None below six of them, and the inliers (M,).
+    """
+    none = np.zeros(len(X), dtype=bool)
+    if len(X) < _SAMPLE:
+        return None, none
+    # The points of one view may fill a corner of the frame: whitening keeps all digits.
+    M = whitening_transform(X)
+    Y = X @ M.T
+    Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
+    best_cost, best, drawn = np.inf, None, 0
+    scored = rng.choice(len(Y), 1000, replace=False) if len(Y) > 1000 else np.arange(len(Y))
+    for _ in range(_MAX_BATCHES):
+        samples = rng.random((_BATCH, len(Y))).argpartition(_SAMPLE - 1, axis=1)[:, :_SAMPLE]
+        P = resect_linear(Y[samples], xy[samples])
+        P = np.concatenate([P, -P])
+        squared = _squared_residuals(P, Y[scored], xy[scored]) / threshold_px**2
+        cost = np.minimum(squared, 1.0).sum(axis=1)
+        drawn += _BATCH
+        if cost.min() < best_cost:
+            best_cost, best = float(cost.min()), P[cost.argmin()]
+        share = 1.0 - best_cost / len(scored)
+        if drawn * np.log1p(-min(share**_SAMPLE, 1 - 1e-9)) < np.log(1e-3):
+            break
+    if best is None:
+        return None, none
+    found, inlier = _refit(best, Y, xy, threshold_px)
+    return (None if found is None else found @ M), inlier
+
+
+def _refit(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:
+    """Estimate the camera again from its inliers, twice."""
+    inlier = _squared_residuals(P[None], X, xy)[0] < threshold_px**2
+    for _ in range(2):
+        if inlier.sum() < _SAMPLE:
+            return None, inlier
+        candidate = resect_linear(X[inlier], xy[inlier])
+        candidate *= np.sign(np.median(X[inlier] @ candidate[2])) or 1.0
+        support = _squared_residuals(candidate[None], X, xy)[0] < threshold_px**2
+        if support.sum() < inlier.sum():
+            break
+        P, inlier = candidate, support
+    return P, inlier
+
+
+def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
+    """Return squared reprojection residuals (B, M), inf on or behind the principal plane."""
+    xh = np.einsum("bij,mj->bmi", P, X)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=-1)
+    return np.where((xh[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
+
+
+def resect_calibrated(
+    X: F64, normalized: F64, *, threshold: float, rng: Generator
+) -> tuple[F64, F64, B8] | None:
+    """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score.
+
+    ``normalized`` (M, 2) are the image points of ``X`` (M, 3), ``threshold`` is in their unit. Returns R, t
+    and inliers (M,), or None below four points or if no sample has a pose.
+    """
+    if len(X) < 4:
+        return None
+    chosen = rng.random((_SAMPLES, len(X))).argpartition(2, axis=1)[:, :3]
+    rays = np.column_stack([normalized, np.ones(len(X))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    R, t, _ = pose_from_three_points(X[chosen], rays[chosen])
+    if len(R) == 0:
+        return None
+    scored = rng.choice(len(X), 500, replace=False) if len(X) > 500 else np.arange(len(X))
+    cost = np.minimum(_squared_of_poses(R, t, X[scored], normalized[scored]) / threshold**2, 1.0).sum(axis=1)
+    best = int(cost.argmin())
+    return (
+        R[best],
+        t[best],
+        _squared_of_poses(R[best : best + 1], t[best : best + 1], X, normalized)[0] < threshold**2,
+    )
+
+
+def _squared_of_poses(R: F64, t: F64, X: F64, xy: F64) -> F64:
+    Y = np.einsum("cij,mj->cmi", R, X) + t[:, None]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        squared = np.sum((Y[..., :2] / Y[..., 2:] - xy) ** 2, axis=-1)
+    return np.where((Y[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
