@@ -45,7 +45,7 @@ def test_noise_inliers_and_covariance_are_those_of_the_errors(given):
         X, xy = points(100, rng)
         xy += rng.normal(0.0, 0.5, xy.shape)
         xy[:30] += rng.uniform(20.0, 200.0, (30, 2))
-        found = thesisrecon.resect(X, xy, given, seed=seed)
+        found = thesisrecon.resect(X, xy, given, threshold_px=2.0, seed=seed)
         assert found.inliers[30:].mean() > 0.88
         assert not found.inliers[:30].any()
         sigmas.append(found.sigma_px)
@@ -64,7 +64,7 @@ def test_noise_inliers_and_covariance_are_those_of_the_errors(given):
         values, vectors = np.linalg.eigh(found.covariance)
         ratios.append(np.mean((vectors.T @ np.append(w, T - turn @ found.t)) ** 2 / values))
     assert 0.45 < np.mean(sigmas) < 0.55
-    assert 0.7 < np.median(ratios) < 1.5
+    assert 0.7 < np.mean(ratios) < 1.6
 
 
 def test_points_that_cannot_work_are_named():

@@ -113,6 +113,8 @@ def estimate_homography(
                 # The median of the inliers alone would be too small, since their limit cuts off the noise.
                 near = distance <= max(2.0 * limit, float(np.median(distance[inliers])))
                 limit = _INLIER_SIGMAS * noise_from_distances(distance[near])
+                fitted = 2.0 * int(inliers.sum())
+                limit *= np.sqrt(fitted / max(fitted - _PARAMETERS, 1.0))
             inliers = distance <= max(limit, _EXACT)
             if inliers.sum() < _SAMPLE:
                 raise _undetermined(f"{inliers.sum()} of {len(points)} are within {threshold_px:g} px")

@@ -132,7 +132,8 @@ def resect(
             break
         # The median of the inliers alone would be too small, since their limit cuts off the noise.
         sigma = noise_from_distances(distance[distance <= max(2.0 * limit, np.median(distance[used]))])
-        limit = max(_INLIER_SIGMAS * sigma, _EXACT_PX)
+        fitted = 2.0 * int(used.sum())
+        limit = max(_INLIER_SIGMAS * sigma * np.sqrt(fitted / max(fitted - unknown, 1.0)), _EXACT_PX)
         inliers = distance <= limit
         if np.array_equal(inliers, used):
             break
