@@ -13,19 +13,21 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [  # noqa: F405
-    "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
-    "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__",
-    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view", "match_pair",
-    "match_rectified", "reconstruct", "render", "resect", "self_calibrate", "synthesize_view", "triangulate",
-    "upgrade_affine",
+    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
+    "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
+    "UsageError", "__version__", "compare_models", "estimate_fundamental", "estimate_homography",
+    "estimate_trifocal", "interpolate_view", "match_pair", "match_rectified", "reconstruct", "render",
+    "resect", "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 _HOMES = {
     "Camera": "camera",
+    "ModelComparison": "comparison",
     "Reconstruction": "records",
     "StageFailure": "errors",
     "Tracks": "records",
     "UsageError": "errors",
+    "compare_models": "comparison",
     "estimate_fundamental": "epipolar.estimation",
     "estimate_homography": "epipolar.homography",
     "estimate_trifocal": "epipolar.trifocal_estimation",

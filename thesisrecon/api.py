@@ -8,6 +8,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
+from thesisrecon.comparison import ModelComparison, compare_models
 from thesisrecon.config import PipelineConfig, with_images
 from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
@@ -37,11 +38,11 @@ from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
-    "Camera", "DisparityMap", "FundamentalFit", "Image", "PipelineConfig", "Reconstruction", "RunResult",
-    "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError",
-    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view", "match_pair",
-    "match_rectified", "reconstruct", "render", "resect", "self_calibrate", "synthesize_view", "triangulate",
-    "upgrade_affine",
+    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
+    "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
+    "UsageError", "compare_models", "estimate_fundamental", "estimate_homography", "estimate_trifocal",
+    "interpolate_view", "match_pair", "match_rectified", "reconstruct", "render", "resect", "self_calibrate",
+    "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 

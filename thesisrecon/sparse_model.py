@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.geometry.similarity import Similarity
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,3 +58,23 @@ class SparseModel:
     def names(self) -> list[str]:
         """Names of the V images."""
         return [view.name for view in self.views]
+
+    def transformed(self, similarity: Similarity) -> SparseModel:
+        """Return the model in another world: y = scale R x + t of its points and camera centres.
+
+        Parameters
+        ----------
+        similarity : Similarity
+            From the world of this model to the new one.
+
+        Returns
+        -------
+        SparseModel
+        """
+        rotations = [view.R @ similarity.R.T for view in self.views]
+        shifts = [similarity.scale * view.t for view in self.views]
+        views = [
+            replace(view, R=R, t=t - R @ similarity.t)
+            for view, R, t in zip(self.views, rotations, shifts, strict=True)
+        ]
+        return replace(self, views=views, X=similarity.apply(self.X))

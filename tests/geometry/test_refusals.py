@@ -8,7 +8,7 @@ from thesisrecon.geometry import camera_matrix, conics, strata, three_view, two_
 from thesisrecon.geometry.homogeneous import normalizing_transform
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.resection import resect_linear
-from validation.metrics.similarity import estimate_similarity
+from thesisrecon.geometry.similarity import estimate_similarity
 
 RNG = np.random.default_rng(0)
 P, OTHER = RNG.normal(size=(2, 3, 4))

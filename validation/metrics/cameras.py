@@ -8,8 +8,8 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
+from thesisrecon.geometry.similarity import estimate_similarity, rotation_errors_deg
 from thesisrecon.records import Reconstruction
-from validation.metrics.similarity import estimate_similarity
 
 
 @dataclass(frozen=True)
@@ -73,17 +73,6 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
         centre_error=_centre_error(centres, truth.C[views]),
         rotation_error_deg=float(np.median(rotation_errors_deg(R, truth.R[views]))),
     )
-
-
-def rotation_errors_deg(R: F64, R_true: F64) -> F64:
-    """Angles (V,) between R (V, 3, 3) and R_true after the world rotation that fits best (chordal mean)."""
-    U, _, Vt = np.linalg.svd(np.einsum("vji,vjk->ik", R_true, R))
-    common = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    difference = np.einsum("vij,jk,vlk->vil", R_true, common, R)
-    # The chord keeps its digits at small angles, where arccos of the trace loses half of them.
-    chord = np.linalg.norm(difference - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
-    angles: F64 = np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0)))
-    return angles
 
 
 def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:

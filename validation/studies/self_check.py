@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
 from thesisrecon.metric._shared_camera import check_shared_cameras, contradicted_focal_priors
 from thesisrecon.records import IntrinsicInterval, RunResult, SelfCalibration
-from validation.metrics.similarity import estimate_similarity
 from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
 from validation.studies.runner import Part, Rows, report_progress, scenes_here, text_table
 

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.similarity import Similarity, estimate_similarity
 from thesisrecon.records import Reconstruction
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task, slug
 from validation.harness.rows import OURS, read_arrays, row
 from validation.harness.scenes import has_images, load_images
 from validation.harness.stages.cameras import COLMAP, COLMAP_PP, read_model
 from validation.metrics.record import Metric
-from validation.metrics.similarity import Similarity, estimate_similarity
 from validation.references.open3d_geometry import refine_by_icp
 from validation.scenes.real import Scene
 
