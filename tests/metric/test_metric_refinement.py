@@ -8,11 +8,8 @@ import pytest
 from tests.metric.test_population import refine
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
-<<<<<<< HEAD
 from thesisrecon.geometry.robust_resection import resect_calibrated
-=======
 from thesisrecon.geometry.similarity import estimate_similarity
->>>>>>> ce2965e (compare_models: errors of cameras and distances of points after a similarity, by the functions that validation uses)
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
