@@ -24,6 +24,7 @@ _HOMES = {
     "Camera": "camera",
     "ModelComparison": "comparison",
     "Reconstruction": "records",
+    "RunResult": "results",
     "StageFailure": "errors",
     "Tracks": "records",
     "UsageError": "errors",

@@ -25,12 +25,12 @@ from thesisrecon.records import (
     FundamentalFit,
     Image,
     Reconstruction,
-    RunResult,
     SelfCalibration,
     TexturedMesh,
     Tracks,
     TwoView,
 )
+from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import stream
 from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
 from thesisrecon.view_interpolation import interpolate_view

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,9 @@ class Camera:
     distortion : ndarray (C,), optional
         Radial coefficients k1, k2, ...: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 +
         ...). None: no distortion.
+    std : mapping of str to float, optional
+        Standard deviations of estimated intrinsics: "focal_px", "aspect", "skew_px", "principal_x_px",
+        "principal_y_px", "k1", "k2", "k3" (0: as assumed). None: unknown.
 
     Raises
     ------
@@ -58,6 +62,7 @@ class Camera:
     t: F64
     size: tuple[int, int]
     distortion: F64 | None = None
+    std: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         fields = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("K", "R", "t")}

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +26,16 @@ class Image:
     name: str
     rgb: NDArray[np.uint8]
     original_size: tuple[int, int]
+
+    @classmethod
+    def without_pixels(cls, name: str, size: tuple[int, int]) -> Image:
+        """Return a grey image in the place of one that is not at hand; it takes no memory."""
+        return cls(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), size)
+
+    @property
+    def has_pixels(self) -> bool:
+        """Whether the image was read, and is not one of :meth:`without_pixels`."""
+        return any(self.rgb.strides)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -425,64 +433,3 @@ class StageReport:
     counts: Mapping[str, int] = field(default_factory=dict)
     metrics: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """All results of one run; None or empty beyond the last stage.
-
-    Coordinates are pixels at working size; ``summary`` and the exported files are in original pixels.
-
-    Parameters
-    ----------
-    out, settings : Path, mapping
-        Output folder, and the settings: stage -> field -> value.
-    images, groups : tuple of Image, ndarray (V,) of int
-        The V views at working size, and the camera number of each.
-    unread : mapping
-        File name -> reason of unreadable images.
-    features, pair_choice, pairs, tracks, projective, calibration, metric, mesh, held_out
-        Results of the stages; ``pairs`` are all matched ones, accepted or not.
-    views, depth_maps : tuple of PinholeView, tuple of DepthMap
-        Undistorted images and their depth maps.
-    reports, warnings, failure : tuple of StageReport, tuple of str, str
-        One report per stage, all warnings, and the failure that ended the run, empty otherwise.
-    summary : mapping
-        Content of ``summary.json``.
-    """
-
-    out: Path
-    images: tuple[Image, ...]
-    unread: Mapping[str, str]
-    features: tuple[Features, ...]
-    pairs: tuple[TwoView, ...]
-    groups: I64
-    settings: Mapping[str, Mapping[str, Any]]
-    pair_choice: PairChoice | None = None
-    tracks: Tracks | None = None
-    projective: Reconstruction | None = None
-    calibration: SelfCalibration | None = None
-    metric: MetricResult | None = None
-    views: tuple[PinholeView, ...] = ()
-    depth_maps: tuple[DepthMap, ...] = ()
-    mesh: TexturedMesh | None = None
-    held_out: HeldOut | None = None
-    reports: tuple[StageReport, ...] = ()
-    warnings: tuple[str, ...] = ()
-    summary: Mapping[str, Any] = field(default_factory=dict)
-    failure: str = ""
-
-    @property
-    def best_reconstruction(self) -> Reconstruction | None:
-        """The metric reconstruction, else the projective one, else None."""
-        return self.metric.reconstruction if self.metric is not None else self.projective
-
-    @property
-    def refused(self) -> dict[str, str]:
-        """File name -> reason of every image without a camera: unreadable or not registered."""
-        best = self.best_reconstruction
-        if best is None:
-            return dict(self.unread)
-        views = zip(self.images, best.registered, best.reasons, strict=True)
-        reasons = {image.name: reason or "no reason was recorded" for image, in_, reason in views if not in_}
-        return {**self.unread, **reasons}

@@ -6,9 +6,10 @@ import pytest
 
 from tests.report.synthetic import made_up_run, projective_run
 from thesisrecon.errors import StageFailure
-from thesisrecon.records import DegeneracyReport, IntrinsicInterval, RunResult
+from thesisrecon.records import DegeneracyReport, IntrinsicInterval
 from thesisrecon.report import _assessment
 from thesisrecon.report._data import ResidualSummary, summarize
+from thesisrecon.results import RunResult
 
 TIME = "Computing time"
 

@@ -24,7 +24,7 @@ from thesisrecon.io._files import printable, read_json
 
 if TYPE_CHECKING:
     from thesisrecon.config import PipelineConfig
-    from thesisrecon.records import RunResult
+    from thesisrecon.results import RunResult
 
 _DEMO_SETTINGS: dict[str, Any] = {"dense": {"max_side": 512, "match_side": 512}}
 """Small depth maps: the demo should show a model soon."""

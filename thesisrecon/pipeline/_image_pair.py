@@ -10,7 +10,7 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._images import read_image
-from thesisrecon.records import Image, TwoView
+from thesisrecon.records import Image, Matches, TwoView
 from thesisrecon.runtime._run import stream
 
 ImageInput = str | Path | np.ndarray | Image
@@ -65,16 +65,26 @@ def match_pair(
 def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
     """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason."""
     rng = stream(seed, "matches", *pair)
-    candidates = 0
     try:
         matches = config.matching.match(
             view1, view2, pair=pair, estimate_fundamental=config.epipolar.estimate, rng=rng
         )
-        candidates = len(matches.xy1)
+    except StageFailure as failure:
+        return _rejected_pair(pair, 0, str(failure))
+    return verify_matches(config, matches, seed, rng)
+
+
+def verify_matches(
+    config: PipelineConfig, matches: Matches, seed: int, rng: np.random.Generator | None = None
+) -> TwoView:
+    """Estimate F of matches and verify them; a pair without F is rejected with a reason."""
+    pair = matches.i, matches.j
+    rng = rng or stream(seed, "matches", *pair)
+    try:
         fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
         return config.verification.verify(matches, fit, rng)
     except StageFailure as failure:
-        return _rejected_pair(pair, candidates, str(failure))
+        return _rejected_pair(pair, len(matches.xy1), str(failure))
 
 
 def _rejected_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:

@@ -16,13 +16,14 @@ from thesisrecon._settings import toml_from_config
 from thesisrecon.arrays import F32, U8
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io._exports import cameras_table, write_point_cloud
-from thesisrecon.io._files import read_json, write_json, write_text
+from thesisrecon.io._files import read_json, write_atomically, write_json, write_text
 from thesisrecon.io._meshes import write_mesh
 from thesisrecon.io.colmap import write_colmap_model
 from thesisrecon.pipeline._state import name_images
-from thesisrecon.records import Reconstruction, RunResult, TexturedMesh
+from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, point_colors, summarize
 from thesisrecon.report._page import render_report
+from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
@@ -55,7 +56,7 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
 
     A run with an earlier last stage keeps the files of a longer one in the folder.
     """
-    result = _with_image_names(result)
+    result = with_image_names(result)
     later = _later_end(run.directory.path, until) if failure is None else None
     if later is None:
         return _write(run, result, until, failure)
@@ -64,7 +65,7 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
     return _described(run, result, until, failure)
 
 
-def _with_image_names(result: RunResult) -> RunResult:
+def with_image_names(result: RunResult) -> RunResult:
     """Sentences about images by file name."""
     names = [image.name for image in result.images]
 
@@ -103,19 +104,10 @@ def _described(run: Run, result: RunResult, until: str, failure: StageFailure | 
 
 
 def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
-    out, colors, affine = run.directory.path, None, None
+    out = run.directory.path
     with run.clock("outputs"):
-        if result.metric is not None and result.projective is not None and result.calibration is not None:
-            colors = point_colors(result.metric.reconstruction, result.images)
-            run.warnings.extend(_write_model(run.directory, result, result.metric.reconstruction, colors))
-            affine = upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
-            write_affine(out / "affine.ply", affine, colors)
-            if result.mesh is not None:
-                write_mesh(out / "model.glb", result.mesh)
-            else:
-                run.directory.remove(("model.glb",))
-        else:
-            run.directory.remove(MODEL_FILES)
+        colors, affine, warnings = _write_results(run.directory, result)
+        run.warnings.extend(warnings)
         result = _described(run, result, until, failure)
         config = toml_from_config(run.config)
         write_text(out / "config.toml", config)
@@ -145,6 +137,36 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     result = replace(result, reports=tuple(run.reports.values()), summary=summary)
     write_json(out / SUMMARY, result.summary)
     return result
+
+
+def save_result(result: RunResult, folder: Path) -> None:
+    """Copy the result files of a run, or write those of a run that had no folder (without its page)."""
+    if result.out is not None and (result.out / SUMMARY).is_file():
+        for name in RESULT_FILES:
+            if (result.out / name).is_file():
+                write_atomically(folder / name, (result.out / name).read_bytes())
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_results(RunDirectory(folder), result)
+    write_json(folder / SUMMARY, result.summary)
+
+
+def _write_results(
+    directory: RunDirectory, result: RunResult
+) -> tuple[U8 | None, Reconstruction | None, list[str]]:
+    """Write cameras, points and model, or remove old ones; return colours, affine points, warnings."""
+    if result.metric is None or result.projective is None or result.calibration is None:
+        directory.remove(MODEL_FILES)
+        return None, None, []
+    colors = point_colors(result.metric.reconstruction, result.images)
+    warnings = _write_model(directory, result, result.metric.reconstruction, colors)
+    affine = upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
+    write_affine(directory.path / "affine.ply", affine, colors)
+    if result.mesh is not None:
+        write_mesh(directory.path / "model.glb", result.mesh)
+    else:
+        directory.remove(("model.glb",))
+    return colors, affine, warnings
 
 
 def _failure_warnings(result: RunResult) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,11 +26,12 @@ from thesisrecon.records import (
     PairChoice,
     PinholeView,
     Reconstruction,
-    RunResult,
     SelfCalibration,
     TexturedMesh,
+    Tracks,
     TwoView,
 )
+from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Batch, stream
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
@@ -94,18 +95,27 @@ def match_pairs(state: PipelineState) -> None:
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         views, shared = _prepared(state), run.workers.in_process
+        assert isinstance(views, PreparedViews)
         for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel()):
             some = [pairs[n] for n in numbers]
             given = views if shared else views.subset({view for pair in some for view in pair})
             yield numbers, (state.config, given, some, run.seed)
 
-    two_views: list[TwoView] = run.map_cached("matches", keys, _match_all, batches)
-    state.result = replace(result, pairs=tuple(two_views))
+    finish_matches(state, run.map_cached("matches", keys, _match_all, batches))
+
+
+def finish_matches(state: PipelineState, two_views: Sequence[TwoView]) -> None:
+    """Report the matched pairs; sets ``result.pairs``."""
+    state.result = replace(state.result, pairs=tuple(two_views))
     accepted = [pair for pair in two_views if pair.accepted]
-    counts = {"pairs": len(pairs), "accepted": len(accepted), "verified": sum(p.inliers for p in accepted)}
-    counts["undetermined"] = sum(pair.undetermined for pair in accepted)
+    counts = {
+        "pairs": len(two_views),
+        "accepted": len(accepted),
+        "verified": sum(pair.inliers for pair in accepted),
+        "undetermined": sum(pair.undetermined for pair in accepted),
+    }
     metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
-    run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
+    state.run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
 
 
 def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
@@ -119,7 +129,7 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
     return [f"The epipolar geometry of {of_all} is degenerate ({listed})"]
 
 
-def _prepared(state: PipelineState) -> PreparedViews:
+def _prepared(state: PipelineState) -> Sequence[Any]:
     if state.prepared is None:
         given = zip(state.result.images, state.result.features, strict=True)
         state.prepared = PreparedViews(state.config.matching, dict(enumerate(given)))
@@ -135,20 +145,31 @@ def _match_all(
 def build_tracks(state: PipelineState) -> None:
     """Build tracks from the accepted pairs; sets ``result.tracks``."""
     run, result = state.run, state.result
-    accepted = [pair for pair in result.pairs if pair.accepted]
-    if not accepted:
+    require_accepted_pair(state)
+    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
+    build, rng = state.config.tracks.build, stream(run.seed, "tracks")
+    finish_tracks(
+        state, run.cached("tracks", "tracks", key, lambda: build(_prepared(state), result.pairs, rng))
+    )
+
+
+def require_accepted_pair(state: PipelineState) -> None:
+    """Raise ``StageFailure`` if no pair is accepted."""
+    result = state.result
+    if not any(pair.accepted for pair in result.pairs):
         best = max(result.pairs, key=lambda pair: pair.inliers)
         tried, verified = counted(len(result.pairs), "pair"), counted(best.inliers, "verified match")
         evidence = f"the best of {tried} has {verified}: {best.reason}"
         advice = "add images with more overlap, all of one textured scene"
         raise StageFailure("no two images could be matched", evidence, advice)
-    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
-    build, rng = state.config.tracks.build, stream(run.seed, "tracks")
-    tracks = run.cached("tracks", "tracks", key, lambda: build(_prepared(state), result.pairs, rng))
-    state.result = replace(result, tracks=tracks)
+
+
+def finish_tracks(state: PipelineState, tracks: Tracks) -> None:
+    """Report the tracks; sets ``result.tracks``."""
+    state.result = replace(state.result, tracks=tracks)
     seen = np.bincount(tracks.point_index, minlength=tracks.n_points)
     counts = {"points": tracks.n_points, "observations": len(tracks.xy)}
-    run.finish("tracks", counts=counts | {"seen_3_times": int((seen >= 3).sum())})
+    state.run.finish("tracks", counts=counts | {"seen_3_times": int((seen >= 3).sum())})
 
 
 def _cached(
@@ -185,10 +206,11 @@ def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
     run, prior, projective = state.run, state.prior, state.result.projective
     assert projective is not None
     upstream = run.logs["projective"].keys[f"attempt-{attempt}"]
-    method = state.config.selfcalibration
+    method, images = state.config.selfcalibration, state.result.images
+    pixels = images if all(image.has_pixels for image in images) else ()
     calibration: SelfCalibration = _cached(
         state, "selfcalibration", attempt, [upstream, prior.shared, prior.mean, prior.std, prior.kind],
-        lambda rng: with_images(method, state.result.images).calibrate(projective, prior=prior, rng=rng),
+        lambda rng: with_images(method, pixels).calibrate(projective, prior=prior, rng=rng),
     )  # fmt: skip
     state.result = replace(state.result, calibration=calibration)
     counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
@@ -241,6 +263,11 @@ def reconstruct_metric(state: PipelineState) -> None:
         raise failures[0]
     if len(tried) > 1:
         state.run.warnings.append(f"{len(tried)} initial pairs were tried; the best result is used")
+
+
+def best_attempt(result: RunResult, attempts: Sequence[Mapping[str, Any]]) -> RunResult:
+    """The result with the fields of the attempt that the rule of :func:`reconstruct_metric` chooses."""
+    return max((replace(result, **fields) for fields in attempts), key=_quality, default=result)
 
 
 def _quality(result: RunResult) -> tuple[bool, bool, int, int]:

@@ -6,7 +6,7 @@ import re
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
 from thesisrecon.numerics.observations import morton_pair_order
-from thesisrecon.records import Features, Image, RunResult
+from thesisrecon.records import Features, Image
+from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run
 
 CACHE_BYTES = 2**30
@@ -96,7 +97,11 @@ class PipelineState:
     inputs: ImageSet
     result: RunResult
     until: str
-    prepared: PreparedViews | None = None
+    prepared: Sequence[Any] | None = None
+
+    def with_result(self, **fields: Any) -> RunResult:
+        """The result with other values of some fields."""
+        return replace(self.result, **fields)
 
     @property
     def config(self) -> PipelineConfig:

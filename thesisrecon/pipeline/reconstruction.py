@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -26,7 +28,7 @@ from thesisrecon.pipeline._stages import (
     select_pairs,
 )
 from thesisrecon.pipeline._state import PipelineState, name_images
-from thesisrecon.records import RunResult
+from thesisrecon.results import RunResult
 from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
 
@@ -103,30 +105,48 @@ def reconstruct(
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
         run.title = scene_name(Path(images)) or run.title
     # Claim the folder first: reading images takes long.
-    claim = run.directory.claim(_settings_identity(run), overwrite=overwrite)
-    with run.workers, claim, run.resumable():
+    surface_required = options.get("until") is not None
+    with claimed(run, overwrite=overwrite):
         inputs = _read_inputs(run, images)
         pairs = run.config.pairs
         if isinstance(pairs, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
             pairs.check([image.name for image in inputs.images], inputs.refused)
-        state = PipelineState(run, inputs, _empty_result(run, inputs), until)
-        run.directory.adopt(_identity(run, inputs), overwrite=overwrite, results=RESULT_FILES)
-        try:
-            state.require_images()
-            precompile(until, run.workers.threads, run.progress)
-            _run_steps(state, surface_required=options.get("until") is not None)
-        except StageFailure as error:
-            parts = (error.reason, error.evidence, error.advice)
-            failure = StageFailure(*(name_images(part, state.names) for part in parts))
-            write_outputs(run, state.result, until=until, failure=failure)
-            raise failure from None
-        return write_outputs(run, state.result, until=until, failure=None)
+        state = PipelineState(run, inputs, empty_result(run, inputs), until)
+        run.directory.adopt(identity_of(run, inputs), overwrite=overwrite, results=RESULT_FILES)
+        return run_steps(state, STEPS[until], surface_required=surface_required)
 
 
-def _run_steps(state: PipelineState, *, surface_required: bool) -> None:
+@contextmanager
+def claimed(run: Run, *, overwrite: bool) -> Iterator[None]:
+    """Hold the workers and the output folder of a run."""
+    claim = run.directory.claim(_settings_identity(run), overwrite=overwrite)
+    with run.workers, claim, run.resumable():
+        yield
+
+
+def run_steps(
+    state: PipelineState, steps: Sequence[Callable[[PipelineState], None]], *, surface_required: bool
+) -> RunResult:
+    """Run the steps and write the outputs, of a failed run too."""
+    run = state.run
+    try:
+        state.require_images()
+        precompile(state.until, run.workers.threads, run.progress)
+        _run_all(state, steps, surface_required=surface_required)
+    except StageFailure as error:
+        parts = (error.reason, error.evidence, error.advice)
+        failure = StageFailure(*(name_images(part, state.names) for part in parts))
+        write_outputs(run, state.result, until=state.until, failure=failure)
+        raise failure from None
+    return write_outputs(run, state.result, until=state.until, failure=None)
+
+
+def _run_all(
+    state: PipelineState, steps: Sequence[Callable[[PipelineState], None]], *, surface_required: bool
+) -> None:
     """Run the steps; a surface that fails is only a warning unless it was asked for."""
-    for step in STEPS[state.until]:
+    for step in steps:
         try:
             step(state)
         except StageFailure as failure:
@@ -169,14 +189,14 @@ def _settings_identity(run: Run) -> dict[str, Any]:
     return {"version": 1, "seed": run.seed, "settings": tables_from_config(run.config)}
 
 
-def _identity(run: Run, inputs: ImageSet) -> dict[str, Any]:
+def identity_of(run: Run, inputs: ImageSet) -> dict[str, Any]:
     """Settings, seed and content of the images: runs with equal identity are the same."""
     digests = {p.image.name: p.digest for p in inputs.decoded}
     refused = {name: f"refused: {reason}" for name, reason in inputs.refused.items()}
     return _settings_identity(run) | {"images": digests | refused}
 
 
-def _empty_result(run: Run, inputs: ImageSet) -> RunResult:
+def empty_result(run: Run, inputs: ImageSet) -> RunResult:
     sizes = [image.original_size for image in inputs.images]
     groups = camera_numbers(sizes, run.config.intrinsics, inputs.exif_focal_px)
     settings = tables_from_config(run.config)

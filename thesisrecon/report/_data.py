@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,11 +20,11 @@ from thesisrecon.records import (
     MetricResult,
     PairChoice,
     Reconstruction,
-    RunResult,
     StageReport,
     TexturedMesh,
     TwoView,
 )
+from thesisrecon.results import RunResult, in_original_pixels
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,6 @@ class ReportData:
     def best_reconstruction(self) -> Reconstruction | None:
         """The metric reconstruction, else the projective one, else None."""
         return self.metric.reconstruction if self.metric is not None else self.reconstruction
-
-
-def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> IntrinsicInterval:
-    """Convert an intrinsic whose name ends in ``_px`` to original pixels, undoing (x + 0.5) scale - 0.5."""
-    if not name.endswith("_px"):
-        return interval
-    shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0
-    return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)
 
 
 @dataclass(frozen=True)

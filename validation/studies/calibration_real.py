@@ -18,7 +18,8 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.reconstruction import reconstruct
-from thesisrecon.records import Reconstruction, RunResult
+from thesisrecon.records import Reconstruction
+from thesisrecon.results import RunResult
 from validation.harness.scenes import truth_of
 from validation.metrics.cameras import measure_cameras
 from validation.metrics.intervals import LEVEL, focal_errors_pct, interval_scores, join_scores

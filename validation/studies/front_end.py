@@ -20,7 +20,8 @@ import numpy as np
 
 from thesisrecon import reconstruct
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
-from thesisrecon.records import Reconstruction, RunResult, TwoView
+from thesisrecon.records import Reconstruction, TwoView
+from thesisrecon.results import RunResult
 from validation.metrics.record import Metric
 from validation.references.colmap import reconstruct_with_pycolmap
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS

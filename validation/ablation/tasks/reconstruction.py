@@ -15,7 +15,7 @@ from thesisrecon._code_digest import code_digest
 from thesisrecon._settings import tables_from_config
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.records import RunResult
+from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task

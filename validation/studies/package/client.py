@@ -11,7 +11,8 @@ import numpy as np
 import thesisrecon
 from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.records import DisparityMap, RenderedView, RunResult, SelfCalibration, TexturedMesh, TwoView
+from thesisrecon.records import DisparityMap, RenderedView, SelfCalibration, TexturedMesh, TwoView
+from thesisrecon.results import RunResult
 
 
 def points_of_two(first: Path, second: Path) -> F64:

@@ -1,0 +1,98 @@
+"""Steps of Algorithm 1 that take corners, matches or tracks that other programs found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.config import PipelineConfig
+from thesisrecon.pipeline._image_pair import verify_matches
+from thesisrecon.pipeline._stages import finish_matches, finish_tracks, require_accepted_pair
+from thesisrecon.pipeline._state import PipelineState
+from thesisrecon.records import Features, Matches, PairChoice, Tracks, TwoView
+from thesisrecon.runtime._run import Batch
+
+
+@dataclass(frozen=True)
+class Given:
+    """Corners (N_i, 2) of V views in working pixels, and (i, j), i < j -> rows (M, 2) of matched corners.
+
+    ``tracks`` are given too, or built from the matches.
+    """
+
+    corners: Sequence[F64]
+    matches: dict[tuple[int, int], I64]
+    tracks: Tracks | None = None
+
+
+def take_corners(given: Given, state: PipelineState) -> None:
+    """Set ``result.features`` to the given corners."""
+    run, found = state.run, list[Features]()
+    for i, xy in enumerate(given.corners):
+        ones = np.ones(len(xy), dtype=np.float32)
+        key = run.key("features", "given", xy)
+        found.append(run.cached("features", f"{i:05d}", key, partial(Features, xy, ones, ones)))
+    counts = [len(xy) for xy in given.corners]
+    report = {"images": len(counts), "corners": sum(counts), "fewest_in_one_image": min(counts)}
+    run.finish("features", counts=report)
+    # Tracks are built from the corners alone.
+    state.prepared = [SimpleNamespace(features=features) for features in found]
+    state.result = state.with_result(features=tuple(found))
+
+
+def take_pairs(given: Given, state: PipelineState) -> None:
+    """Set ``result.pair_choice`` to the pairs with given matches."""
+    run, views = state.run, len(given.corners)
+    pairs = np.array(sorted(given.matches), dtype=np.int64).reshape(-1, 2)
+    choice = run.cached(
+        "pairs",
+        "choice",
+        run.key("pairs", "given", pairs),
+        partial(PairChoice, pairs, "the pairs with matches"),
+    )
+    state.result = state.with_result(pair_choice=choice)
+    run.finish("pairs", counts={"possible": views * (views - 1) // 2, "compared": 0, "chosen": len(pairs)})
+
+
+def verify_pairs(given: Given, state: PipelineState) -> None:
+    """Estimate and verify the epipolar geometry of the given matches (chapter 5); sets ``result.pairs``."""
+    run = state.run
+    pairs = sorted(given.matches)
+    matches = [_as_matches(given, pair) for pair in pairs]
+    variants = [run.variant_key(stage) for stage in ("epipolar", "verification")]
+    keys = {
+        f"{m.i:05d}-{m.j:05d}": run.key(
+            "matches", "given", variants, m.xy1, m.xy2, m.index1, m.index2, run.seed
+        )
+        for m in matches
+    }
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        return (([n], (state.config, matches[n], run.seed)) for n in missing)
+
+    finish_matches(state, run.map_cached("matches", keys, _verify, batches))
+
+
+def _as_matches(given: Given, pair: tuple[int, int]) -> Matches:
+    (i, j), rows = pair, given.matches[pair]
+    xy1, xy2 = given.corners[i][rows[:, 0]], given.corners[j][rows[:, 1]]
+    score, affine = np.ones(len(rows), dtype=np.float32), np.tile(np.eye(2), (len(rows), 1, 1))
+    return Matches(i, j, rows[:, 0], rows[:, 1], xy1, xy2, score, affine)
+
+
+def _verify(config: PipelineConfig, matches: Matches, seed: int) -> list[TwoView]:
+    return [verify_matches(config, matches, seed)]
+
+
+def take_tracks(given: Given, state: PipelineState) -> None:
+    """Set ``result.tracks`` to the given tracks."""
+    require_accepted_pair(state)
+    tracks, run = given.tracks, state.run
+    assert tracks is not None
+    key = run.key("tracks", "given", tracks.view_index, tracks.point_index, tracks.xy)
+    finish_tracks(state, run.cached("tracks", "tracks", key, lambda: tracks))

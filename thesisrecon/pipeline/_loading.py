@@ -1,0 +1,117 @@
+"""Finished runs read back from their folders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.arrays import I64
+from thesisrecon.errors import UsageError
+from thesisrecon.io._files import read_json
+from thesisrecon.pipeline._outputs import SUMMARY, with_image_names
+from thesisrecon.pipeline._stages import best_attempt
+from thesisrecon.records import Image
+from thesisrecon.results import RunResult
+from thesisrecon.runtime._run import FOLDERS
+from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, ChangedRecord, StageFolder
+
+
+def load(out: str | Path) -> RunResult:
+    """Read the result of a finished run from its folder.
+
+    Parameters
+    ----------
+    out : path
+        Output folder of :func:`thesisrecon.reconstruct` or of the command.
+
+    Returns
+    -------
+    RunResult
+        As the run returned it, except for what is not stored: the pixels of ``images`` (grey), ``views`` and
+        ``depth_maps``.
+
+    Raises
+    ------
+    UsageError
+        If no run has finished in the folder, or a file is damaged.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from thesisrecon import load, reconstruct
+    >>> rng = np.random.default_rng(0)
+    >>> images = [rng.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(2)]
+    >>> with TemporaryDirectory() as out:
+    ...     found = len(reconstruct(images, out, until="features").features[0].xy)
+    ...     len(load(out).features[0].xy) == found
+    True
+    """
+    folder = Path(out)
+    summary, run = read_json(folder / SUMMARY), read_json(folder / RUN_FILE)
+    if not isinstance(summary, dict) or not isinstance(run, dict):
+        raise UsageError(f"{folder} holds no {SUMMARY} and {RUN_FILE}; no run has finished in this folder")
+    try:
+        return _loaded(folder, summary, run)
+    except ChangedRecord as error:
+        raise UsageError(f"a stored result is damaged ({error}); repeat the run in {folder}") from None
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise UsageError(f"{folder} does not hold a run of this version; repeat the run") from None
+
+
+def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
+    stages = {stage: _records(folder / name) for stage, name in FOLDERS.items()}
+    reports = [StageFolder(folder / name).finished(_keys(folder / name)) for name in FOLDERS.values()]
+    views, projective = summary["cameras"], list(stages["projective"].values())
+    sizes = projective[0].sizes if projective else [_working_size(view) for view in views]
+    names = [view["name"] for view in views]
+    unread = {one["name"]: one["reason"] for one in summary["refused"] if one["name"] not in names}
+    result = RunResult(
+        out=folder,
+        images=tuple(_image(view, size) for view, size in zip(views, sizes, strict=True)),
+        unread=unread,
+        features=tuple(stages["features"].values()),
+        pairs=tuple(stages["matches"].values()),
+        groups=np.array([view["camera"] for view in views], dtype=np.int64),
+        settings=run["settings"],
+        pair_choice=stages["pairs"].get("choice"),
+        tracks=stages["tracks"].get("tracks"),
+        mesh=stages["model"].get("model"),
+        held_out=stages["model"].get("held-out"),
+        reports=tuple(report for report in reports if report is not None),
+        warnings=tuple(summary["warnings"]),
+        summary=summary,
+        failure=summary["failure"] or "",
+    )
+    attempts = [
+        {name: stages[stage].get(item) for stage, name in _ATTEMPTS.items()} for item in stages["projective"]
+    ]
+    return with_image_names(best_attempt(result, attempts))
+
+
+_ATTEMPTS = {"projective": "projective", "selfcalibration": "calibration", "metric": "metric"}
+"""Stages that are tried from several initial pairs, and their fields of the result."""
+
+
+def _keys(folder: Path) -> dict[str, str]:
+    content = read_json(folder / MANIFEST_FILE)
+    return dict(content["keys"]) if isinstance(content, dict) else {}
+
+
+def _records(folder: Path) -> dict[str, Any]:
+    """Item -> record of a stage, in order of the items; empty if the stage did not run."""
+    stage = StageFolder(folder)
+    found = {item: stage.load(item, key) for item, key in sorted(_keys(folder).items())}
+    return {item: record for item, record in found.items() if record is not None}
+
+
+def _working_size(view: Mapping[str, Any]) -> I64:
+    return np.array([int(view[side] * view["working_scale"] + 1e-9) for side in ("width_px", "height_px")])
+
+
+def _image(view: Mapping[str, Any], size: I64) -> Image:
+    grey = Image.without_pixels(view["name"], (int(size[0]), int(size[1])))
+    return Image(grey.name, grey.rgb, (view["width_px"], view["height_px"]))

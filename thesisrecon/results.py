@@ -1,0 +1,202 @@
+"""The result of a run: cameras, points and observations in pixels of the original images, and all stages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.camera import Camera
+from thesisrecon.records import (
+    DepthMap,
+    Features,
+    HeldOut,
+    Image,
+    IntrinsicInterval,
+    MetricResult,
+    PairChoice,
+    PinholeView,
+    Reconstruction,
+    SelfCalibration,
+    StageReport,
+    TexturedMesh,
+    Tracks,
+    TwoView,
+)
+
+
+class SeenPoints(NamedTuple):
+    """Observations of one image: positions (M, 2) in original pixels, and rows (M,) of ``result.points``."""
+
+    xy: F64
+    point: I64
+
+
+def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> IntrinsicInterval:
+    """Convert an intrinsic whose name ends in ``_px`` to original pixels, undoing (x + 0.5) scale - 0.5."""
+    if not name.endswith("_px"):
+        return interval
+    shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0
+    return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)
+
+
+class Cameras(Mapping[str, Camera]):
+    """The registered cameras by image name, or by the number of the image among all that were read."""
+
+    def __init__(self, images: tuple[Image, ...], metric: MetricResult) -> None:
+        self._images, self._metric = images, metric
+        self._number = {image.name: i for i, image in enumerate(images)}
+
+    def __getitem__(self, image: str | int) -> Camera:
+        i = self._number.get(image, -1) if isinstance(image, str) else int(image)
+        if isinstance(image, str) and i < 0:
+            raise KeyError(f"there is no image {image!r}; the first of {len(self._images)} is {self._some!r}")
+        if not -len(self._images) <= i < len(self._images):
+            raise KeyError(f"there is no image {i}; {len(self._images)} were read")
+        r = self._metric.reconstruction
+        if not r.registered[i]:
+            raise KeyError(f"image {self._images[i].name!r} is not registered: {r.reasons[i]}")
+        assert r.K is not None
+        assert r.distortion is not None
+        scale, intrinsics = self._images[i].scale, self._metric.intrinsics[i]
+        offset = 0.5 / scale - 0.5
+        K = np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]]) @ r.K[i]
+        Rt = np.linalg.solve(r.K[i], r.P[i])
+        std = {name: in_original_pixels(name, interval, scale).std for name, interval in intrinsics.items()}
+        return Camera(K, Rt[:, :3], Rt[:, 3], self._images[i].original_size, r.distortion[i], std)
+
+    @property
+    def _some(self) -> str:
+        return self._images[0].name
+
+    def __iter__(self) -> Iterator[str]:
+        registered = self._metric.reconstruction.registered
+        return (image.name for image, there in zip(self._images, registered, strict=True) if there)
+
+    def __len__(self) -> int:
+        return int(self._metric.reconstruction.registered.sum())
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """All results of one run; None or empty beyond the last stage.
+
+    ``cameras``, ``points``, ``observations``, ``summary`` and all files are in pixels of the original images;
+    the records of the stages are in pixels at working size.
+
+    Parameters
+    ----------
+    out, settings : Path, mapping
+        Output folder (None if the run had none), and the settings: stage -> field -> value.
+    images, groups : tuple of Image, ndarray (V,) of int
+        The V views at working size, and the camera number of each.
+    unread : mapping
+        File name -> reason of unreadable images.
+    features, pair_choice, pairs, tracks, projective, calibration, metric, mesh, held_out
+        Results of the stages; ``pairs`` are all matched ones, accepted or not.
+    views, depth_maps : tuple of PinholeView, tuple of DepthMap
+        Undistorted images and their depth maps.
+    reports, warnings, failure : tuple of StageReport, tuple of str, str
+        One report per stage, all warnings, and the failure that ended the run, empty otherwise.
+    summary : mapping
+        Content of ``summary.json``.
+    """
+
+    out: Path | None
+    images: tuple[Image, ...]
+    unread: Mapping[str, str]
+    features: tuple[Features, ...]
+    pairs: tuple[TwoView, ...]
+    groups: I64
+    settings: Mapping[str, Mapping[str, Any]]
+    pair_choice: PairChoice | None = None
+    tracks: Tracks | None = None
+    projective: Reconstruction | None = None
+    calibration: SelfCalibration | None = None
+    metric: MetricResult | None = None
+    views: tuple[PinholeView, ...] = ()
+    depth_maps: tuple[DepthMap, ...] = ()
+    mesh: TexturedMesh | None = None
+    held_out: HeldOut | None = None
+    reports: tuple[StageReport, ...] = ()
+    warnings: tuple[str, ...] = ()
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    failure: str = ""
+
+    @property
+    def best_reconstruction(self) -> Reconstruction | None:
+        """The metric reconstruction, else the projective one, else None."""
+        return self.metric.reconstruction if self.metric is not None else self.projective
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """File name -> reason of every image without a camera: unreadable or not registered."""
+        best = self.best_reconstruction
+        if best is None:
+            return dict(self.unread)
+        views = zip(self.images, best.registered, best.reasons, strict=True)
+        reasons = {image.name: reason or "no reason was recorded" for image, in_, reason in views if not in_}
+        return {**self.unread, **reasons}
+
+    def _metric_result(self, what: str) -> MetricResult:
+        if self.metric is None:
+            stage = "the run ended before the metric stage" if not self.failure else self.failure
+            raise AttributeError(f"there are no {what}: {stage}")
+        return self.metric
+
+    @property
+    def cameras(self) -> Cameras:
+        """Registered cameras by image name or number, in original pixels, with standard deviations."""
+        return Cameras(self.images, self._metric_result("cameras"))
+
+    @property
+    def points(self) -> F64:
+        """The valid points (N, 3) of the metric reconstruction."""
+        r = self._metric_result("points").reconstruction
+        X = r.X[r.valid]
+        return np.asarray(X[:, :3] / X[:, 3:])
+
+    def observations(self, image: str | int) -> SeenPoints:
+        """Return the inlier observations of one image.
+
+        Parameters
+        ----------
+        image : str or int
+            Name of the image, or its number in ``images``; ``KeyError`` if there is none.
+
+        Returns
+        -------
+        SeenPoints
+            ``xy`` (M, 2) in original pixels and ``point`` (M,), the rows of ``points``.
+        """
+        r = self._metric_result("observations").reconstruction
+        names = [one.name for one in self.images]
+        if image not in names and not (isinstance(image, int) and -len(names) <= image < len(names)):
+            raise KeyError(f"there is no image {image!r}")
+        i = names.index(image) if isinstance(image, str) else image % len(names)
+        view, point = r.tracks.view_index, r.tracks.point_index
+        used = r.inlier & r.registered[view] & r.valid[point] & (view == i)
+        row = np.cumsum(r.valid) - 1
+        return SeenPoints((r.tracks.xy[used] + 0.5) / self.images[i].scale - 0.5, row[point[used]])
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``cameras.json``, ``points.ply``, ``sparse/0``, ``model.glb`` and ``summary.json``.
+
+        Parameters
+        ----------
+        folder : path
+            Created if missing; files of these names are replaced.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be written.
+        """
+        # The writers know this record.
+        from thesisrecon.pipeline._outputs import save_result
+
+        save_result(self, Path(folder))
