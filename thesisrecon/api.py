@@ -19,6 +19,12 @@ from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.io._images import read_image
 from thesisrecon.pipeline._image_pair import ImageInput, match_pair
+from thesisrecon.pipeline._loading import load
+from thesisrecon.pipeline.from_matches import (
+    reconstruct_from_colmap,
+    reconstruct_from_matches,
+    reconstruct_from_tracks,
+)
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import (
     DisparityMap,
@@ -38,10 +44,11 @@ from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
-    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
-    "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "compare_models", "estimate_fundamental", "estimate_homography", "estimate_trifocal",
-    "interpolate_view", "match_pair", "match_rectified", "reconstruct", "render", "resect", "self_calibrate",
+    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig", "Reconstruction",
+    "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError",
+    "compare_models", "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view",
+    "load", "match_pair", "match_rectified", "reconstruct", "reconstruct_from_colmap",
+    "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect", "self_calibrate",
     "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 

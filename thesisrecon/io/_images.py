@@ -87,7 +87,7 @@ _budget = MemoryBudget(MAX_DECODED_BYTES)
 
 
 @dataclass(frozen=True)
-class _DecodedImage:
+class DecodedImage:
     """An image at working size, a hash of its pixels and original size, and a warning for the user or "".
 
     ``exif_focal_px`` is the focal length from EXIF in original pixels, NaN = unknown.
@@ -103,7 +103,7 @@ class _DecodedImage:
 class ImageSet:
     """The usable images of a run, sorted by name, and name -> reason of the other files."""
 
-    decoded: tuple[_DecodedImage, ...]
+    decoded: tuple[DecodedImage, ...]
     refused: dict[str, str]
 
     @property
@@ -162,7 +162,7 @@ def read_images(
     """
     items = _named_items(source)
 
-    def read(item: tuple[str, Any]) -> _DecodedImage | str:
+    def read(item: tuple[str, Any]) -> DecodedImage | str:
         try:
             return _read(*item, max_size_px)
         except UnusableImage as refusal:
@@ -170,7 +170,7 @@ def read_images(
 
     results = list(map_all(read, items))
     refused = {name: r for (name, _), r in zip(items, results, strict=True) if isinstance(r, str)}
-    distinct: dict[str, _DecodedImage] = {}
+    distinct: dict[str, DecodedImage] = {}
     for decoded in (r for r in results if not isinstance(r, str)):
         first = distinct.setdefault(decoded.digest, decoded)
         if first is not decoded:
@@ -209,12 +209,12 @@ def _names(names: Iterable[str]) -> list[str]:
     return list(taken)
 
 
-def _read(name: str, item: Any, max_size_px: int) -> _DecodedImage:
+def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
     """Read an image, refuse small and blank ones, and hash the content."""
     if isinstance(item, Path):
         decoded = _decode(name, item, max_size_px)
     elif isinstance(item, Image):
-        decoded = _DecodedImage(item, "")
+        decoded = DecodedImage(item, "")
     else:
         array = np.asarray(item)
         if array.dtype != np.uint8 or (array.ndim != 2 and array.shape[2:] != (3,)):
@@ -222,7 +222,7 @@ def _read(name: str, item: Any, max_size_px: int) -> _DecodedImage:
                 f"an image array must be (H, W) or (H, W, 3) uint8; got {array.shape} {array.dtype}"
             )
         stored = StoredImage(PIL.Image.fromarray(array))
-        decoded = _DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), "")
+        decoded = DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), "")
     rgb = decoded.image.rgb
     if min(rgb.shape[:2]) < MIN_SIDE:
         raise UnusableImage(
@@ -235,7 +235,7 @@ def _read(name: str, item: Any, max_size_px: int) -> _DecodedImage:
     return replace(decoded, digest=content.hexdigest()[:32])
 
 
-def _decode(name: str, path: Path, max_size_px: int) -> _DecodedImage:
+def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
     # Special files are refused: reading a pipe or a device may never end.
     try:
         found = path.stat()
@@ -271,7 +271,7 @@ def _decode(name: str, path: Path, max_size_px: int) -> _DecodedImage:
         ) from None
 
 
-def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> _DecodedImage:
+def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> DecodedImage:
     # Cameras store a preview as a second frame of a JPEG (MPO).
     several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
     focal_35mm, transform = _exif(file)
@@ -280,7 +280,7 @@ def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> _De
     known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
     focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
     image = Image(name, resized_to(stored, max_size_px), stored.size)
-    return _DecodedImage(image, "", focal, "only the first frame is used" if several else "")
+    return DecodedImage(image, "", focal, "only the first frame is used" if several else "")
 
 
 def _too_large(file: PIL.Image.Image, needed: int) -> str:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.pipeline._image_pair import verify_matches
 from thesisrecon.pipeline._stages import finish_matches, finish_tracks, require_accepted_pair
@@ -20,13 +20,10 @@ from thesisrecon.runtime._run import Batch
 
 @dataclass(frozen=True)
 class Given:
-    """Corners (N_i, 2) of V views in working pixels, and (i, j), i < j -> rows (M, 2) of matched corners.
-
-    ``tracks`` are given too, or built from the matches.
-    """
+    """Corners (N_i, 2) of V views in working pixels, their matches, and tracks unless they are built."""
 
     corners: Sequence[F64]
-    matches: dict[tuple[int, int], I64]
+    matches: Sequence[Matches]
     tracks: Tracks | None = None
 
 
@@ -48,7 +45,7 @@ def take_corners(given: Given, state: PipelineState) -> None:
 def take_pairs(given: Given, state: PipelineState) -> None:
     """Set ``result.pair_choice`` to the pairs with given matches."""
     run, views = state.run, len(given.corners)
-    pairs = np.array(sorted(given.matches), dtype=np.int64).reshape(-1, 2)
+    pairs = np.array([(m.i, m.j) for m in given.matches], dtype=np.int64).reshape(-1, 2)
     choice = run.cached(
         "pairs",
         "choice",
@@ -61,9 +58,7 @@ def take_pairs(given: Given, state: PipelineState) -> None:
 
 def verify_pairs(given: Given, state: PipelineState) -> None:
     """Estimate and verify the epipolar geometry of the given matches (chapter 5); sets ``result.pairs``."""
-    run = state.run
-    pairs = sorted(given.matches)
-    matches = [_as_matches(given, pair) for pair in pairs]
+    run, matches = state.run, given.matches
     variants = [run.variant_key(stage) for stage in ("epipolar", "verification")]
     keys = {
         f"{m.i:05d}-{m.j:05d}": run.key(
@@ -76,13 +71,6 @@ def verify_pairs(given: Given, state: PipelineState) -> None:
         return (([n], (state.config, matches[n], run.seed)) for n in missing)
 
     finish_matches(state, run.map_cached("matches", keys, _verify, batches))
-
-
-def _as_matches(given: Given, pair: tuple[int, int]) -> Matches:
-    (i, j), rows = pair, given.matches[pair]
-    xy1, xy2 = given.corners[i][rows[:, 0]], given.corners[j][rows[:, 1]]
-    score, affine = np.ones(len(rows), dtype=np.float32), np.tile(np.eye(2), (len(rows), 1, 1))
-    return Matches(i, j, rows[:, 0], rows[:, 1], xy1, xy2, score, affine)
 
 
 def _verify(config: PipelineConfig, matches: Matches, seed: int) -> list[TwoView]:

@@ -1,0 +1,166 @@
+"""Matches and tracks of other programs: the same cameras from each form, and one sentence for wrong input."""
+
+import sqlite3
+
+import numpy as np
+import pytest
+
+import thesisrecon
+from tests.given_scene import given_scene
+from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
+
+SCENE = given_scene()
+ORIENTATIONS = "CREATE TABLE {} (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
+
+
+@pytest.fixture(scope="module")
+def from_rows():
+    return reconstruct_from_matches(SCENE.keypoints, SCENE.matches, SCENE.sizes)
+
+
+def focal_is_right(result, scene=SCENE):
+    camera = result.cameras[0]
+    assert len(result.cameras) == len(scene.cameras)
+    assert abs(camera.K[0, 0] - scene.cameras[0].K[0, 0]) < 4 * camera.std["focal_px"]
+    return camera.K[0, 0]
+
+
+def test_rows_of_keypoints_give_the_focal_length_within_its_interval(from_rows):
+    focal_is_right(from_rows)
+    assert from_rows.summary["trusted"]
+
+
+def test_positions_give_the_same_cameras_as_rows(from_rows):
+    k = SCENE.keypoints
+    positions = {(i, j): (k[i], k[j]) for i, j in SCENE.matches}
+    result = reconstruct_from_matches(None, positions, SCENE.sizes)
+    assert focal_is_right(result) == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-3)
+
+
+def test_pairs_in_the_other_order_are_the_same(from_rows):
+    turned = {(j, i): rows[:, ::-1] for (i, j), rows in SCENE.matches.items()}
+    result = reconstruct_from_matches(SCENE.keypoints, turned, SCENE.sizes)
+    assert np.array_equal(result.points, from_rows.points)
+
+
+def test_tracks_give_the_same_focal_length_although_some_are_wrong(from_rows):
+    tracks = SCENE.tracks
+    tracks.xy[::25] += 20.0
+    result = reconstruct_from_tracks(tracks, SCENE.sizes)
+    assert focal_is_right(result) == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-2)
+    assert result.tracks.n_points == 200
+
+
+def test_a_keypoint_at_the_position_of_another_does_not_split_its_tracks(from_rows):
+    """SIFT repeats a position with another orientation; both rows are matched."""
+    keypoints = [np.concatenate([xy, xy[:50]]) for xy in SCENE.keypoints]
+    matches = {pair: np.concatenate([rows, rows[:50] + 200]) for pair, rows in SCENE.matches.items()}
+    matches[0, 1] = np.concatenate([SCENE.matches[0, 1][50:], SCENE.matches[0, 1][:50] + 200])
+    result = reconstruct_from_matches(keypoints, matches, SCENE.sizes)
+    assert result.tracks.n_points == from_rows.tracks.n_points
+
+
+def test_images_give_colours_and_other_sizes_of_work(from_rows):
+    images = [np.full((480, 640, 3), 40 * i, np.uint8) for i in range(5)]
+    for i, image in enumerate(images):
+        image[::8] = 200
+        image[0, 0] = i
+    config = thesisrecon.PipelineConfig(images=thesisrecon.config.ImageOptions(max_size_px=320))
+    result = reconstruct_from_matches(
+        SCENE.keypoints, SCENE.matches, SCENE.sizes, images=images, config=config, until="metric"
+    )
+    assert result.images[0].size == (320, 240)
+    assert focal_is_right(result) == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-4)
+
+
+def test_a_run_in_a_folder_is_resumed_and_other_matches_are_another_run(tmp_path):
+    out = tmp_path / "out"
+    reconstruct_from_matches(SCENE.keypoints, SCENE.matches, SCENE.sizes, out)
+    again = reconstruct_from_matches(SCENE.keypoints, SCENE.matches, SCENE.sizes, out)
+    assert "projective" in again.summary["resumed"]
+    assert (out / "report.html").is_file()
+    fewer = {pair: rows[20:] for pair, rows in SCENE.matches.items()}
+    with pytest.raises(UsageError, match=r"holds another run \(matches was"):
+        reconstruct_from_matches(SCENE.keypoints, fewer, SCENE.sizes, out)
+
+
+def moved(index, value):
+    keypoints = [xy.copy() for xy in SCENE.keypoints]
+    keypoints[index] = value(keypoints[index])
+    return keypoints
+
+
+WRONG = {
+    "sizes must be": (SCENE.keypoints, SCENE.matches, [640, 480]),
+    "whole numbers of pixels": (SCENE.keypoints, SCENE.matches, [(640.5, 480)] * 5),
+    r"reach .* px outside 480 x 640 px: sizes are \(width": (
+        SCENE.keypoints,
+        SCENE.matches,
+        [(480, 640)] * 5,
+    ),
+    "keypoints of 4 images and 5 sizes": (SCENE.keypoints[:4], SCENE.matches, SCENE.sizes),
+    "finite positions": (moved(1, lambda xy: xy * np.nan), SCENE.matches, SCENE.sizes),
+    r"\(N, 2\)": (moved(1, lambda xy: xy.T), SCENE.matches, SCENE.sizes),
+    "two different numbers from 0 to 4": (SCENE.keypoints, {(0, 5): SCENE.matches[0, 1]}, SCENE.sizes),
+    "given twice": (SCENE.keypoints, SCENE.matches | {(1, 0): SCENE.matches[0, 1]}, SCENE.sizes),
+    "does not exist": (SCENE.keypoints, {(0, 1): SCENE.matches[0, 1] + 1}, SCENE.sizes),
+    "whole numbers, rows": (SCENE.keypoints, {(0, 1): SCENE.matches[0, 1] + 0.5}, SCENE.sizes),
+    "keypoints is None": (None, SCENE.matches, SCENE.sizes),
+    "there are no matches": (SCENE.keypoints, {}, SCENE.sizes),
+}
+
+
+@pytest.mark.parametrize("sentence", WRONG)
+def test_wrong_input_gets_one_sentence(sentence):
+    with pytest.raises(UsageError, match=sentence):
+        reconstruct_from_matches(*WRONG[sentence])
+
+
+def test_the_model_needs_images():
+    with pytest.raises(UsageError, match="needs the images"):
+        reconstruct_from_matches(SCENE.keypoints, SCENE.matches, SCENE.sizes, until="model")
+
+
+def test_tracks_of_other_images_are_refused():
+    with pytest.raises(UsageError, match="tracks are of 5 images, the sizes of 4"):
+        reconstruct_from_tracks(SCENE.tracks, SCENE.sizes[:4])
+
+
+def write_database(path, *, verified):
+    """The tables of COLMAP's database that hold keypoints and matches."""
+    base = sqlite3.connect(path)
+    base.execute("CREATE TABLE cameras (camera_id INTEGER, model INTEGER, width INTEGER, height INTEGER)")
+    base.execute("CREATE TABLE images (image_id INTEGER, name TEXT, camera_id INTEGER)")
+    base.execute("CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
+    for table in ("matches", "two_view_geometries"):
+        base.execute(ORIENTATIONS.format(table))
+    base.execute("INSERT INTO cameras VALUES (7, 2, 640, 480)")
+    for i, xy in enumerate(SCENE.keypoints):
+        # Names in the opposite order of the numbers.
+        base.execute("INSERT INTO images VALUES (?, ?, 7)", (i + 1, f"{9 - i}.jpg"))
+        data = np.column_stack([xy + 0.5, np.ones((len(xy), 2))]).astype("<f4").tobytes()
+        base.execute("INSERT INTO keypoints VALUES (?, ?, 4, ?)", (i + 1, len(xy), data))
+    for (i, j), rows in SCENE.matches.items():
+        row = ((i + 1) * (2**31 - 1) + j + 1, len(rows), 2, rows.astype("<u4").tobytes())
+        base.execute(
+            f"INSERT INTO {'two_view_geometries' if verified else 'matches'} VALUES (?, ?, ?, ?)", row
+        )
+    base.commit()
+    base.close()
+    return path
+
+
+@pytest.mark.parametrize("verified", [True, False])
+def test_a_database_gives_the_same_cameras(verified, tmp_path, from_rows):
+    result = reconstruct_from_colmap(write_database(tmp_path / "database.db", verified=verified))
+    assert list(result.cameras) == [f"{i}.jpg" for i in range(5, 10)]
+    # Keypoints are stored in single precision.
+    assert result.cameras["9.jpg"].K[0, 0] == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-3)
+
+
+def test_other_files_are_no_database(tmp_path):
+    (tmp_path / "text.db").write_text("no database")
+    with pytest.raises(UsageError, match="is not a COLMAP database"):
+        reconstruct_from_colmap(tmp_path / "text.db")
+    with pytest.raises(UsageError, match="there is no COLMAP database or model"):
+        reconstruct_from_colmap(tmp_path / "none.db")

@@ -1,0 +1,87 @@
+"""What a run returns: cameras, points and observations in original pixels, saved and read back."""
+
+import numpy as np
+import pytest
+
+import thesisrecon
+from tests.given_scene import SIZE, given_scene
+from thesisrecon.errors import UsageError
+from thesisrecon.io._exports import read_cameras
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    scene = given_scene()
+    out = tmp_path_factory.mktemp("results") / "out"
+    return scene, thesisrecon.reconstruct_from_matches(scene.keypoints, scene.matches, scene.sizes, out)
+
+
+def test_points_project_to_their_observations_in_original_pixels(run):
+    scene, result = run
+    for name, camera in result.cameras.items():
+        seen = result.observations(name)
+        distance = np.linalg.norm(camera.project(result.points[seen.point]) - seen.xy, axis=1)
+        assert len(seen.xy) > 150
+        assert np.median(distance) < 1.5 * scene.noise_px
+        assert camera.size == SIZE
+
+
+def test_a_camera_is_found_by_name_and_by_number_and_has_standard_deviations(run):
+    scene, result = run
+    camera = result.cameras["image-3"]
+    assert np.array_equal(camera.P, result.cameras[3].P)
+    assert np.array_equal(camera.P, result.cameras[-2].P)
+    assert abs(camera.K[0, 0] - scene.cameras[3].K[0, 0]) < 4 * camera.std["focal_px"]
+    assert 0 < camera.std["focal_px"] < 50
+
+
+def test_unknown_images_are_named(run):
+    result = run[1]
+    with pytest.raises(KeyError, match="there is no image 'other'"):
+        result.cameras["other"]
+    with pytest.raises(KeyError, match="there is no image 9; 5 were read"):
+        result.cameras[9]
+    with pytest.raises(KeyError, match="there is no image 7"):
+        result.observations(7)
+
+
+def test_a_finished_folder_is_read_back(run):
+    result = run[1]
+    loaded = thesisrecon.load(result.out)
+    assert loaded.summary == result.summary
+    assert list(loaded.cameras) == list(result.cameras)
+    assert np.array_equal(loaded.points, result.points)
+    assert np.array_equal(loaded.cameras[1].K, result.cameras[1].K)
+    assert len(loaded.pairs) == len(result.pairs)
+    assert loaded.tracks.n_points == result.tracks.n_points
+
+
+def test_a_loaded_result_is_saved_as_the_run_wrote_it(run, tmp_path):
+    result = run[1]
+    thesisrecon.load(result.out).save(tmp_path / "copy")
+    for name in ("cameras.json", "points.ply", "summary.json", "sparse/0/images.bin"):
+        assert (tmp_path / "copy" / name).read_bytes() == (result.out / name).read_bytes()
+
+
+def test_a_result_without_a_folder_is_saved(run, tmp_path):
+    scene, kept = run
+    result = thesisrecon.reconstruct_from_matches(scene.keypoints, scene.matches, scene.sizes)
+    assert result.out is None
+    result.save(str(tmp_path / "saved"))
+    saved = read_cameras(tmp_path / "saved" / "cameras.json")
+    assert np.allclose(saved["image-2"].K, kept.cameras[2].K)
+    assert (tmp_path / "saved" / "points.ply").read_bytes() == (kept.out / "points.ply").read_bytes()
+
+
+def test_a_folder_without_a_finished_run_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="no run has finished in this folder"):
+        thesisrecon.load(tmp_path)
+
+
+def test_cameras_of_an_earlier_stage_are_refused_with_the_reason(run, tmp_path):
+    scene = run[0]
+    result = thesisrecon.reconstruct_from_matches(
+        scene.keypoints, scene.matches, scene.sizes, tmp_path / "early", until="matches"
+    )
+    with pytest.raises(AttributeError, match="the run ended before the metric stage"):
+        result.cameras  # noqa: B018
