@@ -6,7 +6,7 @@ import pytest
 import thesisrecon
 from tests.given_scene import SIZE, given_scene
 from thesisrecon.errors import UsageError
-from thesisrecon.io._exports import read_cameras
+from thesisrecon.io._models import read_cameras
 
 
 @pytest.fixture(scope="module")

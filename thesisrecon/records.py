@@ -29,7 +29,18 @@ class Image:
 
     @classmethod
     def without_pixels(cls, name: str, size: tuple[int, int]) -> Image:
-        """Return a grey image in the place of one that is not at hand; it takes no memory."""
+        """Return a grey image in the place of one that is not available.
+
+        Parameters
+        ----------
+        name, size : str, tuple of int
+            File name, and (width, height).
+
+        Returns
+        -------
+        Image
+            It takes no memory; ``has_pixels`` is False.
+        """
         return cls(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), size)
 
     @property

@@ -37,7 +37,17 @@ class SeenPoints(NamedTuple):
 
 
 def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> IntrinsicInterval:
-    """Convert an intrinsic whose name ends in ``_px`` to original pixels, undoing (x + 0.5) scale - 0.5."""
+    """Convert an intrinsic from working to original pixels, undoing (x + 0.5) scale - 0.5.
+
+    Parameters
+    ----------
+    name, interval, scale : str, IntrinsicInterval, float
+        Only names that end in ``_px`` have a unit; working over original size.
+
+    Returns
+    -------
+    IntrinsicInterval
+    """
     if not name.endswith("_px"):
         return interval
     shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0

@@ -23,7 +23,7 @@ from thesisrecon.pipeline._given import Given, take_corners, take_pairs, take_tr
 from thesisrecon.pipeline._outputs import RESULT_FILES
 from thesisrecon.pipeline._stages import build_tracks
 from thesisrecon.pipeline._state import PipelineState
-from thesisrecon.pipeline.reconstruction import STEPS, claimed, empty_result, identity_of, run_steps
+from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
 from thesisrecon.records import Image, Matches, Tracks
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
@@ -99,7 +99,7 @@ def reconstruct_from_matches(
     >>> same = np.column_stack([np.arange(200), np.arange(200)])
     >>> pairs = {(i, j): same for i in range(5) for j in range(i + 1, 5)}
     >>> result = reconstruct_from_matches(keypoints, pairs, [(640, 480)] * 5)
-    >>> abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"]
+    >>> bool(abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"])
     True
     """
     views = _views(sizes, names, images)
@@ -153,7 +153,7 @@ def reconstruct_from_tracks(
     >>> xy = np.concatenate([camera.project(X) for camera in cameras]) + rng.normal(0, 0.3, (1000, 2))
     >>> tracks = Tracks(np.repeat(np.arange(5), 200), np.tile(np.arange(200), 5), xy, 5, 200)
     >>> result = reconstruct_from_tracks(tracks, [(640, 480)] * 5)
-    >>> abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"]
+    >>> bool(abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"])
     True
     """
     views = _views(sizes, names, images)
@@ -198,8 +198,8 @@ def reconstruct_from_colmap(
         if any(view.size is None for view in model.views) or not len(model.xy):
             raise UsageError(f"{path} holds no observations of points; give a COLMAP model or a database")
         order = np.lexsort((model.view_index, model.point_index))
-        view, point, xy = (a[order] for a in (model.view_index, model.point_index, model.xy))
-        tracks = Tracks(view, point, xy, len(model.views), len(model.X))
+        view, point = model.view_index[order], model.point_index[order]
+        tracks = Tracks(view, point, model.xy[order], len(model.views), len(model.X))
         views = _views([view.size for view in model.views if view.size is not None], model.names, images)
         given = _given_tracks(tracks, views)
     else:

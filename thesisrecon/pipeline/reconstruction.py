@@ -2,46 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
 
-from thesisrecon._settings import tables_from_config
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure, UsageError, counted
-from thesisrecon.intrinsics import IntrinsicsOptions, camera_numbers
+from thesisrecon.errors import UsageError, counted
+from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._images import ImageSet, ImageSource, list_images, read_images, scene_name
 from thesisrecon.matching.pair_selection import ListedPairs
-from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
-from thesisrecon.pipeline._stages import (
-    build_model,
-    build_tracks,
-    estimate_depth_maps,
-    find_features,
-    match_pairs,
-    reconstruct_metric,
-    reconstruct_projective,
-    select_pairs,
-)
-from thesisrecon.pipeline._state import PipelineState, name_images
+from thesisrecon.pipeline._outputs import RESULT_FILES
+from thesisrecon.pipeline._state import PipelineState
+from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
 from thesisrecon.results import RunResult
-from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
-
-STEPS = {
-    "features": (find_features,),
-    "matches": (find_features, select_pairs, match_pairs),
-    "projective": (find_features, select_pairs, match_pairs, build_tracks, reconstruct_projective),
-    "metric": (find_features, select_pairs, match_pairs, build_tracks, reconstruct_metric),
-}
-"""Algorithm 1: the steps up to each last stage."""
-SURFACE_STEPS = (estimate_depth_maps, build_model)
-STEPS["dense"] = (*STEPS["metric"], *SURFACE_STEPS[:1])
-STEPS["model"] = (*STEPS["metric"], *SURFACE_STEPS)
 
 
 def reconstruct(
@@ -117,45 +93,6 @@ def reconstruct(
         return run_steps(state, STEPS[until], surface_required=surface_required)
 
 
-@contextmanager
-def claimed(run: Run, *, overwrite: bool) -> Iterator[None]:
-    """Hold the workers and the output folder of a run."""
-    claim = run.directory.claim(_settings_identity(run), overwrite=overwrite)
-    with run.workers, claim, run.resumable():
-        yield
-
-
-def run_steps(
-    state: PipelineState, steps: Sequence[Callable[[PipelineState], None]], *, surface_required: bool
-) -> RunResult:
-    """Run the steps and write the outputs, of a failed run too."""
-    run = state.run
-    try:
-        state.require_images()
-        precompile(state.until, run.workers.threads, run.progress)
-        _run_all(state, steps, surface_required=surface_required)
-    except StageFailure as error:
-        parts = (error.reason, error.evidence, error.advice)
-        failure = StageFailure(*(name_images(part, state.names) for part in parts))
-        write_outputs(run, state.result, until=state.until, failure=failure)
-        raise failure from None
-    return write_outputs(run, state.result, until=state.until, failure=None)
-
-
-def _run_all(
-    state: PipelineState, steps: Sequence[Callable[[PipelineState], None]], *, surface_required: bool
-) -> None:
-    """Run the steps; a surface that fails is only a warning unless it was asked for."""
-    for step in steps:
-        try:
-            step(state)
-        except StageFailure as failure:
-            if surface_required or step not in SURFACE_STEPS:
-                raise
-            state.run.warnings.append(f"No surface model was built: {failure}")
-            return
-
-
 def _read_inputs(run: Run, images: ImageSource) -> ImageSet:
     with run.clock("images"):
         size = run.config.images.max_size_px
@@ -182,22 +119,3 @@ def _exif_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
         found = f"No EXIF focal length was found in {counted(total, 'image')}"
         return [f"{found}{rest or ': no focal prior is used'}"]
     return [f"{missing} of the {total} images have no EXIF focal length{rest or ' and no focal prior'}"]
-
-
-def _settings_identity(run: Run) -> dict[str, Any]:
-    """The part of a run's identity that is known before its images are read."""
-    return {"version": 1, "seed": run.seed, "settings": tables_from_config(run.config)}
-
-
-def identity_of(run: Run, inputs: ImageSet) -> dict[str, Any]:
-    """Settings, seed and content of the images: runs with equal identity are the same."""
-    digests = {p.image.name: p.digest for p in inputs.decoded}
-    refused = {name: f"refused: {reason}" for name, reason in inputs.refused.items()}
-    return _settings_identity(run) | {"images": digests | refused}
-
-
-def empty_result(run: Run, inputs: ImageSet) -> RunResult:
-    sizes = [image.original_size for image in inputs.images]
-    groups = camera_numbers(sizes, run.config.intrinsics, inputs.exif_focal_px)
-    settings = tables_from_config(run.config)
-    return RunResult(run.directory.path, inputs.images, inputs.refused, (), (), groups, settings)
