@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [  # noqa: F405
-    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig", "Reconstruction",
-    "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError",
-    "compare_models", "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view",
-    "load", "match_pair", "match_rectified", "reconstruct", "reconstruct_from_colmap",
-    "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect", "self_calibrate",
-    "synthesize_view", "triangulate", "upgrade_affine", "__version__",
+    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
+    "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
+    "UsageError", "__version__", "compare_models", "estimate_fundamental", "estimate_homography",
+    "estimate_trifocal", "interpolate_view", "load", "match_pair", "match_rectified", "reconstruct",
+    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect",
+    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 _HOMES = {

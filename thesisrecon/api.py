@@ -44,10 +44,10 @@ from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
-    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig", "Reconstruction",
-    "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError",
-    "compare_models", "estimate_fundamental", "estimate_homography", "estimate_trifocal", "interpolate_view",
-    "load", "match_pair", "match_rectified", "reconstruct", "reconstruct_from_colmap",
+    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
+    "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
+    "UsageError", "compare_models", "estimate_fundamental", "estimate_homography", "estimate_trifocal",
+    "interpolate_view", "load", "match_pair", "match_rectified", "reconstruct", "reconstruct_from_colmap",
     "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect", "self_calibrate",
     "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip

@@ -17,7 +17,7 @@ from thesisrecon.errors import UsageError, counted, in_words
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.similarity import Similarity, estimate_similarity, rotation_errors_deg
 from thesisrecon.io._models import read_model
-from thesisrecon.records import RunResult
+from thesisrecon.results import RunResult
 from thesisrecon.sparse_model import SparseModel, SparseView
 
 _THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)

@@ -23,10 +23,8 @@ from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
 from thesisrecon.metric._shared_camera import check_shared_cameras, contradicted_focal_priors
-from thesisrecon.records import IntrinsicInterval, RunResult, SelfCalibration
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 from thesisrecon.results import RunResult
-from validation.metrics.similarity import estimate_similarity
 from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
 from validation.studies.runner import Part, Rows, report_progress, scenes_here, text_table
 
