@@ -15,10 +15,11 @@ __version__ = "0.1.0"
 __all__ = [  # noqa: F405
     "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
     "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "__version__", "compare_models", "estimate_fundamental", "estimate_homography",
-    "estimate_trifocal", "interpolate_view", "load", "match_pair", "match_rectified", "reconstruct",
-    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect",
-    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "UsageError", "__version__", "align_to_positions", "compare_models", "estimate_fundamental",
+    "estimate_homography", "estimate_trifocal", "export", "interpolate_view", "load", "match_pair",
+    "match_rectified", "reconstruct", "reconstruct_from_colmap", "reconstruct_from_matches",
+    "reconstruct_from_tracks", "render", "resect", "scaled", "self_calibrate", "synthesize_view",
+    "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 _HOMES = {
@@ -29,11 +30,14 @@ _HOMES = {
     "StageFailure": "errors",
     "Tracks": "records",
     "UsageError": "errors",
+    "align_to_positions": "alignment",
     "compare_models": "comparison",
     "estimate_fundamental": "epipolar.estimation",
     "estimate_homography": "epipolar.homography",
     "estimate_trifocal": "epipolar.trifocal_estimation",
+    "export": "model_export",
     "resect": "geometry.robust_resection",
+    "scaled": "alignment",
     "triangulate": "geometry.triangulation",
 }
 """Modules of what needs no configuration, whose import takes longest; the others are in `api`."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from thesisrecon.alignment import align_to_positions, scaled
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.comparison import ModelComparison, compare_models
@@ -18,6 +19,7 @@ from thesisrecon.geometry.robust_resection import resect
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.io._images import read_image
+from thesisrecon.model_export import export
 from thesisrecon.pipeline._image_pair import ImageInput, match_pair
 from thesisrecon.pipeline._loading import load
 from thesisrecon.pipeline.from_matches import (
@@ -46,10 +48,10 @@ from thesisrecon.views.render import render
 __all__ = [
     "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
     "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "compare_models", "estimate_fundamental", "estimate_homography", "estimate_trifocal",
-    "interpolate_view", "load", "match_pair", "match_rectified", "reconstruct", "reconstruct_from_colmap",
-    "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect", "self_calibrate",
-    "synthesize_view", "triangulate", "upgrade_affine",
+    "UsageError", "align_to_positions", "compare_models", "estimate_fundamental", "estimate_homography",
+    "estimate_trifocal", "export", "interpolate_view", "load", "match_pair", "match_rectified", "reconstruct",
+    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect",
+    "scaled", "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 

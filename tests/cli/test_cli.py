@@ -103,6 +103,18 @@ def test_inspect_prints_the_results(killed_and_resumed, capsys):
     assert "camera 0: focal length" in printed
 
 
+def test_a_run_is_exported_with_the_images_that_it_was_made_from(killed_and_resumed, photographs, tmp_path):
+    out, _ = killed_and_resumed
+    assert run_command(["export", str(out), "--to", "nerfstudio", "-o", str(tmp_path)]) == 0
+    table = read(tmp_path / "transforms.json")
+    written = [frame["file_path"] for frame in table["frames"]]
+    assert written == [f"images/{path.name}" for path in sorted(photographs.iterdir())]
+    assert all((tmp_path / name).is_file() for name in written)
+    summary = read(out / "summary.json")
+    assert summary["images_folder"] == str(photographs)
+    assert table["fl_x"] == pytest.approx(summary["cameras"][0]["focal_px"]["value"])
+
+
 def test_an_early_end_prints_the_results_of_its_stage(photographs, tmp_path, capsys):
     few, out = tmp_path / "few", tmp_path / "out"
     few.mkdir()

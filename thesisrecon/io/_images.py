@@ -132,6 +132,27 @@ def list_images(folder: Path) -> list[Path]:
     ]
 
 
+def images_folder(source: ImageSource) -> Path | None:
+    """Absolute path of the folder of all images; None if they are in several folders or in memory."""
+    if isinstance(source, str | Path):
+        return Path(source).absolute()
+    folders = {Path(item).absolute().parent if isinstance(item, str | Path) else None for item in source}
+    return folders.pop() if len(folders) == 1 else None
+
+
+def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Locate image files by name, which may have subfolders, in a folder; UsageError if one is missing."""
+    listed = dict(_named_items(folder))
+    paths = [Path(listed.get(name, folder / name)) for name in names]
+    missing = [name for name, path in zip(names, paths, strict=True) if not path.is_file()]
+    if missing:
+        share = f"{len(missing)} of the {len(names)} images of the model"
+        raise UsageError(
+            f"{share} are not in {folder}, such as {missing[0]!r}; give their folder with --images"
+        )
+    return paths
+
+
 def scene_name(folder: Path) -> str:
     """Name a scene after its image folder, or after the parent of a folder called "images" or similar."""
     folder = folder.resolve()

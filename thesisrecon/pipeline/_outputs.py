@@ -217,6 +217,7 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "version": __version__,
         "seed": run.seed,
         "until": until,
+        "images_folder": None if run.images_folder is None else str(run.images_folder),
         "threads": run.workers.threads,
         "executor": run.workers.name,
         "seconds": seconds | {"total": round(sum(seconds.values()), 3)},

@@ -16,7 +16,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._colmap_database import read_database
-from thesisrecon.io._images import DecodedImage, ImageSet, read_image
+from thesisrecon.io._images import DecodedImage, ImageSet, images_folder, read_image
 from thesisrecon.io._models import read_model
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks, corners_from_matches
 from thesisrecon.pipeline._given import Given, take_corners, take_pairs, take_tracks, verify_pairs
@@ -444,6 +444,8 @@ def _reconstruct(
             if requested and until in ("dense", "model"):
                 raise UsageError(f"until = {until!r} needs the images; give images, or until = 'metric'")
             until = "metric" if until == "model" else until
+        else:
+            run.images_folder = images_folder(views.images)
         with claimed(run, overwrite=overwrite):
             with run.clock("images"):
                 digests = [key_of(views.names[i], views.sizes[i], xy) for i, xy in enumerate(given.corners)]

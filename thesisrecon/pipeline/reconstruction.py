@@ -11,7 +11,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.intrinsics import IntrinsicsOptions
-from thesisrecon.io._images import ImageSet, ImageSource, list_images, read_images, scene_name
+from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
 from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline._outputs import RESULT_FILES
 from thesisrecon.pipeline._state import PipelineState
@@ -80,6 +80,7 @@ def reconstruct(
         if not list_images(Path(images)):
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
         run.title = scene_name(Path(images)) or run.title
+    run.images_folder = images_folder(images)
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
     with claimed(run, overwrite=overwrite):

@@ -81,6 +81,7 @@ class Run:
     directory: RunDirectory
     progress: Progress
     title: str  #: of the report
+    images_folder: Path | None = None  #: of all images, None if they are from several or from memory
     logs: dict[str, _StageLog] = field(default_factory=dict)
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)  #: stages read from the cache

@@ -8,7 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from thesisrecon.arrays import F32, F64
+from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.geometry.camera_matrix import distort
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.image_filters import cubic_weights
 from thesisrecon.kernels import empty, kernel
 
@@ -138,6 +140,24 @@ def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]
         _sample_image(pixels, places, strip)
         out[first:last] = strip[first - start :]
     return out[:, :, 0] if image.ndim == 2 else out
+
+
+def undistort_image(rgb: U8, K: F64, distortion: F64, pinhole_K: F64, size: tuple[int, int]) -> tuple[U8, B8]:
+    """Resample an image (H, W, 3) with radial distortion into a pinhole camera of (width, height).
+
+    Returns the image, black outside the original, and the mask of pixels inside.
+    """
+    inverse = np.linalg.inv(pinhole_K)
+
+    def lookup(rows: range) -> F64:
+        x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(rows.start), float(rows.stop)))
+        rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ inverse.T
+        xy = distort(dehomogenize(rays), distortion) @ K[:2, :2].T + K[:2, 2]
+        return np.asarray(xy.reshape(*x.shape, 2))
+
+    pixels = warp_image(rgb.astype(np.float32), lookup, size)
+    seen = np.asarray(np.isfinite(pixels).all(axis=2))
+    return np.clip(np.rint(np.where(seen[:, :, None], pixels, 0.0)), 0.0, 255.0).astype(np.uint8), seen
 
 
 def bilinear_samples(values: F32, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]:

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import camera_centre, distort, project
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.camera_matrix import camera_centre, project
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link_sequence, pixel_transfer
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
-from thesisrecon.stereo._resampling import warp_image
+from thesisrecon.stereo._resampling import undistort_image
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 
 BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
@@ -135,17 +135,7 @@ def _pinhole_view(
     P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
     if not distortion.any() and size == image.size:
         return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
-    inverse = np.linalg.inv(S @ K[view])
-
-    def lookup(rows: range) -> F64:
-        x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(rows.start), float(rows.stop)))
-        rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ inverse.T
-        xy = distort(dehomogenize(rays), distortion) @ K[view, :2, :2].T + K[view, :2, 2]
-        return np.asarray(xy.reshape(*x.shape, 2))
-
-    pixels = warp_image(image.rgb.astype(np.float32), lookup, size)
-    seen = np.asarray(np.isfinite(pixels).all(axis=2))
-    rgb = np.clip(np.rint(np.where(seen[:, :, None], pixels, 0.0)), 0.0, 255.0).astype(np.uint8)
+    rgb, seen = undistort_image(image.rgb, K[view], distortion, S @ K[view], size)
     return PinholeView(view, P, rgb, seen)
 
 

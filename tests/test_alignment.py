@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from thesisrecon import Camera, UsageError, align_to_positions, scaled
+from thesisrecon.sparse_model import SparseModel, SparseView
+
+R0, T0, S0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), np.array([40.0, -7.0, 3.0]), 2.5
+
+
+def make_model(count, seed=0):
+    rng = np.random.default_rng(seed)
+    K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    views = []
+    for i in range(count):
+        R = Rotation.from_rotvec(rng.normal(0, 0.2, 3)).as_matrix()
+        t = -R @ np.array([*rng.uniform(-3, 3, 2), -6 + rng.uniform(-1, 1)])
+        views.append(SparseView(f"{i}.jpg", R, t, K, (640, 480), np.zeros(3)))
+    X = rng.uniform(-1, 1, (20, 3))
+    xy = np.concatenate([Camera(v.K, v.R, v.t, v.size).project(X) for v in views])
+    return SparseModel(views, X, None, np.repeat(np.arange(count), 20), np.tile(np.arange(20), count), xy)
+
+
+def true_positions(model):
+    return {view.name: S0 * R0 @ view.centre + T0 for view in model.views}
+
+
+def observed(model):
+    views = [model.views[i] for i in model.view_index]
+    pairs = zip(views, model.X[model.point_index], strict=True)
+    return np.array([Camera(v.K, v.R, v.t, v.size).project(X[None])[0] for v, X in pairs])
+
+
+@pytest.mark.parametrize("count", [3, 4, 25])
+def test_exact_positions_give_the_similarity_and_keep_every_projection(count):
+    model = make_model(count)
+    aligned, report = align_to_positions(model, true_positions(model))
+    assert report.similarity.scale == pytest.approx(S0, rel=1e-9)
+    assert report.inlier.all()
+    np.testing.assert_allclose(aligned.X, S0 * model.X @ R0.T + T0, atol=1e-8)
+    np.testing.assert_allclose(observed(aligned), model.xy, atol=1e-6)
+    for view, position in zip(aligned.views, true_positions(model).values(), strict=True):
+        np.testing.assert_allclose(view.centre, position, atol=1e-8)
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(6, 1), (12, 4), (40, 15)])
+@pytest.mark.parametrize("seed", range(5))
+def test_wrong_positions_are_found_and_the_noise_is_measured(count, wrong, seed):
+    model, rng = make_model(count, seed), np.random.default_rng(seed)
+    positions = {name: X + rng.normal(0, 0.02, 3) for name, X in true_positions(model).items()}
+    bad = rng.choice(count, wrong, replace=False)
+    for i in bad:
+        positions[f"{i}.jpg"] += rng.choice([-1, 1], 3) * rng.uniform(2, 30, 3)
+    aligned, report = align_to_positions(model, positions | {"lost.jpg": np.zeros(3)}, seed=seed)
+    assert not report.inlier[bad].any()
+    # 1 % of the good positions are beyond the limit, more if there are few of them.
+    assert report.inlier.sum() >= 0.8 * (count - wrong)
+    assert 0.005 < report.sigma < 0.04
+    errors = [view.centre - X for view, X in zip(aligned.views, true_positions(model).values(), strict=True)]
+    assert np.sqrt(np.mean(np.square(errors))) < 0.03
+    assert report.unknown == ("lost.jpg",)
+    text = str(report)
+    assert text.count("outlier") == count - report.inlier.sum()
+    assert f"{report.inlier.sum()} of {count} positions used" in text
+
+
+def test_the_report_states_the_residual_of_each_position():
+    model = make_model(5)
+    positions = true_positions(model)
+    positions["2.jpg"] = positions["2.jpg"] + [0.0, 3.0, 4.0]
+    _, report = align_to_positions(model, positions)
+    assert "2.jpg: 5  (outlier, not used)" in str(report)
+    assert report.distance[2] == pytest.approx(5.0)
+
+
+def test_too_few_and_collinear_positions_are_refused():
+    model = make_model(6)
+    positions = true_positions(model)
+    few = {name: positions[name] for name in ("0.jpg", "1.jpg")}
+    with pytest.raises(UsageError, match=r"at least 3 images; got 2; 'x.jpg' is not an image of the model"):
+        align_to_positions(model, few | {"x.jpg": np.zeros(3)})
+    with pytest.raises(UsageError, match="three finite coordinates"):
+        align_to_positions(model, positions | {"0.jpg": [0.0, np.nan, 1.0]})
+    line = [SparseView(f"{i}.jpg", np.eye(3), np.array([float(i), 0, 0])) for i in range(6)]
+    with pytest.raises(UsageError, match="camera centres of the 6 images lie on one line"):
+        align_to_positions(SparseModel(line), positions)
+    with pytest.raises(UsageError, match="the positions of the 6 images lie on one line"):
+        align_to_positions(model, {f"{i}.jpg": [1.0 * i, 2.0 * i, 0.0] for i in range(6)})
+    # A street: beside its line there is only noise.
+    rng = np.random.default_rng(1)
+    street = [SparseView(v.name, v.R, v.t + rng.normal(0, 0.02, 3)) for v in line]
+    noisy = {view.name: view.centre + rng.normal(0, 0.05, 3) for view in line}
+    with pytest.raises(UsageError, match="rotation about it free"):
+        align_to_positions(SparseModel(street), noisy)
+
+
+def test_a_known_distance_gives_the_scale():
+    model = make_model(4)
+    metres = scaled(model, "1.jpg", "3.jpg", 7.5)
+    assert np.linalg.norm(metres.views[1].centre - metres.views[3].centre) == pytest.approx(7.5)
+    np.testing.assert_allclose(observed(metres), model.xy, atol=1e-6)
+    for names, distance, words in [
+        (("1.jpg", "4.jpg"), 1.0, "unknown image '4.jpg'"),
+        (("1.jpg", "1.jpg"), 1.0, "positive distance of two different cameras"),
+        (("1.jpg", "2.jpg"), 0.0, "got 0"),
+        (("1.jpg", "2.jpg"), np.nan, "got nan"),
+    ]:
+        with pytest.raises(UsageError, match=words):
+            scaled(model, *names, distance)

@@ -1,0 +1,239 @@
+"""Sparse models in metres: aligned to known positions of cameras, or scaled by one known distance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import gammaincinv
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.errors import UsageError, counted, unknown_word
+from thesisrecon.geometry.similarity import Similarity, estimate_similarity
+from thesisrecon.io._models import read_model
+from thesisrecon.results import RunResult
+from thesisrecon.sparse_model import SparseModel
+
+_MAX_TRIPLES = 1000
+"""All triples up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong."""
+_INLIER_SIGMAS = 3.37
+"""99 % of the lengths of three-dimensional normal residuals are shorter."""
+_MIN_WIDTH_REL = 1e-3
+"""Smallest spread of the positions beside their line, as a fraction of the spread along it."""
+_ROUNDING_REL = 1e-9
+"""Residuals below this fraction of the extent are rounding."""
+_PARAMETERS = 7
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentReport:
+    """Result of an alignment to positions, in the unit of the positions."""
+
+    similarity: Similarity  #: from the old to the new coordinates
+    names: tuple[str, ...]  #: images with a position
+    residual: F64  #: (N, 3) aligned centre minus position
+    inlier: B8  #: (N,) positions used by the final fit
+    sigma: float  #: standard deviation of one coordinate, estimated from the inliers
+    unknown: tuple[str, ...] = ()  #: names of positions without an image in the model
+
+    @property
+    def distance(self) -> F64:
+        """Lengths (N,) of the residuals."""
+        return np.asarray(np.linalg.norm(self.residual, axis=1))
+
+    def __str__(self) -> str:
+        """One line per position, and a summary."""
+        lines = [
+            f"{name}: {d:.4g}{'' if used else '  (outlier, not used)'}"
+            for name, d, used in zip(self.names, self.distance, self.inlier, strict=True)
+        ]
+        rms = math.sqrt(float(np.mean(self.distance[self.inlier] ** 2)))
+        total = f"{int(self.inlier.sum())} of {counted(len(self.names), 'position')} used"
+        lines.append(f"{total}, residual {rms:.4g} RMS; 1 unit of the model is {self.similarity.scale:.6g}")
+        if self.unknown:
+            lines.append(
+                f"{counted(len(self.unknown), 'position')} without an image, such as {self.unknown[0]}"
+            )
+        return "\n".join(lines)
+
+
+def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
+    """Return the model of a run or a file.
+
+    Parameters
+    ----------
+    model : SparseModel, RunResult or path
+        A model, a run or its output folder, or a COLMAP model.
+
+    Returns
+    -------
+    SparseModel
+    """
+    if isinstance(model, SparseModel):
+        return model
+    if not isinstance(model, RunResult):
+        return read_model(model)
+    if model.out is not None:
+        return read_model(model.out)
+    with TemporaryDirectory() as folder:
+        model.save(folder)
+        return read_model(folder)
+
+
+def align_to_positions(
+    model: SparseModel | RunResult | str | Path, positions: Mapping[str, ArrayLike], *, seed: int = 0
+) -> tuple[SparseModel, AlignmentReport]:
+    """Move a model to known positions of its cameras by a robust similarity.
+
+    Similarities of triples of positions are compared by a quantile of their residuals (least median of
+    squares, Rousseeuw 1984). The quantile gives the noise, and positions beyond its 99 % limit are left out
+    of the least-squares fit.
+
+    Parameters
+    ----------
+    model : SparseModel, RunResult or path
+        A model, a run or its output folder, or a COLMAP model.
+    positions : mapping of str to (3,)
+        Image name -> position, in metres or any other unit.
+    seed : int
+        Of the triples, above 18 positions.
+
+    Returns
+    -------
+    SparseModel, AlignmentReport
+        The model in the frame of the positions, and the residuals.
+
+    Raises
+    ------
+    UsageError
+        If fewer than three images have a position, or the positions lie on one line within their noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import align_to_positions
+    >>> from thesisrecon.sparse_model import SparseModel, SparseView
+    >>> centres = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> model = SparseModel([SparseView(name, np.eye(3), -c) for name, c in zip("abcd", centres)])
+    >>> aligned, report = align_to_positions(model, dict(zip("abcd", 2.5 * centres + 10)))
+    >>> round(report.similarity.scale, 6), aligned.views[1].centre.round(6).tolist()
+    (2.5, [12.5, 10.0, 10.0])
+    """
+    model = as_sparse_model(model)
+    centres = {view.name: view.centre for view in model.views}
+    names = tuple(name for name in positions if name in centres)
+    unknown = tuple(name for name in positions if name not in centres)
+    if len(names) < 3:
+        rest = f"; {unknown[0]!r} is not an image of the model" if unknown else ""
+        raise UsageError(f"alignment needs the positions of at least 3 images; got {len(names)}{rest}")
+    source = np.array([centres[name] for name in names])
+    target = np.array([np.asarray(positions[name], dtype=np.float64) for name in names])
+    if target.shape != (len(names), 3) or not np.isfinite(target).all():
+        raise UsageError("alignment needs three finite coordinates of each position")
+    for points, what in ((source, "camera centres"), (target, "positions")):
+        _require_width(points, what, 0.0)
+    similarity, inlier, sigma = _robust_similarity(source, target, seed)
+    _require_width(target[inlier], "positions", sigma)
+    report = AlignmentReport(similarity, names, similarity.apply(source) - target, inlier, sigma, unknown)
+    return model.transformed(similarity), report
+
+
+def _require_width(points: F64, what: str, sigma: float) -> None:
+    """Require points off a line by more than their noise: the rotation about the line is free otherwise."""
+    along, across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2] / math.sqrt(len(points))
+    if across <= max(_MIN_WIDTH_REL * along, sigma):
+        beside = f"RMS {across:.3g} beside the line, {along:.3g} along it, noise {sigma:.2g}"
+        raise UsageError(
+            f"the {what} of the {len(points)} images lie on one line ({beside}), which leaves the rotation "
+            "about it free; add positions beside the line, or use only the scale (--scale)"
+        )
+
+
+def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity, B8, float]:
+    """Similarity, inliers and noise of one coordinate."""
+    n = len(source)
+    floor = _ROUNDING_REL * float(np.linalg.norm(target - target.mean(axis=0), axis=1).max())
+
+    def distances(found: Similarity) -> F64:
+        return np.asarray(np.linalg.norm(found.apply(source) - target, axis=1))
+
+    # A triple fits itself, so that the quantile of Rousseeuw counts three positions more than half.
+    rank = (n + 4) // 2
+    best, least = estimate_similarity(source, target), math.inf
+    for triple in _triples(n, seed):
+        try:
+            found = estimate_similarity(source[triple], target[triple])
+        except ValueError:
+            continue
+        quantile = float(np.partition(distances(found), rank - 1)[rank - 1])
+        if quantile < least:
+            best, least = found, quantile
+    # Rousseeuw's correction for few points, and the quantile of the lengths of normal residuals.
+    sigma = least * (1.0 + 5.0 / max(n - 3, 1)) / math.sqrt(2.0 * gammaincinv(1.5, rank / (n + 1)))
+    inlier = distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
+    for _ in range(20):
+        _require_width(target[inlier], "positions", 0.0)
+        best = estimate_similarity(source[inlier], target[inlier])
+        free = 3 * int(inlier.sum()) - _PARAMETERS
+        sigma = math.sqrt(float(np.sum(distances(best)[inlier] ** 2)) / free)
+        before, inlier = inlier, distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
+        if inlier.sum() < 3 or (inlier == before).all():
+            inlier = before
+            break
+    return best, inlier, sigma
+
+
+def _triples(n: int, seed: int) -> list[list[int]]:
+    if math.comb(n, 3) <= _MAX_TRIPLES:
+        return [list(triple) for triple in combinations(range(n), 3)]
+    rng = np.random.default_rng(seed)
+    return [rng.choice(n, 3, replace=False).tolist() for _ in range(_MAX_TRIPLES)]
+
+
+def scaled(
+    model: SparseModel | RunResult | str | Path, name1: str, name2: str, distance: float
+) -> SparseModel:
+    """Scale a model so that two camera centres have a known distance.
+
+    Parameters
+    ----------
+    model : SparseModel, RunResult or path
+        A model, a run or its output folder, or a COLMAP model.
+    name1, name2, distance : str, str, float
+        Two images, and the distance of their cameras in the wanted unit.
+
+    Returns
+    -------
+    SparseModel
+        The model about the same origin.
+
+    Raises
+    ------
+    UsageError
+        If an image is unknown, or a distance is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import scaled
+    >>> from thesisrecon.sparse_model import SparseModel, SparseView
+    >>> views = [SparseView(name, np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 0.5))]
+    >>> scaled(SparseModel(views), "a", "b", 3.0).views[1].centre.tolist()
+    [-3.0, 0.0, 0.0]
+    """
+    model = as_sparse_model(model)
+    centres = {view.name: view.centre for view in model.views}
+    for name in (name1, name2):
+        if name not in centres:
+            raise UsageError(unknown_word("image", name, centres))
+    now = float(np.linalg.norm(centres[name1] - centres[name2]))
+    if not (0.0 < distance < math.inf and now > 0.0):
+        have = f"got {distance:g}, and the cameras of {name1} and {name2} are {now:g} apart in the model"
+        raise UsageError(f"the scale needs a positive distance of two different cameras; {have}")
+    return model.transformed(Similarity(distance / now, np.eye(3), np.zeros(3)))

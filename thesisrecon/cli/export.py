@@ -1,0 +1,67 @@
+"""The command ``export``: a finished run or a COLMAP model for other programs, in metres if wanted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thesisrecon.cli.common import OutputFolder, Threads, cap_threads, interruptible, parse_folder
+from thesisrecon.errors import UsageError
+from thesisrecon.io._files import printable, read_positions
+
+
+def export(
+    model: Annotated[
+        Path, typer.Argument(parser=parse_folder, metavar="OUT", help="Folder of a run, or a COLMAP model.")
+    ],
+    folder: OutputFolder,
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="FORMAT",
+            help="colmap, colmap-undistorted, nerfstudio, openmvs, bundler, opencv or kalibr.",
+        ),
+    ],
+    images: Annotated[
+        Path | None,
+        typer.Option("--images", help="Folder of the original images (default: that of the run)."),
+    ] = None,
+    scale: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(
+            "--scale", metavar="NAME1 NAME2 DISTANCE", help="Known distance of the cameras of two images."
+        ),
+    ] = None,
+    align: Annotated[
+        Path | None,
+        typer.Option("--align", metavar="FILE", help="Known camera positions: a CSV of name,x,y,z."),
+    ] = None,
+    threads: Threads = 0,
+) -> None:
+    """Write cameras, points and undistorted images for another program."""
+    cap_threads(threads)
+    if scale is not None and align is not None:
+        raise UsageError("--scale and --align exclude each other; positions determine the scale")
+    positions = None if align is None else read_positions(align)
+    from thesisrecon.alignment import align_to_positions, scaled
+    from thesisrecon.io._models import read_model
+    from thesisrecon.model_export import export as write_export
+    from thesisrecon.model_export import recorded_images
+
+    if folder.resolve() == model.resolve():
+        raise UsageError(f"the folder {folder} holds the model; export to another folder")
+    found = read_model(model)
+    if scale is not None:
+        found = scaled(found, *scale)
+    if positions is not None:
+        found, report = align_to_positions(found, positions)
+        typer.echo("\n".join(map(printable, str(report).splitlines())))
+    with interruptible("repeat the command to write all files"):
+        images = images or recorded_images(model)
+        written = write_export(found, folder, to=to, images=images, threads=threads)
+    for note in written.notes:
+        typer.echo(f"note: {note}")
+    typer.echo(f"{len(found.views)} images and {len(found.X)} points: {printable(str(written.file))}")

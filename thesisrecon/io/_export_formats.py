@@ -1,0 +1,241 @@
+"""Sparse models in the formats of other programs: nerfstudio, OpenMVS, Bundler, OpenCV and Kalibr.
+
+Here the centre of the top-left pixel is (0, 0). It is (0.5, 0.5) in nerfstudio, and (0, 0) in OpenMVS, OpenCV
+and Kalibr; Bundler counts from the centre of the image with y up. nerfstudio and Bundler cameras look along
+-z with y up. Each writer returns its main file; images lie in ``images/`` beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from thesisrecon.arrays import F64
+from thesisrecon.geometry.camera_matrix import undistort
+from thesisrecon.io._exports import write_point_cloud
+from thesisrecon.io._files import write_atomically, write_json, write_text
+from thesisrecon.io.colmap import colors_of
+from thesisrecon.sparse_model import SparseModel, SparseView
+
+_PIXEL_CENTRE = 0.5
+_LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
+"""From axes x right, y down, z forward to x right, y up, z back."""
+_MVS_VERSION = 2
+"""OpenMVS reads all versions up to its own; later ones add only optional fields."""
+
+
+def write_nerfstudio(folder: Path, model: SparseModel) -> Path:
+    """Write ``transforms.json`` and ``points.ply`` of pinhole views; cx, cy are ours plus 0.5.
+
+    ``transform_matrix`` is camera-to-world with OpenGL axes; the intrinsics stand at the top if all views
+    share them, else in each frame.
+    """
+    cameras = [_nerfstudio_camera(view) for view in model.views]
+    shared = all(camera == cameras[0] for camera in cameras)
+    frames = []
+    for view, camera in zip(model.views, cameras, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = view.R.T @ _LOOKS_BACK, view.centre
+        own = {} if shared else camera
+        frames.append({"file_path": f"images/{view.name}", **own, "transform_matrix": pose})
+    head = {"camera_model": "OPENCV", **(cameras[0] if shared else {}), "ply_file_path": "points.ply"}
+    write_point_cloud(folder / "points.ply", model.X, colors_of(model))
+    write_json(folder / "transforms.json", {**head, "frames": frames})
+    return folder / "transforms.json"
+
+
+def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
+    K, (width, height) = _calibration(view)
+    cx, cy = K[0, 2] + _PIXEL_CENTRE, K[1, 2] + _PIXEL_CENTRE
+    values = {
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": cx,
+        "cy": cy,
+        "k1": 0.0,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+    }
+    return {"w": width, "h": height, **{name: float(value) for name, value in values.items()}}
+
+
+def write_openmvs(folder: Path, model: SparseModel) -> Path:
+    """Write ``scene.mvs``, OpenMVS's interface format ("MVSI", version 2), of pinhole views.
+
+    One platform has all cameras at its origin and one pose (R, centre) per image. Pixels are as ours; points
+    are float32, colours BGR.
+    """
+    cameras, number = _distinct_cameras(model)
+    still = _matrices(np.eye(3), np.zeros(3))
+    parts = [b"MVSI", struct.pack("<II", _MVS_VERSION, 0), _count(1), _text("platform"), _count(len(cameras))]
+    for i, view in enumerate(cameras):
+        K, size = _calibration(view)
+        parts += [_text(f"camera{i}"), struct.pack("<II", *size), _matrices(K), still]
+    parts += [_count(len(model.views)), *(_matrices(view.R, view.centre) for view in model.views)]
+    parts.append(_count(len(model.views)))
+    for i, view in enumerate(model.views):
+        parts += [_text(f"images/{view.name}"), struct.pack("<III", 0, number[i], i)]
+    parts.append(_count(len(model.X)))
+    for X, seen in zip(model.X.tolist(), _observations_of_points(model), strict=True):
+        views = model.view_index[seen].tolist()
+        parts += [struct.pack("<3fQ", *X, len(views)), *(struct.pack("<If", view, 0.0) for view in views)]
+    colors = np.ascontiguousarray(colors_of(model)[:, ::-1]).tobytes()
+    # No normals; after the colours no lines, their normals and colours; the transform of the frame.
+    parts += [_count(0), _count(len(model.X)), colors, _count(0) * 3, _matrices(np.eye(4))]
+    write_atomically(folder / "scene.mvs", b"".join(parts))
+    return folder / "scene.mvs"
+
+
+def _count(number: int) -> bytes:
+    return struct.pack("<Q", number)
+
+
+def _text(text: str) -> bytes:
+    encoded = text.encode("utf-8", "surrogateescape")
+    return _count(len(encoded)) + encoded
+
+
+def _matrices(*values: F64) -> bytes:
+    return b"".join(np.ascontiguousarray(value, dtype="<f8").tobytes() for value in values)
+
+
+def write_bundler(folder: Path, model: SparseModel) -> Path:
+    """Write ``bundle.out`` (v0.3) and ``list.txt`` of pinhole views of one focal length and a centred image.
+
+    The origin of pixels is the image centre, ours ((w - 1) / 2, (h - 1) / 2), with y up.
+    """
+    lines = ["# Bundle file v0.3", f"{len(model.views)} {len(model.X)}"]
+    centre = np.zeros((len(model.views), 2))
+    for i, view in enumerate(model.views):
+        K, _ = _calibration(view)
+        centre[i] = K[:2, 2]
+        rows = [[K[0, 0], 0.0, 0.0], *(_LOOKS_BACK @ view.R), _LOOKS_BACK @ view.t]
+        lines += [_numbers(row) for row in rows]
+    xy = (model.xy - centre[model.view_index]) * [1.0, -1.0]
+    keys = _keys(model)
+    points = zip(model.X, colors_of(model).tolist(), _observations_of_points(model), strict=True)
+    for X, rgb, seen in points:
+        entries = [f"{model.view_index[k]} {keys[k]} {_numbers(xy[k])}" for k in seen]
+        lines += [_numbers(X), " ".join(map(str, rgb)), " ".join([str(len(entries)), *entries])]
+    write_text(folder / "list.txt", "".join(f"images/{view.name}\n" for view in model.views))
+    write_text(folder / "bundle.out", "\n".join(lines) + "\n")
+    return folder / "bundle.out"
+
+
+def _keys(model: SparseModel) -> list[int]:
+    """Number of each observation among those of its view."""
+    keys = np.zeros(len(model.view_index), np.int64)
+    for i in range(len(model.views)):
+        here = np.flatnonzero(model.view_index == i)
+        keys[here] = np.arange(len(here))
+    return keys.tolist()
+
+
+def write_opencv(folder: Path, model: SparseModel) -> Path:
+    """Write OpenCV FileStorage YAML: ``camera_N.yml`` of each camera, and ``poses.yml`` of the images.
+
+    Pixels are as ours, and ``distortion_coefficients`` are k1, k2, p1, p2, k3 with p1 = p2 = 0.
+    """
+    cameras, number = _distinct_cameras(model)
+    head = "%YAML:1.0\n---\n"
+    for i, view in enumerate(cameras):
+        K, (width, height) = _calibration(view)
+        k1, k2, k3 = coefficients(view)
+        entries = [f"image_width: {width}\nimage_height: {height}\n", _matrix("camera_matrix", K)]
+        entries.append(_matrix("distortion_coefficients", np.array([[k1, k2, 0.0, 0.0, k3]])))
+        write_text(folder / f"camera_{i}.yml", head + "".join(entries))
+    images = []
+    for view, i in zip(model.views, number, strict=True):
+        name = f'name: {json.dumps(view.name, ensure_ascii=False)}\ncamera: "camera_{i}.yml"\n'
+        entry = name + _matrix("R", view.R) + _matrix("T", view.t[:, None])
+        images.append("   -\n" + "".join(f"      {line}\n" for line in entry.splitlines()))
+    write_text(folder / "poses.yml", f"{head}images:\n{''.join(images)}")
+    return folder / "poses.yml"
+
+
+def _matrix(name: str, values: F64) -> str:
+    rows, cols = values.shape
+    data = ", ".join(map(repr, values.ravel().tolist()))
+    return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]\n"
+
+
+def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
+    """Write ``camchain.yaml`` with one pinhole-radtan camera per distinct camera, not a rig: no T_cn_cnm1.
+
+    Pixels are as ours. The model has no k3: the best k1 and k2 replace the three coefficients, and the
+    returned notes state the largest difference in the image.
+    """
+    lines, notes = list[str](), list[str]()
+    for i, view in enumerate(_distinct_cameras(model)[0]):
+        K, (width, height) = _calibration(view)
+        (k1, k2), error_px = _two_coefficients(view)
+        if error_px > 0.0:
+            notes.append(f"cam{i}: k1 and k2 replace k1, k2 and k3, within {error_px:.2g} px in the image")
+        lines += [
+            f"cam{i}:",
+            "  camera_model: pinhole",
+            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]], ', ')}]",
+            "  distortion_model: radtan",
+            f"  distortion_coeffs: [{_numbers(np.array([k1, k2, 0.0, 0.0]), ', ')}]",
+            f"  resolution: [{width}, {height}]",
+            f"  rostopic: /cam{i}/image_raw",
+        ]
+    write_text(folder / "camchain.yaml", "\n".join(lines) + "\n")
+    return folder / "camchain.yaml", notes
+
+
+def _two_coefficients(view: SparseView) -> tuple[F64, float]:
+    """Best k1, k2 (least squares over the image area) for k1, k2, k3, and the largest difference (px)."""
+    k = coefficients(view)
+    if k[2] == 0.0:
+        return k[:2], 0.0
+    K, (width, height) = _calibration(view)
+    corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)]) @ np.linalg.inv(K).T
+    r = np.linspace(0.0, float(np.linalg.norm(undistort(corners[:, :2], k), axis=1).max()), 500)[1:]
+    powers = r[:, None] ** [3, 5, 7]
+    # The area of a ring is proportional to r.
+    weight = np.sqrt(r)[:, None]
+    fitted = np.linalg.lstsq(weight * powers[:, :2], weight[:, 0] * (powers @ k), rcond=None)[0]
+    return np.asarray(fitted, np.float64), float(
+        np.abs(powers @ k - powers[:, :2] @ fitted).max() * max(K[0, 0], K[1, 1])
+    )
+
+
+def _distinct_cameras(model: SparseModel) -> tuple[list[SparseView], list[int]]:
+    """Return one view per set of intrinsics and size, and the number of each view's set."""
+    first, number, cameras = dict[tuple[object, ...], int](), list[int](), list[SparseView]()
+    for view in model.views:
+        K, size = _calibration(view)
+        key = (size, K.tobytes(), coefficients(view).tobytes())
+        if key not in first:
+            first[key] = len(cameras)
+            cameras.append(view)
+        number.append(first[key])
+    return cameras, number
+
+
+def coefficients(view: SparseView) -> F64:
+    """Distortion k1, k2, k3 of a view in which it is known."""
+    assert view.distortion is not None
+    return view.distortion
+
+
+def _calibration(view: SparseView) -> tuple[F64, tuple[int, int]]:
+    assert view.K is not None
+    assert view.size is not None
+    return view.K, view.size
+
+
+def _observations_of_points(model: SparseModel) -> list[list[int]]:
+    """Numbers of the observations of each point, by view."""
+    order = np.lexsort((model.view_index, model.point_index))
+    counts = np.bincount(model.point_index, minlength=len(model.X))
+    return [part.tolist() for part in np.split(order, np.cumsum(counts)[:-1])] if len(model.X) else []
+
+
+def _numbers(values: F64 | list[float], separator: str = " ") -> str:
+    return separator.join(repr(float(value)) for value in values)

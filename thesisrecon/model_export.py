@@ -1,0 +1,292 @@
+"""Export of a model to other programs: the files they read, and images without lens distortion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+
+import numpy as np
+
+from thesisrecon.alignment import as_sparse_model
+from thesisrecon.arrays import F64
+from thesisrecon.errors import UsageError, unknown_word
+from thesisrecon.geometry.camera_matrix import undistort
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.io import _export_formats as formats
+from thesisrecon.io._export_formats import coefficients
+from thesisrecon.io._exports import write_image
+from thesisrecon.io._files import read_json
+from thesisrecon.io._images import find_images, read_image
+from thesisrecon.io.colmap import has_skew, write_sparse_model
+from thesisrecon.results import RunResult
+from thesisrecon.runtime._executors import available_threads
+from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.stereo._resampling import undistort_image
+
+_MAX_GROWTH = 0.5
+"""Largest extension of an undistorted image beyond each side of the original, as a fraction of the side."""
+_INNER = 0.99
+"""Fraction of the radius at which a lens model folds back that an undistorted image may reach."""
+_MIN_SIDE_PX = 16
+_ROUNDING_PX = 1e-6
+_FLOAT32_REL = 1e-4
+"""Largest single-precision rounding of coordinates, as a fraction of the extent of the points."""
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """Main file of an export, and remarks on it."""
+
+    file: Path
+    notes: tuple[str, ...] = ()
+
+
+def _colmap(folder: Path, model: SparseModel, *, pinhole: bool) -> Path:
+    write_sparse_model(folder / "sparse" / "0", model, pinhole=pinhole)
+    return folder / "sparse" / "0"
+
+
+_DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] = {
+    "colmap": lambda folder, model: (_colmap(folder, model, pinhole=False), []),
+    "opencv": lambda folder, model: (formats.write_opencv(folder, model), []),
+    "kalibr": formats.write_kalibr,
+}
+"""Formats of cameras with distortion, which need no images."""
+_PINHOLE: Mapping[str, Callable[[Path, SparseModel], Path]] = {
+    "colmap-undistorted": lambda folder, model: _colmap(folder, model, pinhole=True),
+    "nerfstudio": formats.write_nerfstudio,
+    "openmvs": formats.write_openmvs,
+    "bundler": formats.write_bundler,
+}
+"""Formats with undistorted images."""
+FORMATS = (*_PINHOLE, *_DISTORTED)
+
+
+def export(
+    model: SparseModel | RunResult | str | Path,
+    out: str | Path,
+    *,
+    to: str,
+    images: str | Path | None = None,
+    threads: int = 0,
+) -> ExportReport:
+    """Write a model for another program.
+
+    Parameters
+    ----------
+    model : SparseModel, RunResult or path
+        A model, a run or its output folder, or a COLMAP model.
+    out : path
+        Folder of the export; created if missing, files of the same names are replaced.
+    to : str
+        ``"colmap-undistorted"``, ``"nerfstudio"``, ``"openmvs"`` and ``"bundler"`` write undistorted images
+        of pinhole cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
+    images : path, optional
+        Folder of the original images; None: the folder that the run was made from.
+    threads : int
+        Images that are undistorted at one time; 0: one per processor.
+
+    Returns
+    -------
+    ExportReport
+        ``file``: what the other program opens; ``notes``: differences from the model.
+
+    Raises
+    ------
+    UsageError
+        If the format is unknown, cannot hold the cameras, or the images are not found.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from thesisrecon import export
+    >>> from thesisrecon.sparse_model import SparseModel, SparseView
+    >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    >>> view = SparseView("a.jpg", np.eye(3), np.zeros(3), K, (640, 480), np.array([-0.1, 0, 0]))
+    >>> with TemporaryDirectory() as folder:
+    ...     report = export(SparseModel([view]), folder, to="kalibr")
+    >>> report.file.name
+    'camchain.yaml'
+    """
+    if to not in FORMATS:
+        raise UsageError(unknown_word("export format", to, FORMATS))
+    folder = Path(out)
+    images = images or recorded_images(model)
+    model = as_sparse_model(model)
+    _require_cameras(model, to)
+    if (folder / "run.json").exists():
+        raise UsageError(f"the folder {folder} holds a run; export to another folder")
+    notes = _rounding_notes(model) if to in ("nerfstudio", "openmvs") else []
+    if to in _DISTORTED:
+        file, more = _DISTORTED[to](folder, model)
+        return ExportReport(file, (*notes, *more))
+    undistorted = _undistorted(model, bundler=to == "bundler")
+    _write_images(folder / "images", model, undistorted, images, threads)
+    return ExportReport(_PINHOLE[to](folder, undistorted), tuple(notes))
+
+
+def _require_cameras(model: SparseModel, to: str) -> None:
+    """Require views with intrinsics that the format can hold."""
+    if not model.views:
+        raise UsageError("the model has no camera; there is nothing to export")
+    for view in model.views:
+        if view.K is None or view.size is None:
+            raise UsageError(f"image {view.name} has no intrinsics or no size, which every export needs")
+        if view.distortion is None:
+            known = "only radial distortion (k1, k2, k3) can be exported"
+            raise UsageError(f"the lens model of image {view.name} is unknown or of another kind; {known}")
+        if to in _DISTORTED and has_skew(view.K):
+            advice = "colmap-undistorted removes it from the images"
+            raise UsageError(f"{to} has no camera model with skew, but image {view.name} has skew; {advice}")
+
+
+def _rounding_notes(model: SparseModel) -> list[str]:
+    """A note on coordinates far from the origin, which files in single precision round."""
+    if len(model.X) < 2:
+        return []
+    rounding = float(np.spacing(np.float32(np.abs(model.X).max())))
+    if rounding <= _FLOAT32_REL * float(np.median(np.ptp(model.X, axis=0))):
+        return []
+    return [
+        f"points are stored in single precision, rounded to {rounding:.2g}; subtract an offset from positions"
+    ]
+
+
+def recorded_images(model: SparseModel | RunResult | str | Path) -> Path | None:
+    """Return the folder of the images that a run was made from, None if it is not known.
+
+    Parameters
+    ----------
+    model : SparseModel, RunResult or path
+        The run or its output folder, or any other model.
+
+    Returns
+    -------
+    Path or None
+    """
+    if isinstance(model, SparseModel):
+        return None
+    summary = model.summary if isinstance(model, RunResult) else read_json(Path(model) / "summary.json")
+    folder = summary.get("images_folder") if isinstance(summary, Mapping) else None
+    return Path(folder) if isinstance(folder, str) else None
+
+
+def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
+    """The model with pinhole views, observations in their pixels, and names of files that can be written."""
+    frames: dict[tuple[bytes, bytes, object], tuple[F64, tuple[int, int]]] = {}
+    views, xy = list[SparseView](), model.xy.copy()
+    for i, view in enumerate(model.views):
+        assert view.K is not None
+        assert view.size is not None
+        k = coefficients(view)
+        key = (view.K.tobytes(), k.tobytes(), view.size)
+        if key not in frames:
+            frames[key] = _pinhole_frame(view, centred=bundler)
+        K, size = frames[key]
+        here = model.view_index == i
+        xy[here] = _normalized(view, xy[here]) @ K[:2, :2].T + K[:2, 2]
+        views.append(
+            replace(view, name=_file_name(view.name, plain=bundler), K=K, size=size, distortion=np.zeros(3))
+        )
+    names = [view.name for view in views]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(f"two images of the model would be written as {twice}; rename one of them")
+    return replace(model, views=views, xy=xy)
+
+
+def _file_name(name: str, *, plain: bool) -> str:
+    """Relative name of a JPEG or PNG file, for list files of names (``plain``) without blanks."""
+    path = PurePath(*(part for part in PurePath(name).parts if part not in ("..", PurePath(name).anchor)))
+    text = path.as_posix() if path.suffix.lower() in (".jpg", ".jpeg", ".png") else f"{path.as_posix()}.png"
+    return "_".join(text.split()) if plain else text
+
+
+def _normalized(view: SparseView, xy: F64) -> F64:
+    """Undistorted normalised points (N, 2) of pixels."""
+    assert view.K is not None
+    return undistort(dehomogenize(homogenize(xy) @ np.linalg.inv(view.K).T), coefficients(view))
+
+
+def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, int]]:
+    """K without skew and size of the largest pinhole image whose pixels all lie in the original.
+
+    The focal lengths are kept, so that an image without distortion does not change. If ``centred``, there is
+    one focal length, and the principal point is the centre of the image.
+    """
+    assert view.K is not None
+    assert view.size is not None
+    width, height = view.size
+    x, y = np.arange(float(width)), np.arange(float(height))
+    sides = [(np.zeros(height), y), (np.full(height, width - 1.0), y), (x, np.zeros(width))]
+    borders = [
+        _normalized(view, np.column_stack(side)) for side in (*sides, (x, np.full(width, height - 1.0)))
+    ]
+    focal = np.array([view.K[0, 0], view.K[0, 0] if centred else view.K[1, 1]])
+    low = focal * [borders[0][:, 0].max(), borders[2][:, 1].max()]
+    high = focal * [borders[1][:, 0].min(), borders[3][:, 1].min()]
+    corner = float(np.hypot(*(np.maximum(-low, high) / focal)))
+    inner = min(1.0, _INNER * _growing_radius(coefficients(view)) / corner)
+    low, high, K = low * inner, high * inner, np.diag([*focal, 1.0])
+    if centred:
+        reach = np.minimum(np.minimum(-low, high), np.array(view.size) * (0.5 + _MAX_GROWTH))
+        size = np.floor(2.0 * reach + _ROUNDING_PX).astype(np.int64) + 1
+        K[:2, 2] = (size - 1) / 2
+    else:
+        centre, growth = view.K[:2, 2], _MAX_GROWTH * np.array(view.size)
+        first = np.ceil(np.maximum(low + centre, -growth) - _ROUNDING_PX)
+        last = np.floor(np.minimum(high + centre, np.array(view.size) - 1 + growth) + _ROUNDING_PX)
+        size = (last - first).astype(np.int64) + 1
+        K[:2, 2] = centre - first
+    if not (np.isfinite(K).all() and size.min() >= _MIN_SIDE_PX):
+        k = ", ".join(f"{value:.3g}" for value in coefficients(view))
+        place = f"distortion {k}, principal point {view.K[0, 2]:.0f}, {view.K[1, 2]:.0f}"
+        raise UsageError(
+            f"the undistorted image of {view.name} would be {size[0]} x {size[1]} px ({place}); "
+            "the camera is not plausible, so export the model as colmap"
+        )
+    return K, (int(size[0]), int(size[1]))
+
+
+def _growing_radius(distortion: F64) -> float:
+    """Normalised radius up to which r (1 + k1 r^2 + k2 r^4 + k3 r^6) grows, infinity if everywhere."""
+    k1, k2, k3 = distortion.tolist()
+    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    squares = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(np.sqrt(squares.min())) if len(squares) else np.inf
+
+
+def _write_images(
+    folder: Path, model: SparseModel, pinholes: SparseModel, images: str | Path | None, threads: int
+) -> None:
+    """Undistort the images of a model into a folder."""
+    if images is None:
+        raise UsageError(
+            "the model does not record the folder of its images; give it with --images (images=)"
+        )
+    originals = Path(images)
+    paths = find_images(originals, model.names)
+    if folder.resolve() == originals.resolve():
+        raise UsageError(
+            f"the undistorted images would replace the originals in {originals}; export elsewhere"
+        )
+
+    def write(view: SparseView, pinhole: SparseView, path: Path) -> None:
+        assert view.K is not None
+        assert view.distortion is not None
+        assert pinhole.K is not None
+        assert pinhole.size is not None
+        image = read_image(path, max_size_px=np.iinfo(np.int32).max).images[0]
+        if image.size != view.size:
+            sizes = f"{image.size} pixels, but {view.size} (width, height) in the model"
+            raise UsageError(f"{path} has {sizes}; give the images of the model")
+        rgb = image.rgb
+        if view.distortion.any() or view.size != pinhole.size or not np.array_equal(view.K, pinhole.K):
+            rgb, _ = undistort_image(rgb, view.K, view.distortion, pinhole.K, pinhole.size)
+        write_image(folder / pinhole.name, rgb)
+
+    with ThreadPoolExecutor(threads or available_threads()) as pool:
+        list(pool.map(write, model.views, pinholes.views, paths))
