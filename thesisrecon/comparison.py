@@ -20,7 +20,7 @@ from thesisrecon.io._models import read_model
 from thesisrecon.results import RunResult
 from thesisrecon.sparse_model import SparseModel, SparseView
 
-_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
+THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Distances of points, relative to the size of the scene."""
 _LINE = 0.01
 """Extent of the centres across a line, relative to that along it, below which they hardly leave the line."""
@@ -288,7 +288,7 @@ def _intrinsic_errors(a: SparseView, b: SparseView) -> tuple[float, float]:
 def _point_distances(X: F64, X_b: F64) -> PointDistances | None:
     if not (len(X) and len(X_b)):
         return None
-    thresholds = np.array(_THRESHOLDS) / scene_frame(X_b)[1]
+    thresholds = np.array(THRESHOLDS) / scene_frame(X_b)[1]
     there, back = (scipy.spatial.cKDTree(to).query(of)[0] for of, to in ((X, X_b), (X_b, X)))
     within = [np.mean(distances[:, None] < thresholds, axis=0) for distances in (there, back)]
     return PointDistances(float(np.median(there)), float(np.median(back)), thresholds, *within)

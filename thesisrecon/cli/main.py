@@ -12,6 +12,7 @@ import typer
 
 from thesisrecon import __version__
 from thesisrecon.cli.common import DEBUG_VARIABLE, exit_code_of
+from thesisrecon.cli.compare import compare
 from thesisrecon.cli.export import export
 from thesisrecon.cli.runs import demo, inspect, reconstruct
 from thesisrecon.cli.views import interpolate, render
@@ -24,7 +25,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-for _command in (reconstruct, demo, inspect, render, interpolate, export):
+for _command in (reconstruct, demo, inspect, compare, render, interpolate, export):
     app.command()(_command)
 
 

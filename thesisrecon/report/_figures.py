@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre, decompose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Reconstruction, TwoView
+from thesisrecon.sparse_model import SparseModel
 
 MAX_POINTS = 25_000
 _BINS = 28
@@ -55,17 +56,34 @@ def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS)
     parts = [decompose_camera(reconstruction.P[i]) for i in views]
     rotations = np.stack([R for _, R, _ in parts])
     centres = np.stack([dehomogenize(camera_centre(reconstruction.P[i])) for i in views])
-    upright = upright_rotation(rotations)
-    index = _kept_points(reconstruction, max_points)
-    points = reconstruction.X[index, :3] @ upright.T
-    centres_up = centres @ upright.T
-    depth = _pyramid_depth(centres_up, points)
-    cameras = zip(parts, reconstruction.sizes[views], centres_up, strict=True)
-    corners = np.stack([c + depth * _corner_rays(K, size) @ R @ upright.T for (K, R, _), size, c in cameras])
-    everything = np.concatenate([points, centres_up, corners.reshape(-1, 3)])
+    rays = [_corner_rays(K, size) for (K, _, _), size in zip(parts, reconstruction.sizes[views], strict=True)]
+    index = _kept_points(reconstruction.X, reconstruction.valid, max_points)
+    points = reconstruction.X[:, :3]
+    return _scene(points, index, views, (centres, rotations, rays), upright_rotation(rotations))
+
+
+def model_scene(model: SparseModel, upright: F64, *, max_points: int = MAX_POINTS) -> Scene:
+    """3D view of a sparse model as in :func:`build_scene`; cameras without intrinsics are square."""
+    rays = []
+    for view in model.views:
+        K = np.eye(3) if view.K is None else view.K
+        rays.append(_corner_rays(K, np.array(view.size or 2.0 * K[:2, 2] + 1.0)))
+    centres, rotations = (np.stack([getattr(view, name) for view in model.views]) for name in ("centre", "R"))
+    index = _kept_points(model.X, np.ones(len(model.X), dtype=np.bool_), max_points)
+    return _scene(model.X, index, np.arange(len(rays)), (centres, rotations, rays), upright)
+
+
+def _scene(X: F64, index: I64, views: I64, cameras: tuple[F64, F64, list[F64]], upright: F64) -> Scene:
+    """The points of these numbers and the cameras: centres, rotations and rays through the image corners."""
+    points, centres = X[index] @ upright.T, cameras[0] @ upright.T
+    depth = _pyramid_depth(centres, points)
+    corners = np.stack(
+        [c + depth * rays @ R @ upright.T for c, R, rays in zip(centres, *cameras[1:], strict=True)]
+    )
+    everything = np.concatenate([points, centres, corners.reshape(-1, 3)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     margin = 0.03 * float((high - low).max()) or 1.0
-    return Scene(points, index, views, centres_up, corners, low - margin, high + margin)
+    return Scene(points, index, views, centres, corners, low - margin, high + margin)
 
 
 def upright_rotation(rotations: F64) -> F64:
@@ -87,13 +105,13 @@ def upright_rotation(rotations: F64) -> F64:
     return np.stack([np.cross(ahead, up), ahead, up])
 
 
-def _kept_points(reconstruction: Reconstruction, max_points: int) -> I64:
-    valid = np.flatnonzero(reconstruction.valid & np.isfinite(reconstruction.X).all(axis=1))
-    if len(valid) == 0:
-        return valid.astype(np.int64)
-    X = reconstruction.X[valid, :3]
+def _kept_points(X: F64, valid: B8, max_points: int) -> I64:
+    kept = np.flatnonzero(valid & np.isfinite(X).all(axis=1)).astype(np.int64)
+    if len(kept) == 0:
+        return kept
+    X = X[kept, :3]
     distance = np.linalg.norm(X - np.median(X, axis=0), axis=1)
-    near: I64 = valid[distance <= 4.0 * np.quantile(distance, 0.8)].astype(np.int64)
+    near: I64 = kept[distance <= 4.0 * np.quantile(distance, 0.8)].astype(np.int64)
     step = max(1, int(np.ceil(len(near) / max_points)))
     return near[::step]
 
@@ -119,14 +137,18 @@ def _pyramid_depth(centres: F64, points: F64) -> float:
 Figure = dict[str, Any]
 
 
-def scene_figure(scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | None) -> Figure:
-    """Cameras and coloured points as a plotly.js figure; ``colors`` are those of the points X."""
+def scene_figure(
+    scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | str | None, *, accent: str = _ACCENT
+) -> Figure:
+    """Cameras and points as a plotly.js figure; ``colors`` are those of the points X, or one for all."""
     digits = _useful_digits(scene)
-    paint = "#9fb4c7" if colors is None else [f"#{bytes(rgb).hex()}" for rgb in colors[scene.index]]
+    paint: object = "#9fb4c7" if colors is None else colors
+    if isinstance(colors, np.ndarray):
+        paint = [f"#{bytes(rgb).hex()}" for rgb in colors[scene.index]]
     marks = [f"{i + 1} · {escape(names[i])}" for i in scene.views]
     hover = {"text": marks, "hovertemplate": "%{text}<extra></extra>"}
     points = _markers("points", 2, paint, _xyz(scene.points, digits)) | {"hoverinfo": "skip"}
-    centres = _markers("centres", 4, _ACCENT, _xyz(scene.centres, digits)) | hover
+    centres = _markers("centres", 4, accent, _xyz(scene.centres, digits)) | hover
     extent = scene.high - scene.low
     aspect = 1.7 * extent / max(float(extent.max()), 1e-12)
     ranges = zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True)
@@ -139,7 +161,7 @@ def scene_figure(scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] |
         "scene": {**axes, "aspectmode": "manual", "aspectratio": ratio, "dragmode": "turntable"},
         "hoverlabel": {"font": {"family": "system-ui, sans-serif"}},
     }
-    return {"data": [points, _pyramids(scene, digits), centres], "layout": layout}
+    return {"data": [points, _pyramids(scene, digits, accent), centres], "layout": layout}
 
 
 def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
@@ -147,7 +169,7 @@ def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
     return {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, **xyz}
 
 
-def _pyramids(scene: Scene, digits: int) -> Figure:
+def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
     """Draw all pyramids as one line trace: rim, roof over the upper edge, four edges; None interrupts it."""
     rows: list[list[float] | None] = []
     for centre, corners in zip(scene.centres, scene.corners, strict=True):
@@ -158,7 +180,7 @@ def _pyramids(scene: Scene, digits: int) -> Figure:
             rows += [np.round(vertex, digits).tolist() for vertex in stroke]
             rows.append(None)
     columns = {name: [None if row is None else row[d] for row in rows] for d, name in enumerate("xyz")}
-    line = {"color": _ACCENT, "width": 2.5}
+    line = {"color": accent, "width": 2.5}
     kind = {"type": "scatter3d", "mode": "lines", "name": "cameras", "hoverinfo": "skip", "line": line}
     return {**kind, **columns}
 

@@ -100,6 +100,16 @@ def plotly_script() -> str:
     return str(get_plotlyjs()).replace("</script", "<\\/script")
 
 
+def figure_content(figures: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
+    """Return the scripts that draw plotly.js figures by element id, and what the template needs for them."""
+    library = plotly_script() if figures else ""
+    scripts = [page_resource("unpack.js"), page_resource("page.js")] if figures else []
+    packed = base64.b64encode(gzip.compress(library.encode("utf-8"), mtime=0)).decode("ascii")
+    # page.js adds the unpacked library as a script, which the policy of the page must list too.
+    allowed = [*scripts, library] if figures else []
+    return allowed, {"figures": figures, "figure_scripts": scripts, "plotly": packed}
+
+
 def strip_page(
     title: str, frames: Sequence[tuple[str, NDArray[np.uint8]]], *, notes: Sequence[str] = ()
 ) -> str:
@@ -132,13 +142,11 @@ def render_report(data: ReportData) -> str:
         names = [image.name for image in data.images]
         model = viewer_data(data.model, data.metric.reconstruction, names)
     depths, side = sorted(data.depth_maps.items()), depth_side(len(data.depth_maps))
-    library = plotly_script() if figures else ""
-    figure_scripts = [page_resource("unpack.js"), page_resource("page.js")] if figures else []
+    figure_scripts, drawing = figure_content(figures)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     return render_page(
         page_resource("template.html.j2"),
-        # page.js adds the unpacked library as a script, which the policy of the page must list too.
-        [*figure_scripts, *model_scripts, *([library] if library else [])],
+        [*figure_scripts, *model_scripts],
         filters={"grouped": grouped, "decimals": decimals, "significant": significant},
         count_of=count_of,
         data=data,
@@ -154,7 +162,7 @@ def render_report(data: ReportData) -> str:
         held_out=draw_held_out(data.held_out) if data.held_out is not None else None,
         scale=SCALE,
         difference_limit=round(DIFFERENCE_LIMIT),
-        figures=figures,
+        **drawing,
         shown_points=shown,
         most_points=MAX_POINTS,
         all_points=int(best.valid.sum()) if best is not None else 0,
@@ -165,8 +173,6 @@ def render_report(data: ReportData) -> str:
         warnings=_warnings(data),
         self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
         summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
-        figure_scripts=figure_scripts,
-        plotly=base64.b64encode(gzip.compress(library.encode("utf-8"), mtime=0)).decode("ascii"),
         model_scripts=model_scripts,
         histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
     )

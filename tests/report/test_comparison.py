@@ -1,0 +1,25 @@
+"""The page of a comparison in a browser."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tests.io.test_colmap import export, scene
+from tests.report import synthetic
+from thesisrecon import compare_models
+from thesisrecon.geometry.similarity import Similarity
+from thesisrecon.io._models import read_model
+from thesisrecon.report._comparison import comparison_page
+
+
+def test_a_browser_draws_both_models(browser, tmp_path):
+    export(tmp_path, scene())
+    b = read_model(tmp_path)
+    a = replace(b, X=b.X + 0.2).transformed(Similarity(3.0, np.eye(3), np.ones(3)))
+    path = tmp_path / "page.html"
+    path.write_text(comparison_page(compare_models(a, b), "a", "b"), encoding="utf-8")
+    seen = synthetic.Witness(browser, path, 900, drawn=("scene-figure",))
+    colors = seen.pixels("#scene-figure").reshape(-1, 3).astype(int)
+    for points in ((255, 199, 138), (159, 216, 247)):
+        assert (np.abs(colors - points).max(axis=1) < 30).sum() > 20
+    assert seen.errors == []
