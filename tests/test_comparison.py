@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from tests.io.test_colmap import NAMES, SIZE, export, scene
-from thesisrecon import Camera, UsageError, compare_models
+from thesisrecon import Camera, RunResult, UsageError, compare_models
 from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.io._models import read_model
 from thesisrecon.sparse_model import SparseModel, SparseView
@@ -117,7 +116,8 @@ def test_distances_of_points_count_both_ways(truth):
 def test_results_folders_and_cameras_by_name_are_models(tmp_path, truth):
     cameras = {v.name: Camera(v.K, v.R, v.t, v.size) for v in truth.views[::-1]}
     (tmp_path / "cameras.json").write_text(TRUTH.read_text(encoding="utf-8"), encoding="utf-8")
-    found = compare_models(SimpleNamespace(out=tmp_path), cameras)
+    result = RunResult(tmp_path, (), {}, (), (), np.zeros(0, np.int64), {})
+    found = compare_models(result, cameras)
     assert found.names == tuple(truth.names)
     assert found.summary["centre_error"]["max"] < 1e-9
     refuses(UsageError, "the second model of a comparison must be a path", compare_models, cameras, 3)

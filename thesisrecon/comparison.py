@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import scipy
 
+from thesisrecon.alignment import as_sparse_model
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.similarity import Similarity, estimate_similarity, rotation_errors_deg
-from thesisrecon.io._models import read_model
 from thesisrecon.results import RunResult
 from thesisrecon.sparse_model import SparseModel, SparseView
 
@@ -201,19 +201,15 @@ def compare_models(a: Model, b: Model) -> ModelComparison:
 
 
 def _model(model: Model, which: str) -> SparseModel:
-    model = getattr(model, "out", model)
-    if isinstance(model, str | Path):
-        return read_model(model)
     if isinstance(model, Mapping):
-        model = SparseModel(
-            [SparseView(name, c.R, c.t, c.K, c.size, c.distortion) for name, c in model.items()]
-        )
-    if not isinstance(model, SparseModel) or not len(model.views):
-        kinds = (
-            "a path, a RunResult, a SparseModel or a mapping of names to cameras, with at least one camera"
-        )
-        raise UsageError(f"the {which} model of a comparison must be {kinds}; got {in_words(model)}")
-    return model
+        cameras = model.items()
+        model = SparseModel([SparseView(name, c.R, c.t, c.K, c.size, c.distortion) for name, c in cameras])
+    if isinstance(model, str | Path | RunResult | SparseModel):
+        model = as_sparse_model(model)
+        if len(model.views):
+            return model
+    kinds = "a path, a RunResult, a SparseModel or a mapping of names to cameras, with at least one camera"
+    raise UsageError(f"the {which} model of a comparison must be {kinds}; got {in_words(model)}")
 
 
 def _pairs(a: SparseModel, b: SparseModel) -> list[tuple[int, int]]:
