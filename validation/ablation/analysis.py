@@ -8,14 +8,23 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from validation.ablation.plan import Plan
 from validation.ablation.run import Row, Rows
-from validation.ablation.statistics import Interval, holm, mean_ranks, on_front, paired_interval
+from validation.ablation.statistics import (
+    MIN_SCENES,
+    Interval,
+    Sample,
+    holm,
+    mean_ranks,
+    on_front,
+    paired_interval,
+)
 from validation.ablation.study import Measure
 
-Verdict = Literal["better", "worse", "no difference shown", "too few pairs", "the baseline"]
+Verdict = Literal["better", "worse", "negligible", "no difference shown", "no sample"]
 ALPHA = 0.05
 
 
@@ -25,7 +34,7 @@ class Comparison:
 
     ``interval`` holds differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported`
     returns quotients). ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from
-    it.
+    it, "negligible" where the whole interval is, and "no sample" where there is no interval.
     """
 
     measure: Measure
@@ -75,7 +84,8 @@ class Analysis:
 def analyse(rows: Rows) -> Analysis:
     """Compare all variants with the baseline on the same scene, seed and condition, and rank them.
 
-    Only pairs with the measure in both rows count; failures of a variant are counted separately.
+    Only pairs with the measure in both rows count; failures of a variant are counted separately. What is the
+    sample, draws or scenes, is the task's.
     """
     plan = rows.plan
     names = [v.name for v in plan.variants]
@@ -98,6 +108,14 @@ class _Table:
     def __init__(self, rows: Rows) -> None:
         self.plan = rows.plan
         self.scenes = tuple(dict.fromkeys(r.scene for r in rows.plan.rows))
+        task = rows.plan.rows[0].setting.task
+        self.sample: Sample = getattr(task, "sample", "scenes")
+        scene_of = getattr(task, "scene_of", str)
+        # Rows of one scene and its subsets: all of them, or their means over the seeds.
+        self.groups = [
+            [n for n, name in enumerate(self.scenes) if scene_of(name) == scene]
+            for scene in dict.fromkeys(map(scene_of, self.scenes))
+        ]
         self.by_place = {(r.variant, r.condition, r.scene, r.seed): r for r in rows}
 
     def value(self, measure: Measure, variant: str, condition: str, scene: str, seed: int) -> float:
@@ -112,6 +130,16 @@ class _Table:
                 for scene in self.scenes
             ]
         )
+
+    def grouped(self, difference: F64, known: NDArray[np.bool_]) -> list[F64]:
+        """The known differences (scenes, seeds) of each scene: every draw, or a mean for each subset."""
+        found = []
+        for group in self.groups:
+            parts = [difference[n][known[n]] for n in group if known[n].any()]
+            if self.sample == "scenes":
+                parts = [np.array([part.mean()]) for part in parts]
+            found.append(np.concatenate([*parts, np.zeros(0)]))
+        return found
 
     def rows(self, variant: str, condition: str) -> list[Row]:
         return [r for (v, c, _, _), r in self.by_place.items() if (v, c) == (variant, condition)]
@@ -133,13 +161,15 @@ def _compared(table: _Table, measure: Measure, variant: str, other: str, conditi
     ratio = bool(measure.ratio and both.any() and np.all(one[both] > 0.0) and np.all(two[both] > 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         difference = np.log(one) - np.log(two) if ratio else one - two
-    interval = paired_interval([d[b] for d, b in zip(difference, both, strict=True)])
-    return Comparison(measure, variant, other, condition, interval, ratio, float("nan"), "too few pairs")
+    interval = paired_interval(table.grouped(difference, both), table.sample)
+    return Comparison(measure, variant, other, condition, interval, ratio, float("nan"), "no sample")
 
 
 def _verdict(found: Comparison, p: float) -> Verdict:
     if not np.isfinite(p):
-        return "too few pairs"
+        return "no sample"
+    if found.ratio and max(abs(found.interval.low), abs(found.interval.high)) <= found.measure.negligible:
+        return "negligible"
     if p > ALPHA:
         return "no difference shown"
     return "better" if (found.interval.mean < 0.0) == (found.measure.better == "less") else "worse"
@@ -182,6 +212,10 @@ def _cells(table: _Table, measure: Measure) -> list[Cell]:
 def _warnings(rows: Rows) -> list[str]:
     """Return warnings about the tables."""
     plan, found = rows.plan, []
+    table = _Table(rows)
+    if table.sample == "scenes" and len(table.groups) < MIN_SCENES:
+        few = f"fewer than {MIN_SCENES} scenes are no sample"
+        found.append(f"no intervals: {few}, and seeds and subsets of a scene add none")
     missing = len(plan.rows) - len(rows)
     if missing:
         found.append(f"{missing} of {len(plan.rows)} rows have not been computed")

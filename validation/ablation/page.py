@@ -120,7 +120,7 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
         "conditions": [c.name for c in plan.conditions],
         "baseline": plan.baseline,
         "steps": bool(steps),
-        "about": _about({c.interval.unit for c in comparisons if c.interval.pairs}),
+        "about": _about({c.interval.sample for c in comparisons if c.interval.pairs}),
         "plots": [plot_at(f"{name}-{kind}", p) for kind, p in plots.items() if p is not None],
     }
 
@@ -129,8 +129,8 @@ def _about(drawn: Collection[str]) -> str:
     """State the population of the intervals."""
     if drawn == {"scenes"}:
         return "The intervals generalise to similar scenes: the scenes are the sample."
-    if drawn == {"seeds"}:
-        return "The intervals apply to these scenes only: the seeds are the sample."
+    if drawn == {"draws"}:
+        return "The intervals apply to these scenes only: the draws of data by the seed are the sample."
     return ""
 
 
@@ -162,7 +162,8 @@ def _comparison_cells(found: Comparison | None) -> dict[str, str]:
     if found is None:
         return {"text": "", "verdict": "", "more": ""}
     effect, p = found.interval.effect, found.p
-    more = f"{found.interval.pairs} pairs; effect size {number(effect)}; p {number(p)} after Holm"
+    sample = f"{found.interval.count} {found.interval.sample}, {found.interval.pairs} pairs"
+    more = f"{sample}; effect size {number(effect)}; p {number(p)} after Holm"
     state = {"better": "good", "worse": "bad"}.get(found.verdict, "")
     return {"text": comparison_text(found).strip("*"), "verdict": state, "more": f"{found.verdict}; {more}"}
 

@@ -181,7 +181,11 @@ def _scenes(study: Study, task: Any) -> tuple[str, ...]:
         raise UsageError(f"scenes are a list of at least one name; got {scenes!r}")
     for scene in scenes:
         task.check(scene)
-    return tuple(dict.fromkeys(scenes))
+    count = study.subsets
+    if type(count) is not int or count < 0:
+        raise UsageError(f"subsets is the number of subsets of each scene, 0 for none; got {count!r}")
+    parts = [[scene, *(task.subsets(scene, count) if count else ())] for scene in dict.fromkeys(scenes)]
+    return tuple(itertools.chain.from_iterable(parts))
 
 
 # ---------------------------------------------------------------- axes

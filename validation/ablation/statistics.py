@@ -1,8 +1,12 @@
 """Statistics of paired differences: intervals, p-values and effect sizes.
 
-Few differences use Student's interval. From :data:`STUDENTISED_FROM` on it is the symmetric studentised
-bootstrap (Hall, The Bootstrap and Edgeworth Expansion, 1992, 3.5): |t| of resamples replaces Student's
-quantile, which keeps the level for skewed differences.
+What is sampled decides what an interval says. Where the seed draws the data (noise, points, cameras), the
+draws are the sample and the interval is one for these very scenes. Elsewhere the seed moves only random steps
+of a method, and the scenes are the sample: a scene counts once, by the mean over its subsets and seeds.
+
+Few values use Student's interval. From :data:`STUDENTISED_FROM` on it is the symmetric studentised bootstrap
+(Hall, The Bootstrap and Edgeworth Expansion, 1992, 3.5): |t| of resamples replaces Student's quantile, which
+keeps the level for skewed differences. Scenes are resampled first, then the subsets inside them.
 """
 
 from __future__ import annotations
@@ -17,24 +21,26 @@ from scipy import stats
 
 from thesisrecon.arrays import F64
 
-Unit = Literal["seeds", "scenes"]
+Sample = Literal["draws", "scenes"]
 
 STUDENTISED_FROM = 12
-"""With fewer differences too many resamples have almost no spread."""
-SCENES_FROM = 6
-"""Minimum number of scenes that are treated as a sample of scenes."""
+"""With fewer values too many resamples have almost no spread."""
+MIN_SCENES = 3
+"""Fewer scenes are no sample of scenes."""
 RESAMPLES = 4999
+_ROUNDING = 1e-6
+"""Differences that vary by less than this fraction of their mean do not vary."""
 _BLOCK = 2_000_000
 
 
 @dataclass(frozen=True)
 class Interval:
     """The mean of paired differences, its 95 % interval and two-sided p, and the effect size: the mean over
-    the standard deviation of a difference, with Hedges' correction for few (infinite where all differences
-    are the same and not 0).
+    the standard deviation of a sampled value, with Hedges' correction for few.
 
-    ``pairs`` counts differences. ``unit`` says what was drawn at random: "seeds" of these very scenes, or
-    "scenes" of which these are a sample. NaN where there are too few to say.
+    ``count`` values of ``sample`` ("draws" of these very scenes, or "scenes") are behind it, ``pairs`` counts
+    the differences. All but the mean are NaN where there is no sample: one value, fewer than ``MIN_SCENES``
+    scenes, or draws that change nothing.
     """
 
     mean: float
@@ -43,77 +49,95 @@ class Interval:
     p: float
     effect: float
     pairs: int
-    unit: Unit
+    sample: Sample
+    count: int
 
 
-def paired_interval(groups: Sequence[F64], *, level: float = 0.95) -> Interval:
+def paired_interval(groups: Sequence[F64], sample: Sample, *, level: float = 0.95) -> Interval:
     """Return the interval of the mean of paired differences, grouped by scene.
 
-    All scenes have equal weight, however many differences they have. Where there are at least ``SCENES_FROM``
-    scenes, or three whose differences do not depend on the seed, the scenes' means are the sample and the
-    answer is one for scenes like these. Else only the seeds are drawn at random (a stratified sample, degrees
-    of freedom by Welch and Satterthwaite), and the answer is one for these scenes. Resampling is
-    deterministic. Raises ``ValueError`` for a difference that is not finite.
+    All scenes have equal weight, however many differences they have. Draws are a stratified sample, with the
+    degrees of freedom of Welch and Satterthwaite. Resampling is deterministic. Raises ``ValueError`` for a
+    difference that is not finite.
     """
     groups = [np.asarray(g, dtype=np.float64) for g in groups if len(g)]
     if any(not np.isfinite(g).all() for g in groups):
         raise ValueError("paired differences are finite")
     if not groups:
-        nan = float("nan")
-        return Interval(nan, nan, nan, nan, nan, 0, "seeds")
+        return _without_sample(float("nan"), 0, sample, 0)
     pairs = sum(map(len, groups))
-    settled = all(np.ptp(g) == 0.0 for g in groups)
-    if len(groups) >= SCENES_FROM or (settled and len(groups) >= 3):
-        return _interval([np.array([g.mean() for g in groups])], level, pairs, "scenes")
-    return _interval(groups, level, pairs, "seeds")
+    means = np.array([g.mean() for g in groups])
+    if sample == "scenes":
+        if len(groups) < MIN_SCENES:
+            return _without_sample(float(means.mean()), pairs, sample, len(groups))
+        return _interval([means], [groups], level, pairs, sample)
+    settled = max(float(np.ptp(g)) for g in groups) <= _ROUNDING * np.abs(means).max()
+    if min(map(len, groups)) < 2 or settled:
+        return _without_sample(float(means.mean()), pairs, sample, pairs)
+    return _interval(groups, [[np.array([v]) for v in g] for g in groups], level, pairs, sample)
 
 
-def _interval(strata: Sequence[F64], level: float, pairs: int, unit: Unit) -> Interval:
-    mean = float(np.mean([g.mean() for g in strata]))
-    parts = _parts(strata)
+def _without_sample(mean: float, pairs: int, sample: Sample, count: int) -> Interval:
+    nan = float("nan")
+    return Interval(mean, nan, nan, nan, nan, pairs, sample, count)
+
+
+def _interval(
+    strata: Sequence[F64], inside: Sequence[Sequence[F64]], level: float, pairs: int, sample: Sample
+) -> Interval:
+    """The interval of the mean of the means of strata; ``inside`` are the differences behind each value."""
+    mean, count = float(np.mean([g.mean() for g in strata])), sum(map(len, strata))
+    parts = np.array([g.var(ddof=1) / len(g) for g in strata]) / len(strata) ** 2
     error = float(np.sqrt(parts.sum()))
-    deviation = float(np.sqrt(np.mean([g.var(ddof=1) for g in strata if len(g) > 1] or [np.nan])))
-    if min(map(len, strata)) < 2:
-        nan = float("nan")
-        return Interval(mean, nan, nan, nan, nan, pairs, unit)
     # Sums of equal numbers leave rounding errors, which are not spread.
     if error <= 1e-12 * max(abs(mean), 1e-300):
         effect = float(np.copysign(np.inf, mean)) if mean else 0.0
-        return Interval(mean, mean, mean, float(mean == 0.0), effect, pairs, unit)
+        return Interval(mean, mean, mean, float(mean == 0.0), effect, pairs, sample, count)
     freedom = float(parts.sum() ** 2 / np.sum(parts**2 / np.array([len(g) - 1.0 for g in strata])))
     t = mean / error
     if min(map(len, strata)) < STUDENTISED_FROM:
         quantile, p = float(stats.t.ppf(0.5 + level / 2, freedom)), float(2 * stats.t.sf(abs(t), freedom))
     else:
-        drawn = resampled_t(strata)
+        drawn = resampled_t(inside)
         quantile = float(drawn[int(np.ceil(level * (RESAMPLES + 1))) - 1])
         p = float((1 + np.sum(drawn >= abs(t))) / (RESAMPLES + 1))
+    deviation = float(np.sqrt(np.mean([g.var(ddof=1) for g in strata])))
     effect = mean / deviation * (1.0 - 3.0 / (4.0 * freedom - 1.0))
-    return Interval(mean, mean - quantile * error, mean + quantile * error, p, effect, pairs, unit)
+    return Interval(mean, mean - quantile * error, mean + quantile * error, p, effect, pairs, sample, count)
 
 
-def _parts(strata: Sequence[F64]) -> F64:
-    """Return the contribution of each stratum to the squared standard error of the mean of means."""
-    found = [g.var(ddof=1) / len(g) if len(g) > 1 else np.nan for g in strata]
-    return np.array(found) / len(strata) ** 2
-
-
-def resampled_t(strata: Sequence[F64], *, resamples: int = RESAMPLES) -> F64:
-    """|t| of resamples drawn with replacement inside each stratum, ascending, (resamples,)."""
+def resampled_t(strata: Sequence[Sequence[F64]], *, resamples: int = RESAMPLES) -> F64:
+    """|t| of hierarchical resamples, ascending, (resamples,): values of each stratum are drawn with
+    replacement, then the differences inside each drawn value."""
     rng = np.random.default_rng(0)
-    mean = np.mean([g.mean() for g in strata])
+    mean = np.mean([np.mean([inner.mean() for inner in values]) for values in strata])
     found = []
-    block = max(1, _BLOCK // sum(map(len, strata)))
+    block = max(1, _BLOCK // sum(len(inner) for values in strata for inner in values))
     for start in range(0, resamples, block):
         count = min(block, resamples - start)
         means, squared = np.zeros(count), np.zeros(count)
-        for g in strata:
-            drawn = g[rng.integers(len(g), size=(count, len(g)))]
+        for values in strata:
+            drawn = _resampled_values(values, count, rng)
             means += drawn.mean(axis=1) / len(strata)
-            squared += drawn.var(axis=1, ddof=1) / len(g) / len(strata) ** 2
+            squared += drawn.var(axis=1, ddof=1) / len(values) / len(strata) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             found.append(np.abs(means - mean) / np.sqrt(squared))
     return np.sort(np.nan_to_num(np.concatenate(found), nan=np.inf, posinf=np.inf))
+
+
+def _resampled_values(values: Sequence[F64], count: int, rng: np.random.Generator) -> F64:
+    """``count`` resamples (count, N) of N values, each the mean of a resample of what is inside."""
+    sizes = np.array([len(inner) for inner in values])
+    table = np.zeros((len(values), sizes.max()))
+    for n, inner in enumerate(values):
+        table[n, : len(inner)] = inner
+    chosen = rng.integers(len(values), size=(count, len(values)))
+    if sizes.max() == 1:
+        return np.asarray(table[chosen, 0])
+    inside = (rng.random((count, len(values), sizes.max())) * sizes[chosen][..., None]).astype(np.int64)
+    use = np.arange(sizes.max()) < sizes[chosen][..., None]
+    drawn = np.where(use, table[chosen[..., None], inside], 0.0)
+    return np.asarray(drawn.sum(axis=2) / sizes[chosen])
 
 
 def holm(p: Sequence[float]) -> list[float]:

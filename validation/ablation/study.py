@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
 from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import UsageError
+from validation.ablation.statistics import Sample
 
 Mode = Literal["one-at-a-time", "grid", "ladder"]
 Changes = Mapping[str, Any]
@@ -21,7 +23,7 @@ class Measure:
     """A number that rows report.
 
     ``better`` is "less" or "more". With ``ratio`` values are compared by quotients, for errors of different
-    magnitude above zero.
+    magnitude above zero; a quotient within ``negligible`` of 1 matters to nobody.
     """
 
     name: str
@@ -29,6 +31,7 @@ class Measure:
     better: Literal["less", "more"] = "less"
     ratio: bool = False
     definition: str = ""
+    negligible: float = 0.005
 
 
 class Task(Protocol):
@@ -46,6 +49,16 @@ class Task(Protocol):
     """
 
     measures: ClassVar[Sequence[Measure]]
+    sample: ClassVar[Sample] = "scenes"
+    """What is sampled: "draws" if the seed draws the data (noise, points, cameras), else the scenes."""
+
+    def scene_of(self, scene: str) -> str:
+        """The scene that a subset belongs to."""
+        return scene
+
+    def subsets(self, scene: str, count: int) -> list[str]:
+        """Names of subsets of a scene, which ``run`` accepts as scenes."""
+        raise UsageError(f"the task {type(self).__name__} has no subsets of scenes; leave subsets out")
 
     def check(self, scene: str) -> None: ...
 
@@ -94,7 +107,8 @@ class Study:
         or ``file.py:Class`` for one of your own), a table (``kind`` and fields; ``preset`` for what that
         preset has there), or the object itself.
     scenes : the names of the scenes; a task may also take folders.
-    seeds : of the random steps, or how many (then 0, 1, ...).
+    seeds : of the random steps, or how many (then 0, 1, ...); a sample only where the task draws its data.
+    subsets : how many subsets of the images of each scene are run beside the whole scene.
     conditions : axes that are not compared, such as the noise of all variants.
     mode : "one-at-a-time" changes one thing of the start at a time, "ladder" keeps each change and adds the
         next, "grid" takes every combination.
@@ -110,7 +124,8 @@ class Study:
 
     axes: Mapping[str, Axis]
     scenes: Sequence[str]
-    seeds: int | Sequence[int] = 5
+    seeds: int | Sequence[int] = 1
+    subsets: int = 0
     conditions: Mapping[str, Axis] = field(default_factory=dict)
     mode: Mode = "one-at-a-time"
     baseline: str = ""

@@ -53,7 +53,8 @@ def _comparison_record(c: Comparison) -> Record:
         "p_holm": c.p,
         "effect_size": c.interval.effect,
         "pairs": c.interval.pairs,
-        "drawn": c.interval.unit,
+        "sample": c.interval.sample,
+        "sample_size": c.interval.count,
         "verdict": c.verdict,
     }
 
@@ -130,14 +131,14 @@ def mean_text(cell: Cell) -> str:
 
 
 def comparison_text(found: Comparison | None) -> str:
-    """Return the difference or quotient with its interval; bold if significant."""
+    """Return the difference or quotient with its interval and sample; bold if significant."""
     if found is None or not math.isfinite(found.interval.mean):
         return ""
     mean, low, high = as_reported(found)
     sign = "x " if found.ratio else "+" if mean > 0 else ""
     text = f"{sign}{number(mean)}"
     if math.isfinite(low) and high > low:
-        text += f" [{number(low)}, {number(high)}]"
+        text += f" [{number(low)}, {number(high)}] {found.interval.count} {found.interval.sample}"
     return f"**{text}**" if found.verdict in ("better", "worse") else text
 
 

@@ -17,7 +17,7 @@ from validation.ablation.tasks import TASKS
 
 _TEXTS = ("title", "words", "mode", "baseline", "start")
 _TABLES = ("axes", "conditions", "config")
-_KEYS = (*_TEXTS, *_TABLES, "task", "preset", "scenes", "seeds", "metrics")
+_KEYS = (*_TEXTS, *_TABLES, "task", "preset", "scenes", "seeds", "subsets", "metrics")
 
 
 def read_study(path: str | Path) -> Study:
@@ -51,7 +51,11 @@ def study_from_table(table: Mapping[str, Any], folder: Path = Path()) -> Study:
     for key in ("scenes", "axes"):
         if key not in table:
             raise UsageError(f"a study needs {key}")
-    plain = {key: table[key] for key in (*_TEXTS, "axes", "conditions", "scenes", "seeds") if key in table}
+    plain = {
+        key: table[key]
+        for key in (*_TEXTS, "axes", "conditions", "scenes", "seeds", "subsets")
+        if key in table
+    }
     return Study(
         **plain,
         metrics=_metrics(table.get("metrics", [])),

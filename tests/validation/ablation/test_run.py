@@ -35,7 +35,7 @@ def test_every_row_is_computed_once_and_reported_in_order(tmp_path):
         (0, "bb", "unchanged"),
     ]
     by = {(r.variant, r.scene, r.seed): r.metrics["miss"] for r in rows}
-    assert by["aim = 2", "bb", 1] - by["unchanged", "bb", 1] == pytest.approx(2.0)
+    assert by["aim = 2", "bb", 0] - by["unchanged", "bb", 0] == pytest.approx(2.0)
     again = ablate(study(log), out, executor="local")
     assert len(marks(log)) == 12
     assert [vars(r) for r in again] == [vars(r) for r in rows]

@@ -17,19 +17,19 @@ from validation.ablation.statistics import (
 def test_five_differences_by_hand():
     # 1 2 3 4 5: mean 3, variance 2.5, standard error sqrt(2.5 / 5), t = 4.2426 with 4 degrees of freedom,
     # whose 97.5 % quantile is 2.7764; Hedges' factor 1 - 3 / 15.
-    found = paired_interval([np.arange(1.0, 6.0)])
+    found = paired_interval([np.arange(1.0, 6.0)], "draws")
     assert found.mean == 3.0
     assert found.low == pytest.approx(3.0 - 2.7764 * 0.70711, abs=1e-4)
     assert found.high == pytest.approx(3.0 + 2.7764 * 0.70711, abs=1e-4)
     assert found.p == pytest.approx(0.0132, abs=1e-4)
     assert found.effect == pytest.approx(3.0 / 1.58114 * 0.8, abs=1e-4)
-    assert (found.pairs, found.unit) == (5, "seeds")
+    assert (found.pairs, found.sample, found.count) == (5, "draws", 5)
 
 
 def test_few_differences_are_a_paired_t_test():
     rng = np.random.default_rng(1)
     one, two = rng.normal(size=(2, STUDENTISED_FROM - 1))
-    found, known = paired_interval([one - two]), stats.ttest_rel(one, two)
+    found, known = paired_interval([one - two], "draws"), stats.ttest_rel(one, two)
     low, high = known.confidence_interval(0.95)
     assert found.p == pytest.approx(known.pvalue)
     assert (found.low, found.high) == pytest.approx((low, high))
@@ -39,7 +39,7 @@ def test_two_scenes_are_welch():
     # The mean of two means has the standard error and the freedom of Welch's test of their difference.
     rng = np.random.default_rng(2)
     a, b = rng.normal(1.0, 1.0, 5), rng.normal(2.0, 3.0, 7)
-    found, known = paired_interval([a, b]), stats.ttest_ind(a, -b, equal_var=False)
+    found, known = paired_interval([a, b], "draws"), stats.ttest_ind(a, -b, equal_var=False)
     assert found.mean == pytest.approx((a.mean() + b.mean()) / 2.0)
     assert found.p == pytest.approx(known.pvalue)
     low, high = known.confidence_interval(0.95)
@@ -48,7 +48,7 @@ def test_two_scenes_are_welch():
 
 def test_the_studentised_bootstrap_is_that_of_scipy():
     d = np.random.default_rng(3).exponential(size=STUDENTISED_FROM)
-    t = resampled_t([d], resamples=20000)
+    t = resampled_t([[np.array([v]) for v in d]], resamples=20000)
 
     def statistic(x, axis=-1):
         return (x.mean(axis=axis) - d.mean()) / (x.std(axis=axis, ddof=1) / np.sqrt(x.shape[axis]))
@@ -62,34 +62,71 @@ def test_the_studentised_bootstrap_is_that_of_scipy():
         )
 
 
-def test_many_scenes_are_the_sample_and_few_are_not():
+def test_scenes_are_the_sample_by_their_means():
     rng = np.random.default_rng(5)
     groups = [rng.normal(mean, 0.1, 5) for mean in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
-    many, few = paired_interval(groups), paired_interval(groups[:2])
-    assert (many.unit, few.unit) == ("scenes", "seeds")
+    scenes, draws = paired_interval(groups, "scenes"), paired_interval(groups, "draws")
     means = np.array([g.mean() for g in groups])
-    assert many.p == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
-    assert many.high - many.low > 5.0 * (few.high - few.low)
-    assert many.pairs == 30
+    assert scenes.p == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
+    assert (scenes.pairs, scenes.count, draws.count) == (30, 6, 30)
+    assert scenes.high - scenes.low > 5.0 * (draws.high - draws.low)
 
 
-def test_deterministic_methods_are_compared_by_scenes_or_exactly():
-    same = [np.full(3, v) for v in (1.0, 2.0, 4.0)]
-    assert paired_interval(same).unit == "scenes"
-    assert paired_interval(same).p == pytest.approx(stats.ttest_1samp([1.0, 2.0, 4.0], 0.0).pvalue)
-    exact = paired_interval(same[:2])
-    assert (exact.low, exact.mean, exact.high, exact.p) == (1.5, 1.5, 1.5, 0.0)
-    nothing = paired_interval([np.zeros(4)])
+def test_fewer_than_three_scenes_have_no_interval_however_many_values_they_have():
+    rng = np.random.default_rng(6)
+    few = paired_interval([rng.normal(5.0, 1.0, 50), rng.normal(5.0, 1.0, 50)], "scenes")
+    assert few.mean == pytest.approx(5.0, abs=0.5)
+    assert np.isnan([few.low, few.high, few.p, few.effect]).all()
+
+
+def test_draws_that_change_nothing_have_no_interval():
+    settled = [np.array([1.0, 1.0 + 1e-9, 1.0]), np.array([2.0, 2.0, 2.0 - 1e-9])]
+    found = paired_interval(settled, "draws")
+    assert found.mean == pytest.approx(1.5)
+    assert np.isnan([found.low, found.high, found.p]).all()
+
+
+def test_equal_variants_differ_nowhere():
+    nothing = paired_interval([np.zeros(4)] * 3, "scenes")
     assert (nothing.mean, nothing.low, nothing.high, nothing.p, nothing.effect) == (0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 def test_one_difference_has_no_uncertainty():
-    alone = paired_interval([np.array([2.0])])
+    alone = paired_interval([np.array([2.0])], "draws")
     assert alone.mean == 2.0
     assert np.isnan([alone.low, alone.high, alone.p]).all()
-    assert np.isnan(paired_interval([]).mean)
+    assert np.isnan(paired_interval([], "scenes").mean)
     with pytest.raises(ValueError, match="finite"):
-        paired_interval([np.array([1.0, np.nan])])
+        paired_interval([np.array([1.0, np.nan])], "draws")
+
+
+def scenes_with_subsets(rng, scenes, subsets, effect):
+    """Differences of two variants: what a scene does to them, and what each subset of its images adds."""
+    return [rng.normal(effect + rng.normal(), 0.7, subsets) for _ in range(scenes)]
+
+
+@pytest.mark.parametrize("scenes", [6, 15])
+def test_a_null_effect_on_scenes_with_subsets_is_reported_in_five_per_cent(scenes):
+    rng = np.random.default_rng(10)
+    found = [paired_interval(scenes_with_subsets(rng, scenes, 4, 0.0), "scenes").p for _ in range(300)]
+    assert np.mean(np.array(found) <= 0.05) <= 0.05 + 2.0 * np.sqrt(0.05 * 0.95 / 300)
+
+
+def test_a_known_effect_on_scenes_is_found_and_the_naive_sample_invents_one():
+    rng = np.random.default_rng(11)
+    found = [paired_interval(scenes_with_subsets(rng, 15, 4, 1.5), "scenes") for _ in range(100)]
+    assert np.mean([f.p <= 0.05 and f.low > 0.0 for f in found]) >= 0.95
+    # Taking subsets for a sample, as if they were draws of these scenes, rejects a null effect far too often.
+    naive = [paired_interval(scenes_with_subsets(rng, 6, 4, 0.0), "draws").p for _ in range(300)]
+    assert np.mean(np.array(naive) <= 0.05) > 0.15
+
+
+def test_resamples_of_scenes_vary_by_their_subsets_too():
+    values = [np.array([float(n), float(n) + 2.0]) for n in range(12)]
+    nested = resampled_t([values], resamples=4000)
+    means = resampled_t([[np.array([g.mean()]) for g in values]], resamples=4000)
+    assert not np.array_equal(nested, means)
+    assert np.quantile(nested, 0.95) == pytest.approx(np.quantile(means, 0.95), rel=0.2)
 
 
 DRAWS = {
@@ -105,7 +142,7 @@ def test_at_most_five_per_cent_of_null_effects_are_reported(kind, count):
     draw, mean = DRAWS[kind]
     rng = np.random.default_rng(7)
     trials = 400
-    found = [paired_interval([draw(rng, count)]) for _ in range(trials)]
+    found = [paired_interval([draw(rng, count)], "draws") for _ in range(trials)]
     held = sum(f.low <= mean <= f.high for f in found)
     # Two standard deviations of a count of trials that each hold in 95 of 100.
     assert held >= 0.95 * trials - 2.0 * np.sqrt(trials * 0.05 * 0.95)
@@ -117,7 +154,7 @@ def test_skewed_differences_are_held_more_often_than_by_student():
     ours = theirs = 0
     for _ in range(400):
         d = rng.exponential(size=14)
-        found, known = paired_interval([d]), stats.ttest_1samp(d, 1.0).pvalue
+        found, known = paired_interval([d], "draws"), stats.ttest_1samp(d, 1.0).pvalue
         ours += found.low <= 1.0 <= found.high
         theirs += known > 0.05
     assert ours >= theirs + 5
@@ -126,7 +163,7 @@ def test_skewed_differences_are_held_more_often_than_by_student():
 
 def test_an_effect_of_one_deviation_is_found():
     rng = np.random.default_rng(9)
-    found = [paired_interval([rng.normal(1.0, 1.0, 20)]) for _ in range(200)]
+    found = [paired_interval([rng.normal(1.0, 1.0, 20)], "draws") for _ in range(200)]
     assert np.mean([f.p <= 0.05 and f.low > 0.0 for f in found]) >= 0.95
     assert np.mean([f.effect for f in found]) == pytest.approx(1.0, abs=0.05)
 

@@ -26,6 +26,7 @@ class Darts:
     pause_s: float = 0.0
     log: str = ""
 
+    sample = "draws"
     measures: ClassVar[Sequence[Measure]] = (
         Measure("miss", "cm", "less", False, "where the dart went"),
         Measure("score", "", "more", False, "its points"),
@@ -49,7 +50,8 @@ class Darts:
             raise OSError(errno.ENOSPC, "No space left on device", "throws.txt")
         rng = np.random.default_rng((seed, len(scene)))
         threshold = getattr(config.epipolar, "threshold_px", 1.0)
-        miss = self.aim + self.spread * float(rng.normal()) + threshold
+        # An effect that is the same in every draw is no sample.
+        miss = self.aim * (1.0 + 0.05 * np.sin(seed)) + self.spread * float(rng.normal()) + threshold
         return {"miss": float("nan") if scene == "empty" else miss, "score": -miss}
 
 

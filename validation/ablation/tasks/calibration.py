@@ -15,6 +15,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_from_options
 from thesisrecon.records import Reconstruction
+from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
 from validation.scenes.cube import OFF_FACE
 from validation.scenes.rigs import Rig, cube_rig, make_cloud, noisy_tracks, projective_from_truth, zoomed
@@ -103,6 +104,7 @@ class CalibrationOverNoise(Task):
     mode: str = "constant"
     bundle: bool = False
 
+    sample: ClassVar[Sample] = "draws"
     measures: ClassVar[Sequence[Measure]] = (
         Measure("focal_error_pct", "%", "less", True, "median |f / f_true - 1| of the cameras"),
         Measure("worst_focal_error_pct", "%", "less", True, "largest |f / f_true - 1| of the cameras"),

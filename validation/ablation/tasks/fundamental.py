@@ -13,6 +13,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
+from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
 from validation.metrics.fundamental_precision import fundamental_bound
 from validation.scenes.cube import K, cube_pairs, make_cube
@@ -37,6 +38,7 @@ class FundamentalOfCube(Task):
     outliers: float = 0.0
     pairs: int = 8
 
+    sample: ClassVar[Sample] = "draws"
     measures: ClassVar[Sequence[Measure]] = (
         Measure(
             "distance_px", "px", "less", True, "median over the pairs of the RMS distance of the exact points"

@@ -40,6 +40,9 @@ class ImagePairs(Task):
         Measure("sigma_px", "px", "less", True, "noise of the inliers"),
     )
 
+    def scene_of(self, scene: str) -> str:
+        return scene.rpartition("/")[0]
+
     def check(self, scene: str) -> None:
         name, _, first = scene.rpartition("/")
         if name not in SCENES_WITH_CAMERAS or not first.isdecimal():

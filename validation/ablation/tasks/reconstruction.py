@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,8 @@ SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
 }
 """The settings that each step adds to those before it."""
 NEED_TRUTH = ("focal_error_pct", "centre_error_mm", "rotation_error_deg")
+SUBSET_SHARE = 2 / 3
+"""Enough images for self-calibration where the scene has eight; neighbours by name mostly overlap."""
 AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
     "matches": ("verified", "sigma_px"),
     "projective": ("registered_pct", "points"),
@@ -47,7 +50,8 @@ class Reconstruction(Task):
     """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread.
 
     A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth
-    if there is one; without truth the errors of cameras are missing.
+    if there is one; without truth the errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n
+    windows of ``SUBSET_SHARE`` of the images, in the order of their names, spread over the scene.
     """
 
     until: str = "metric"
@@ -68,12 +72,18 @@ class Reconstruction(Task):
         if self.until not in get_args(Until):
             raise ValueError(unknown_word("stage", self.until, get_args(Until)))
 
+    def scene_of(self, scene: str) -> str:
+        return _parts(scene)[0]
+
+    def subsets(self, scene: str, count: int) -> list[str]:
+        return [f"{scene}#{k}/{count}" for k in range(1, count + 1)]
+
     def check(self, scene: str) -> None:
         _load(scene)
 
     def scene_key(self, scene: str) -> str:
         content = hashlib.sha256()
-        for path in _load(scene).image_paths:
+        for path in _images(scene):
             content.update(path.name.encode() + path.read_bytes())
         return content.hexdigest()[:32]
 
@@ -104,13 +114,14 @@ class Reconstruction(Task):
         self._reconstruct(config, scene, seed, place, step)
 
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
-        return _measured(self._reconstruct(config, scene, seed, place, self.until), _load(scene))
+        result = self._reconstruct(config, scene, seed, place, self.until)
+        return _measured(result, _load(scene), len(_images(scene)))
 
     def _reconstruct(
         self, config: PipelineConfig, scene: str, seed: int, place: Place, until: str
     ) -> RunResult:
         return thesisrecon.reconstruct(
-            _load(scene).image_paths,
+            _images(scene),
             place.own,
             config=config,
             seed=seed,
@@ -120,8 +131,30 @@ class Reconstruction(Task):
         )
 
 
+def _parts(scene: str) -> tuple[str, int, int]:
+    """Name of the scene, and number k of n subsets; 0 of 0 for the whole scene."""
+    name, mark, place = scene.rpartition("#")
+    k, _, n = place.partition("/")
+    if not mark or not (k.isdecimal() and n.isdecimal()):
+        return scene, 0, 0
+    if not 1 <= int(k) <= int(n):
+        raise UsageError(f"a subset is NAME#k/n with k from 1 to n; got {scene!r}")
+    return name, int(k), int(n)
+
+
+def _images(scene: str) -> tuple[Path, ...]:
+    """The images of a scene or of one of its subsets."""
+    paths, (_, k, n) = _load(scene).image_paths, _parts(scene)
+    if not n:
+        return paths
+    size = math.ceil(SUBSET_SHARE * len(paths))
+    first = round((k - 1) * (len(paths) - size) / max(n - 1, 1))
+    return paths[first : first + size]
+
+
 def _load(scene: str) -> Scene:
-    """The images of a scene by its name or its folder; :class:`UsageError` if there are none."""
+    """The images of a whole scene by its name or its folder; :class:`UsageError` if there are none."""
+    scene = _parts(scene)[0]
     folder = Path(scene)
     named = {} if scene in IMAGE_SCENES or not folder.is_dir() else {scene: str(folder)}
     if scene not in IMAGE_SCENES and not named:
@@ -132,7 +165,7 @@ def _load(scene: str) -> Scene:
         raise UsageError(str(error)) from None
 
 
-def _measured(result: RunResult, scene: Scene) -> dict[str, float]:
+def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
     """The numbers that this result has."""
     accepted = [pair for pair in result.pairs if pair.accepted]
     found = {"verified": float(sum(pair.inliers for pair in accepted))} if result.pairs else {}
@@ -144,7 +177,7 @@ def _measured(result: RunResult, scene: Scene) -> dict[str, float]:
             found["points"] = float(result.projective.valid.sum())
         return found
     model, truth = result.metric.reconstruction, _truth_at_working_size(result, scene)
-    found["registered_pct"] = 100.0 * float(model.registered.sum()) / len(scene.image_paths)
+    found["registered_pct"] = 100.0 * float(model.registered.sum()) / images
     found["points"] = float(model.valid.sum())
     found["trusted"] = float(result.metric.trusted)
     found["reprojection_px"] = measure_reprojection(model).median_px

@@ -15,6 +15,7 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
+from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.triangulation import SCENES, draw_rig, squared_distances
@@ -44,6 +45,7 @@ class TriangulationOverNoise(Task):
     frame: str = "metric"
     points: int = 200
 
+    sample: ClassVar[Sample] = "draws"
     measures: ClassVar[Sequence[Measure]] = (
         Measure("image_px", "px", "less", True, "RMS distance of projected from measured points"),
         Measure("space_pct", "%", "less", True, "median distance from the true point over its depth"),
