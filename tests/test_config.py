@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import is_dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,15 +11,18 @@ from tests.conftest import refuses
 from thesisrecon._settings import (
     _parse,
     _toml_lines,
+    as_config,
+    build_config,
     config_from_tables,
     config_from_toml,
     tables_from_config,
     tables_from_settings,
     toml_from_config,
 )
-from thesisrecon.config import KINDS, PRESETS, preset
+from thesisrecon.config import KINDS, PRESETS, PipelineConfig, preset
 from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import INTRINSICS, IntrinsicsOptions, camera_numbers, prior_from_options
+from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
 from thesisrecon.pipeline.reconstruction import _exif_warnings
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
@@ -66,6 +70,67 @@ def test_every_kind_can_be_chosen_by_its_word(stage, kind):
     assert type(variant) is KINDS[stage][kind]
     assert is_dataclass(variant)
     assert type(variant).__dataclass_params__.frozen
+
+
+def test_options_build_the_same_configuration_as_settings(tmp_path):
+    file, pairs = tmp_path / "a.toml", tmp_path / "pairs.txt"
+    file.write_text('preset = "thesis"\n[images]\nmax_size_px = 900\n', encoding="utf-8")
+    pairs.write_text("a.png b.png\n", encoding="utf-8")
+    assert build_config() == build_config("default") == build_config(preset="default") == preset("default")
+    assert build_config("thesis") == build_config(preset="thesis") == as_config("thesis") == preset("thesis")
+    assert build_config(file) == build_config(str(file)) == as_config(file)
+    assert build_config(file).images.max_size_px == 900
+    assert build_config(file, preset="default").features == preset("default").features
+    given = {"max_size": 640, "cameras": "per-image", "pairs": "window:3"}
+    texts = [
+        "images.max_size_px=640",
+        "intrinsics.cameras=per-image",
+        "pairs.kind=sequence-window",
+        "pairs.window=3",
+    ]
+    assert build_config(**given) == build_config(settings=texts) == apply_settings(*texts)
+    config = build_config(
+        settings={"matching.ratio": np.float64(0.5), "intrinsics.principal_point_px": np.ones(2)}
+    )
+    assert (config.matching.ratio, config.intrinsics.principal_point_px) == (0.5, (1.0, 1.0))
+    for knowledge, kind in (
+        ("all", AllPairs()),
+        ("overlap", OverlapEstimate()),
+        ("window:3", SequenceWindow(3)),
+    ):
+        assert build_config(pairs=knowledge).pairs == kind
+    listed = ListedPairs((("a.png", "b.png"),))
+    for knowledge in (pairs, str(pairs), [("a.png", "b.png")], [["a.png", "b.png"]]):
+        assert build_config(pairs=knowledge).pairs == listed
+    assert build_config(PipelineConfig(pairs=listed), max_size=99).pairs == listed
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"config": "thesys"}, "did you mean thesis.*no TOML file"),
+        ({"config": 3}, "name of a preset or a TOML file"),
+        ({"config": "nowhere.toml"}, "no TOML file of this name"),
+        ({"config": Path("no/x")}, "cannot be read"),
+        ({"config": "thesis", "preset": "default"}, "contradict"),
+        ({"config": PipelineConfig(), "preset": "thesis"}, "contradict"),
+        ({"preset": "best"}, "unknown preset"),
+        ({"max_size": 800, "settings": ["images.max_size_px=900"]}, "max_size.*800.*900 contradict"),
+        ({"pairs": "all", "settings": {"pairs.kind": "overlap-estimate"}}, "contradict"),
+        ({"cameras": "two"}, "unknown value of intrinsics.cameras"),
+        ({"max_size": "big"}, "takes a whole number"),
+        ({"pairs": "windw:3"}, "there is no file 'windw:3'"),
+        ({"pairs": "window:x"}, "whole number of images"),
+        ({"pairs": [("a", "b", "c")]}, "pairs of file names"),
+        ({"pairs": 3}, "pairs of file names"),
+        ({"settings": "matching.ratio=0.8"}, "a mapping or a list"),
+        ({"settings": [3]}, "stage.field=value"),
+        ({"settings": {"matching": 0.8}}, "stage.field=value"),
+        ({"settings": {3: 0.8}}, "stage.field=value"),
+    ],
+)  # fmt: skip
+def test_options_that_contradict_or_are_unknown_get_a_sentence(given, words):
+    refuses(UsageError, words, build_config, **given)
 
 
 def test_the_file_names_its_preset_unless_the_command_did():

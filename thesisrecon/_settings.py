@@ -13,16 +13,103 @@ import tomllib
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from thesisrecon.config import KINDS, PipelineConfig, kind_of, preset
+import numpy as np
+
+from thesisrecon.config import KINDS, PRESETS, PipelineConfig
+from thesisrecon.config import preset as _preset
 from thesisrecon.errors import UsageError, in_words, unknown_setting, unknown_word
+from thesisrecon.io._files import read_pairs, read_text
+from thesisrecon.plug_ins import NOT_IN_A_FILE, is_reference, load_reference, text_of
 
 T = TypeVar("T")
 Table = dict[str, Any]
+Config = PipelineConfig | str | Path
+"""A configuration, the name of a preset, or a TOML file."""
+Pairs = str | Path | Sequence[Sequence[str]]
+"""The words of ``--pairs``, a file of pairs, or pairs of file names."""
+Settings = Mapping[str, Any] | Sequence[str]
+"""``{"stage.field": value}``, or texts ``stage.field=value``."""
 _NONE, _KIND = "none", "kind"
 _MAX_DEPTH = 16
 """Maximum nesting of a setting, from its stage to its field."""
+
+
+def build_config(
+    config: Config | None = None,
+    *,
+    preset: str | None = None,
+    max_size: int | None = None,
+    cameras: str | None = None,
+    pairs: Pairs | None = None,
+    settings: Settings = (),
+) -> PipelineConfig:
+    """Build the configuration of a run from the options of the command and of :func:`reconstruct`.
+
+    The preset (the given one, else that of the file), the file, the options and the settings apply in this
+    order; an option and a setting of different values contradict each other.
+    """
+    options: dict[str, Table] = {
+        "intrinsics": {} if cameras is None else {"cameras": cameras},
+        "images": {} if max_size is None else {"max_size_px": max_size},
+        "pairs": {} if pairs is None else _pairs_table(pairs),
+    }
+    options = {stage: table for stage, table in options.items() if table}
+    over = tables_from_settings(settings)
+    for stage, word in (("intrinsics", "cameras"), ("images", "max_size"), ("pairs", "pairs")):
+        given = over.get(stage, {})
+        for key, value in options.get(stage, {}).items():
+            if isinstance(given, Mapping) and given.get(key, value) != value:
+                both = f"{word} ({stage}.{key}={value}) and the setting {stage}.{key}={given[key]}"
+                raise UsageError(f"{both} contradict each other; give one of them")
+    text, base = "", None
+    if isinstance(config, PipelineConfig):
+        base = config
+    elif isinstance(config, Path) or (isinstance(config, str) and Path(config).is_file()):
+        text = read_text(Path(config))
+    elif isinstance(config, str) and config in PRESETS:
+        base = PRESETS[config]
+    elif isinstance(config, str):
+        raise UsageError(
+            f"{unknown_word('preset', config, PRESETS)}; there is no TOML file of this name either"
+        )
+    elif config is not None:
+        takes = "config takes a PipelineConfig, the name of a preset or a TOML file"
+        raise UsageError(f"{takes}; got {in_words(config)}")
+    chosen = None if preset is None else _preset(preset)
+    if base is not None and chosen not in (None, base):
+        raise UsageError(f"preset={preset!r} and config contradict each other; give one of them")
+    return config_from_toml(text, base or chosen, fixed_preset=chosen is not None, changes=(options, over))
+
+
+def as_config(config: Config | None) -> PipelineConfig:
+    """Return the configuration, of a preset by its name, or of a TOML file; None: the preset ``default``."""
+    return config if isinstance(config, PipelineConfig) else build_config(config)
+
+
+def _pairs_table(value: Pairs) -> Table:
+    """Return the settings for the option ``pairs``; a file takes precedence over the word "window"."""
+    if not isinstance(value, str | Path):
+        try:
+            listed = [(one, two) for one, two in value]
+        except (TypeError, ValueError):
+            raise UsageError(f"pairs takes pairs of file names; got {in_words(value)}") from None
+        return {_KIND: "listed-pairs", "listed": listed}
+    words = {"all": "all-pairs", "overlap": "overlap-estimate"}
+    if str(value) in words:
+        return {_KIND: words[str(value)]}
+    word, colon, number = str(value).partition(":")
+    if word == "window" and (colon or not Path(value).is_file()):
+        try:
+            return {_KIND: "sequence-window", "window": int(number)}
+        except ValueError:
+            raise UsageError(f"pairs=window:N takes a whole number of images; got {str(value)!r}") from None
+    if not Path(value).is_file():
+        known = "all, overlap, window:N, or a file of pairs"
+        raise UsageError(f"pairs takes {known}; there is no file {str(value)!r}")
+    return {_KIND: "listed-pairs", "listed": read_pairs(Path(value))}
 
 
 def config_from_toml(
@@ -45,7 +132,7 @@ def config_from_toml(
         raise UsageError("the configuration is nested too deeply") from None
     name = tables.pop("preset", None)
     if name is not None and not fixed_preset:
-        base = preset(name)
+        base = _preset(name)
     base = base or PipelineConfig()
     for change in changes:
         tables = _merged_stages(tables, change, base)
@@ -58,7 +145,7 @@ def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: Pipe
     for stage, table in over.items():
         old = under.get(stage)
         if isinstance(old, Mapping) and isinstance(table, Mapping):
-            kind = old.get(_KIND, kind_of(stage, getattr(base, stage))) if stage in KINDS else None
+            kind = old.get(_KIND, _kind_of(stage, getattr(base, stage))) if stage in KINDS else None
             merged[stage] = table if table.get(_KIND, kind) != kind else _merged(old, table)
         else:
             merged[stage] = table
@@ -93,31 +180,63 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
     if stage not in KINDS:
         return dataclass_from_table(type(current), table, stage, current)
     fields = {key: value for key, value in table.items() if key != _KIND}
-    kind = table.get(_KIND, kind_of(stage, current))
-    if not isinstance(kind, str) or (kind not in KINDS[stage] and type(current).__name__ != kind):
-        raise UsageError(unknown_word(f"kind of {stage}", kind, KINDS[stage]))
-    variant = KINDS[stage].get(kind, type(current))
-    names = [item.name for item in dataclasses.fields(variant)]
+    own = _kind_of(stage, current)
+    kind = table.get(_KIND, own)
+    method = current
+    if kind != own or kind in KINDS[stage]:
+        method = _method_of_kind(stage, kind, current)
+    if isinstance(method, type) and not dataclasses.is_dataclass(method) and not fields:
+        return method()
+    variant = method if isinstance(method, type) else type(method)
+    if not dataclasses.is_dataclass(variant):
+        if fields:
+            raise UsageError(f"{stage}.kind={kind} has no settings; got {stage}.{next(iter(fields))}")
+        return method
+    names = _settings_of(variant)
     for key in fields:
         if key not in names:
             raise unknown_setting(stage, key, [_KIND, *names])
-    return dataclass_from_table(variant, fields, stage, current if type(current) is variant else None)
+    return dataclass_from_table(variant, fields, stage, None if isinstance(method, type) else method)
 
 
-def tables_from_settings(settings: Sequence[str]) -> Table:
-    """Parse the texts of ``--set``, ``stage.field=value``; later ones override."""
+def _method_of_kind(stage: str, kind: Any, current: Any) -> Any:
+    """The class of a word, or what ``file.py:name`` names; the current object if it has this kind."""
+    if is_reference(kind):
+        return load_reference(kind, f"{stage}.{_KIND}")
+    if isinstance(kind, str) and kind.endswith(NOT_IN_A_FILE):
+        name = kind.removesuffix(NOT_IN_A_FILE)
+        raise UsageError(
+            f"{stage}: the function {name} was defined in a running program and cannot be loaded; put it in "
+            f"a file and set {stage}.kind=path/to/file.py:{name}, or pass it to reconstruct in Python"
+        )
+    if not isinstance(kind, str) or kind not in KINDS[stage]:
+        known = unknown_word(f"kind of {stage}", kind, KINDS[stage])
+        raise UsageError(f"{known}; code in a file is path/to/file.py:name")
+    variant = KINDS[stage][kind]
+    return current if type(current) is variant else variant
+
+
+def tables_from_settings(settings: Settings) -> Table:
+    """Parse settings, ``{"stage.field": value}`` or texts ``stage.field=value``; later ones override."""
+    if isinstance(settings, str):
+        raise UsageError(f"set takes a mapping or a list of stage.field=value; got {in_words(settings)}")
     tables: Table = {}
-    for setting in settings:
-        place, equals, text = setting.partition("=")
-        path = place.strip().split(".")
-        if not equals or not 2 <= len(path) <= _MAX_DEPTH or not all(path):
+    items = settings.items() if isinstance(settings, Mapping) else (_parse_setting(text) for text in settings)
+    for place, value in items:
+        path = place.strip().split(".") if isinstance(place, str) else []
+        if not 2 <= len(path) <= _MAX_DEPTH or not all(path):
             example = "for example features.kind=harris-corners"
-            raise UsageError(f"--set takes stage.field=value, {example}; got {in_words(setting)}")
-        value = _parse(text)
+            option = "set" if isinstance(settings, Mapping) else "--set"
+            raise UsageError(f"{option} takes stage.field=value, {example}; got {in_words(place)}")
         for key in reversed(path):
             value = {key: value}
         tables = _merged(tables, value)
     return tables
+
+
+def _parse_setting(setting: Any) -> tuple[str, Any]:
+    place, equals, text = setting.partition("=") if isinstance(setting, str) else ("", "", "")
+    return (place, _parse(text)) if equals else (setting, None)
 
 
 def _parse(text: str) -> Any:
@@ -140,22 +259,40 @@ def _parse_plain(text: str) -> Any:
     return text.strip("\"'")
 
 
+def _kind_of(stage: str, variant: Any) -> str:
+    """The word for a method in text: that of ``KINDS``, else its file and name."""
+    return next((k for k, cls in KINDS[stage].items() if cls is type(variant)), None) or text_of(variant)
+
+
 def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
     """Return the complete configuration as plain tables."""
     stages = {item.name: getattr(config, item.name) for item in dataclasses.fields(config)}
-    kinds = {stage: {_KIND: kind_of(stage, stages[stage])} for stage in KINDS}
+    kinds = {stage: {_KIND: _kind_of(stage, stages[stage])} for stage in KINDS}
     return {stage: kinds.get(stage, {}) | table_from_dataclass(value) for stage, value in stages.items()}
 
 
 def table_from_dataclass(value: Any) -> Table:
-    """Convert a dataclass to a table; one of several dataclasses gives a table that begins with ``kind``."""
-    hints = typing.get_type_hints(type(value))
+    """Convert a dataclass to a table; one of several dataclasses gives a table that begins with ``kind``.
+
+    The settings of an object that is no dataclass are not known: its table is empty.
+    """
+    if not dataclasses.is_dataclass(value):
+        return {}
+    hints = _hints(type(value))
     table = {}
     for name in _settings_of(type(value)):
         content, several = getattr(value, name), _alternatives(typing.get_args(hints[name]))
         head = {_KIND: _word_of(type(content))} if type(content) in several.values() else {}
         table[name] = head | _plain(content) if head else _plain(content)
     return table
+
+
+def _hints(kind: type[Any]) -> dict[str, Any]:
+    """Types of the fields, or the text of each where it cannot be evaluated, as at a prompt."""
+    try:
+        return typing.get_type_hints(kind)
+    except NameError:
+        return {item.name: item.type for item in dataclasses.fields(kind)}
 
 
 def _settings_of(kind: type[Any]) -> list[str]:
@@ -179,12 +316,16 @@ def _plain(value: Any) -> Any:
         return table_from_dataclass(value)
     if isinstance(value, tuple):
         return [_plain(v) for v in value]
-    return _NONE if value is None else value
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str | list | dict):
+        return _NONE if value is None else value
+    return type(value).__name__
 
 
 def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, base: T | None = None) -> T:
     """Build a dataclass from a table; ``where`` is its name in messages, ``base`` supplies other fields."""
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     names = _settings_of(kind)
     changes = {}
     for key, value in table.items():
@@ -203,6 +344,7 @@ def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any
 
     An int is accepted for a float, never the reverse; text is never accepted for a number.
     """
+    value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         if value is None or value == _NONE:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from thesisrecon._settings import Config, as_config
 from thesisrecon.alignment import align_to_positions, scaled
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.comparison import ModelComparison, compare_models
-from thesisrecon.config import PipelineConfig, with_images
+from thesisrecon.config import PipelineConfig
 from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
 from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal
@@ -40,7 +41,7 @@ from thesisrecon.records import (
 )
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import stream
-from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
+from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine, with_images
 from thesisrecon.view_interpolation import interpolate_view
 from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
@@ -56,7 +57,7 @@ __all__ = [
 
 
 def match_rectified(
-    left: ImageInput, right: ImageInput, *, max_disparity_px: float, config: PipelineConfig | None = None
+    left: ImageInput, right: ImageInput, *, max_disparity_px: float, config: Config | None = None
 ) -> DisparityMap:
     """Compute the disparity map of a rectified pair (2.5).
 
@@ -67,7 +68,7 @@ def match_rectified(
         to 255 with NaN for missing pixels; of one size.
     max_disparity_px : float
         Largest disparity; x_right = x_left - d with d from 0 to this.
-    config : PipelineConfig, optional
+    config : PipelineConfig, str or path, optional
         The matcher is ``config.dense.pairs``; None: the preset ``default``.
 
     Returns
@@ -86,7 +87,7 @@ def match_rectified(
     6.0
     """
     images = [side if isinstance(side, np.ndarray) else _full_size(side) for side in (left, right)]
-    dense = (config or PipelineConfig()).dense
+    dense = as_config(config).dense
     return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)
 
 
@@ -97,7 +98,7 @@ def _full_size(path: ImageInput) -> np.ndarray:
 def self_calibrate(
     reconstruction: Reconstruction,
     *,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
     images: Sequence[Image] = (),
     seed: int = 0,
 ) -> SelfCalibration:
@@ -107,7 +108,7 @@ def self_calibrate(
     ----------
     reconstruction : Reconstruction
         Projective reconstruction of at least three views.
-    config : PipelineConfig, optional
+    config : PipelineConfig, str or path, optional
         ``config.selfcalibration`` is the method, ``config.intrinsics`` the prior knowledge; by default images
         of one size share one camera.
     images, seed : sequence of Image, int
@@ -148,7 +149,7 @@ def self_calibrate(
     """
     if reconstruction.stratum != "projective":
         raise ValueError(f"self_calibrate takes a projective reconstruction; got {reconstruction.stratum}")
-    config = config or PipelineConfig()
+    config = as_config(config)
     prior = prior_for(reconstruction, config.intrinsics)
     method, rng = with_images(config.selfcalibration, images), stream(seed, "selfcalibration")
     return method.calibrate(reconstruction, prior=prior, rng=rng)
@@ -158,7 +159,7 @@ def upgrade_affine(
     reconstruction: Reconstruction,
     plane: F64 | None = None,
     *,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
     images: Sequence[Image] = (),
     seed: int = 0,
 ) -> Reconstruction:
@@ -204,7 +205,7 @@ def upgrade_affine(
     if reconstruction.stratum != "projective":
         raise ValueError(f"upgrade_affine takes a projective reconstruction; got {reconstruction.stratum}")
     if plane is None:
-        config = config or PipelineConfig()
+        config = as_config(config)
         method = with_images(config.selfcalibration, images)
         rng = stream(seed, "selfcalibration")
         prior = prior_for(reconstruction, config.intrinsics)

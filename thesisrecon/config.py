@@ -6,9 +6,12 @@ Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis).
 
 from __future__ import annotations
 
+import logging
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,7 +19,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.verification import PairVerification
-from thesisrecon.errors import UsageError, unknown_word
+from thesisrecon.errors import UsageError, in_words, unknown_word
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
@@ -25,6 +28,7 @@ from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, MapAll, O
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.plug_ins import FunctionMatcher, as_method
 from thesisrecon.projective.factorization import Factorization
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.projective.sequential import SequentialProjective
@@ -251,23 +255,6 @@ class SelfCalibrator(Protocol):
         """
 
 
-def with_images(method: SelfCalibrator, images: Sequence[Image]) -> SelfCalibrator:
-    """Give the images to a self-calibration method that detects parallel lines in them.
-
-    Parameters
-    ----------
-    method, images : SelfCalibrator, sequence of Image
-        Any method, and one image per view or none.
-
-    Returns
-    -------
-    SelfCalibrator
-        The method with the images, or unchanged if it does not use them.
-    """
-    given = getattr(method, "with_images", None)
-    return method if given is None or not images else cast(SelfCalibrator, given(images))
-
-
 class MetricRefiner(Protocol):
     """Refine the metric model: missing cameras, bundle adjustment, intervals and self-check."""
 
@@ -289,11 +276,8 @@ class MetricRefiner(Protocol):
         """
 
 
-class DepthEstimator(Protocol):
-    """Estimate depth maps one view at a time (2.5).
-
-    ``scene`` has all views, or those of ``required_views``.
-    """
+class StereoMatcher(Protocol):
+    """Match two views; :func:`thesisrecon.reconstruct` does not need it."""
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap:
         """Compute the disparities of a rectified pair.
@@ -323,6 +307,10 @@ class DepthEstimator(Protocol):
         RectifiedPair
             Rectified images and disparities of both.
         """
+
+
+class DepthEstimator(StereoMatcher, Protocol):
+    """Estimate depth maps one view at a time (2.5); ``scene`` has all or the ``required_views``."""
 
     def prepare(
         self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
@@ -421,7 +409,10 @@ class PipelineConfig:
     images, intrinsics : ImageOptions, IntrinsicsOptions
         How images are read, and prior knowledge of the cameras.
     features, pairs, matching, ... : Detector, PairSelector, Matcher, ...
-        The method of each stage; its ``Protocol`` states what the stage calls.
+        The method of each stage: any object with the methods of its ``Protocol``. The stages ``features``,
+        ``pairs``, ``matching`` and ``epipolar`` also take a plain function (:mod:`thesisrecon.plug_ins`).
+
+        A method that does not fit is a ``UsageError``.
 
     Examples
     --------
@@ -430,6 +421,8 @@ class PipelineConfig:
     >>> config = PipelineConfig(images=ImageOptions(max_size_px=800))
     >>> type(config.epipolar).__name__
     'LocallyOptimisedRansac'
+    >>> type(PipelineConfig(matching=lambda image1, image2: ([], [])).matching).__name__
+    'FunctionMatcher'
     """
 
     images: ImageOptions = ImageOptions()
@@ -447,6 +440,22 @@ class PipelineConfig:
     metric: MetricRefiner = field(default_factory=MetricRefinement)
     dense: DepthEstimator = field(default_factory=MultiViewStereo)
     model: ModelBuilder = field(default_factory=SurfaceModel)
+
+    def __post_init__(self) -> None:
+        for stage, kind in _stage_types().items():
+            value = getattr(self, stage)
+            if stage in KINDS:
+                object.__setattr__(self, stage, as_method(stage, value, kind))
+            elif not isinstance(value, kind):
+                raise UsageError(f"{stage} takes {kind.__name__}(...); got {in_words(value)}")
+        if isinstance(self.matching, FunctionMatcher) and self.tracks == AlignedTracks():
+            logging.getLogger(__name__).info("matches of a function are not aligned: tracks=PlainTracks()")
+            object.__setattr__(self, "tracks", PlainTracks())
+
+
+@cache
+def _stage_types() -> dict[str, type[Any]]:
+    return typing.get_type_hints(PipelineConfig)
 
 
 PRESETS: Mapping[str, PipelineConfig] = {
@@ -488,19 +497,3 @@ def preset(name: Any) -> PipelineConfig:
     if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(unknown_word("preset", name, PRESETS))
     return PRESETS[name]
-
-
-def kind_of(stage: str, variant: Any) -> str:
-    """Return the word for a method in text.
-
-    Parameters
-    ----------
-    stage, variant : str, object
-        Field of the config, and the method.
-
-    Returns
-    -------
-    str
-        Its word in :data:`KINDS`, else its class name.
-    """
-    return next((k for k, cls in KINDS[stage].items() if cls is type(variant)), type(variant).__name__)

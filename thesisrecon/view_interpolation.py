@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
@@ -35,7 +36,7 @@ def interpolate_view(
     s: float,
     *,
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
 ) -> U8:
     """Interpolate the view between two rectified images (thesis, section 1.2; Seitz and Dyer 1995).
 
@@ -48,7 +49,7 @@ def interpolate_view(
     disparity : ndarray (H, W), DisparityMap or tuple of both sides, optional
         Disparities of the left image, x_right = x_left - d, NaN = unknown; those of the right image add what
         only it shows. Matched by ``config.dense`` if None.
-    config : PipelineConfig, optional
+    config : PipelineConfig, str or path, optional
         The default configuration if None.
 
     Returns
@@ -85,7 +86,7 @@ def prepare_rectified_pair(
     right: Any,
     *,
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
 ) -> InterpolatedPair:
     """Prepare two rectified images for any number of views between them.
 
@@ -104,7 +105,7 @@ def prepare_rectified_pair(
     if shapes[0] != shapes[1]:
         raise ValueError(f"rectified images must have one size; got {shapes[0]} and {shapes[1]}")
     if disparity is None:
-        config = config or PipelineConfig()
+        config = as_config(config)
         most = _largest_disparity(*images, config)
         maps = match_both_sides(partial(config.dense.match_rectified, max_disparity_px=most), *images)
     elif isinstance(disparity, tuple):
@@ -155,7 +156,7 @@ def _reduced(image: U8) -> F32:
 
 
 def prepare_pair(
-    first: Image, second: Image, *, config: PipelineConfig | None = None, seed: int = 0
+    first: Image, second: Image, *, config: Config | None = None, seed: int = 0
 ) -> InterpolatedPair:
     """Match and rectify two images of any pose for any number of views between them.
 
@@ -165,7 +166,7 @@ def prepare_pair(
     ----------
     first, second : Image
         Images of one size.
-    config, seed : PipelineConfig, int
+    config, seed : PipelineConfig or str or path, int
         Configuration (None: the default) and random seed.
 
     Returns
@@ -180,7 +181,7 @@ def prepare_pair(
         moved forwards: epipolar lines then cannot become rows, and every view in between is one of the
         images, scaled.
     """
-    config = config or PipelineConfig()
+    config = as_config(config)
     require_comparable_images((first, second))
     pair = match_pair(first.rgb, second.rgb, config=config, seed=seed)
     _require_sideways_motion(pair, (first, second))

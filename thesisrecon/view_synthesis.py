@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.camera_matrix import calibration_matrix
@@ -30,16 +31,14 @@ class MatchedImages:
     exif_focal_px: F64  #: (2,) of the originals, NaN = unknown
 
 
-def match_images(
-    image1: Any, image2: Any, *, config: PipelineConfig | None = None, seed: int = 0
-) -> MatchedImages:
+def match_images(image1: Any, image2: Any, *, config: Config | None = None, seed: int = 0) -> MatchedImages:
     """Match two images sparsely and densely.
 
     Parameters
     ----------
     image1, image2 : str, Path, ndarray (H, W, 3) uint8 or Image
         The images.
-    config, seed : PipelineConfig, int
+    config, seed : PipelineConfig or str or path, int
         Configuration (None: the default) and random seed.
 
     Returns
@@ -52,7 +51,7 @@ def match_images(
     UsageError, StageFailure
         If a file does not exist or cannot be read; if the images do not match or show no parallax.
     """
-    config = config or PipelineConfig()
+    config = as_config(config)
     read = [read_image(source, max_size_px=config.images.max_size_px) for source in (image1, image2)]
     first, second = (found.images[0] for found in read)
     pair = match_pair(first, second, config=config, seed=seed)
@@ -62,7 +61,7 @@ def match_images(
 
 
 def prepare_trilinear_views(
-    found: MatchedImages, *, K: ArrayLike | None = None, config: PipelineConfig | None = None
+    found: MatchedImages, *, K: ArrayLike | None = None, config: Config | None = None
 ) -> TensorSynthesis:
     """Prepare two matched images for views of any camera by the trilinear tensor (section 1.3).
 
@@ -74,7 +73,7 @@ def prepare_trilinear_views(
         Intrinsics of both images, in pixels of the given images. If None, the prior of ``config.intrinsics``;
         without a focal length there, a typical one: the views are then correct up to a projective
         transformation of space.
-    config : PipelineConfig, optional
+    config : PipelineConfig, str or path, optional
         The default configuration if None.
 
     Returns
@@ -87,7 +86,7 @@ def prepare_trilinear_views(
     StageFailure
         If the matches contradict F, or no solution has the scene in front of both cameras.
     """
-    config = config or PipelineConfig()
+    config = as_config(config)
     K1, K2 = _intrinsics(found, K, config)
     pair = pair_from_fundamental(found.pair.F, found.pair.xy1, found.pair.xy2, K1=K1, K2=K2)
     first, second = found.images
@@ -102,7 +101,7 @@ def synthesize_view(
     translation: ArrayLike,
     *,
     K: ArrayLike | None = None,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
     seed: int = 0,
 ) -> U8:
     """Compute the view of a virtual camera from two images by the trilinear tensor (section 1.3).
@@ -116,7 +115,7 @@ def synthesize_view(
         units of the distance between the two cameras. R = I and t = 0 reproduce the second image.
     K : array_like (3, 3) or (2, 3, 3), optional
         Intrinsics, as in :func:`prepare_trilinear_views`.
-    config, seed : PipelineConfig, int
+    config, seed : PipelineConfig or str or path, int
         Configuration (None: the default) and random seed of the matching.
 
     Returns

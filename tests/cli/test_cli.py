@@ -12,12 +12,11 @@ from pathlib import Path
 import pytest
 
 from tests.fake_stages import kept_bytes, read
+from thesisrecon._settings import build_config
 from thesisrecon.cli import common
-from thesisrecon.cli import runs as cli
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.runs import _duration, _intrinsic_lines
 from thesisrecon.io import _images
-from thesisrecon.matching.pair_selection import AllPairs, OverlapEstimate, SequenceWindow
 
 ROOT = Path(__file__).parents[2]
 COURTYARD = ROOT / "fixtures" / "courtyard"
@@ -185,8 +184,8 @@ def test_the_focal_length_is_given_as_in_the_readme(photographs, tmp_path, monke
     assert f"`{words}`" in (ROOT / "README.md").read_text(encoding="utf-8")
     asked = []
 
-    def listen(*_, config, **__):
-        asked.append(config.intrinsics)
+    def listen(*_, set, **__):
+        asked.append(build_config(settings=set).intrinsics)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", listen)
@@ -253,14 +252,6 @@ def test_help_and_version(capsys):
 def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_path, refused):
     monkeypatch.setattr(_images, "files", lambda _: tmp_path / "thesisrecon")
     assert str(tmp_path / "thesisrecon" / "courtyard") in refused(["demo", "-o", tmp_path / "out"])
-
-
-@pytest.mark.parametrize(
-    ("knowledge", "kind"),
-    [("all", AllPairs()), ("overlap", OverlapEstimate()), ("window:3", SequenceWindow(3))],
-)
-def test_the_pairs_of_the_command_are_those_of_the_settings(knowledge, kind):
-    assert cli._config(None, None, cli._option_tables(None, None, knowledge), []).pairs == kind
 
 
 def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, capsys, refused):

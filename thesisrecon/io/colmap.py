@@ -32,7 +32,7 @@ _TRACK_ENTRY = np.dtype([("image", "<u4"), ("row", "<u4")])
 
 
 def write_colmap_model(
-    folder: Path,
+    folder: str | Path,
     reconstruction: Reconstruction,
     names: Sequence[str],
     *,
@@ -48,7 +48,7 @@ def write_colmap_model(
 
     Parameters
     ----------
-    folder : Path
+    folder : path
         Created if necessary; the same reconstruction gives the same bytes.
     reconstruction : Reconstruction
         Metric, with K and distortion.
@@ -91,16 +91,16 @@ def write_colmap_model(
         seen = project_camera(r.K[i], R, t, _points(r.X[point[here]]), distortion=r.distortion[i])
         distance[here] = np.linalg.norm((seen - xy[here]) * scales[i], axis=1)
     observed = _Observations(view, point, (xy + _PIXEL_CENTRE) * scales[view, None], distance)
-    _write(folder, posed, observed, np.unique(point), (r.X, colors))
+    _write(Path(folder), posed, observed, np.unique(point), (r.X, colors))
     return 0
 
 
-def write_sparse_model(folder: Path, model: SparseModel, *, pinhole: bool = False) -> None:
+def write_sparse_model(folder: str | Path, model: SparseModel, *, pinhole: bool = False) -> None:
     """Write a sparse model as a binary COLMAP model; views of equal intrinsics share a camera.
 
     Parameters
     ----------
-    folder, model : Path, SparseModel
+    folder, model : path, SparseModel
         Views with K, size and known distortion, without skew; view i becomes image i + 1, and point j,
         observed or not, point j + 1.
     pinhole : bool
@@ -119,7 +119,7 @@ def write_sparse_model(folder: Path, model: SparseModel, *, pinhole: bool = Fals
         distance[here] = np.linalg.norm(seen - model.xy[here], axis=1)
     observed = _Observations(model.view_index, model.point_index, model.xy + _PIXEL_CENTRE, distance)
     Xh = np.column_stack([model.X, np.ones(len(model.X))])
-    _write(folder, posed, observed, np.arange(len(Xh)), (Xh, colors_of(model)))
+    _write(Path(folder), posed, observed, np.arange(len(Xh)), (Xh, colors_of(model)))
 
 
 def has_skew(K: F64) -> B8:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -214,10 +215,10 @@ class PlainTracks:
         """See `thesisrecon.config.TrackBuilder.build`."""
         del rng
         accepted = _best_first(pairs)
-        if any((p.index1 < 0).any() or (p.index2 < 0).any() for p in accepted):
+        features = [getattr(p, "features", None) for p in prepared] if _numbered(accepted) else [None]
+        corners = [found.xy for found in features if found is not None]
+        if len(corners) < len(prepared):
             corners, accepted = corners_from_matches(accepted, len(prepared), self.merge_px)
-        else:
-            corners = [p.features.xy for p in prepared]
         chains = _link_matches(corners, accepted)
         return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(prepared))
 
@@ -227,15 +228,18 @@ class AlignedTracks:
     """Tracks whose observations are aligned by least squares with the window of their middle view.
 
     The middle view of a track has most direct matches in it; local maps to the other views are chained along
-    the matches.
+    the matches. Matches without corners, and views that another matcher has prepared, give
+    :class:`PlainTracks`.
     """
 
     def build(
         self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
     ) -> Tracks:
         """See `thesisrecon.config.TrackBuilder.build`."""
-        del rng
         accepted = _best_first(pairs)
+        if not (_numbered(accepted) and isinstance(prepared[0], PreparedImage)):
+            logging.getLogger(__name__).warning("tracks are not aligned: the matcher prepares no windows")
+            return PlainTracks().build(prepared, pairs, rng)
         chains = _link_matches([p.features.xy for p in prepared], accepted)
         start, affine, middle = _affines_from_middle_view(chains, accepted)
         xy, kept = start.copy(), np.ones(len(start), np.bool_)
@@ -245,6 +249,11 @@ class AlignedTracks:
             found, _, score = align_corners(view1, prepared[j], matches, affine_std=AFFINE_STD)
             xy[group], kept[group] = found, score >= MIN_CORRELATION
         return _tracks(chains, xy, kept, len(prepared))
+
+
+def _numbered(pairs: Sequence[TwoView]) -> bool:
+    """Whether all matches are between corners."""
+    return not any((p.index1 < 0).any() or (p.index2 < 0).any() for p in pairs)
 
 
 def corners_from_matches(

@@ -7,18 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.config import PipelineConfig
+from thesisrecon._settings import Config, as_config
+from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._images import read_image
+from thesisrecon.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.records import Image, Matches, TwoView
 from thesisrecon.runtime._run import stream
 
+OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
 ImageInput = str | Path | np.ndarray | Image
 """A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
 
 
 def match_pair(
-    image1: ImageInput, image2: ImageInput, *, config: PipelineConfig | None = None, seed: int = 0
+    image1: ImageInput, image2: ImageInput, *, config: Config | None = None, seed: int = 0
 ) -> TwoView:
     """Match two images and estimate their fundamental matrix (4.2 and chapter 5).
 
@@ -26,8 +29,8 @@ def match_pair(
     ----------
     image1, image2 : path, ndarray (H, W) or (H, W, 3) uint8, or Image
         The two images.
-    config : PipelineConfig, optional
-        Settings; None: the preset ``default``.
+    config : PipelineConfig, str or path, optional
+        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
     seed : int
         Random seed.
 
@@ -52,7 +55,7 @@ def match_pair(
     >>> pair.F.shape, len(pair.xy1) > 60
     ((3, 3), True)
     """
-    config = config or PipelineConfig()
+    config = as_config(config)
     size = config.images.max_size_px
     images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
     views = [config.matching.prepare(image, config.features.detect(image)) for image in images]
@@ -69,6 +72,8 @@ def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int,
         matches = config.matching.match(
             view1, view2, pair=pair, estimate_fundamental=config.epipolar.estimate, rng=rng
         )
+        if type(config.matching) not in OWN_MATCHERS:
+            matches = matches_of(config.matching, matches, pair, (view1, view2))
     except StageFailure as failure:
         return _rejected_pair(pair, 0, str(failure))
     return verify_matches(config, matches, seed, rng)

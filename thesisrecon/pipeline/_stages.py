@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon._code_digest import code_digest
 from thesisrecon.camera import Camera
-from thesisrecon.config import PipelineConfig, with_images
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.pipeline._image_pair import match_views
@@ -33,6 +33,7 @@ from thesisrecon.records import (
 )
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Batch, stream
+from thesisrecon.selfcalibration.stratified import with_images
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render

@@ -12,8 +12,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F64, I64
-from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._colmap_database import read_database
 from thesisrecon.io._images import DecodedImage, ImageSet, images_folder, read_image
@@ -45,7 +45,7 @@ def reconstruct_from_matches(
     *,
     names: Sequence[str] | None = None,
     images: str | Path | Sequence[Any] | None = None,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
@@ -114,7 +114,7 @@ def reconstruct_from_tracks(
     *,
     names: Sequence[str] | None = None,
     images: str | Path | Sequence[Any] | None = None,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
@@ -165,7 +165,7 @@ def reconstruct_from_colmap(
     out: str | Path | None = None,
     *,
     images: str | Path | Sequence[Any] | None = None,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
@@ -428,12 +428,12 @@ def _reconstruct(
     given: Given,
     views: _Views,
     out: str | Path | None,
-    config: PipelineConfig | None,
+    config: Config | None,
     seed: int,
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> RunResult:
-    config = config or PipelineConfig()
+    config = as_config(config)
     if isinstance(config.tracks, AlignedTracks):
         # There are no prepared images to align the observations with.
         config = replace(config, tracks=PlainTracks())

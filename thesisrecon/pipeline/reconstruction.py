@@ -7,8 +7,8 @@ from typing import Unpack
 
 import numpy as np
 
+from thesisrecon._settings import Config, Pairs, Settings, build_config
 from thesisrecon.arrays import F64
-from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
@@ -24,7 +24,12 @@ def reconstruct(
     images: ImageSource,
     out: str | Path,
     *,
-    config: PipelineConfig | None = None,
+    config: Config | None = None,
+    preset: str | None = None,
+    max_size: int | None = None,
+    cameras: str | None = None,
+    pairs: Pairs | None = None,
+    set: Settings = (),
     seed: int = 0,
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
@@ -37,8 +42,18 @@ def reconstruct(
         A folder, or the images.
     out : path
         Output folder: created if missing, resumed if it holds the same run.
-    config : PipelineConfig, optional
-        Settings; None: the preset ``default``.
+    config : PipelineConfig, str or path, optional
+        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
+    preset : {"default", "thesis"}, optional
+        Pipeline to start from.
+    max_size : int, optional
+        Long side (px) to which larger images are reduced (1600).
+    cameras : {"shared", "per-image"}, optional
+        One camera per image size (default), or one per image.
+    pairs : str, path or list of (str, str), optional
+        "all", "overlap", "window:N", a file of pairs, or pairs of file names.
+    set : mapping or list of str
+        Single settings: ``{"matching.ratio": 0.7}`` or ``["matching.ratio=0.7"]``.
     seed : int
         Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
         workers.
@@ -59,7 +74,8 @@ def reconstruct(
     Raises
     ------
     UsageError
-        If there are no images, the output folder cannot be used, or the workers are lost.
+        If there are no images, options contradict each other, the output folder cannot be used, or the
+        workers are lost.
     StageFailure
         If the images cannot be reconstructed; intermediate results, summary and report are in ``out``.
 
@@ -75,7 +91,10 @@ def reconstruct(
     >>> len(result.features), result.failure
     (2, '')
     """
-    until, run, overwrite = start_run(out, config or PipelineConfig(), seed, progress, options)
+    chosen = build_config(
+        config, preset=preset, max_size=max_size, cameras=cameras, pairs=pairs, settings=set
+    )
+    until, run, overwrite = start_run(out, chosen, seed, progress, options)
     if isinstance(images, str | Path):
         if not list_images(Path(images)):
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
@@ -85,10 +104,10 @@ def reconstruct(
     surface_required = options.get("until") is not None
     with claimed(run, overwrite=overwrite):
         inputs = _read_inputs(run, images)
-        pairs = run.config.pairs
-        if isinstance(pairs, ListedPairs) and until != "features" and len(inputs.images) >= 2:
+        listed = run.config.pairs
+        if isinstance(listed, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
-            pairs.check([image.name for image in inputs.images], inputs.refused)
+            listed.check([image.name for image in inputs.images], inputs.refused)
         state = PipelineState(run, inputs, empty_result(run, inputs), until)
         run.directory.adopt(identity_of(run, inputs), overwrite=overwrite, results=RESULT_FILES)
         return run_steps(state, STEPS[until], surface_required=surface_required)

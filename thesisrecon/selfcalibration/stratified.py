@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, Linear
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
+
+M = TypeVar("M")
 
 # Number of closed-form candidates to refine.
 _MAX_REFINED = 3
@@ -202,3 +205,20 @@ def _facing(affine: Reconstruction) -> F64:
     depth = np.einsum("kj,kj->k", affine.P[view, 2], affine.X[point])
     balance = np.bincount(view, np.sign(depth), minlength=len(affine.P))
     return affine.P * np.where(balance < 0.0, -1.0, 1.0)[:, None, None]
+
+
+def with_images(method: M, images: Sequence[Image]) -> M:
+    """Give the images to a self-calibration method that detects parallel lines in them.
+
+    Parameters
+    ----------
+    method, images : SelfCalibrator, sequence of Image
+        Any method, and one image per view or none.
+
+    Returns
+    -------
+    SelfCalibrator
+        The method with the images, or unchanged if it does not use them.
+    """
+    given = getattr(method, "with_images", None)
+    return method if given is None or not images else cast(M, given(images))
