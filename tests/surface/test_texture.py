@@ -8,6 +8,7 @@ import pytest
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
+from thesisrecon.io._meshes import write_mesh
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import _texture_kernels as kernels
 from thesisrecon.surface._mesh import face_neighbours, vertex_normals
@@ -39,6 +40,16 @@ def test_a_new_view_shows_the_painted_sphere(sphere):
     mesh = TextureAtlas().texture(sphere, [photograph(m) for m in ring_of()])
     assert mesh.untextured.mean() < 0.05
     assert np.sqrt(np.mean(difference(mesh) ** 2)) < 6.0
+
+
+def test_a_model_of_noisy_depths_is_a_small_file(tmp_path):
+    views = ring_of()
+    noisy = [sphere_map(m.view, m.P, noise=0.01) for m in views]
+    mesh = SurfaceModel().build(noisy, [photograph(m) for m in views])
+    write_mesh(tmp_path / "model.glb", mesh)
+    # 12 bytes for the corners of a face, 20 for a vertex (a sixth are repeated on seams), and the texture.
+    assert len(mesh.faces) < 4300
+    assert (tmp_path / "model.glb").stat().st_size < 28 * len(mesh.faces)
 
 
 def test_hidden_and_cut_off_points_are_not_visible(sphere):

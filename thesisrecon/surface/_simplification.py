@@ -1,7 +1,8 @@
 """Simplification of a mesh: edges collapse within an error limit at each vertex (Garland and Heckbert 1997).
 
 A vertex keeps the squared distances to the planes of all faces it replaces as a quadratic form. An edge
-collapses to the point with the smallest sum if the root mean square stays below the limit.
+collapses to the point with the smallest sum if the root mean square stays below the limit. Then each vertex
+moves by the mean distance of the original vertices from the faces around it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I32, I64, U8
+from thesisrecon.arrays import F32, F64, I32, I64, U8
 from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface._mesh import face_areas, remove_unused_vertices, simplify_mesh
@@ -24,8 +25,10 @@ ROUNDS = 2
 """Rounds, each with blocks across another axis."""
 PASSES = 10
 """Passes over the faces, the limit rising evenly; one vertex takes part in one collapse of a pass."""
-BORDER_WEIGHT = 1.0
+BORDER_WEIGHT = 0.3
 """Weight of the planes that keep the borders in place, relative to that of the faces."""
+FITTED_POINTS = 0.3
+"""Original vertices, counted by their share in a new one, that it needs to be moved."""
 TOWARDS_MIDDLE = 1e-3
 """Weight of the middle of the edge where planes leave directions undetermined."""
 MAX_TURN = 0.5
@@ -44,7 +47,8 @@ class MeshState(NamedTuple):
     ``points`` (N, 3); ``planes`` (N, 11): sum of n n' (upper triangle), n d and d^2 of the planes n x = d,
     weighted, and the sum of the face areas; ``limit`` (N,) squared; ``border`` (N,) 1 on borders; ``faces``
     (M, 3), removed ones begin with -1; ``first`` (N,) corner 3 m + k of each vertex and ``following`` (3M,)
-    its next corner, -1 for none; ``block`` (N,) of a vertex with all of its faces in one block, else -1.
+    its next corner, -1 for none; ``block`` (N,) of a vertex with all of its faces in one block, else -1;
+    ``into`` (N,) the vertex that replaced one, or itself.
     """
 
     points: F64
@@ -55,6 +59,7 @@ class MeshState(NamedTuple):
     first: I32
     following: I32
     block: I32
+    into: I32
 
 
 @kernel
@@ -274,6 +279,7 @@ def _merge(mesh: MeshState, v: int, w: int, planes: F64, point: F64) -> None:
         mesh.points[v, d] = point[d]
     for n in range(11):
         mesh.planes[v, n] = planes[n]
+    mesh.into[w] = v
     mesh.limit[v] = min(mesh.limit[v], mesh.limit[w])
     mesh.border[v] = max(mesh.border[v], mesh.border[w])
     last = -1
@@ -296,6 +302,48 @@ def _merge(mesh: MeshState, v: int, w: int, planes: F64, point: F64) -> None:
         mesh.first[v] = -1
     else:
         mesh.following[last] = -1
+
+
+@kernel
+def sum_distances(mesh: MeshState, original: F32, total: F64) -> None:
+    """Sum the distances of the ``original`` vertices (N, 3) from the faces around those that replaced them.
+
+    ``total`` (N, 4) receives, at the corners of the faces, sums of distance times normal and of the weights,
+    the barycentric coordinates of points that lie over a face.
+    """
+    points, faces = mesh.points, mesh.faces
+    side, other, away, normal, across = empty(3), empty(3), empty(3), empty(3), empty(3)
+    for p in range(original.shape[0]):
+        v = p
+        while mesh.into[v] != v:
+            v = mesh.into[v]
+        corner = mesh.first[v]
+        while corner >= 0:
+            m = corner // 3
+            corner = mesh.following[corner]
+            for d in range(3):
+                side[d] = points[faces[m, 1], d] - points[faces[m, 0], d]
+                other[d] = points[faces[m, 2], d] - points[faces[m, 0], d]
+                away[d] = original[p, d] - points[faces[m, 0], d]
+            area = _cross(side, other, normal)
+            if not area > 0.0:
+                continue
+            second = _cross(away, other, across) * _dot(across, normal) / area
+            third = _cross(side, away, across) * _dot(across, normal) / area
+            if min(second, third, 1.0 - second - third) < 0.0:
+                continue
+            distance = _dot(away, normal)
+            for k in range(3):
+                share = 1.0 - second - third if k == 0 else (second if k == 1 else third)
+                for d in range(3):
+                    total[faces[m, k], d] += share * distance * normal[d]
+                total[faces[m, k], 3] += share
+            break
+
+
+@kernel
+def _dot(a: F64, b: F64) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def simplify_surface(
@@ -322,10 +370,11 @@ def simplify_surface(
     """
     size, centre = len(mesh.vertices), mesh.vertices.mean(axis=0)
     points = np.subtract(mesh.vertices, centre, out=mesh.vertices if overwrite else None)
+    original = points.astype(np.float32)
     state = _linked(MeshState(
         points, np.zeros((size, 11)), limit**2, np.zeros(size, np.uint8),
         mesh.faces.astype(np.int32, copy=not overwrite), np.empty(size, np.int32), np.empty(0, np.int32),
-        np.full(size, -1, np.int32),
+        np.full(size, -1, np.int32), np.arange(size, dtype=np.int32),
     ))  # fmt: skip
     sum_planes(state)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
@@ -337,6 +386,11 @@ def simplify_surface(
             state = state._replace(faces=state.faces[state.faces[:, 0] >= 0])
             if len(starts) == 2:
                 break
+    state = _linked(state._replace(planes=np.zeros((0, 11))))
+    total = np.zeros((size, 4))
+    sum_distances(state, original, total)
+    moved = total[:, 3] >= FITTED_POINTS
+    points[moved] += total[moved, :3] / total[moved, 3:]
     made = remove_unused_vertices(replace(mesh, vertices=points, faces=state.faces.astype(np.int64)))
     return replace(made, vertices=made.vertices + centre)
 
