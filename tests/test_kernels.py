@@ -60,6 +60,19 @@ def test_a_second_process_compiles_nothing(package):
     assert run_in(package, PYTHONHASHSEED="7") == ["8.0", "1"]
 
 
+def test_a_changed_variable_of_numba_leaves_the_level(package):
+    changed = """
+import os, numba, caller, callee
+values = [callee.inner(3.0)]
+os.environ["NUMBA_NUM_THREADS"] = "1"  # numba reads all its settings again when it compiles
+numba.njit(lambda x: x)(1.0)
+values.append(caller.outer(3.0))
+print(*values, sum(caller.outer.stats.cache_hits.values()))
+"""
+    assert run_in(package) == ["8.0", "0"]
+    assert run_in(package, changed) == ["4.0", "8.0", "1"]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "value"), [("x + OFFSET", "x - OFFSET", "4.0"), ("= 1.0", "= 2.0", "10.0")]
 )

@@ -58,9 +58,15 @@ PACKAGE = Path(__file__).parent
 
 _pickled: Callable[[Any], bytes] = dumps
 
-# Level 2 compiles a third faster than numba's default of 3.
-if "NUMBA_OPT" not in os.environ:
-    vars(numba.config)["OPT"] = type(vars(numba.config)["OPT"])(2)
+
+def _set_level() -> None:
+    """Compile at level 2, a third faster than numba's default of 3, unless NUMBA_OPT is set.
+
+    Numba's compiler resets its settings once any variable NUMBA_* has changed: that is done first.
+    """
+    numba.config.reload_config()
+    if "NUMBA_OPT" not in os.environ:
+        vars(numba.config)["OPT"] = type(vars(numba.config)["OPT"])(2)
 
 
 @overload
@@ -196,6 +202,7 @@ class KernelCache(NullCache):
 
         def compile_and_release(signature: Any) -> Any:
             before = set(self._locks)
+            _set_level()
             try:
                 with _without_garbage_collection():
                     return compile_signature(signature)
