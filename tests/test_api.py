@@ -6,13 +6,19 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pytest
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from tests import fake_stages as fakes
 from tests.conftest import refuses
-from tests.synthetic import reconstruction_of
+from tests.epipolar.pairs import make_pair
+from tests.synthetic import reconstruction_of, texture
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.two_view import epipolar_lines, fundamental_from_cameras, plane_homography
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._exports import _original_from_working
 from thesisrecon.records import Image, TexturedMesh, Tracks
@@ -139,3 +145,53 @@ def test_a_model_is_rendered_through_the_front_door():
     seen = thesisrecon.render(mesh, thesisrecon.Camera(K, np.eye(3), np.zeros(3), (32, 24)))
     assert seen.valid[12, 12]
     assert seen.depth[12, 12] == pytest.approx(2.0)
+
+
+def test_a_pair_is_rectified_and_matched_from_arrays():
+    """A plane in front of two turned cameras: rows correspond, and disparities are those of the matches."""
+    K = np.array([[300.0, 0.0, 127.5], [0.0, 300.0, 95.5], [0.0, 0.0, 1.0]])
+    R, t = Rotation.from_rotvec([0.02, -0.06, 0.1]).as_matrix(), np.array([-0.4, 0.05, 0.02])
+    P1, P2 = compose_camera(K, np.eye(3), np.zeros(3)), compose_camera(K, R, t)
+    H = plane_homography(P1, P2, np.array([0.1, 0.0, -1.0, 4.0]))
+    wall = texture(192, 256)
+    y, x = np.mgrid[:192.0, :256.0]
+    back = dehomogenize(homogenize(np.stack([x, y], axis=2).reshape(-1, 2)) @ np.linalg.inv(H).T)
+    right = map_coordinates(wall, back[:, ::-1].T, order=3, mode="nearest").reshape(192, 256)
+    left, right = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in (wall, right))
+    rng = np.random.default_rng(0)
+    X = np.column_stack([rng.uniform(-1.2, 1.2, (60, 2)), rng.uniform(3.0, 6.0, 60)])
+    xy1, xy2 = project(P1, X), project(P2, X)
+    F = fundamental_from_cameras(P1, P2)
+    pair = thesisrecon.rectify(left, right, F, xy1, xy2)
+    places = [pair.rectified_from_original(side, xy) for side, xy in enumerate((xy1, xy2))]
+    np.testing.assert_allclose(places[0][:, 1], places[1][:, 1], atol=1e-6)
+    disparity = places[0][:, 0] - places[1][:, 0]
+    assert disparity.min() >= 0.0
+    assert disparity.max() <= pair.max_disparity_px
+    np.testing.assert_allclose(pair.original_from_rectified(1, places[1]), xy2, atol=1e-6)
+    found = thesisrecon.match_rectified(pair.left, pair.right, max_disparity_px=pair.max_disparity_px)
+    rows, columns = np.nonzero(np.isfinite(found.disparity))
+    at = np.column_stack([columns, rows]).astype(float)
+    moved = pair.original_from_rectified(1, at - np.outer(found.disparity[rows, columns], [1.0, 0.0]))
+    true = dehomogenize(homogenize(pair.original_from_rectified(0, at)) @ H.T)
+    assert len(at) > 0.3 * left.size
+    assert np.median(np.linalg.norm(moved - true, axis=1)) < 0.3
+    refuses(ValueError, r"finite F \(3, 3\)", thesisrecon.rectify, left, right, np.zeros((3, 3)), xy1, xy2)
+
+
+def test_epipolar_lines_pass_through_the_matches(tmp_path):
+    pair = make_pair(5, np.random.default_rng(0))
+    S = np.diag([5.0, 5.0, 1.0])
+    F, xy1, xy2 = S @ pair.F @ S, 0.2 * pair.xy1, 0.2 * pair.xy2
+    gray = np.full((192, 256), 128, np.uint8)
+    PIL.Image.fromarray(np.tile(np.arange(256, dtype=np.uint8), (192, 1))).save(tmp_path / "a.png")
+    for image in (gray, tmp_path / "a.png"):
+        drawn = thesisrecon.draw_epipolar_lines(image, image, F, xy1[:1], xy2[:1])
+        for side, (canvas, xy) in enumerate(zip(drawn, (xy1, xy2), strict=True)):
+            rows, columns = np.nonzero((canvas == [255, 0, 0]).all(axis=2))
+            line = (epipolar_lines(F, xy1) if side else epipolar_lines(F.T, xy2))[0]
+            off = np.abs(np.column_stack([columns, rows, np.ones(len(rows))]) @ line)
+            near = np.hypot(*(np.column_stack([columns, rows]) - xy[0]).T) < 6.0
+            assert off[~near].max() < 1.0
+            assert (~near).sum() > 100
+    refuses(ValueError, "needs F", thesisrecon.draw_epipolar_lines, gray, gray, F, xy1, xy2[:2])

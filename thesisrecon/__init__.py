@@ -15,11 +15,12 @@ __version__ = "0.1.0"
 __all__ = [  # noqa: F405
     "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
     "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "__version__", "align_to_positions", "compare_models", "estimate_fundamental",
-    "estimate_homography", "estimate_trifocal", "export", "interpolate_view", "load", "match_pair",
-    "match_rectified", "reconstruct", "reconstruct_from_colmap", "reconstruct_from_matches",
-    "reconstruct_from_tracks", "render", "resect", "scaled", "self_calibrate", "synthesize_view",
-    "triangulate", "upgrade_affine",
+    "UsageError", "__version__", "absolute_dual_quadric", "align_to_positions", "compare_models",
+    "draw_epipolar_lines", "estimate_fundamental", "estimate_homography", "estimate_trifocal", "export",
+    "interpolate_view", "kruppa", "load", "match_pair", "match_rectified", "plane_at_infinity",
+    "reconstruct", "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks",
+    "rectify", "render", "resect", "scaled", "self_calibrate", "synthesize_view", "triangulate",
+    "upgrade_affine",
 ]  # fmt: skip
 
 _HOMES = {
@@ -36,6 +37,7 @@ _HOMES = {
     "estimate_homography": "epipolar.homography",
     "estimate_trifocal": "epipolar.trifocal_estimation",
     "export": "model_export",
+    "kruppa": "selfcalibration.kruppa",
     "resect": "geometry.robust_resection",
     "scaled": "alignment",
     "triangulate": "geometry.triangulation",

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from thesisrecon._settings import Config, as_config
 from thesisrecon.alignment import align_to_positions, scaled
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, U8
+from thesisrecon.calibration import absolute_dual_quadric, plane_at_infinity, self_calibrate, upgrade_affine
 from thesisrecon.camera import Camera
 from thesisrecon.comparison import ModelComparison, compare_models
 from thesisrecon.config import PipelineConfig
+from thesisrecon.epipolar.drawing import draw_lines
 from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
 from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.robust_resection import resect
 from thesisrecon.geometry.triangulation import triangulate
-from thesisrecon.intrinsics import prior_for
-from thesisrecon.io._images import read_image
 from thesisrecon.model_export import export
 from thesisrecon.pipeline._image_pair import ImageInput, match_pair
 from thesisrecon.pipeline._loading import load
@@ -40,20 +38,99 @@ from thesisrecon.records import (
     TwoView,
 )
 from thesisrecon.results import RunResult
-from thesisrecon.runtime._run import stream
-from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine, with_images
-from thesisrecon.view_interpolation import interpolate_view
+from thesisrecon.selfcalibration.kruppa import kruppa
+from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range, rectify_pair
+from thesisrecon.view_interpolation import interpolate_view, read_pixels
 from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
     "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
     "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "align_to_positions", "compare_models", "estimate_fundamental", "estimate_homography",
-    "estimate_trifocal", "export", "interpolate_view", "load", "match_pair", "match_rectified", "reconstruct",
-    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "render", "resect",
-    "scaled", "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "UsageError", "absolute_dual_quadric", "align_to_positions", "compare_models", "draw_epipolar_lines",
+    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "export", "interpolate_view",
+    "kruppa", "load", "match_pair", "match_rectified", "plane_at_infinity", "reconstruct",
+    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render",
+    "resect", "scaled", "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
+
+
+def draw_epipolar_lines(
+    image1: ImageInput, image2: ImageInput, F: F64, xy1: F64, xy2: F64, *, max_lines: int = 30
+) -> tuple[U8, U8]:
+    """Draw the epipolar lines of matches into both images (figure 3.11).
+
+    Parameters
+    ----------
+    image1, image2 : path or ndarray (H, W) or (H, W, 3) uint8
+        Files, read at full size, or images.
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches in pixels of these images.
+    max_lines : int
+        Number of matches to draw, spread over all; each has one colour in both images.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8, twice
+        The images, with the line F x1 and the point x2 in the second, F' x2 and x1 in the first.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import draw_epipolar_lines
+    >>> F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    >>> gray = np.full((60, 80), 128, np.uint8)
+    >>> left, right = draw_epipolar_lines(gray, gray, F, np.array([[40.0, 30]]), np.array([[20.0, 30]]))
+    >>> left.shape, np.unique(np.nonzero((right != 128).any(axis=2))[0]).tolist()
+    ((60, 80, 3), [26, 27, 28, 29, 30, 31, 32, 33, 34])
+    """
+    return draw_lines(read_pixels(image1), read_pixels(image2), F, xy1, xy2, max_lines=max_lines)
+
+
+def rectify(
+    image1: ImageInput, image2: ImageInput, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
+) -> RectifiedImages:
+    """Rectify two images by their fundamental matrix: epipolar lines become common rows (2.5).
+
+    Parameters
+    ----------
+    image1, image2 : path or ndarray (H, W) or (H, W, 3) uint8
+        Files, read at full size, or images.
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and N >= 8 of its inliers in pixels of these images.
+    planar : bool
+        Allow homographies only, which need epipoles outside the images.
+
+    Returns
+    -------
+    RectifiedImages
+        The rectified images, for :func:`match_rectified`, and the maps between them and the images.
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape.
+    StageFailure
+        If the pair has no parallax or too few matches; an epipole inside an image with ``planar``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import rectify
+    >>> xy1 = np.random.default_rng(0).uniform(20, 140, (30, 2))
+    >>> xy2 = xy1 - np.array([[8.0, 4]]) / np.random.default_rng(1).uniform(1, 4, (30, 1))
+    >>> F = np.array([[0.0, 0, 4], [0, 0, -8], [-4, 8, 0]])
+    >>> gray = np.full((160, 160), 128, np.uint8)
+    >>> pair = rectify(gray, gray, F, xy1, xy2)
+    >>> rows = [pair.rectified_from_original(k, xy)[:, 1] for k, xy in enumerate((xy1, xy2))]
+    >>> bool(np.abs(rows[0] - rows[1]).max() < 1e-6)
+    True
+    """
+    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    images = read_pixels(image1), read_pixels(image2)
+    size1, size2 = ((image.shape[1], image.shape[0]) for image in images)
+    frame = rectify_pair(F, xy1, xy2, size1, size2, methods=PLANAR if planar else METHODS)
+    return RectifiedImages.of(frame, images, disparity_range(frame, xy1, xy2))
 
 
 def match_rectified(
@@ -86,131 +163,6 @@ def match_rectified(
     >>> round(float(np.nanmedian(found.disparity)), 1)
     6.0
     """
-    images = [side if isinstance(side, np.ndarray) else _full_size(side) for side in (left, right)]
+    images = [side if isinstance(side, np.ndarray) else read_pixels(side) for side in (left, right)]
     dense = as_config(config).dense
     return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)
-
-
-def _full_size(path: ImageInput) -> np.ndarray:
-    return read_image(path, max_size_px=np.iinfo(np.int32).max).images[0].rgb
-
-
-def self_calibrate(
-    reconstruction: Reconstruction,
-    *,
-    config: Config | None = None,
-    images: Sequence[Image] = (),
-    seed: int = 0,
-) -> SelfCalibration:
-    """Estimate the metric frame and the intrinsics of a projective reconstruction (chapter 7).
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction of at least three views.
-    config : PipelineConfig, str or path, optional
-        ``config.selfcalibration`` is the method, ``config.intrinsics`` the prior knowledge; by default images
-        of one size share one camera.
-    images, seed : sequence of Image, int
-        The images, one per view, for methods that detect parallel lines; and the random seed.
-
-    Returns
-    -------
-    SelfCalibration
-        ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) with standard deviations, and all candidates.
-
-    Raises
-    ------
-    ValueError, StageFailure
-        If the reconstruction is not projective or the seed is invalid; if no calibration is determined.
-
-    Examples
-    --------
-    Six views of a cloud of points by one camera of unknown focal length:
-
-    >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import Camera, Reconstruction, Tracks, self_calibrate
-    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
-    >>> angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5], [5, 40, -15]])
-    >>> R = Rotation.from_euler("xyz", angles).as_matrix()
-    >>> cameras = [Camera(K, r, np.array([0.0, 0, 5]), (640, 480)) for r in R]
-    >>> X = np.random.default_rng(0).uniform(-1, 1, (80, 3))
-    >>> xy = np.stack([camera.project(X) for camera in cameras], axis=1).reshape(-1, 2)
-    >>> tracks = Tracks(np.tile(np.arange(6), 80), np.repeat(np.arange(80), 6), xy, 6, 80)
-    >>> H = np.random.default_rng(1).normal(size=(4, 4))
-    >>> P = np.array([camera.P for camera in cameras]) @ np.linalg.inv(H)
-    >>> projective = Reconstruction(
-    ...     "projective", P, np.column_stack([X, np.ones(80)]) @ H.T, np.ones(6, bool), np.ones(80, bool),
-    ...     np.ones(480, bool), tracks, sizes=np.tile([640, 480], (6, 1)), sigma_px=0.5, reasons=("",) * 6,
-    ... )
-    >>> round(self_calibrate(projective).K[0, 0, 0])
-    800
-    """
-    if reconstruction.stratum != "projective":
-        raise ValueError(f"self_calibrate takes a projective reconstruction; got {reconstruction.stratum}")
-    config = as_config(config)
-    prior = prior_for(reconstruction, config.intrinsics)
-    method, rng = with_images(config.selfcalibration, images), stream(seed, "selfcalibration")
-    return method.calibrate(reconstruction, prior=prior, rng=rng)
-
-
-def upgrade_affine(
-    reconstruction: Reconstruction,
-    plane: F64 | None = None,
-    *,
-    config: Config | None = None,
-    images: Sequence[Image] = (),
-    seed: int = 0,
-) -> Reconstruction:
-    """Upgrade a projective reconstruction to an affine one (3.3, chapter 7).
-
-    Parallel lines and ratios of lengths along them are then those of the scene.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    plane : ndarray (4,), optional
-        Plane at infinity in the projective frame. None: located by the first step of the method if
-        ``config.selfcalibration`` is :class:`~thesisrecon.selfcalibration.stratified.Stratified` (no
-        calibration needed), else taken from :func:`self_calibrate`.
-    config, images, seed
-        As for :func:`self_calibrate`.
-
-    Returns
-    -------
-    Reconstruction
-        The same cameras and points in an affine frame.
-
-    Raises
-    ------
-    ValueError, StageFailure
-        If the reconstruction is not projective, the plane is zero or not finite, or the seed is invalid; if
-        the plane at infinity cannot be located.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon import Reconstruction, Tracks, upgrade_affine
-    >>> none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), 1, 2)
-    >>> projective = Reconstruction(
-    ...     "projective", np.eye(3, 4)[None], np.array([[1.0, 2, 4, 3], [0, 1, 2, 1]]), np.ones(1, bool),
-    ...     np.ones(2, bool), np.zeros(0, bool), none, np.array([[640, 480]]), 1.0, ("",),
-    ... )
-    >>> affine = upgrade_affine(projective, plane=np.array([0.0, 0, 0.5, 0]))
-    >>> affine.stratum, bool((affine.X[:, 3] == 1).all())
-    ('affine', True)
-    """
-    if reconstruction.stratum != "projective":
-        raise ValueError(f"upgrade_affine takes a projective reconstruction; got {reconstruction.stratum}")
-    if plane is None:
-        config = as_config(config)
-        method = with_images(config.selfcalibration, images)
-        rng = stream(seed, "selfcalibration")
-        prior = prior_for(reconstruction, config.intrinsics)
-        if isinstance(method, Stratified):
-            plane = method.locate(reconstruction, prior=prior, rng=rng)
-        else:
-            plane = method.calibrate(reconstruction, prior=prior, rng=rng).plane_at_infinity
-    return upgrade_to_affine(reconstruction, plane)

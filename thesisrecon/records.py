@@ -251,6 +251,50 @@ class Reconstruction:
     K: F64 | None = None
     distortion: F64 | None = None
 
+    @classmethod
+    def from_cameras(
+        cls, *cameras: F64, sizes: I64, X: F64 | None = None, xy: F64 | None = None,
+        stratum: Stratum = "metric", sigma_px: float = 1.0,
+    ) -> Reconstruction:  # fmt: skip
+        """Return the reconstruction of plain arrays.
+
+        Parameters
+        ----------
+        *cameras : ndarray
+            P (V, 3, 4), or K (V, 3, 3) or (3, 3), R (V, 3, 3) and t (V, 3) of a metric frame.
+        sizes : array_like (V, 2) or (2,)
+            Image width and height.
+        X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
+            Points, and their pixels, NaN where not observed; X None: triangulated from xy.
+        stratum, sigma_px : {"metric", "affine", "projective"}, float
+            Frame of P, and the noise of one image coordinate.
+
+        Returns
+        -------
+        Reconstruction
+            All views registered; ``ValueError`` if the arrays do not fit together, or pixels lie outside
+            their images.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from thesisrecon import Reconstruction
+        >>> K, R, t = np.diag([800.0, 800, 1]), np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 0], [-1, 0, 0]])
+        >>> Reconstruction.from_cameras(K, R, t, sizes=(640, 480)).P[1].tolist()
+        [[800.0, 0.0, 0.0, -800.0], [0.0, 800.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+        """
+        # Imported on use: records are imported by all other modules.
+        from thesisrecon.geometry._from_arrays import checked_cameras, checked_points
+
+        P, K, sizes = checked_cameras(cameras, sizes, metric=stratum == "metric")
+        Xh, view, point, pixels = checked_points(P, sizes, X, xy, finite=stratum == "metric")
+        tracks = Tracks(view, point, pixels, len(P), len(Xh))
+        valid = np.any(Xh != 0.0, axis=1)
+        return cls(
+            stratum, P, Xh, np.ones(len(P), dtype=bool), valid, valid[point], tracks, sizes, sigma_px,
+            ("",) * len(P), K, None if K is None else np.zeros((len(P), 3)),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Upgrade:
@@ -286,7 +330,8 @@ class SelfCalibration:
         Calibration matrices, zeros where not registered, and the standard deviations of their entries: 0 if
         known, that of the prior if not estimated, NaN if unknown.
     identifiable, reasons, identifiability : bool, tuple of str, IdentifiabilityReport
-        Whether the views determine the calibration, else why not, and the evidence (None: not tested).
+        Whether the views determine the calibration, and the evidence (None: not tested). The reasons say why
+        not, or that bundle adjustment moves the focal length far from ``K``, which is then a start only.
     candidates : tuple of Upgrade
         All candidates, best first.
     """
@@ -298,6 +343,12 @@ class SelfCalibration:
     reasons: tuple[str, ...]
     candidates: tuple[Upgrade, ...] = ()
     identifiability: IdentifiabilityReport | None = None
+
+    @property
+    def Q(self) -> F64:
+        """Absolute dual quadric in the projective frame (4, 4), rank 3, unit norm."""
+        G = np.linalg.inv(self.metric_from_projective)[:, :3]
+        return np.asarray(G @ G.T / np.linalg.norm(G @ G.T), dtype=np.float64)
 
     @property
     def plane_at_infinity(self) -> F64:

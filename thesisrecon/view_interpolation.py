@@ -100,7 +100,7 @@ def prepare_rectified_pair(
     InterpolatedPair
         Its ``view(s)`` interpolates.
     """
-    images = _pixels(left), _pixels(right)
+    images = read_pixels(left), read_pixels(right)
     shapes = [image.shape[:2] for image in images]
     if shapes[0] != shapes[1]:
         raise ValueError(f"rectified images must have one size; got {shapes[0]} and {shapes[1]}")
@@ -118,7 +118,18 @@ def prepare_rectified_pair(
     return InterpolatedPair(images, np.stack([np.eye(3)] * 2), *maps)
 
 
-def _pixels(side: Any) -> U8:
+def read_pixels(side: Any) -> U8:
+    """Return a file at full size, or a checked array, as RGB.
+
+    Parameters
+    ----------
+    side : str, Path or ndarray (H, W) or (H, W, 3) uint8
+        The image.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8
+    """
     if not isinstance(side, np.ndarray):
         return read_image(side, max_size_px=int(np.iinfo(np.int32).max)).images[0].rgb
     if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] != 3):

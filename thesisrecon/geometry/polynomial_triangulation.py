@@ -364,7 +364,7 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
         epipole gives the centre of the other camera; with both there, some point of the baseline.
     """
     if P.shape != (2, 3, 4):
-        raise ValueError(f"the polynomial method needs exactly two cameras, not {len(P)}; use \"optimal\"")
+        raise ValueError(f'the polynomial method needs exactly two cameras, not {len(P)}; use "optimal"')
     require_shapes("triangulate_polynomial", xy=(xy, (2, "N", 2)))
     require_finite("triangulate_polynomial", P)
     scale, centre, T = _conditioning(xy)

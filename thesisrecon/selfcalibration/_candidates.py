@@ -11,7 +11,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.records import Reconstruction, SelfCalibration, Upgrade
+from thesisrecon.records import IdentifiabilityReport, Reconstruction, SelfCalibration, Upgrade
 from thesisrecon.selfcalibration._frame import ReferenceFrame, metric_from_calibration
 from thesisrecon.selfcalibration._identifiability import (
     check_identifiability,
@@ -169,10 +169,26 @@ def select_candidate(
     std_log_f = focal_std(criterion, frame, theta)
     report = check_identifiability(reconstruction, best, frame.prior)
     K_std = _calibration_std(frame, best.K, candidate, np.minimum(std_log_f[frame.group], _MAX_LOG_STD))
+    reasons = _biased_focal(frame, best, report) if report.identifiable else report.sentences
     return SelfCalibration(
-        best.metric_from_projective, best.K, K_std, report.identifiable,
-        () if report.identifiable else report.sentences, tuple(upgrade for _, upgrade in chosen), report,
+        best.metric_from_projective, best.K, K_std, report.identifiable, reasons,
+        tuple(upgrade for _, upgrade in chosen), report,
     )  # fmt: skip
+
+
+def _biased_focal(frame: ReferenceFrame, best: Upgrade, report: IdentifiabilityReport) -> tuple[str, ...]:
+    """A sentence if bundle adjustment moves the focal length by over 3 % and three standard deviations."""
+    longest = frame.pixel_from_unit[frame.views, 0, 0]
+    focal = float(np.median(best.K[frame.views, 0, 0] / longest))
+    refined = report.evidence.get("focal_long_sides", focal)
+    if abs(focal / refined - 1.0) <= max(0.03, 3.0 * report.evidence.get("focal_std_rel_median", 0.0)):
+        return ()
+    pixels = refined * float(np.median(longest))
+    return (
+        f"the focal length of this method is {focal / refined - 1.0:+.0%} from that of bundle adjustment, "
+        f"{pixels:.0f} px: the views determine it, but K is only a start; use a method that refines it, such "
+        "as nonlinear-quadric",
+    )
 
 
 def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction, tried: int) -> StageFailure:
@@ -258,9 +274,11 @@ def _upgrade_of_candidate(
 def _share_in_front(reconstruction: Reconstruction, G: F64) -> float:
     """Return the share of inlier observations with positive depth after the upgrade G (4, 4)."""
     keep = reconstruction.inlier
+    if not keep.any():
+        return 1.0  # cameras alone do not determine the handedness
     view, point = reconstruction.tracks.view_index[keep], reconstruction.tracks.point_index[keep]
     P = reconstruction.P @ np.linalg.inv(G)
     P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
     X = reconstruction.X @ G.T
     in_front = np.einsum("kj,kj->k", P[view, 2], X[point]) * X[point, 3] > 0
-    return float(in_front.mean()) if len(in_front) else 0.0
+    return float(in_front.mean())

@@ -17,7 +17,7 @@ from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.numerics.observations import Observations
-from thesisrecon.records import IdentifiabilityReport, Reconstruction, Upgrade
+from thesisrecon.records import IdentifiabilityReport, Reconstruction, Tracks, Upgrade
 from thesisrecon.selfcalibration._critical_motions import (
     OPTICAL_AXIS,
     PARALLEL_AXES,
@@ -51,6 +51,7 @@ _NOISE_FLOOR_PX = 0.05
 # The same in long sides, for ratios of noise.
 _NOISE_FLOOR_REL = 3e-5
 _MAX_OBSERVATIONS = 12000
+_VIRTUAL_POINTS = 300
 _MAX_ITERATIONS = 12
 _NEEDED_EQUATIONS = 8
 _FREE_STD = 1e3
@@ -121,6 +122,8 @@ def check_identifiability(
     lengths under the prior; a second covariance, with free aspect ratio and principal point, shows what
     depends on these. ``evidence`` holds the measures of critical motions and those of :func:`_report`.
     """
+    if not reconstruction.inlier.any():
+        reconstruction = _with_virtual_points(reconstruction, upgrade)
     problem = _bundle_problem(reconstruction, upgrade, prior)
     if problem is None:
         return identifiability_without_calibration(reconstruction, prior)
@@ -200,6 +203,35 @@ class _Problem:
         cameras = replace(fit.cameras, shared=shared, intrinsics=intrinsics)
         prior = IntrinsicsPrior.unshared(intrinsics, std)
         return replace(self, cameras=cameras, X=fit.X, prior=prior, sigma_px=max(fit.sigma_px, 1e-6))
+
+
+def _with_virtual_points(reconstruction: Reconstruction, upgrade: Upgrade) -> Reconstruction:
+    """Add exact observations of a cloud of points where the optical axes meet, for cameras without points.
+
+    Their covariance, at the noise floor, says how well the motion of the cameras determines the calibration.
+    """
+    G, views = np.linalg.inv(upgrade.metric_from_projective), np.flatnonzero(reconstruction.registered)
+    P = reconstruction.P[views] @ G
+    P *= np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
+    axes = P[:, 2, :3] / np.linalg.norm(P[:, 2, :3], axis=1, keepdims=True)
+    C = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
+    spread = float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
+    # The point nearest to all axes; parallel ones meet at five times the spread of the centres.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]
+    expected = C.mean(axis=0) + 5.0 * spread * axes.mean(axis=0)
+    weighted = np.einsum("vij,vj->i", across, C) / len(C) + 1e-3 * expected
+    middle = np.linalg.solve(across.mean(axis=0) + 1e-3 * np.eye(3), weighted)
+    radius = 0.3 * float(np.median(np.linalg.norm(C - middle, axis=1)))
+    X = middle + radius * np.random.default_rng(0).uniform(-1.0, 1.0, (_VIRTUAL_POINTS, 3))
+    x = np.einsum("vij,nj->nvi", P, np.column_stack([X, np.ones(len(X))]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = x[..., :2] / x[..., 2:]
+    seen = (x[..., 2] > 0.0) & (np.abs(xy / reconstruction.sizes[views] - 0.5) <= 0.5).all(axis=2)
+    point, place = np.nonzero(seen)
+    tracks = Tracks(views[place], point, xy[point, place], len(reconstruction.P), len(X))
+    every = np.ones(len(X), dtype=bool)
+    Xh = np.column_stack([X, np.ones(len(X))]) @ G.T
+    return replace(reconstruction, X=Xh, valid=every, inlier=np.ones(len(point), dtype=bool), tracks=tracks)
 
 
 def _bundle_problem(

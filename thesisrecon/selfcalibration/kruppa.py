@@ -18,6 +18,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry.homogeneous import pixel_from_unit, require_finite, require_shapes
 from thesisrecon.geometry.two_view import fundamental_from_cameras, unit_norm
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
@@ -42,8 +43,14 @@ from thesisrecon.selfcalibration._refinement import RotationCriterion, central_d
 _ROOT2 = np.sqrt(2.0)
 # Number of planes to refine for each calibration.
 _MAX_PLANES = 8
-# Residual of a good pair, against which priors are weighed.
-_NOISE = 0.01
+# Residual of a good pair, against which priors are weighed, and that of rounding.
+_NOISE, _ROUNDING = 0.01, 1e-9
+# Standard deviation of the log focal length from which it is undetermined, and the step of its derivative.
+_MAX_FOCAL_STD, _STEP = 0.15, 0.05
+# Prior of the principal point in long sides, as for all methods by default.
+_CENTRE_STD = 0.01
+# Log focal lengths that differ by less are the same; ratio of residuals up to which two solutions fit alike.
+_SAME, _ALIKE = 0.03, 2.0
 
 
 @dataclass(frozen=True)
@@ -61,6 +68,8 @@ def _overlapping_pairs(frame: ReferenceFrame, reconstruction: Reconstruction, mi
     seen = np.zeros((tracks.n_views, tracks.n_points))
     seen[tracks.view_index[keep], tracks.point_index[keep]] = 1.0
     common = seen[frame.views] @ seen[frame.views].T
+    if not keep.any():
+        common[:] = np.inf  # cameras without points: all pairs
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
     places, found = [], []
     for i, j in np.argwhere(np.triu(common >= min_common, 1)):
@@ -121,13 +130,27 @@ def _minimize_kruppa(
     return unknown.calibrations(found.x[None])[0], unknown.calibration_std(found.x, found.covariance)
 
 
+def _residual_and_focal_std(pairs: _Pairs, K: F64) -> tuple[float, float]:
+    """Return the rms residual of calibrations K (R, 3, 3), and the standard deviation of log f from it.
+
+    By the change of the residuals with a common factor of all focal lengths.
+    """
+    scaled = np.repeat(K[None], 3, axis=0)
+    scaled[:, :, :2, :2] *= np.exp([-_STEP, 0.0, _STEP])[:, None, None, None]
+    lower, middle, upper = _pair_residuals(pairs, scaled)
+    slope = float(np.linalg.norm(upper - lower)) / (2.0 * _STEP)
+    residual = float(np.sqrt(np.mean(np.sum(middle**2, axis=1))))
+    return residual, max(residual, _ROUNDING) / max(slope, 1e-300)
+
+
 @dataclass(frozen=True)
 class KruppaEquations:
     """Self-calibration by the Kruppa equations over all camera pairs.
 
     One common focal length is scanned; the best minima are refined over all unknown intrinsics, and a plane
     at infinity is fitted to each. The candidate whose cameras are nearest to rotations is selected, because
-    few pairs leave false solutions without residual, among them focal lengths near 0.
+    few pairs leave false solutions without residual. Solutions that do not determine the focal length are
+    rejected: those near 0, and all of cameras on a sphere that look at its centre [1]_.
 
     Parameters
     ----------
@@ -141,6 +164,10 @@ class KruppaEquations:
         Minimum number of common observations of a pair.
     criterion : RotationCriterion
         Criterion that selects the candidate.
+
+    References
+    ----------
+    .. [1] P. Sturm, "A case against Kruppa's equations for camera self-calibration", PAMI 22(10), 2000.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
@@ -165,12 +192,33 @@ class KruppaEquations:
             )
         unknown = solver_unknowns(frame, prior)
         candidates = []
-        for log_f in self._scan(pairs, len(frame.views)):
-            start = unknown.from_log_focals(np.full((1, len(frame.views)), log_f))[0]
-            K, K_std = _minimize_kruppa(pairs, unknown, start, self.loss_scale)
+        for K, K_std, _ in self._solutions(pairs, unknown, len(frame.views)):
             plane, cost = _plane_for_focals(frame, self.criterion, group_log_focals(frame, K))
             candidates.append(Candidate(plane, K, cost, "Kruppa equations", K_std))
         return select_candidate(frame, reconstruction, self.criterion, candidates)
+
+    def _solutions(self, pairs: _Pairs, unknown: SolverUnknowns, n: int) -> list[tuple[F64, F64, float]]:
+        """Return K (n, 3, 3), its standard deviations and rms residual of minima, best first.
+
+        Only those that determine the focal length; ``StageFailure`` if there is none.
+        """
+        found, weakest = [], np.inf
+        for log_f in self._scan(pairs, n):
+            start = unknown.from_log_focals(np.full((1, n), log_f))[0]
+            K, K_std = _minimize_kruppa(pairs, unknown, start, self.loss_scale)
+            residual, focal_std = _residual_and_focal_std(pairs, K)
+            weakest = min(weakest, focal_std)
+            if focal_std < _MAX_FOCAL_STD:
+                found.append((K, K_std, residual))
+        if found:
+            return sorted(found, key=lambda solution: solution[2])
+        raise StageFailure(
+            "the Kruppa equations do not determine the focal length",
+            f"{counted(len(pairs.i), 'pair')} of views agree with "
+            + ("any focal length" if weakest > 1.0 else f"focal lengths within {weakest:.0%}"),
+            "vary the distance to the scene and the point that the cameras look at (cameras on a sphere that "
+            "look at its centre are critical), or use the projective cameras too, as nonlinear-quadric does",
+        )
 
     def _scan(self, pairs: _Pairs, n: int) -> list[float]:
         """Return the best local minima of one common log focal length."""
@@ -199,3 +247,67 @@ def _plane_for_focals(frame: ReferenceFrame, criterion: RotationCriterion, log_f
     theta, cost = refine_hypotheses(criterion, frame, theta[order], planes_only=True)
     best = int(np.nan_to_num(cost, nan=np.inf).argmin())
     return theta[best, :3], float(cost[best])
+
+
+def kruppa(F: F64, sizes: I64) -> F64:
+    """Calibrate one constant camera from fundamental matrices alone, by the Kruppa equations (section 7.3).
+
+    Square pixels without skew and a principal point within about 1 % of the image centre are assumed. F is
+    normalised first; :class:`KruppaEquations` also allows different cameras.
+
+    Parameters
+    ----------
+    F : ndarray (M, 3, 3) or (3, 3)
+        Fundamental matrices of M pairs of images of the camera, px.
+    sizes : array_like (2,) or (V, 2)
+        Width and height of the images, all equal.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        K in pixels.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are wrong, a matrix is not finite or has rank 1, or the sizes differ.
+    StageFailure
+        If the equations do not determine the focal length, or have several solutions.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from thesisrecon import kruppa
+    >>> from thesisrecon.geometry.two_view import fundamental_from_cameras
+    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
+    >>> R = Rotation.from_euler("xyz", [[0, 0, 0], [0.1, -0.4, 0.1], [-0.3, 0.2, 0.5]]).as_matrix()
+    >>> P = K @ np.concatenate([R, [[[0], [0], [5]], [[1], [0], [6]], [[0], [2], [4]]]], axis=2)
+    >>> F = np.stack([fundamental_from_cameras(P[i], P[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
+    >>> round(float(kruppa(F, (640, 480))[0, 0]), 3)
+    800.0
+    """
+    F = np.asarray(F, dtype=np.float64)
+    F = F[None] if F.ndim == 2 else F
+    require_shapes("kruppa", F=(F, ("M", 3, 3)))
+    require_finite("kruppa", F)
+    sizes = np.unique(np.atleast_2d(sizes), axis=0)
+    if sizes.shape != (1, 2):
+        raise ValueError(f"kruppa needs images of one size, width and height; got {sizes.tolist()}")
+    unit = pixel_from_unit(sizes)[0]
+    F = unit_norm(unit.T @ F @ unit)
+    if not len(F) or not (np.linalg.svd(F, compute_uv=False)[:, 1] > 1e-9).all():
+        raise ValueError("kruppa needs at least one fundamental matrix, each of rank 2")
+    same = np.zeros(len(F), dtype=np.int64)
+    index, known = np.array([[0, -1, -1, 1, 2]]), np.zeros((1, 5))
+    unknown = SolverUnknowns(index, known, np.zeros(3), np.array([np.inf, _CENTRE_STD, _CENTRE_STD]))
+    best, *others = KruppaEquations()._solutions(_Pairs(same, same, F), unknown, 1)
+    focal = [float(unit[0, 0] * K[0, 0, 0]) for K, _, _ in (best, *others)]
+    for f, (_, _, residual) in zip(focal[1:], others, strict=True):
+        if abs(np.log(f / focal[0])) > _SAME and residual <= max(_ALIKE * best[2], _ROUNDING):
+            raise StageFailure(
+                "the Kruppa equations have several solutions",
+                f"focal lengths of {focal[0]:.0f} and {f:.0f} px satisfy {counted(len(F), 'pair')} alike",
+                "add pairs of images, or calibrate from projective cameras (self_calibrate)",
+            )
+    return np.asarray(unit @ best[0][0])

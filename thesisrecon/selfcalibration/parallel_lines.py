@@ -363,23 +363,67 @@ def _points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
         v /= np.linalg.norm(v, axis=1, keepdims=True)
         found.append(_triangulate_directions(P[[place[int(given.view[m])] for m in mine]][None], v[None])[0])
     if len(found) < 3:
-        raise StageFailure(
-            "the plane at infinity needs three directions of parallel lines",
-            f"{len(found)} have vanishing points in two registered images",
-            "give the vanishing points of a third direction",
-        )
+        raise _too_few_directions(len(found))
     return np.array(found)
+
+
+def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
+    """Return the plane at infinity (4,), unit norm, from vanishing points of three directions or more.
+
+    Parameters
+    ----------
+    P, xyh : ndarray (V, 3, 4), ndarray (V, D, 3)
+        Projective cameras, and homogeneous pixels of the vanishing points, NaN where not seen.
+    unit : ndarray (V, 3, 3)
+        Pixels from unit-free coordinates.
+
+    Returns
+    -------
+    ndarray (4,)
+    """
+    cameras = np.linalg.inv(unit) @ P
+    cameras = cameras / np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
+    # In this frame of space the rows of the cameras are orthonormal.
+    M = np.linalg.qr(cameras.reshape(-1, 4))[1]
+    cameras, v = cameras @ np.linalg.inv(M), np.einsum("vij,vdj->vdi", np.linalg.inv(unit), xyh)
+    v = v / np.linalg.norm(v, axis=2, keepdims=True)
+    seen = np.isfinite(v).all(axis=2)
+    used = np.flatnonzero(seen.sum(axis=0) >= 2)
+    if len(used) < 3:
+        raise _too_few_directions(len(used))
+    X = [_triangulate_directions(cameras[None, seen[:, d]], v[None, seen[:, d], d])[0] for d in used]
+    plane = M.T @ _null_plane(np.stack(X))
+    return np.asarray(plane / np.linalg.norm(plane))
+
+
+def _too_few_directions(found: int) -> StageFailure:
+    return StageFailure(
+        "the plane at infinity needs three directions of parallel lines",
+        f"{found} have vanishing points in two registered images",
+        "give the vanishing points of a third direction",
+    )
+
+
+def _null_plane(X: F64) -> F64:
+    """Return the plane (4,) through three or more points (D, 4), by SVD; ``StageFailure`` on one line."""
+    _, s, Vt = np.linalg.svd(X / np.linalg.norm(X, axis=1, keepdims=True))
+    if not s[2] > _MIN_SPREAD * s[0]:
+        raise _one_plane(float(s[2] / s[0]))
+    return np.asarray(Vt[-1])
 
 
 def _plane_through_points(X: F64) -> F64:
     """Return p (3,) of the plane (p, 1) through three or more points (D, 4), by SVD."""
-    _, s, Vt = np.linalg.svd(X / np.linalg.norm(X, axis=1, keepdims=True))
-    plane = Vt[-1]
-    if not s[2] > _MIN_SPREAD * s[0] or abs(plane[3]) < 1e-9:
-        raise StageFailure(
-            "the directions of the parallel lines lie in one plane, so their vanishing points do not "
-            "determine the plane at infinity",
-            f"the third singular value is {s[2] / s[0]:.1e} of the first",
-            "give lines of a direction outside that plane",
-        )
+    plane = _null_plane(X)
+    if abs(plane[3]) < 1e-9:
+        raise _one_plane(abs(plane[3]))
     return np.asarray(plane[:3] / plane[3])
+
+
+def _one_plane(ratio: float) -> StageFailure:
+    return StageFailure(
+        "the directions of the parallel lines lie in one plane, so their vanishing points do not "
+        "determine the plane at infinity",
+        f"the third singular value is {ratio:.1e} of the first",
+        "give lines of a direction outside that plane",
+    )

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.stereo._epipolar_pair import (
     EpipolarPair,
@@ -33,6 +34,78 @@ PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)
 """Methods from F with homographies."""
 METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar, aligned=False))
 """All methods; the common orientation needs cameras."""
+
+
+@dataclass(frozen=True)
+class RectifiedImages:
+    """Two images whose rows correspond: x_right = x_left - d with disparities d >= 0.
+
+    Parameters
+    ----------
+    left, right : ndarray (H, W, 3) float32
+        Rectified images, NaN outside the originals.
+    max_disparity_px : float
+        Largest disparity of the matches, with a margin.
+    frame, shift : Rectification, int
+        Maps between the images and the rectified frame, and the columns by which the right image was moved.
+    """
+
+    left: F32
+    right: F32
+    max_disparity_px: float
+    frame: Rectification
+    shift: int
+
+    @classmethod
+    def of(cls, frame: Rectification, images: tuple[U8, U8], disparities: tuple[int, int]) -> RectifiedImages:
+        """Resample two images; the right one moves by whole columns so that disparities begin at 0.
+
+        Parameters
+        ----------
+        frame, images, disparities : Rectification, tuple of ndarray (H, W, 3), tuple of int
+            The maps, the images, and the first and last disparity.
+
+        Returns
+        -------
+        RectifiedImages
+        """
+        left, right = (frame.warp(image.astype(np.float32), side) for side, image in enumerate(images))
+        shift, width = disparities[0], right.shape[1]
+        right = np.roll(right, shift, axis=1)
+        right[:, : max(shift, 0)] = right[:, max(min(width + shift, width), 0) :] = np.nan
+        return cls(left, right, float(disparities[1] - shift), frame, shift)
+
+    def rectified_from_original(self, side: int, xy: F64) -> F64:
+        """Map pixels of an image (side 0 or 1) to the rectified one.
+
+        Parameters
+        ----------
+        side, xy : int, ndarray (N, 2)
+            Image and pixels.
+
+        Returns
+        -------
+        ndarray (N, 2)
+            NaN beyond the line that is sent to infinity.
+        """
+        moved = self.frame.rectified_from_original(side, xy, within=False)
+        return np.asarray(moved + np.array([side * self.shift, 0]))
+
+    def original_from_rectified(self, side: int, xy: F64) -> F64:
+        """Map pixels of a rectified image (side 0 or 1) to the original one.
+
+        Parameters
+        ----------
+        side, xy : int, ndarray (N, 2)
+            Image and pixels.
+
+        Returns
+        -------
+        ndarray (N, 2)
+            NaN beyond the epipole.
+        """
+        places = np.asarray(xy - np.array([side * self.shift, 0]))
+        return self.frame.original_from_rectified(side, places, within=False)
 
 
 def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:

@@ -1,0 +1,295 @@
+"""Chapter 7 in one call each: plane at infinity, affine frame, absolute dual quadric, metric frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from thesisrecon._settings import Config, as_config
+from thesisrecon.arrays import F64, I64
+from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
+from thesisrecon.errors import StageFailure, UsageError, unknown_word
+from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit, require_shapes
+from thesisrecon.intrinsics import prior_for
+from thesisrecon.records import Image, Reconstruction, SelfCalibration
+from thesisrecon.runtime._run import stream
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch
+from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.parallel_lines import ParallelLines, plane_from_vanishing_points
+from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine, with_images
+
+METHODS: Mapping[str, Callable[[], SelfCalibrator]] = {
+    **KINDS["selfcalibration"],
+    "cheirality-search": lambda: Stratified(CheiralitySearch()),
+    "modulus-constraint": lambda: Stratified(ModulusConstraint()),
+    "parallel-lines": lambda: Stratified(ParallelLines()),
+}
+"""Methods by name; the last three are the ways of "stratified" to the plane at infinity."""
+
+
+def self_calibrate(
+    reconstruction: Reconstruction | F64,
+    sizes: I64 | None = None,
+    *,
+    X: F64 | None = None,
+    xy: F64 | None = None,
+    method: str | SelfCalibrator | None = None,
+    config: Config | None = None,
+    images: Sequence[Image] = (),
+    seed: int = 0,
+) -> SelfCalibration:
+    """Estimate the metric frame and the intrinsics of a projective reconstruction (chapter 7).
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction or ndarray (V, 3, 4)
+        Projective reconstruction of at least three views, or their cameras P alone.
+    sizes : array_like (V, 2) or (2,)
+        Image width and height, for plain P.
+    X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
+        Points and their pixels for plain P, as in :meth:`Reconstruction.from_cameras`. Without them the world
+        may be mirrored, and noise is not considered.
+    method : str or SelfCalibrator, optional
+        "hypotheses-and-refinement", "nonlinear-quadric", "linear-quadric", "kruppa-equations", "stratified"
+        with "cheirality-search", "modulus-constraint" or "parallel-lines", or a method object; None:
+        ``config.selfcalibration``.
+    config : PipelineConfig, str or path, optional
+        ``config.intrinsics`` is the prior knowledge; by default images of one size share one camera.
+    images, seed : sequence of Image, int
+        The images, one per view, for methods that detect parallel lines; and the random seed.
+
+    Returns
+    -------
+    SelfCalibration
+        ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) with standard deviations, and all candidates.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        If the reconstruction is not projective, the method is unknown or the seed is invalid; if no
+        calibration is determined.
+
+    Examples
+    --------
+    Six views of a cloud of points by one camera of unknown focal length:
+
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from thesisrecon import Camera, Reconstruction, self_calibrate
+    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
+    >>> angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5], [5, 40, -15]])
+    >>> R = Rotation.from_euler("xyz", angles).as_matrix()
+    >>> cameras = [Camera(K, r, np.array([0.0, 0, 5]), (640, 480)) for r in R]
+    >>> X = np.random.default_rng(0).uniform(-1, 1, (80, 3))
+    >>> xy = np.stack([camera.project(X) for camera in cameras])
+    >>> H = np.random.default_rng(1).normal(size=(4, 4))
+    >>> P = np.array([camera.P for camera in cameras]) @ np.linalg.inv(H)
+    >>> projective = Reconstruction.from_cameras(P, sizes=(640, 480), xy=xy, stratum="projective")
+    >>> round(self_calibrate(projective).K[0, 0, 0])
+    800
+    >>> round(self_calibrate(P, (640, 480), method="nonlinear-quadric").K[0, 0, 0])
+    800
+    """
+    projective = _projective("self_calibrate", reconstruction, sizes, X, xy)
+    calibrator, settings = _method(projective, method, config, images)
+    prior = prior_for(projective, settings.intrinsics)
+    return calibrator.calibrate(projective, prior=prior, rng=stream(seed, "selfcalibration"))
+
+
+def absolute_dual_quadric(
+    reconstruction: Reconstruction | F64,
+    sizes: I64 | None = None,
+    *,
+    X: F64 | None = None,
+    xy: F64 | None = None,
+    config: Config | None = None,
+    method: str = "nonlinear",
+) -> SelfCalibration:
+    """Estimate the absolute dual quadric Q of projective cameras, P Q P' ~ K K' (7.3, direct; HZ 19.3).
+
+    Parameters
+    ----------
+    reconstruction, sizes, X, xy, config
+        As for :func:`self_calibrate`.
+    method : {"nonlinear", "linear"}
+        Over all unknown intrinsics, or by linear equations, which are biased for most lenses.
+
+    Returns
+    -------
+    SelfCalibration
+        ``Q`` (4, 4), ``K`` (V, 3, 3), ``identifiable``, ``reasons`` and the rest.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        As :func:`self_calibrate`.
+
+    Examples
+    --------
+    ``projective`` as in the example of `thesisrecon.self_calibrate`:
+
+    >>> from thesisrecon import absolute_dual_quadric
+    >>> found = absolute_dual_quadric(projective.P, (640, 480))
+    >>> w = projective.P[0] @ found.Q @ projective.P[0].T
+    >>> bool(np.allclose(w / w[2, 2], found.K[0] @ found.K[0].T, rtol=1e-6)), found.identifiable
+    (True, True)
+    """
+    if method not in ("nonlinear", "linear"):
+        raise ValueError(unknown_word("method", method, ("nonlinear", "linear")))
+    return self_calibrate(reconstruction, sizes, X=X, xy=xy, method=f"{method}-quadric", config=config)
+
+
+def plane_at_infinity(
+    reconstruction: Reconstruction | F64,
+    sizes: I64 | None = None,
+    *,
+    X: F64 | None = None,
+    xy: F64 | None = None,
+    config: Config | None = None,
+    images: Sequence[Image] = (),
+    seed: int = 0,
+    vanishing_points: F64 | None = None,
+    method: str | SelfCalibrator | None = None,
+) -> F64:
+    """Locate the plane at infinity of a projective frame (chapter 7, stratified).
+
+    Parameters
+    ----------
+    reconstruction, sizes, X, xy, config, images, seed
+        As for :func:`self_calibrate`; two views are enough with vanishing points.
+    vanishing_points : ndarray (V, D, 2) or (V, D, 3), optional
+        Pixels of the vanishing points of D >= 3 directions, each seen in at least two views, NaN where not;
+        homogeneous for points at infinity of the image.
+    method : str or SelfCalibrator, optional
+        As for :func:`self_calibrate`. Those of "stratified" need no calibration.
+
+    Returns
+    -------
+    ndarray (4,)
+        Plane of unit norm, pi'X = 0 for points X at infinity.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        As :func:`self_calibrate`; if the directions do not determine the plane.
+
+    Examples
+    --------
+    The vanishing points of the axes in two metric cameras; their plane at infinity is (0, 0, 0, 1):
+
+    >>> import numpy as np
+    >>> from thesisrecon import plane_at_infinity
+    >>> K, turn = np.diag([800.0, 800, 1]), np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
+    >>> P = K @ np.stack([np.c_[turn, [0, 0, 5.0]], np.c_[turn.T, [1.0, 0, 6]]])
+    >>> v = P[:, :, :3].transpose(0, 2, 1)
+    >>> np.abs(plane_at_infinity(P, (640, 480), vanishing_points=v)).round(6).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
+    projective = _projective("plane_at_infinity", reconstruction, sizes, X, xy)
+    if vanishing_points is None:
+        calibrator, settings = _method(projective, method, config, images)
+        prior, rng = prior_for(projective, settings.intrinsics), stream(seed, "selfcalibration")
+        if isinstance(calibrator, Stratified):
+            return calibrator.locate(projective, prior=prior, rng=rng)
+        return calibrator.calibrate(projective, prior=prior, rng=rng).plane_at_infinity
+    v = np.asarray(vanishing_points, dtype=np.float64)
+    v = homogenize(v) if v.shape[-1:] == (2,) else v
+    require_shapes("plane_at_infinity", P=(projective.P, ("V", 3, 4)), vanishing_points=(v, ("V", "D", 3)))
+    seen = projective.registered
+    return plane_from_vanishing_points(projective.P[seen], v[seen], pixel_from_unit(projective.sizes)[seen])
+
+
+def upgrade_affine(
+    reconstruction: Reconstruction,
+    plane: F64 | None = None,
+    *,
+    config: Config | None = None,
+    images: Sequence[Image] = (),
+    seed: int = 0,
+) -> Reconstruction:
+    """Upgrade a projective reconstruction to an affine one (3.3, chapter 7).
+
+    Parallel lines and ratios of lengths along them are then those of the scene.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    plane : ndarray (4,), optional
+        Plane at infinity in the projective frame; None: located by :func:`plane_at_infinity`.
+    config, images, seed
+        As for :func:`self_calibrate`.
+
+    Returns
+    -------
+    Reconstruction
+        The same cameras and points in an affine frame.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        If the reconstruction is not projective, the plane is zero or not finite, or the seed is invalid; if
+        the plane at infinity cannot be located.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Reconstruction, Tracks, upgrade_affine
+    >>> none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), 1, 2)
+    >>> projective = Reconstruction(
+    ...     "projective", np.eye(3, 4)[None], np.array([[1.0, 2, 4, 3], [0, 1, 2, 1]]), np.ones(1, bool),
+    ...     np.ones(2, bool), np.zeros(0, bool), none, np.array([[640, 480]]), 1.0, ("",),
+    ... )
+    >>> affine = upgrade_affine(projective, plane=np.array([0.0, 0, 0.5, 0]))
+    >>> affine.stratum, bool((affine.X[:, 3] == 1).all())
+    ('affine', True)
+    """
+    projective = _projective("upgrade_affine", reconstruction, None, None, None)
+    if plane is None:
+        plane = plane_at_infinity(projective, config=config, images=images, seed=seed)
+    return upgrade_to_affine(projective, plane)
+
+
+def _projective(
+    caller: str, given: Reconstruction | F64, sizes: I64 | None, X: F64 | None, xy: F64 | None
+) -> Reconstruction:
+    """The projective reconstruction that was given, or that of plain cameras."""
+    if not isinstance(given, Reconstruction):
+        if sizes is None:
+            raise ValueError(f"{caller} needs the sizes (width, height) of the images with plain cameras")
+        return Reconstruction.from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
+    if given.stratum == "projective":
+        return given
+    advice = (
+        "its calibration is its field K already; to estimate it again pass the projective one, such as "
+        "result.projective, or its cameras as plain P (reconstruction.P, reconstruction.sizes)"
+        if given.stratum == "metric"
+        else "pass the projective one that it was made from"
+    )
+    raise ValueError(f"{caller} takes a projective reconstruction; got {given.stratum}: {advice}")
+
+
+def _method(
+    projective: Reconstruction,
+    method: str | SelfCalibrator | None,
+    config: Config | None,
+    images: Sequence[Image],
+) -> tuple[SelfCalibrator, PipelineConfig]:
+    settings = as_config(config)
+    if isinstance(method, str):
+        if method not in METHODS:
+            raise UsageError(unknown_word("method", method, METHODS))
+        method = METHODS[method]()
+    method = method or settings.selfcalibration
+    if (
+        isinstance(method, Stratified)
+        and not isinstance(method.plane, ParallelLines)
+        and not projective.inlier.any()
+    ):
+        raise StageFailure(
+            "this method searches the plane at infinity within bounds that points set",
+            "the cameras come without points",
+            "give xy (V, N, 2), the pixels of points, or use nonlinear-quadric",
+        )
+    return with_images(method, images), settings

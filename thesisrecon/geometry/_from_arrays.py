@@ -1,0 +1,78 @@
+"""Cameras, sizes, points and pixels as a user passes them, checked and in the shapes of the records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera
+from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes
+from thesisrecon.geometry.triangulation import triangulate
+
+# Pixels this far outside an image, in long sides, show that width and height are swapped or belong elsewhere.
+_OUTSIDE = 0.1
+
+
+def checked_sizes(caller: str, sizes: I64, n: int) -> I64:
+    """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
+    given = np.asarray(sizes)
+    if given.shape not in ((2,), (n, 2)) or not np.isin(given.dtype.kind, ("i", "u", "f")):
+        raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height; got {given.shape}, V = {n}")
+    if not (np.isfinite(given).all() and (given >= 1).all() and (given == np.round(given)).all()):
+        raise ValueError(f"{caller} needs sizes of whole numbers above 0; got {given.tolist()}")
+    return np.broadcast_to(given, (n, 2)).astype(np.int64)
+
+
+def checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tuple[F64, F64 | None, I64]:
+    """P (V, 3, 4), K (V, 3, 3) of a metric frame, and sizes (V, 2), of P alone or of K, R and t."""
+    caller = "Reconstruction.from_cameras"
+    arrays = [np.asarray(array, dtype=np.float64) for array in cameras]
+    if len(arrays) == 1:
+        require_shapes(caller, P=(arrays[0], ("V", 3, 4)))
+        require_finite(caller, *arrays)
+        P, K = arrays[0], None
+        if metric:
+            parts = [decompose_camera(camera) for camera in P]
+            P, K = np.stack([compose_camera(*part) for part in parts]), np.stack([part[0] for part in parts])
+    elif len(arrays) == 3 and metric:
+        K, R, t = arrays
+        K = np.broadcast_to(K, (len(R), 3, 3)) if K.ndim == 2 else K
+        require_shapes(caller, K=(K, ("V", 3, 3)), R=(R, ("V", 3, 3)), t=(t, ("V", 3)))
+        require_finite(caller, K, R, t)
+        P = compose_camera(K, R, t)
+    else:
+        raise ValueError(f"{caller} needs P, or K, R and t of a metric frame; got {len(arrays)} arrays")
+    return P, K, checked_sizes(caller, sizes, len(P))
+
+
+def checked_points(
+    P: F64, sizes: I64, X: F64 | None, xy: F64 | None, *, finite: bool
+) -> tuple[F64, I64, I64, F64]:
+    """Points (N, 4), zeros where unknown, and view, point and pixels (K,), (K,), (K, 2) of the observations.
+
+    ``finite``: the last coordinate of the points is 1.
+    """
+    caller = "Reconstruction.from_cameras"
+    if xy is None:
+        xy = np.full((len(P), 0 if X is None else len(X), 2), np.nan)
+    xy = np.asarray(xy, dtype=np.float64)
+    require_shapes(caller, P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
+    with np.errstate(invalid="ignore"):
+        reach = np.maximum(-xy, xy - sizes[:, None]) / sizes.max(axis=1)[:, None, None]
+    if (worst := float(np.nanmax(reach, initial=-1.0))) > _OUTSIDE:
+        view = int(np.argwhere(reach == worst)[0, 0])
+        raise ValueError(
+            f"pixels of view {view} lie outside its size {tuple(sizes[view].tolist())} by {worst:.0%} of the "
+            "long side; sizes are (width, height)"
+        )
+    X = triangulate(P, xy) if X is None and xy.shape[1] else np.zeros((0, 4)) if X is None else np.asarray(X)
+    X = homogenize(X.astype(np.float64)) if X.ndim == 2 and X.shape[1] == 3 else X.astype(np.float64)
+    require_shapes(caller, X=(X, ("N", 4)), xy=(xy[0], ("N", 2)))
+    require_finite(caller, X)
+    if finite:
+        near = np.abs(X[:, 3:]) > 1e-12 * np.linalg.norm(X, axis=1, keepdims=True)
+        X = np.where(near, X / np.where(near, X[:, 3:], 1.0), 0.0)
+    point, views = np.nonzero(np.isfinite(xy).all(axis=2).T)
+    return X, views, point, xy[views, point]
