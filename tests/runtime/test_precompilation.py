@@ -20,10 +20,10 @@ def listed(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(_precompilation, "LIST", tmp_path / "kernels.txt")
 
-    def compiled(*lines, until="model"):
+    def compiled(*lines, until="model", workers=2):
         (tmp_path / "kernels.txt").write_text("\n".join(lines), encoding="utf-8")
         calls = []
-        precompile(until, 2, lambda *call: calls.append(call))
+        precompile(until, workers, lambda *call: calls.append(call))
         return calls
 
     return compiled
@@ -50,6 +50,23 @@ def test_kernels_are_compiled_once_and_up_to_the_last_stage(listed, tmp_path):
     assert listed(*lines, until="features") == []
     assert listed(*lines)[-1] == ("kernels", 2, 2)
     assert len(list((tmp_path / "cache").rglob("kernels.copy_to-*"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("kernels", "workers", "started"), [(1, 64, 1), (16, 64, 2), (17, 64, 3), (80, 2, 2)]
+)
+def test_no_more_processes_start_than_there_is_work_for(listed, monkeypatch, kernels, workers, started):
+    processes = []
+
+    def quick_start():
+        answer = "import sys\nfor line in sys.stdin: print('compiled', flush=True)"
+        pipe = subprocess.PIPE
+        processes.append(subprocess.Popen([sys.executable, "-c", answer], stdin=pipe, stdout=pipe, text=True))
+        return processes[-1]
+
+    monkeypatch.setattr(_precompilation, "_started", quick_start)
+    calls = listed("[features]", *[COPY] * kernels, workers=workers)
+    assert (len(processes), calls[-1]) == (started, ("kernels", kernels, kernels))
 
 
 def test_a_kernel_that_cannot_be_compiled_stops_nothing(listed):

@@ -32,6 +32,9 @@ from {__name__} import compile_requested
 compile_requested()
 """
 POLL_S = 0.1
+COMPILED = "compiled\n"
+KERNELS_PER_WORKER = 8
+"""A worker takes a second to start and 150 MB, a kernel on average less than a second to compile."""
 
 
 def listed_kernels(until: str) -> list[str]:
@@ -74,7 +77,7 @@ def precompile(until: str, workers: int, progress: Callable[[str, int, int], Non
     until : str
         The last stage.
     workers : int
-        Number of processes.
+        Maximum number of processes; fewer are started if there are few kernels.
     progress : callable
         Called with ("kernels", done, total).
     """
@@ -111,13 +114,14 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
             while (line := next_line()) is not None:
                 worker.stdin.write(line + "\n")
                 worker.stdin.flush()
-                if not worker.stdout.readline():
+                if not (answer := worker.stdout.readline()):
                     return
-                finished.append(line)
+                if answer == COMPILED:
+                    finished.append(line)
             worker.stdin.close()
 
     with starting_processes():
-        workers = [_started() for _ in range(min(count, len(lines)))]
+        workers = [_started() for _ in range(min(count, -(-len(lines) // KERNELS_PER_WORKER)))]
 
     def kill() -> None:
         for worker in workers:
@@ -156,6 +160,9 @@ def _started() -> subprocess.Popen[str]:
 def compile_requested() -> None:
     """In a worker: compile the kernels that are named on standard input, and answer with one line each."""
     for line in sys.stdin:
-        kernel, arguments = kernel_and_types(line.strip())
-        kernel.compile(arguments)
-        print("compiled", flush=True)
+        answer = "failed\n"
+        with suppress(Exception):
+            kernel, arguments = kernel_and_types(line.strip())
+            kernel.compile(arguments)
+            answer = COMPILED
+        print(answer, end="", flush=True)
