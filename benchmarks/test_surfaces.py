@@ -1,4 +1,4 @@
-"""Fusion of depth maps beside Open3D."""
+"""Fusion of depth maps to a surface, and its simplification, beside Open3D."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ import pytest
 from benchmarks.conftest import Bench
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
+from thesisrecon.surface._simplification import simplify_surface
 from thesisrecon.surface.fusion import VolumetricFusion
-from validation.references.open3d_geometry import OpenTsdf
+from validation.references.open3d_geometry import OpenTsdf, decimate_open3d
 from validation.scenes.image_files import read_rgb
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
 
 STEP = 2
+# Errors and sides of simplified faces, m: those of the fusion by default.
+LIMIT, LONGEST = 0.0035, 0.7
 
 
 @pytest.fixture(scope="module")
@@ -39,5 +42,18 @@ def depths() -> tuple[list[DepthMap], list[PinholeView]]:
 
 @pytest.mark.parametrize("method", ["ours", "Open3D"])
 def test_fusion(bench: Bench, method: str, depths: tuple[list[DepthMap], list[PinholeView]]) -> None:
-    calls = {"ours": lambda: VolumetricFusion().fuse(depths[0]), "Open3D": lambda: OpenTsdf().fuse(*depths)}
+    every_face = VolumetricFusion(tolerance=0.0)
+    calls = {"ours": lambda: every_face.fuse(depths[0]), "Open3D": lambda: OpenTsdf().fuse(*depths)}
     bench("fusion of four depth maps, 256 x 192", method, calls[method])
+
+
+@pytest.mark.parametrize("method", ["ours", "Open3D"])
+def test_simplification(bench: Bench, method: str, depths: tuple[list[DepthMap], list[PinholeView]]) -> None:
+    mesh = VolumetricFusion(tolerance=0.0).fuse(depths[0])
+    limit = np.full(len(mesh.vertices), LIMIT)
+    fewer = simplify_surface(mesh, limit, longest=LONGEST)
+    calls = {
+        "ours": lambda: simplify_surface(mesh, limit, longest=LONGEST),
+        "Open3D": lambda: decimate_open3d(mesh, len(fewer.faces)),
+    }
+    bench("quadric simplification of the fused surface to the same number of faces", method, calls[method])

@@ -98,6 +98,15 @@ def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
     return np.asarray(renderer.render_to_image()).copy()
 
 
+def decimate_open3d(mesh: TexturedMesh, faces: int) -> TexturedMesh:
+    """Reduce a mesh to a number of faces by quadric decimation (Garland and Heckbert 1997)."""
+    full = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    )
+    fewer = full.simplify_quadric_decimation(faces)
+    return TexturedMesh(np.asarray(fewer.vertices), np.asarray(fewer.triangles).astype(np.int64))
+
+
 @dataclass(frozen=True)
 class OpenTsdf:
     """Truncated signed distances in a grid of blocks (``VoxelBlockGrid``), surface by marching cubes.
