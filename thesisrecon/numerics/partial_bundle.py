@@ -34,8 +34,10 @@ from thesisrecon.numerics.observations import (
     sort_observations,
 )
 
-# Iterations of minimize_reprojection; the median point takes three or four.
+# Iterations of minimize_reprojection; the median point takes four or five.
 _MAX_ITERATIONS = 200
+# Gain relative to the cost that is below its rounding.
+_ROUNDING = 1e-15
 
 
 class _PointOptions(NamedTuple):
@@ -72,27 +74,28 @@ def _point_cost(P: F64, x: F64, view_index: I64, xy: F64, options: _PointOptions
 def _linearize_point(
     P: F64,
     x: F64,
-    tangent: tuple[F64, float],
+    tangent: tuple[F64, float, F64],
     view_index: I64,
     xy: F64,
     options: _PointOptions,
     H: F64,
     g: F64,
 ) -> None:
-    """Fill J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space (Householder vector, factor)."""
-    v, beta = tangent
+    """Fill the lower triangle of J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space.
+
+    ``tangent``: Householder vector, its factor, and scratch memory (2, 4).
+    """
+    v, beta, J = tangent
     H[:] = 0.0
     g[:] = 0.0
-    J = empty((2, 4))
-    r = empty(2)
     for k in range(len(xy)):
         p = P[view_index[k]]
         u0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
         u1 = p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]
         w = away_from_zero(p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3])
         a, b = u0 / w, u1 / w
-        r[0], r[1] = a - xy[k, 0], b - xy[k, 1]
-        weight = loss_weight(r[0] * r[0] + r[1] * r[1], options.delta)
+        r0, r1 = a - xy[k, 0], b - xy[k, 1]
+        weight = loss_weight(r0 * r0 + r1 * r1, options.delta)
         d0 = d1 = 0.0
         for c in range(4):
             J[0, c] = (p[0, c] - a * p[2, c]) / w
@@ -103,8 +106,8 @@ def _linearize_point(
             J[0, c] -= beta * d0 * v[c]
             J[1, c] -= beta * d1 * v[c]
         for m in range(3):
-            g[m] += weight * (J[0, m + 1] * r[0] + J[1, m + 1] * r[1])
-            for n in range(3):
+            g[m] += weight * (J[0, m + 1] * r0 + J[1, m + 1] * r1)
+            for n in range(m + 1):
                 H[m, n] += weight * (J[0, m + 1] * J[0, n + 1] + J[1, m + 1] * J[1, n + 1])
 
 
@@ -113,7 +116,7 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
     """Refine every unit point of X (N, 4) in place by Levenberg-Marquardt in its tangent space."""
     H, M, Mi, root = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
     g, step = empty(3), empty((1, 3))
-    v, beta, moved = empty((1, 4)), empty(1), empty((1, 4))
+    v, beta, moved, J = empty((1, 4)), empty(1), empty((1, 4)), empty((2, 4))
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
         if last - first < 2:
@@ -127,15 +130,16 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
         for _ in range(options.iterations):
             if accepted:
                 tangent_reflectors(x, v, beta)
-                _linearize_point(P, x[0], (v[0], beta[0]), view, seen, options, H, g)
+                _linearize_point(P, x[0], (v[0], beta[0], J), view, seen, options, H, g)
             for m in range(3):
                 for n in range(3):
                     M[m, n] = H[m, n]
                 M[m, m] *= 1.0 + damping
-            accepted = invert_positive_3x3(M, root, Mi)
+            accepted, promised = invert_positive_3x3(M, root, Mi), np.inf
             if accepted:
                 for m in range(3):
                     step[0, m] = -(Mi[m, 0] * g[0] + Mi[m, 1] * g[1] + Mi[m, 2] * g[2])
+                promised = -(g[0] * step[0, 0] + g[1] * step[0, 1] + g[2] * step[0, 2])
                 tangent_step(x, v, beta, step, moved)
                 candidate, flipped = _point_cost(P, moved[0], view, seen, options)
                 accepted = candidate < cost and (flipped == behind or not options.keep_cheirality)
@@ -149,7 +153,8 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
                     break
             else:
                 damping *= 10.0
-                if damping > 1e12:
+                # At the minimum rounding decides about a step; shorter ones gain nothing either.
+                if damping > 1e12 or promised <= _ROUNDING * cost:
                     break
 
 
