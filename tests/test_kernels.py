@@ -147,3 +147,20 @@ def test_a_compilation_that_fails_or_is_done_holds_no_lock(package):
         """
     assert run_in(package, textwrap.dedent(code)) == ["TypingError", "0", "0", "0", "0"]
     assert not list((package / "cache" / "thesisrecon").glob("*.lock"))
+
+
+@pytest.mark.slow
+def test_a_first_fundamental_matrix_compiles_few_kernels(tmp_path):
+    code = """
+        import numpy as np
+        import thesisrecon
+        rng = np.random.default_rng(0)
+        xy1 = rng.uniform(0, 500, (60, 2))
+        xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+        xy2[:20] = rng.uniform(0, 500, (20, 2))
+        print(thesisrecon.estimate_fundamental(xy1, xy2).inliers[20:].all())
+        """
+    assert run_in(tmp_path, textwrap.dedent(code)) == ["True"]
+    compiled = [entry.name.partition("-")[0] for entry in (tmp_path / "cache" / "thesisrecon").iterdir()]
+    # Each takes a quarter of a second of a user's first call.
+    assert len(set(compiled)) == len(compiled) <= 26, sorted(compiled)

@@ -25,7 +25,7 @@ _BISECTIONS = 20
 _SAME_PX = 2.0
 
 
-@kernel(error_model="numpy")
+@kernel
 def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
     """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood.
 
@@ -133,7 +133,7 @@ class NoiseMixture:
         ``sigma`` is an initial value, ``spread`` the standard deviation of wrong residuals in the prior.
         """
         step = max(len(residuals) // _QUANTILES, 1)
-        some = residuals[step // 2 :: step]
+        some = np.ascontiguousarray(residuals[step // 2 :: step])
         share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
         mixture = np.array([sigma, spread, 0.9 * share, 0.1 * share, 1.0 - share])
         likelihood = _fit_mixture(some, parameters / step, spread, _EM_ROUNDS, mixture)

@@ -27,7 +27,7 @@ SUBSET_STEPS, ALL_STEPS, MOST = 3, 4, 600
 MIN_AREA = 1e-3
 
 
-@kernel(inline="always", error_model="numpy")
+@kernel(inline="always")
 def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared distance of a match to the nearest exact match of x2 ~ H x1: c' (J J')^-1 c, to first order.
 
@@ -47,7 +47,7 @@ def _squared_plane_distance(h: F64, x1: float, y1: float, x2: float, y2: float) 
     return squared
 
 
-@kernel(error_model="numpy")
+@kernel
 def _plane_distances(h: F64, points: F64) -> F64:
     """Squared distances (N,) of all points from a homography."""
     squared = empty(len(points))
@@ -56,7 +56,7 @@ def _plane_distances(h: F64, points: F64) -> F64:
     return squared
 
 
-@kernel(error_model="numpy")
+@kernel
 def induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area: float, h: F64) -> bool:
     """Homography of the plane of three matches, H = A - e2 v' with A = [e2]x F (HZ, result 13.6).
 
@@ -91,7 +91,7 @@ def induced_homography(f: F64, e2: F64, points: F64, triple: I64, smallest_area:
     return True
 
 
-@kernel(error_model="numpy")
+@kernel
 def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
     """Write ``G`` (9, 9) of the equations of x2 ~ H x1; returns the sum of min(d^2 / gate^2, 1).
 
@@ -131,7 +131,7 @@ def _plane_normal_equations(h: F64, points: F64, gate: float, G: F64) -> float:
     return total
 
 
-@kernel(error_model="numpy")
+@kernel
 def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
     """Fit ``h`` in place to the points within a gate by reweighted least squares; returns G."""
     G, turned, vectors = empty((9, 9)), empty((9, 9)), empty((9, 9))
@@ -158,7 +158,7 @@ def refine_plane(h: F64, points: F64, gate: float, iterations: int) -> F64:
     return G
 
 
-@kernel(error_model="numpy")
+@kernel
 def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: float, h: F64) -> None:
     """Write the plane ``h`` of triples (S, 3) with the smallest sum of truncated squared distances."""
     best, trial = float(len(points)), empty(9)
@@ -180,7 +180,7 @@ def _search_dominant_plane(f: F64, e2: F64, points: F64, triples: I64, gate: flo
             copy_to(h, trial)
 
 
-@kernel(error_model="numpy")
+@kernel
 def count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
     """Number of points (N, 2) that each homography (S, 3, 3) maps to within ``tolerance``."""
     counts = zeros(len(H), np.int64)
@@ -230,7 +230,7 @@ def plane_covariance(h: F64, points: F64, sigma: float) -> F64:
     return np.asarray(sigma**2 * half @ half.T)
 
 
-@kernel(error_model="numpy")
+@kernel
 def _parallax_lines(h: F64, points: F64) -> F64:
     """Lines (N, 3) x2 x H x1 in image 2 through a match and its position on the plane."""
     lines = empty((len(points), 3))
@@ -243,7 +243,7 @@ def _parallax_lines(h: F64, points: F64) -> F64:
     return lines
 
 
-@kernel(error_model="numpy")
+@kernel
 def _fundamental_of_plane(h: F64, e2: F64, f: F64) -> None:
     """Compute f = [e2]x H, unit norm."""
     for j in range(3):
@@ -257,7 +257,7 @@ def _fundamental_of_plane(h: F64, e2: F64, f: F64) -> None:
         f[i] /= np.sqrt(squares)
 
 
-@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
     """Set ``agree`` (N,) to 1 for columns of (4, N) with a Sampson distance below the gate, else 0."""
     wide = gate * gate
@@ -272,7 +272,7 @@ def _inlier_mask(f: F64, columns: F64, gate: float, agree: F64) -> None:
         agree[k] = 1.0 if e * e < wide * (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) else 0.0
 
 
-@kernel(error_model="numpy")
+@kernel
 def _fundamentals_of_plane(h: F64, points: F64, columns: F64, pairs: I64, gate: float) -> tuple[F64, F64]:
     """F (S, 9) and inliers (S, N) of :func:`fundamentals_of_plane`; ``columns`` (4, N) are ``points`` too."""
     lines = _parallax_lines(h, points)

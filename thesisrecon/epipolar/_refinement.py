@@ -25,7 +25,7 @@ UNBOUNDED = 1e150
 FLATTEST_REL = 1e-14
 
 
-@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
     """Derivatives of at most BLOCK residuals by F, columns of ``D`` (11, BLOCK); returns the cost.
 
@@ -77,7 +77,7 @@ def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delt
     return cost
 
 
-@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: F64) -> float:
     """As :func:`_weighted_derivatives` for the distances r to the nearest exact match.
 
@@ -114,7 +114,7 @@ def _reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D:
     return cost
 
 
-@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64) -> float:
     """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by F; returns the cost.
 
@@ -231,7 +231,7 @@ def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
     return float(np.arctan2(lengths[second], lengths[first]))
 
 
-@kernel(error_model="numpy")
+@kernel
 def _project(B: F64, G: F64, h: F64, H: F64, g: F64) -> None:
     """Write H = B' G B (7, 7) and g = B' h (7,)."""
     GB = empty((9, 7))
@@ -262,37 +262,38 @@ def refine(
     weight; ``delta`` is the width of Huber's loss.
     """
     U, V, Un, Vn = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
-    phi = orthonormal_from_fundamental(f, U, V)
     G, h, Gn, hn = empty((9, 9)), empty(9), empty((9, 9)), empty(9)
     B, step, trial = empty((9, 7)), empty(7), empty(9)
     H, g = empty((7, 7)), empty(7)
-    fundamental_from_orthonormal(U, V, phi, f)
-    cost = normal_equations(f, points, criterion, gate, delta, G, h)
+    phi = phi_n = orthonormal_from_fundamental(f, Un, Vn)
     exact = 1e-26 * len(points)
-    damping, steps = 1e-3, 0
-    while steps < iterations and cost > exact:
-        orthonormal_tangent(U, V, phi, B)
-        _project(B, G, h, H, g)
-        accepted = False
-        while steps < iterations and not accepted:
+    cost, damping, steps = np.inf, 1e-2, 0
+    # The start is the first trial: one call of the normal equations takes half as long to compile.
+    while True:
+        fundamental_from_orthonormal(Un, Vn, phi_n, trial)
+        new_cost = normal_equations(trial, points, criterion, gate, delta, Gn, hn)
+        if steps == 0 or new_cost < cost:
+            gain = cost - new_cost
+            U, Un, V, Vn, phi = Un, U, Vn, V, phi_n
+            G, Gn, h, hn, cost = Gn, G, hn, h, new_cost
+            copy_to(f, trial)
+            if gain <= 1e-6 * cost:
+                break
+            damping = max(1e-9, 0.1 * damping)
+            orthonormal_tangent(U, V, phi, B)
+            _project(B, G, h, H, g)
+        else:
+            damping *= 10.0
+        solved = False
+        while not solved and steps < iterations and cost > exact and damping <= 1e8:
             steps += 1
-            if solve_damped(H, g, damping, step):
-                _rotate_columns(U, step[0:3], Un)
-                _rotate_columns(V, step[3:6], Vn)
-                fundamental_from_orthonormal(Un, Vn, phi + step[6], trial)
-                new_cost = normal_equations(trial, points, criterion, gate, delta, Gn, hn)
-                accepted = new_cost < cost
-            damping = max(1e-9, 0.1 * damping) if accepted else 10.0 * damping
-            if damping > 1e8:
-                return cost, steps
-        if not accepted:
+            solved = solve_damped(H, g, damping, step)
+            damping *= 1.0 if solved else 10.0
+        if not solved:
             break
-        gain = cost - new_cost
-        U, Un, V, Vn, phi = Un, U, Vn, V, phi + step[6]
-        G, Gn, h, hn, cost = Gn, G, hn, h, new_cost
-        copy_to(f, trial)
-        if gain <= 1e-6 * cost:
-            break
+        _rotate_columns(U, step[0:3], Un)
+        _rotate_columns(V, step[3:6], Vn)
+        phi_n = phi + step[6]
     return cost, steps
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.kernels import copy_to, empty, full, kernel
 
 LANES = 32
@@ -19,8 +18,8 @@ LANES = 32
 # matches, 21 and 30 the last three points of either image (9 each), 39 and 45 the two members (6 each) of
 # the pencil basis, 51 the three coefficients of the monic cubic.
 TO_BASIS_1, TO_BASIS_2, FIRST, SECOND, ROWS = 0, 9, 39, 45, 54
-# Points of a local refinement, points scored between two tests.
-SUBSET, STRIDE = 300, 16
+# Points scored between two tests.
+STRIDE = 16
 # The sequential test calls at most one right matrix in a thousand wrong.
 LOG_REJECTION_RATIO = np.log(1e3)
 LARGEST = 1 << 40
@@ -29,7 +28,7 @@ Three = tuple[float, float, float]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
-@kernel(inline="always", error_model="numpy")
+@kernel(inline="always")
 def _basis_transform(
     xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, xd: float, yd: float
 ) -> Nine:
@@ -43,13 +42,13 @@ def _basis_transform(
     return a * a0, a * a1, a * a2, b * b0, b * b1, b * b2, c * c0, c * c1, c * c2
 
 
-@kernel(inline="always", error_model="numpy")
+@kernel(inline="always")
 def _apply_transform(T: Nine, x: float, y: float) -> Three:
     """T (x, y, 1)'."""
     return T[0] * x + T[1] * y + T[2], T[3] * x + T[4] * y + T[5], T[6] * x + T[7] * y + T[8]
 
 
-@kernel(inline="always", error_model="numpy")
+@kernel(inline="always")
 def _basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, float]:
     """Coefficients of F13, F21, F23, F31, F32 in v' F u = 0, with F12 minus their sum."""
     first = v[0] * u[1]
@@ -57,7 +56,7 @@ def _basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, flo
     return F13, F21, F23, v[2] * u[0] - first, v[2] * u[1] - first
 
 
-@kernel(inline="always", error_model="numpy")
+@kernel(inline="always")
 def _determinant(a: Three, b: Three, c: Three) -> float:
     """Determinant of the matrix with columns a, b, c."""
     value: float = (
@@ -68,7 +67,7 @@ def _determinant(a: Three, b: Three, c: Three) -> float:
     return value
 
 
-@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(fastmath={"contract"}, forceinline=True)
 def solve_seven_point_batch(X: F64, Y: F64) -> None:
     """Write the pencils and cubics of LANES samples to ``Y`` (ROWS, LANES); not finite if degenerate.
 
@@ -111,7 +110,7 @@ def solve_seven_point_batch(X: F64, Y: F64) -> None:
         Y[51, k], Y[52, k], Y[53, k] = m2 * inverse, m1 * inverse, m0 * inverse
 
 
-@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(fastmath={"contract"}, forceinline=True)
 def _newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     """Real roots of x^3 + a x^2 + b x + c: one by Newton, the others from the remaining quadratic.
 
@@ -143,7 +142,7 @@ def _newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
     return 3
 
 
-@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(fastmath={"contract"}, forceinline=True)
 def _oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
     """Return whether the seven matches of a lane can be in front of both cameras of the member ``g`` (6,).
 
@@ -171,7 +170,7 @@ def _oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
     return True
 
 
-@kernel(error_model="numpy", fastmath={"contract"}, forceinline=True)
+@kernel(fastmath={"contract"}, forceinline=True)
 def _leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
     """Write F = T2' G T1 as a unit vector to ``f``, G from the entries ``g`` (6,); False if not finite."""
     norm = 0.0
@@ -189,7 +188,7 @@ def _leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
     return True
 
 
-@kernel(error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def seven_point_batch_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
     """Write the F (3, 9) of a solved sample that satisfy the oriented constraint; returns their number.
 
@@ -204,7 +203,7 @@ def seven_point_batch_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
     return found
 
 
-@kernel(inline="always", error_model="numpy")
+@kernel(inline="always")
 def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared Sampson distance, the summand of (5.4)."""
     a0 = f[0] * x1 + f[1] * y1 + f[2]
@@ -216,7 +215,7 @@ def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> floa
     return squared
 
 
-@kernel(error_model="numpy")
+@kernel
 def sampson_distances(f: F64, points: F64) -> F64:
     """Sampson distances (N,) >= 0 of all points."""
     r = empty(len(points))
@@ -225,7 +224,7 @@ def sampson_distances(f: F64, points: F64) -> F64:
     return r
 
 
-@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
     """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and the number with r < gate.
 
@@ -246,7 +245,7 @@ def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tup
     return total, inside
 
 
-@kernel(error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def truncated_score(
     f: F64, columns: F64, gate: float, give_up: float, evidence: tuple[float, float]
 ) -> tuple[float, int, int]:
@@ -324,40 +323,31 @@ def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
                 X[4 * m + c, lane] = points[sample[m], c]
 
 
-@kernel(forceinline=True)
-def _refine_best(points: F64, columns: F64, gate: float, state: F64, F: F64) -> None:
-    """Refine the best F on at most 300 points with twice the gate and keep the better of the two."""
-    f = F.copy()
-    refine(f, points[:SUBSET], SAMPSON, 2.0 * gate, gate, 4)
-    score, inliers, _ = truncated_score(f, columns, gate, state[0], (0.0, 0.0))
-    if score < state[0]:
-        state[0], state[1] = score, inliers / len(points)
-        copy_to(F, f)
-
-
 @kernel
 def search_fundamental(
-    points: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
+    points: F64, columns: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
 ) -> int:
-    """Score a seven-point sample per row of ``uniforms`` (B, 7) until enough are drawn; returns all drawn.
+    """Score a seven-point sample per row of ``uniforms`` (B, 7); returns the number of samples drawn.
 
-    Each new best ``F`` of a batch is refined before it sets the number of samples still required. ``stop``:
-    samples drawn before, minimum number, probability of a sample without outliers. ``state`` (4,): best
-    score, its inlier ratio, points seen and points inside the gate of rejected models.
+    The search ends with the batch that finds a better ``F`` or when enough samples are drawn. ``columns``
+    (4, N) are ``points`` too. ``stop``: samples drawn before, minimum number, probability of a sample without
+    outliers. ``state`` (4,): best score, its inlier ratio, points seen and points inside the gate of rejected
+    models.
     """
-    columns = np.ascontiguousarray(points.T)
     done, least, confidence = stop
     X, Y = full((28, LANES), 1.0), empty((ROWS, LANES))
     solutions, work = empty((3, 9)), empty(9)
+    before = state[0]
     for start in range(0, len(uniforms), LANES):
-        if done >= least and done >= required_samples(state[1], 7, confidence, LARGEST):
+        if state[0] < before or (
+            done >= least and done >= required_samples(state[1], 7, confidence, LARGEST)
+        ):
             break
         batch = uniforms[start : start + LANES]
         done += len(batch)
         _draw_batch(points, batch, X)
         solve_seven_point_batch(X, Y)
         evidence = _log_likelihood_ratios(state[1], state[3] / state[2])
-        before = state[0]
         for lane in range(len(batch)):
             for k in range(seven_point_batch_solutions(Y, lane, work, solutions)):
                 score, inliers, seen = truncated_score(solutions[k], columns, gate, state[0], evidence)
@@ -367,6 +357,4 @@ def search_fundamental(
                 else:
                     state[2] += seen
                     state[3] += inliers
-        if state[0] < before:
-            _refine_best(points, columns, gate, state, F)
     return done

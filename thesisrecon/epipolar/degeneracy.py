@@ -77,7 +77,7 @@ def _select_distinct(
     return count
 
 
-@kernel(error_model="numpy")
+@kernel
 def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
     """Fraction of the nearest neighbours of each chosen point that lie on the plane and contradict it.
 
@@ -287,7 +287,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
 def _contradicted_fraction(points: F64, weights: F64, h: F64, off: B8, near: float) -> float:
     """Fraction of the inliers ``off`` the plane among contradicting matches of the plane, from a sample."""
     chosen = np.flatnonzero(off)
-    chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
+    chosen = np.ascontiguousarray(chosen[:: max(1, len(chosen) // SAMPLED)])
     ratios, some = _contradicted_ratios(h, points, ~off, chosen, near), weights[chosen]
     return float(some[ratios > CONTRADICTED].sum() / max(some.sum(), 1e-300))
 

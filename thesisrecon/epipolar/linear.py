@@ -114,7 +114,7 @@ def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
     return np.array([frame.matrix_in_pixels(f) for f in solutions[:count]]).reshape(count, 3, 3)
 
 
-@kernel(inline="always", error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(inline="always", fastmath={"reassoc", "contract"}, forceinline=True)
 def _reflect(v: F64, start: int, scale: float, x: F64) -> None:
     """Apply x <- (I - scale v v') x with v zero before ``start``."""
     dot = 0.0
@@ -125,7 +125,7 @@ def _reflect(v: F64, start: int, scale: float, x: F64) -> None:
         x[r] -= dot * v[r]
 
 
-@kernel(error_model="numpy", fastmath={"reassoc", "contract"}, forceinline=True)
+@kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _null_pencil(points: F64, sample: I64, pencil: F64) -> bool:
     """Orthonormal basis ``pencil`` (2, 9) of the null space of the seven equations (5.1); False if dependent.
 

@@ -19,6 +19,8 @@ from thesisrecon.records import FundamentalFit
 BATCH = 512
 MINIMUM = 8
 PARAMETERS = 7
+# Linear solves of a refinement inside a search, and its points.
+SEARCH_STEPS, SEARCH_POINTS = 4, 300
 # Linear solves of each refinement of a search and of its last, and the points of all but the last.
 START_STEPS, LAST_STEPS, START_POINTS = 5, 20, 500
 REFINEMENT_STEPS, NOISE_REFINEMENTS = 15, 2
@@ -132,11 +134,12 @@ class LocallyOptimisedRansac:
         samples = 0
         for _ in range(self.max_starts):
             shuffled = points[rng.permutation(len(points))]
-            f, drawn = self._search(shuffled, gate, rng)
+            columns = np.ascontiguousarray(shuffled.T)
+            f, drawn = self._search(shuffled, columns, gate, rng)
             samples += drawn
             if f.any():
                 self._refine_start(f, shuffled, gate)
-                score, _, _ = truncated_score(f, np.ascontiguousarray(shuffled.T), gate, 1.0, (0.0, 0.0))
+                score, _, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
                 found.append((score * len(points), f))
             best = min((score for score, _ in found), default=np.inf)
             agreeing = sum(score - best < SAME_SCORE * len(points) ** 0.5 for score, _ in found)
@@ -150,16 +153,21 @@ class LocallyOptimisedRansac:
         width = self.gates[-1]
         refine(f, points, SAMPSON, width * gate, KNEE * width * gate, LAST_STEPS)
 
-    def _search(self, points: F64, gate: float, rng: Generator) -> tuple[F64, int]:
+    def _search(self, points: F64, columns: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
         least, most = self.min_samples // SEARCHES, self.max_samples // self.max_starts
         confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / SEARCHES)
-        drawn = 0
+        drawn, uniforms = 0, np.empty((0, 7))
         while drawn < most:
-            uniforms = rng.random((min(BATCH, most - drawn), 7))
-            before = drawn
-            drawn = search_fundamental(points, uniforms, gate, (drawn, least, confidence), state, f)
-            if drawn < before + len(uniforms):
+            if not len(uniforms):
+                uniforms = rng.random((min(BATCH, most - drawn), 7))
+            score, before = state[0], drawn
+            stop = (drawn, least, confidence)
+            drawn = search_fundamental(points, columns, uniforms, gate, stop, state, f)
+            uniforms = uniforms[drawn - before :]
+            if state[0] < score:
+                _refine_best(points, columns, gate, state, f)
+            elif len(uniforms):
                 break
         return f, drawn
 
@@ -210,6 +218,16 @@ class _Candidate:
         left = len(self.residuals) - explained
         few = left <= max(more, FEW_WRONG * len(self.residuals))
         return few and self.noise.log_likelihood > other.noise.log_likelihood
+
+
+def _refine_best(points: F64, columns: F64, gate: float, state: F64, f: F64) -> None:
+    """Refine the best F of a search on few points with twice the gate and keep the better of the two."""
+    trial = f.copy()
+    refine(trial, points[:SEARCH_POINTS], SAMPSON, 2.0 * gate, gate, SEARCH_STEPS)
+    score, inliers, _ = truncated_score(trial, columns, gate, state[0], (0.0, 0.0))
+    if score < state[0]:
+        state[:2] = score, inliers / len(points)
+        f[:] = trial
 
 
 def _best_and_competing(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:

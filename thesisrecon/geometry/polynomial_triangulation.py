@@ -33,7 +33,7 @@ _RANK = 1e-13
 """Singular values below this fraction of the largest are zero."""
 
 
-@kernel(error_model="numpy")
+@kernel
 def _horner(c: F64, x: float) -> tuple[float, float]:
     """Return value and derivative of the polynomial c (7,), lowest power first."""
     value, slope = c[_DEGREE], 0.0
@@ -43,7 +43,7 @@ def _horner(c: F64, x: float) -> tuple[float, float]:
     return value, slope
 
 
-@kernel(error_model="numpy")
+@kernel
 def _root_between(c: F64, low: float, high: float, rising: bool) -> float:
     """Return the root of c (7,) in [low, high] by Newton's method, or bisection outside the bracket."""
     x = 0.5 * (low + high)
@@ -65,7 +65,7 @@ def _root_between(c: F64, low: float, high: float, rising: bool) -> float:
     return x
 
 
-@kernel(error_model="numpy")
+@kernel
 def _roots_in_unit_interval(c: F64, roots: F64) -> int:
     """Fill roots (8,) with the real roots in [-1, 1] at which c (7,) changes sign; return their number.
 
@@ -99,14 +99,14 @@ def _roots_in_unit_interval(c: F64, roots: F64) -> int:
     return found
 
 
-@kernel(inline="always", error_model="numpy")
+@kernel(inline="always")
 def _form(B: F64, p0: float, p1: float, q0: float, q1: float) -> float:
     """Return p'Bq."""
     value: float = p0 * (B[0] * q0 + B[1] * q1) + p1 * (B[1] * q0 + B[2] * q1)
     return value
 
 
-@kernel(error_model="numpy")
+@kernel
 def _stationary_polynomial(cost: _PencilCost, c: F64) -> None:
     """Fill c (7,) with half the numerator of the derivative of the cost."""
     n0, n1, E0, E1, E2, G, kappa = cost
@@ -121,7 +121,7 @@ def _stationary_polynomial(cost: _PencilCost, c: F64) -> None:
     c[6] = kappa * kappa * s2
 
 
-@kernel(error_model="numpy")
+@kernel
 def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
     """Return the root of c of least cost in [-1, 1], or on the ``whole`` line with infinity; or NaN."""
     n0, n1, E0, E1, E2, G, kappa = pencil
@@ -146,7 +146,7 @@ def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
     return best
 
 
-@kernel(error_model="numpy")
+@kernel
 def _best_in_sector(own: _Two, B: F64, Q: float, D: float, other: _Two, E: F64, most: float, c: F64) -> _Four:
     """Return the best member q of the pencil and n of both images.
 
@@ -182,7 +182,7 @@ def _best_in_sector(own: _Two, B: F64, Q: float, D: float, other: _Two, E: F64, 
     return q0 + h * x * p0, q1 + h * x * p1, -h * x * Q, n0 + n1 * x
 
 
-@kernel(error_model="numpy")
+@kernel
 def _best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64, c: F64) -> _Four:
     """Return q0, q1, n1, n2 of least n1^2 / (q'B1q) + n2^2 / (q'B2q), n = a q0 + b q1; c (7,) is scratch."""
     cross = a2 * b1 - b2 * a1
@@ -207,7 +207,7 @@ def _best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64
     return q0, q1, n1, n2
 
 
-@kernel(error_model="numpy")
+@kernel
 def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, pencil: F64) -> None:
     """Move every match (N, 2), (N, 2) to its nearest exact one, in place; fill ``pencil`` (N, 2) with q.
 
@@ -233,7 +233,7 @@ def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, 
         xy2[k, 0], xy2[k, 1] = x2 - n2 * u, y2 - n2 * v
 
 
-@kernel(error_model="numpy")
+@kernel
 def _intersect_planes(a: F64, b: F64, c: F64, X: F64) -> float:
     """Fill X (4,) with the common point of three planes, by minors; return its relative norm."""
     s01, s02, s03 = b[0] * c[1] - b[1] * c[0], b[0] * c[2] - b[2] * c[0], b[0] * c[3] - b[3] * c[0]
@@ -246,7 +246,7 @@ def _intersect_planes(a: F64, b: F64, c: F64, X: F64) -> float:
     return math.sqrt((X @ X) / planes) if planes > 0.0 else 0.0
 
 
-@kernel(error_model="numpy")
+@kernel
 def _intersect_rays(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F64) -> None:
     """Fill X (M, 4), unit norm, with the intersections of the rays of exact matches.
 

@@ -28,7 +28,7 @@ _PARALLEL = 1e-14
 """Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
 
 
-@kernel(error_model="numpy")
+@kernel
 def _insert_row(R: F64, row: F64) -> None:
     """Rotate one more row (4,) into the triangle R (4, 4) (Givens); R'R grows by row row'."""
     for c in range(4):
@@ -43,7 +43,7 @@ def _insert_row(R: F64, row: F64) -> None:
             row[k] = cosine * row[k] - sine * above
 
 
-@kernel(error_model="numpy")
+@kernel
 def _least_singular_vector(R: F64, x: F64) -> None:
     """Fill x (4,) with the unit vector of least |R x|, R (4, 4) upper triangular.
 
@@ -75,7 +75,7 @@ def _least_singular_vector(R: F64, x: F64) -> None:
     _jacobi_least(R, x)
 
 
-@kernel(error_model="numpy")
+@kernel
 def _jacobi_least(R: F64, x: F64) -> None:
     """Fill x (4,) with the unit vector of least |R x| by one-sided Jacobi rotations (Hestenes)."""
     A, V = empty((4, 4)), empty((4, 4))
@@ -88,7 +88,7 @@ def _jacobi_least(R: F64, x: F64) -> None:
         x[i] = V[i, best]
 
 
-@kernel(error_model="numpy")
+@kernel
 def _least_algebraic(
     P: F64, obs: tuple[I64, F64, F64], first: int, last: int, R: F64, row: F64, x: F64
 ) -> None:
@@ -104,7 +104,7 @@ def _least_algebraic(
     _least_singular_vector(R, x)
 
 
-@kernel(error_model="numpy")
+@kernel
 def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
     """Return the sum of squared reprojection errors of one point, infinite or NaN in a focal plane."""
     cost = 0.0
@@ -117,7 +117,7 @@ def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64
     return cost
 
 
-@kernel(error_model="numpy")
+@kernel
 def _triangulate_each_linear(
     P: F64, scale: F64, start: I64, view: I64, xy: F64, passes: int, tolerance: float, X: F64
 ) -> None:

@@ -145,7 +145,7 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
     return True
 
 
-@kernel(error_model="numpy")
+@kernel
 def orthogonalize_columns(A: F64, V: F64) -> None:
     """Make the columns of A orthogonal in place by one-sided Jacobi rotations (Hestenes 1958).
 
@@ -184,7 +184,7 @@ def orthogonalize_columns(A: F64, V: F64) -> None:
             break
 
 
-@kernel(error_model="numpy")
+@kernel
 def shortest_column(A: F64) -> int:
     """Index of the column of least length.
 

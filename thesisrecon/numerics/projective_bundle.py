@@ -66,7 +66,8 @@ class _ProjectiveProblem:
         tangent_step(state.P, state.vP, state.bP, views, P)
         tangent_step(state.X, state.vX, state.bX, step[1], X)
         o = self.layout.observations
-        revert_crossing_points(o.start, o.seen.view_index, state.P[:, 8:], P[:, 8:], state.X, X)
+        before, after = np.ascontiguousarray(state.P[:, 8:]), np.ascontiguousarray(P[:, 8:])
+        revert_crossing_points(o.start, o.seen.view_index, before, after, state.X, X)
         return UnitState.at(P, X)
 
     def cost(self, state: UnitState) -> float:
