@@ -3,6 +3,8 @@
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="${THESISRECON_VENV:-$ROOT/.venv}"
+# Bytecode is written for the modules that are imported: pip would take twice as long with that of all.
+unset PYTHONDONTWRITEBYTECODE
 
 fail() {
   echo "$(basename "$0"): $*" >&2
@@ -61,7 +63,8 @@ need_package() {
     "$python" -m venv "$VENV" || fail "no virtual environment could be made in $VENV (Debian: python3-venv)"
   fi
   echo "installing thesisrecon${extras:+ [$extras]} into $VENV"
-  "$VENV/bin/python" -m pip install -qq --disable-pip-version-check -e "$ROOT${extras:+[$extras]}" </dev/null ||
+  "$VENV/bin/python" -m pip install -qq --no-compile --disable-pip-version-check \
+    -e "$ROOT${extras:+[$extras]}" </dev/null ||
     fail "pip could not install the package; its message stands above"
   echo "$wanted" >"$stamp"
 }
