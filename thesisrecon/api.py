@@ -16,8 +16,10 @@ from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
 from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.camera_matrix import cheirality
 from thesisrecon.geometry.robust_resection import resect
 from thesisrecon.geometry.triangulation import triangulate
+from thesisrecon.geometry.two_view import epipolar_lines
 from thesisrecon.model_export import export
 from thesisrecon.pipeline._image_pair import ImageInput, match_pair
 from thesisrecon.pipeline._loading import load
@@ -47,11 +49,12 @@ from thesisrecon.views.render import render
 __all__ = [
     "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
     "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "absolute_dual_quadric", "align_to_positions", "compare_models", "draw_epipolar_lines",
-    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "export", "interpolate_view",
-    "kruppa", "load", "match_pair", "match_rectified", "plane_at_infinity", "reconstruct",
-    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render",
-    "resect", "scaled", "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "UsageError", "absolute_dual_quadric", "align_to_positions", "cheirality", "compare_models",
+    "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental", "estimate_homography",
+    "estimate_trifocal", "export", "interpolate_view", "kruppa", "load", "match_pair", "match_rectified",
+    "plane_at_infinity", "reconstruct", "reconstruct_from_colmap", "reconstruct_from_matches",
+    "reconstruct_from_tracks", "rectify", "render", "resect", "scaled", "self_calibrate",
+    "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 

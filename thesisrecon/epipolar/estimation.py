@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
-from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure, unknown_word
 from thesisrecon.records import FundamentalFit
@@ -100,6 +99,7 @@ def estimate_fundamental(
 
 def _fit_all(xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, refined: bool) -> FundamentalFit:
     """Estimate F from all matches; the noise by the median residual, as for the robust methods."""
+    from thesisrecon.epipolar.linear import estimate_eight_point
     from thesisrecon.epipolar.ransac import discard_outliers
     from thesisrecon.epipolar.refinement import refine_fundamental
 
@@ -114,6 +114,8 @@ def _fit_all(xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, refined: boo
 
 
 def _fit_seven(xy1: NDArray[np.float64], xy2: NDArray[np.float64]) -> FundamentalFit:
+    from thesisrecon.epipolar.linear import estimate_seven_point
+
     solutions = estimate_seven_point(xy1, xy2)
     if not len(solutions):
         raise StageFailure(

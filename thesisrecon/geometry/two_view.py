@@ -124,6 +124,12 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     -------
     ndarray (N, 3)
         Zero for an epipole.
+
+    Examples
+    --------
+    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
+    [[0.0, 1.0, 30.0]]
     """
     return unit_normals(homogenize(xy1) @ F.T)
 
