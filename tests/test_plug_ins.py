@@ -354,6 +354,9 @@ def test_a_function_of_a_prompt_cannot_be_replayed(tmp_path):
     for line in lines:
         config = PipelineConfig(images=SMALL, features=strong, matching=line)
         assert reconstruct(images(2), out, config=config, until="matches", overwrite=True).pairs
+    given = {"config": config, "until": "matches", "overwrite": True, "executor": "processes", "threads": 1}
+    given["config"] = PipelineConfig(images=SMALL, features=lambda image: strong(image))
+    refuses(UsageError, "cannot be sent to another process", reconstruct, images(2), out, **given)
 
 
 def defined(text, name="f", file="<stdin>"):

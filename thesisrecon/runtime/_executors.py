@@ -277,7 +277,7 @@ def _run_all(
             for n, given in islice(left, max(AHEAD * remote.parallel() - len(waiting), 0)):
                 call: Task = (function, *given)
                 if pickled:
-                    call = (_answer, package_key(), pickle.dumps((function, given), 5))
+                    call = (_answer, package_key(), _pickled((function, given)))
                 waiting[remote.executor.submit(*call)] = n
             if not waiting:
                 return
@@ -292,6 +292,15 @@ def _run_all(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def _pickled(task: Any) -> bytes:
+    try:
+        return pickle.dumps(task, 5)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        # A lambda, an inner function, or an object that belongs to this process.
+        advice = "define it at the top of a file, or use the executor local"
+        raise UsageError(f"a method cannot be sent to another process ({error}); {advice}") from None
 
 
 def _lost(remote: _Remote, error: BaseException) -> WorkersLost:
