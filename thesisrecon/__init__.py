@@ -13,17 +13,18 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [  # noqa: F405
-    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
-    "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "__version__", "absolute_dual_quadric", "align_to_positions", "cheirality",
-    "compare_models", "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental",
-    "estimate_homography", "estimate_trifocal", "export", "interpolate_view", "kruppa", "load",
-    "match_pair", "match_rectified", "plane_at_infinity", "reconstruct", "reconstruct_from_colmap",
-    "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render", "resect", "scaled",
-    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "BundleAdjustment", "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison",
+    "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh",
+    "Tracks", "TwoView", "UsageError", "__version__", "absolute_dual_quadric", "align_to_positions",
+    "bundle_adjust", "cheirality", "compare_models", "draw_epipolar_lines", "epipolar_lines",
+    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "export", "interpolate_view",
+    "kruppa", "load", "match_pair", "match_rectified", "plane_at_infinity", "reconstruct",
+    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render",
+    "resect", "scaled", "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 _HOMES = {
+    "BundleAdjustment": "bundle_adjustment",
     "Camera": "camera",
     "ModelComparison": "comparison",
     "Reconstruction": "records",
@@ -33,6 +34,7 @@ _HOMES = {
     "UsageError": "errors",
     "align_to_positions": "alignment",
     "cheirality": "geometry.camera_matrix",
+    "bundle_adjust": "bundle_adjustment",
     "compare_models": "comparison",
     "epipolar_lines": "geometry.two_view",
     "estimate_fundamental": "epipolar.estimation",

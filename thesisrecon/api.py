@@ -7,6 +7,7 @@ import numpy as np
 from thesisrecon._settings import Config, as_config
 from thesisrecon.alignment import align_to_positions, scaled
 from thesisrecon.arrays import F64, U8
+from thesisrecon.bundle_adjustment import BundleAdjustment, bundle_adjust
 from thesisrecon.calibration import absolute_dual_quadric, plane_at_infinity, self_calibrate, upgrade_affine
 from thesisrecon.camera import Camera
 from thesisrecon.comparison import ModelComparison, compare_models
@@ -47,14 +48,14 @@ from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
-    "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison", "PipelineConfig",
-    "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh", "Tracks", "TwoView",
-    "UsageError", "absolute_dual_quadric", "align_to_positions", "cheirality", "compare_models",
-    "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental", "estimate_homography",
-    "estimate_trifocal", "export", "interpolate_view", "kruppa", "load", "match_pair", "match_rectified",
-    "plane_at_infinity", "reconstruct", "reconstruct_from_colmap", "reconstruct_from_matches",
-    "reconstruct_from_tracks", "rectify", "render", "resect", "scaled", "self_calibrate",
-    "synthesize_view", "triangulate", "upgrade_affine",
+    "BundleAdjustment", "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison",
+    "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh",
+    "Tracks", "TwoView", "UsageError", "absolute_dual_quadric", "align_to_positions", "bundle_adjust",
+    "cheirality", "compare_models", "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental",
+    "estimate_homography", "estimate_trifocal", "export", "interpolate_view", "kruppa", "load",
+    "match_pair", "match_rectified", "plane_at_infinity", "reconstruct", "reconstruct_from_colmap",
+    "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render", "resect", "scaled",
+    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
 ]  # fmt: skip
 
 

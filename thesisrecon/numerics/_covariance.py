@@ -1,4 +1,4 @@
-"""Covariance of poses and intrinsics after bundle adjustment, and the noise from the residuals."""
+"""Covariance of poses, intrinsics and points after bundle adjustment, and the noise from the residuals."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.numerics._elimination import BlockIndex
 from thesisrecon.numerics._metric_kernels import FOCAL, POSE_DOF
 from thesisrecon.numerics._reduced_solvers import ReducedSystem, order_views
 from thesisrecon.numerics.levenberg_marquardt import invert_information
+from thesisrecon.numerics.observations import Jacobians
 
 SIMILARITY_DOF = 7
 # Largest number of unknowns for dense inversion.
 MAX_DENSE = 1200
+# Pairs of observations at a time.
+PAIRS = 16384
 MAD_TO_SIGMA = 1.4826
 # Trimming point and variance of a standard normal variable trimmed there.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
@@ -41,41 +45,83 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     return sigma
 
 
-def bundle_covariances(
-    reduced: ReducedSystem, R: F64, t: F64, number: I64, focal: F64, scale: float
-) -> tuple[F64, F64]:
-    """Return covariances of intrinsics (G, C, C) and poses (b, 6, 6), with unit of length 1 / ``scale``.
+def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
+    """Return the covariance (n, C + e, C + e) of pairs of views with a common point, and of the border.
 
-    Poses refer to the inner gauge: of all solutions that differ by a similarity, the one that moved the
-    cameras least. ``R`` and ``t`` are those of the b views with observations, ``number`` (G, C) is the column
-    of each intrinsic; ``focal`` (G,) converts log f to f.
+    Its rows are the columns of view ``row``, then the border, its columns those of view ``column`` and the
+    border. It is that of the inner gauge: of all solutions that differ by a similarity, the one that moved
+    the cameras least. ``R`` and ``t`` are those of the b views with observations.
     """
     b, C, e = reduced.sums.border.shape
-    intrinsics, edge = np.zeros((*number.shape, number.shape[1])), b * C
     if not b:
+        return np.zeros((0, C + e, C + e))
+    compute = _dense_blocks if b * C + e <= MAX_DENSE else _band_blocks
+    return compute(reduced, R, t, row, column)
+
+
+def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
+    """Return covariances of intrinsics (G, C, C) and poses (b, 6, 6), with unit of length 1 / ``scale``.
+
+    ``blocks`` (b, C + e, C + e) are those of each view with itself, ``width`` is C, ``number`` (G, C) is the
+    column of each intrinsic; ``focal`` (G,) converts log f to f.
+    """
+    intrinsics, edge = np.zeros((*number.shape, number.shape[1])), len(blocks) * width
+    if not len(blocks):
         return intrinsics, np.zeros((0, POSE_DOF, POSE_DOF))
-    blocks = _dense_blocks(reduced, R, t) if edge + e <= MAX_DENSE else _band_blocks(reduced, R, t)
     units = np.array([1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale, 1.0 / scale])
     poses = blocks[:, :POSE_DOF, :POSE_DOF] * units * units[:, None]
     for g, row in enumerate(number):
         moves = np.flatnonzero(row >= 0)
-        own = row[moves][row[moves] < edge] // C
+        own = row[moves][row[moves] < edge] // width
         block = int(own[0]) if len(own) else 0
-        index = np.where(row[moves] < edge, row[moves] - C * block, row[moves] - edge + C)
+        index = np.where(row[moves] < edge, row[moves] - width * block, row[moves] - edge + width)
         units = np.where(moves == FOCAL, focal[g], 1.0)
         intrinsics[g][np.ix_(moves, moves)] = blocks[block][np.ix_(index, index)] * units * units[:, None]
     return intrinsics, poses
 
 
-def _dense_blocks(reduced: ReducedSystem, R: F64, t: F64) -> F64:
-    """Return the covariance blocks of each view and the border by dense inversion."""
+def point_covariances(blocks: F64, index: BlockIndex, J: Jacobians, inverse: F64) -> F64:
+    """Return the covariance (N, 3, 3) of the points in the gauge of the cameras' ``blocks``.
+
+    With V = B'B of a point and W' = sum B' [A E], it is V^-1 + V^-1 W' S W V^-1 for the covariance S of the
+    cameras that observe it. ``inverse`` (N, 3, 3) is V^-1; infinite for points in fewer than two views.
+    """
+    count = np.diff(index.start)
+    out, C = inverse.copy(), J.A.shape[2]
+    common = index.common[index.view_index]
+    moves = np.concatenate([J.A, np.where(common[:, None] >= 0, J.E, 0.0)], axis=2)
+    columns = np.concatenate(
+        [np.broadcast_to(np.arange(C), (len(moves), C)), C + np.maximum(common, 0)], axis=1
+    )
+    point = np.repeat(np.arange(len(count)), count)
+    T = inverse[point] @ np.swapaxes(J.B, 1, 2) @ moves
+    block = index.block[index.view_index]
+    # All pairs k <= m of observations of a point: m = k, k + 1, ... of a step at a time.
+    for step in range(int(count.max(initial=0))):
+        for first in range(0, len(T) - step, PAIRS):
+            k = np.arange(first, min(first + PAIRS, len(T) - step))
+            k = k[point[k] == point[k + step]]
+            m = k + step
+            pair = index.pair[block[k], block[m]]
+            S = blocks[pair[:, None, None], columns[k][:, :, None], columns[m][:, None, :]]
+            part = T[k] @ S @ np.swapaxes(T[m], 1, 2)
+            np.add.at(out, point[k], part + np.swapaxes(part, 1, 2) if step else part)
+    n_views = len(index.block)
+    seen = np.unique(point * n_views + index.view_index) // max(n_views, 1)
+    views = np.bincount(seen, minlength=len(count))
+    out[views < 2] = np.diag([np.inf] * 3)
+    return out
+
+
+def _dense_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
+    """Return the blocks of :func:`camera_blocks` by dense inversion."""
     b, C, e = reduced.sums.border.shape
     S = reduced.dense()
     covariance = invert_in_inner_gauge(np.triu(S) + np.triu(S, 1).T, _gauge_basis(reduced, R, t))
     index = np.concatenate(
         [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
     )
-    return np.asarray(covariance[index[:, :, None], index[:, None, :]])
+    return np.asarray(covariance[index[row][:, :, None], index[column][:, None, :]])
 
 
 def invert_in_inner_gauge(information: F64, N: F64) -> F64:
@@ -88,8 +134,8 @@ def invert_in_inner_gauge(information: F64, N: F64) -> F64:
     return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
 
 
-def _band_blocks(reduced: ReducedSystem, R: F64, t: F64) -> F64:
-    """Return the covariance blocks from a banded factor.
+def _band_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
+    """Return the blocks of :func:`camera_blocks` from a banded factor.
 
     Seven coordinates fix the frame; Baarda's S-transformation (I - N N') Q (I - N N') changes to the inner
     gauge.
@@ -100,16 +146,18 @@ def _band_blocks(reduced: ReducedSystem, R: F64, t: F64) -> F64:
     N = _gauge_basis(reduced, R, t)
     moved = None if factored is None else factored.solve(N)
     if factored is None or moved is None:
-        return np.full((b, C + e, C + e), np.inf)
+        return np.full((len(row), C + e, C + e), np.inf)
 
     def rows(matrix: F64) -> F64:
         own = matrix[: b * C].reshape(b, C, -1)
         return np.concatenate([own, np.broadcast_to(matrix[b * C :], (b, e, own.shape[2]))], axis=1)
 
     n, m, middle = rows(N), rows(moved), N.T @ moved
-    cross = m @ np.swapaxes(n, 1, 2)
-    blocks = factored.inverse_blocks()
-    return np.asarray(blocks - cross - np.swapaxes(cross, 1, 2) + n @ middle @ np.swapaxes(n, 1, 2))
+    blocks = factored.inverse_blocks(row, column)
+    blocks -= m[row] @ np.swapaxes(n[column], 1, 2)
+    blocks -= np.swapaxes(m[column] @ np.swapaxes(n[row], 1, 2), 1, 2)
+    blocks += n[row] @ middle @ np.swapaxes(n[column], 1, 2)
+    return blocks
 
 
 def _fix_gauge(reduced: ReducedSystem, R: F64, t: F64) -> None:

@@ -127,20 +127,23 @@ class _BandedFactor:
             return None
         return np.concatenate([views - self.moved @ tail, tail])
 
-    def inverse_blocks(self) -> F64:
-        """Return the rows and columns of S^-1 of each view and of the border; (b, C + e, C + e)."""
+    def inverse_blocks(self, row: I64, column: I64) -> F64:
+        """Return S^-1 of pairs of views inside the band, each with the border; (n, C + e, C + e)."""
         b, C, e = self.border.shape
         band = np.zeros(self.factor.T.shape)
         invert_band(np.ascontiguousarray(self.factor.T), band)
         corner, moved = np.linalg.inv(self.complement), self.moved.reshape(b, C, e)
-        blocks = np.zeros((b, C + e, C + e))
-        first = self.place[:, None] * C + np.arange(C)
+        blocks = np.zeros((len(row), C + e, C + e))
+        place = self.place * C
         for a in range(C):
-            for c in range(a, C):
-                blocks[:, c, a] = blocks[:, a, c] = band[first[:, a], c - a]
-        blocks[:, :C, :C] += np.einsum("bae,ef,bcf->bac", moved, corner, moved)
-        blocks[:, :C, C:] = -moved @ corner
-        blocks[:, C:, :C] = np.swapaxes(blocks[:, :C, C:], 1, 2)
+            for c in range(C):
+                first, second = place[row] + a, place[column] + c
+                low = np.minimum(first, second)
+                blocks[:, a, c] = band[low, np.maximum(first, second) - low]
+        blocks[:, :C, :C] += np.einsum("bae,ef,bcf->bac", moved[row], corner, moved[column])
+        cross = -moved @ corner
+        blocks[:, :C, C:] = cross[row]
+        blocks[:, C:, :C] = np.swapaxes(cross[column], 1, 2)
         blocks[:, C:, C:] = corner
         return blocks
 

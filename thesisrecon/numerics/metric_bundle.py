@@ -9,7 +9,13 @@ import numpy as np
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._covariance import SIMILARITY_DOF, bundle_covariances, robust_sigma
+from thesisrecon.numerics._covariance import (
+    SIMILARITY_DOF,
+    bundle_covariances,
+    camera_blocks,
+    point_covariances,
+    robust_sigma,
+)
 from thesisrecon.numerics._elimination import revert_crossing_points, sum_leverages
 from thesisrecon.numerics._intrinsic_unknowns import (
     IntrinsicColumns,
@@ -40,6 +46,9 @@ from thesisrecon.numerics.observations import (
 # bends: reweighting is safe far from the minimum, Newton's method is faster near it.
 _MIN_CURVATURE, _NEWTON_GAIN = 0.3, 1e-3
 
+_Covariances = tuple[F64, F64 | None, F64 | None]
+"""Of intrinsics (G, C, C), poses (V, 6, 6) and points (N, 3, 3)."""
+
 
 @dataclass(frozen=True)
 class BundleOptions:
@@ -50,14 +59,16 @@ class BundleOptions:
     sigma_px, loss_px : float
         Standard deviation of one image coordinate, the weight of the data against the priors, and turning
         point of Huber's loss; infinite for least squares.
-    max_iterations, covariance, noise_floor_px : int, bool, float
-        Maximum number of linear solves, whether to compute covariances, and the least noise assumed for them.
+    max_iterations, covariance, point_covariance, noise_floor_px : int, bool, bool, float
+        Maximum number of linear solves, whether to compute the covariances of the cameras, and with them
+        those of the points, and the least noise assumed for them.
     """
 
     sigma_px: float = 1.0
     loss_px: float = 1.0
     max_iterations: int = 20
     covariance: bool = False
+    point_covariance: bool = False
     noise_floor_px: float = 0.0
 
     def __post_init__(self) -> None:
@@ -81,6 +92,8 @@ class MetricBundleResult:
         translation) of x -> exp(w) x + d in each camera frame, in the inner gauge (no camera is exact).
     sigma_px : float
         Standard deviation of one image coordinate, estimated from the residuals.
+    point_covariance : ndarray (N, 3, 3), optional
+        In the same gauge; infinite for points in fewer than two views.
     """
 
     cameras: MetricCameras
@@ -90,6 +103,7 @@ class MetricBundleResult:
     intrinsics_covariance: F64
     pose_covariance: F64 | None
     sigma_px: float
+    point_covariance: F64 | None = None
 
 
 @dataclass(frozen=True)
@@ -219,13 +233,13 @@ def refine_metric_bundle(
     )
     residual = project_metric(end, o.seen)
     sigma = problem.sigma(state, residual)
-    covariances: tuple[F64, F64 | None] = (np.zeros((*table.shape, table.shape[1])), None)
+    covariances: _Covariances = (np.zeros((*table.shape, table.shape[1])), None, None)
     if options.covariance:
         noise = max(sigma or options.sigma_px, options.noise_floor_px)
-        covariances = _covariances(problem, state, noise, scale)
+        covariances = _covariances(problem, state, noise, scale, points=options.point_covariance)
     return MetricBundleResult(
         refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), cost,
-        *covariances, sigma,
+        *covariances[:2], sigma, covariances[2],
     )  # fmt: skip
 
 
@@ -260,14 +274,22 @@ def _metric_problem(
     return _MetricProblem(layout, columns, observed, values, weighting, layout.jacobians()), start, table
 
 
-def _covariances(problem: _MetricProblem, state: _State, sigma_px: float, scale: float) -> tuple[F64, F64]:
-    """Return covariances of intrinsics (G, C, C) and poses (V, 6, 6), t in the caller's unit."""
+def _covariances(
+    problem: _MetricProblem, state: _State, sigma_px: float, scale: float, *, points: bool
+) -> _Covariances:
+    """Return the covariances, lengths in the caller's unit."""
     problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
-    reduced, _, _ = problem.linearize(state).reduce(1e-10)
-    m, seen = state.model, problem.observed
+    reduced, sums, _ = problem.linearize(state).reduce(1e-10)
+    m, seen, layout = state.model, problem.observed, problem.layout
     number = problem.columns.columns_of(problem.values.number)
+    own = np.arange(int(seen.sum()))
+    row, column = (layout.row, layout.column) if points else (own, own)
+    blocks = camera_blocks(reduced, m.R[seen], m.t[seen], row, column)
     poses = np.zeros((len(m.t), POSE_DOF, POSE_DOF))
     intrinsics, poses[seen] = bundle_covariances(
-        reduced, m.R[seen], m.t[seen], number, m.intrinsics[:, 0], scale
+        blocks[row == column], layout.width, number, m.intrinsics[:, 0], scale
     )
-    return intrinsics, poses
+    if not points:
+        return intrinsics, poses, None
+    of_points = point_covariances(blocks, layout.index, problem.jacobians, sums.inverse)
+    return intrinsics, poses, of_points / scale**2

@@ -1,0 +1,301 @@
+"""Bundle adjustment in one call: cameras and points with their covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesisrecon._camera_input import CameraInput, as_cameras
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.camera import Camera
+from thesisrecon.errors import unknown_word
+from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras
+from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics.observations import Observations, sort_observations
+from thesisrecon.records import Reconstruction, Tracks
+
+COLUMNS: Mapping[str, tuple[int, ...]] = {
+    "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),
+    "k3": (7,),
+}  # fmt: skip
+"""Rows and columns of each intrinsic in the covariance."""
+STD_NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k1", "k2", "k3")
+"""Names of the standard deviations in :attr:`thesisrecon.Camera.std`."""
+LOSSES = ("huber", "squared")
+_HUBER_SIGMAS = 2.0
+_LEAST_SIGMA_PX = 1e-6
+_SIMILARITY_DOF = 7
+_MAX_BEHIND = 0.5
+"""Share of points behind their cameras that shows another convention of the poses."""
+
+
+@dataclass(frozen=True)
+class BundleAdjustment:
+    """Refined cameras and points with their uncertainty.
+
+    All covariances are those of the inner gauge: among the solutions that differ by a similarity, the one
+    that moved the cameras least. They contain the uncertainty of all other unknowns.
+
+    Parameters
+    ----------
+    cameras, X : tuple of Camera, ndarray (N, 3)
+        Cameras, with ``std`` of their intrinsics (0: not free), and points.
+    residual_px : ndarray (V, N, 2) or (K, 2)
+        Projection minus observation in the order of the observations; NaN where there is none.
+    sigma_px, cost : float
+        Standard deviation of one image coordinate, estimated from the residuals, and 1/2 sum rho, priors
+        included, in units of it.
+    pose_covariance : ndarray (V, 6, 6)
+        Of (rotation vector in rad, translation) of x -> exp(w) x + d in each camera frame.
+    intrinsics_covariance : ndarray (V, 8, 8)
+        Of focal, aspect, skew, principal x and y, k1, k2 and k3; zero where not free.
+    point_covariance : ndarray (N, 3, 3)
+        Infinite for points in fewer than two views.
+    """
+
+    cameras: tuple[Camera, ...]
+    X: F64
+    residual_px: F64
+    sigma_px: float
+    cost: float
+    pose_covariance: F64
+    intrinsics_covariance: F64
+    point_covariance: F64
+
+    @property
+    def centre_covariance(self) -> F64:
+        """Covariance of the camera centres (V, 3, 3)."""
+        R = np.array([camera.R for camera in self.cameras])
+        return np.asarray(np.swapaxes(R, 1, 2) @ self.pose_covariance[:, 3:, 3:] @ R)
+
+
+def bundle_adjust(
+    cameras: CameraInput,
+    X: F64 | None = None,
+    xy: F64 | Tracks | Observations | None = None,
+    *,
+    sizes: I64 | None = None,
+    shared: bool | I64 = True,
+    free: Sequence[str] = ("focal", "k1"),
+    prior: Mapping[str, float] | None = None,
+    loss: str = "huber",
+    loss_px: float | None = None,
+    sigma_px: float | None = None,
+    max_iterations: int = 50,
+) -> BundleAdjustment:
+    """Refine cameras and points together, with their covariances (6.7, HZ 18.1 and A6.3).
+
+    Minimises sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - q0) / std)^2 over poses, points and the free
+    intrinsics q.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera, tuple (K, R, t) or Reconstruction
+        Start: cameras; K (3, 3) or (V, 3, 3), R (V, 3, 3) and t (V, 3) with ``sizes``; or a metric
+        reconstruction: its registered views and, if X is not given, its valid points and inliers.
+    X : ndarray (N, 3)
+        Start of the points.
+    xy : ndarray (V, N, 2), Tracks or Observations
+        Pixels of the points, NaN = not seen; or a list with ``view_index``, ``point_index`` and ``xy``.
+    sizes : array_like (V, 2) or (2,), optional
+        Image width and height, for plain arrays.
+    shared : bool or ndarray (V,) of int
+        True: images of one size share their free intrinsics (they start at their mean); False: each image has
+        its own; or a camera number per image.
+    free : sequence of str
+        Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3".
+    prior : mapping of str to float, optional
+        Standard deviations of free intrinsics about the given cameras: relative for "focal", in pixels for
+        "principal_point" and "skew".
+    loss, loss_px : {"huber", "squared"}, float
+        Loss, and residual where Huber's turns linear (None: two standard deviations of the noise).
+    sigma_px : float, optional
+        Standard deviation of one image coordinate. None: estimated from the residuals.
+    max_iterations : int
+        Maximum number of linear solves.
+
+    Returns
+    -------
+    BundleAdjustment
+        Cameras, points, residuals and covariances; views and points without observations are unchanged.
+
+    Raises
+    ------
+    ValueError
+        If the arrays do not fit together, most points lie behind the cameras, there are fewer observations
+        than unknowns, or an option is unknown.
+
+    Notes
+    -----
+    The covariances are those of the linearised problem at the minimum with the noise that the residuals show
+    (``sigma_px`` only weights the data against the prior). The blocks of the points follow from the Schur
+    complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from thesisrecon import Camera, bundle_adjust
+    >>> rng, K = np.random.default_rng(0), np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
+    >>> R = Rotation.from_euler("yx", rng.uniform(-0.5, 0.5, (6, 2))).as_matrix()
+    >>> true = [Camera(K, r, np.array([0.0, 0, 5]), (640, 480)) for r in R]
+    >>> X = rng.uniform(-1, 1, (60, 3))
+    >>> xy = np.stack([camera.project(X) for camera in true]) + 0.5 * rng.normal(size=(6, 60, 2))
+    >>> found = bundle_adjust(true, X + 0.01 * rng.normal(size=X.shape), xy, prior={"k1": 0.05})
+    >>> bool(abs(found.cameras[0].K[0, 0] - 800) < 4 * found.cameras[0].std["focal_px"])
+    True
+    >>> found.point_covariance.shape, round(found.sigma_px, 1)
+    ((60, 3, 3), 0.5)
+    """
+    views, X, observed, dense = _problem(cameras, X, xy, sizes)
+    free = (free,) if isinstance(free, str) else tuple(free)
+    chosen = _free(free)
+    if loss not in LOSSES:
+        raise ValueError(unknown_word("loss", loss, LOSSES))
+    start = _start(views, shared, chosen)
+    knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
+    _check(start, X, observed, chosen, bool(prior))
+    fit, noise = None, sigma_px or 1.0
+    # Without a given noise the first pass finds it: it weights the prior and places the turn of the loss.
+    for last in (True,) if sigma_px is not None else (False, True):
+        turn = np.inf if loss == "squared" else loss_px or _HUBER_SIGMAS * noise
+        options = BundleOptions(
+            sigma_px=noise,
+            loss_px=turn,
+            max_iterations=max_iterations,
+            covariance=last,
+            point_covariance=last,
+        )
+        fit = refine_metric_bundle(start, X, observed, free=chosen, prior=knowledge, options=options)
+        start, X, noise = fit.cameras, fit.X, max(fit.sigma_px, _LEAST_SIGMA_PX)
+    assert fit is not None
+    assert fit.pose_covariance is not None
+    assert fit.point_covariance is not None
+    residual = fit.residual_px
+    if dense is not None:
+        residual = np.full(dense, np.nan)
+        residual[observed.view_index, observed.point_index] = fit.residual_px
+    K, std = fit.cameras.K, np.sqrt(np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2))
+    rows = fit.cameras.intrinsics
+    refined = tuple(
+        Camera(K[i], fit.cameras.R[i], fit.cameras.t[i], view.size, rows[i, 5:], _by_name(std[i]))
+        for i, view in enumerate(views)
+    )
+    return BundleAdjustment(
+        refined, fit.X, residual, fit.sigma_px, fit.cost, fit.pose_covariance, fit.intrinsics_covariance,
+        fit.point_covariance,
+    )  # fmt: skip
+
+
+def _by_name(std: F64) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(STD_NAMES, std, strict=True)}
+
+
+def _problem(
+    cameras: CameraInput,
+    X: F64 | None,
+    xy: F64 | Tracks | Observations | None,
+    sizes: I64 | None,
+) -> tuple[list[Camera], F64, Observations, tuple[int, ...] | None]:
+    """Cameras, points and observations, and the shape of xy if it was dense."""
+    views = as_cameras("bundle_adjust", cameras, sizes)
+    if isinstance(cameras, Reconstruction) and X is None and xy is None:
+        return views, *_of_reconstruction(cameras), None
+    if X is None or xy is None:
+        raise ValueError("bundle_adjust needs X (N, 3) and xy, the pixels of the points; got None")
+    X, shape = np.asarray(X, dtype=np.float64), None
+    if isinstance(xy, Tracks | Observations):
+        observed = Observations(xy.view_index, xy.point_index, xy.xy)
+    else:
+        xy = np.asarray(xy, dtype=np.float64)
+        shape = (len(views), len(X), 2)
+        if xy.shape != shape:
+            raise ValueError(
+                f"bundle_adjust of {len(views)} cameras and {len(X)} points needs xy {shape}; got {xy.shape}"
+            )
+        point, view = np.nonzero(np.isfinite(xy).all(axis=2).T)
+        observed = Observations(view, point, xy[view, point])
+    require_shapes("bundle_adjust", X=(X, ("N", 3)))
+    return views, X, observed, shape
+
+
+def _of_reconstruction(r: Reconstruction) -> tuple[F64, Observations]:
+    """Valid points, and the inlier observations in registered views."""
+    tracks = r.tracks
+    kept = r.inlier & r.registered[tracks.view_index] & r.valid[tracks.point_index]
+    view, point = np.cumsum(r.registered) - 1, np.cumsum(r.valid) - 1
+    X = r.X[r.valid]
+    observed = Observations(view[tracks.view_index[kept]], point[tracks.point_index[kept]], tracks.xy[kept])
+    return np.asarray(X[:, :3] / X[:, 3:]), observed
+
+
+def _free(names: Sequence[str]) -> B8:
+    """Columns (8,) of the intrinsics to refine."""
+    chosen = np.zeros(len(STD_NAMES), dtype=bool)
+    for name in names:
+        if name not in COLUMNS:
+            raise ValueError(unknown_word("intrinsic in free", name, COLUMNS))
+        chosen[list(COLUMNS[name])] = True
+    return chosen
+
+
+def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCameras:
+    """The cameras as a table with a row per view; views of one number share the free columns."""
+    n = len(views)
+    if isinstance(shared, bool | np.bool_):
+        sizes = list(dict.fromkeys(view.size for view in views))
+        number = np.array([sizes.index(view.size) for view in views]) if shared else np.arange(n)
+    else:
+        number = np.asarray(shared)
+        if number.shape != (n,) or number.dtype.kind not in "iu":
+            raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {number}")
+    table = np.zeros((n, len(STD_NAMES)))
+    for row, view in zip(table, views, strict=True):
+        lens = np.zeros(0) if view.distortion is None else view.distortion
+        if np.any(lens[3:]):
+            raise ValueError(f"bundle_adjust knows distortion by k1, k2, k3; got {len(lens)} coefficients")
+        K = view.K
+        row[:5] = K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2]
+        row[5 : 5 + len(lens[:3])] = lens[:3]
+    R, t = (np.array([getattr(view, name) for view in views]) for name in ("R", "t"))
+    sharing = np.where(free, number[:, None], np.arange(n)[:, None])
+    return MetricCameras(R, t, table, np.arange(n), sharing)
+
+
+def _prior(table: F64, prior: Mapping[str, float], free: B8, names: Sequence[str]) -> IntrinsicsPrior:
+    """Gaussian prior of the table of intrinsics (V, 8)."""
+    std = np.full(table.shape, np.inf)
+    for name, value in prior.items():
+        if name not in COLUMNS or not free[list(COLUMNS[name])].all():
+            raise ValueError(f"prior has {name!r}, which is not among the free intrinsics {tuple(names)}")
+        if not 0.0 < value < np.inf:
+            raise ValueError(f"prior[{name!r}] is a standard deviation and must be above 0; got {value}")
+        std[:, list(COLUMNS[name])] = value
+    return IntrinsicsPrior.unshared(table, std)
+
+
+def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound: bool) -> None:
+    """Refuse cameras that look away from the points, and fewer equations than unknowns."""
+    sort_observations(observed, len(start.R), len(X))
+    view, point = observed.view_index, observed.point_index
+    require_finite("bundle_adjust, for points with observations,", X[point])
+    depth = np.einsum("kb,kb->k", start.R[view, 2], X[point]) + start.t[view, 2]
+    behind = float(np.mean(depth <= 0.0)) if len(depth) else 0.0
+    if behind > _MAX_BEHIND:
+        raise ValueError(
+            f"{behind:.0%} of the observed points lie behind their cameras; R is world to camera and "
+            "t = -R centre"
+        )
+    seen = np.unique(view)
+    assert start.shared is not None
+    own = sum(len(np.unique(start.shared[seen, c])) for c in np.flatnonzero(free)) if not bound else 0
+    unknowns = POSE_DOF * len(seen) + 3 * len(np.unique(point)) + own - _SIMILARITY_DOF
+    if 2 * len(view) < unknowns or len(seen) < 2:
+        raise ValueError(
+            f"bundle_adjust needs two views and as many equations as unknowns; {len(view)} observations in "
+            f"{len(seen)} views give {2 * len(view)} equations for {unknowns} unknowns"
+        )
