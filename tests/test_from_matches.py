@@ -8,6 +8,7 @@ import pytest
 import thesisrecon
 from tests.given_scene import given_scene
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
+from thesisrecon.cli.main import run_command
 
 SCENE = given_scene()
 ORIENTATIONS = "CREATE TABLE {} (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
@@ -164,3 +165,22 @@ def test_other_files_are_no_database(tmp_path):
         reconstruct_from_colmap(tmp_path / "text.db")
     with pytest.raises(UsageError, match="there is no COLMAP database or model"):
         reconstruct_from_colmap(tmp_path / "none.db")
+
+
+def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, capsys):
+    database = write_database(tmp_path / "database.db", verified=True)
+    assert run_command(["reconstruct", "--from", str(database), "-o", str(tmp_path / "first")]) == 0
+    assert "5 of 5 images registered" in capsys.readouterr().out
+    sparse = str(tmp_path / "first" / "sparse" / "0")
+    assert run_command(["reconstruct", "--from", sparse, "-o", str(tmp_path / "second")]) == 0
+    one, two = (thesisrecon.load(tmp_path / name).cameras["7.jpg"].K[0, 0] for name in ("first", "second"))
+    assert two == pytest.approx(one, rel=5e-3)
+
+
+def test_the_command_takes_one_source_of_images(tmp_path, refused):
+    for arguments, sentence in (
+        (["-o", tmp_path], "give the folder of the images, or --from"),
+        (["a", "--from", "b", "-o", tmp_path], "with --from the images are given by --images"),
+        (["a", "--images", "b", "-o", tmp_path], "give the folder of the images, or --from"),
+    ):
+        assert sentence in refused(["reconstruct", *arguments])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -30,8 +30,23 @@ _DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
 
 
 def reconstruct(
-    images: Annotated[Path, typer.Argument(parser=parse_folder, metavar="IMAGES", help="Folder of images.")],
     out: OutputFolder,
+    images: Annotated[
+        Path | None, typer.Argument(parser=parse_folder, metavar="IMAGES", help="Folder of images.")
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="DATABASE|SPARSE",
+            help="Take the matches of a COLMAP database, or the tracks of a COLMAP sparse model; its cameras "
+            "are forgotten.",
+        ),
+    ] = None,
+    images_folder: Annotated[
+        Path | None,
+        typer.Option("--images", help="With --from: the folder of the images, for colours and the model."),
+    ] = None,
     preset: Annotated[
         Literal["default", "thesis"] | None,
         typer.Option("--preset", help="Pipeline to start from (default: default)."),
@@ -82,7 +97,18 @@ def reconstruct(
     chosen: dict[str, Any] = {"config": config, "preset": preset, "cameras": cameras, "pairs": pairs}
     chosen |= {"max_size": max_size, "set": settings or []}
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
-    _run(images, out, seed, chosen | options)
+    if source is None:
+        if images is None or images_folder is not None:
+            raise UsageError(
+                "give the folder of the images, or --from DATABASE|SPARSE with or without --images"
+            )
+        _run(images, out, seed, chosen | options)
+        return
+    if images is not None or chosen.pop("pairs") is not None:
+        raise UsageError(
+            "with --from the images are given by --images, and the pairs are those of the source"
+        )
+    _run_from(source, out, seed, chosen | options | {"images": images_folder})
 
 
 def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0) -> None:
@@ -98,10 +124,22 @@ def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0) -> None:
 def _run(images: Path | list[Path], out: Path, seed: int, options: Mapping[str, Any]) -> None:
     from thesisrecon.pipeline.reconstruction import reconstruct as run_pipeline
 
+    _reported(run_pipeline, images, out, seed, options)
+
+
+def _run_from(source: Path, out: Path, seed: int, options: Mapping[str, Any]) -> None:
+    from thesisrecon.pipeline.from_matches import reconstruct_from_colmap
+
+    _reported(reconstruct_from_colmap, source, out, seed, options)
+
+
+def _reported(
+    function: Callable[..., RunResult], source: Any, out: Path, seed: int, options: Mapping[str, Any]
+) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     advice = f"repeat the command to resume from {printable(str(out))}"
     with interruptible(advice), progress_bars() as progress:
-        result: RunResult = run_pipeline(images, out, seed=seed, progress=progress, **options)
+        result = function(source, out, seed=seed, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))
 
 
