@@ -275,3 +275,38 @@ def _fountain(x: float, y: float) -> list[list[Surface]]:
 def build_courtyard() -> World:
     """The scene, ready to be traced (a few seconds)."""
     return build_world(build_objects(), build_materials(), SUN)
+
+
+def build_yard(seed: int) -> World:
+    """Another yard: the same walls in other places; crates, stones, barrels and columns drawn by the seed."""
+    rng = np.random.default_rng([71, seed])
+    x, y, z = np.eye(3)
+    back, left, right = rng.permutation([BACK, LEFT, RIGHT])
+    walls = [
+        Surface(np.array([-6.2, 0.0, 0.0]), x, z, (12.4 if back == BACK else 9.9, WALL_HEIGHT), int(back)),
+        Surface(np.array([-6.0, -9.9, 0.0]), y, z, (9.9, WALL_HEIGHT), int(left)),
+        Surface(np.array([3.6, 0.0, 0.0]), -y, z, (9.9, WALL_HEIGHT), int(right)),
+        Surface(np.array([-6.3, -10.0, 0.0]), x, y, (12.6, 10.0), GROUND),
+    ]
+    objects, places = list[list[Surface]](), list[np.ndarray]()
+    while len(places) < 9:
+        place = rng.uniform([-4.0, -4.4], [2.8, -0.7])
+        if all(np.linalg.norm(place - other) > 1.2 for other in places):
+            places.append(place)
+            objects += _thing(float(place[0]), float(place[1]), rng)
+    return build_world(objects + [[wall] for wall in walls], build_materials(), SUN)
+
+
+def _thing(x: float, y: float, rng: np.random.Generator) -> list[list[Surface]]:
+    """A crate with perhaps another one on it, a dressed stone, a barrel or a column."""
+    kind, turn = int(rng.integers(4)), float(rng.uniform(-0.4, 0.4))
+    width, height = float(rng.uniform(0.5, 0.95)), float(rng.uniform(0.4, 0.9))
+    if kind == 0:
+        crates = [_box((x, y, 0.0), (width, width, height), WOOD, turn)]
+        return [*crates, _box((x, y, height), (0.6 * width, 0.6 * width, 0.5), WOOD, -turn)]
+    if kind == 1:
+        return [_box((x, y, 0.0), (width, 0.7 * width, 1.6 * height), STONE, turn)]
+    if kind == 2:
+        return [[_drum(x, y, 0.0, 0.3, (2 * PI * 0.3, 1.0), BARREL), _lid(x, y, 1.0, 0.3, WOOD)]]
+    column = _drum(x, y, 0.3, 0.22, (2 * PI * 0.22, 2.6), COLUMN + int(rng.integers(len(COLUMN_SEEDS))))
+    return [_box((x, y, 0.0), (0.62, 0.62, 0.34), STONE, turn), [column]]

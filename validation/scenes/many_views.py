@@ -6,13 +6,16 @@ n of a longer set are the set of n, spread over the same arc.
 
 from __future__ import annotations
 
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from math import cos, pi, sin, tan
 from pathlib import Path
 
 import numpy as np
 
-from validation.scenes.courtyard import build_courtyard
+from thesisrecon.io._files import write_json
+from validation.scenes.courtyard import build_courtyard, build_yard
 from validation.scenes.image_files import write_png
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.sensor import take_image
@@ -68,3 +71,33 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(write, missing))
+
+
+YARD_IMAGES, YARD_SIZE = 10, (960, 720)
+
+
+def yard_folder(seed: int) -> Path:
+    """The folder of images and true cameras of a yard, rendered on first use (a minute)."""
+    folder = Path(tempfile.gettempdir()) / "thesisrecon-yards" / f"yard-{seed}-{YARD_IMAGES}"
+    if not (folder / "cameras.json").is_file():
+        write_yard(folder, seed)
+    return folder
+
+
+def write_yard(folder: Path, seed: int) -> None:
+    """Images and ``cameras.json`` of a yard of its own (:func:`build_yard`), seen by cameras of its own."""
+    world, poses = build_yard(seed), walk(YARD_IMAGES, YARD_SIZE, seed=1000 + seed)
+    zoom = float(np.random.default_rng([72, seed]).uniform(0.85, 1.25))
+    entries = []
+    for k, pose in enumerate(poses):
+        K = pose.K * np.array([[zoom], [zoom], [1.0]])
+        K[:2, 2] = pose.K[:2, 2]
+        seen = replace(pose, K=K)
+        gain, rng = 0.82 * pose.exposure, np.random.default_rng([2003, seed, k])
+        rgb = take_image(world, seen, YARD_SIZE, gains=(gain, gain, gain), rng=rng)
+        name = f"{k:04d}.png"
+        write_png(folder / "images" / name, rgb)
+        t = -seen.R @ seen.C
+        size = {"width": YARD_SIZE[0], "height": YARD_SIZE[1]}
+        entries.append({"name": name, **size, "K": K, "distortion": [0.0, 0.0, 0.0], "R": seen.R, "t": t})
+    write_json(folder / "cameras.json", {"cameras": entries})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,8 @@ from validation.ablation.study import Measure, Place, Task
 from validation.harness.records import ReportOptions
 from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
-from validation.scenes.real import Scene
+from validation.scenes.many_views import yard_folder
+from validation.scenes.real import Scene, read_scene
 
 SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
     "features": ("images", "features"),
@@ -34,6 +36,7 @@ SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
     "model": ("model",),
 }
 """The settings that each step adds to those before it."""
+YARD = re.compile(r"yard-\d{1,4}")
 NEED_TRUTH = ("focal_error_pct", "centre_error_mm", "rotation_error_deg")
 SUBSET_SHARE = 2 / 3
 """Enough images for self-calibration where the scene has eight; neighbours by name mostly overlap."""
@@ -51,7 +54,8 @@ class Reconstruction(Task):
 
     A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth
     if there is one; without truth the errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n
-    windows of ``SUBSET_SHARE`` of the images, in the order of their names, spread over the scene.
+    windows of ``SUBSET_SHARE`` of the images, in the order of their names, spread over the scene. "yard-N" is
+    a rendered yard with true cameras, another one for each number.
     """
 
     until: str = "metric"
@@ -155,6 +159,8 @@ def _images(scene: str) -> tuple[Path, ...]:
 def _load(scene: str) -> Scene:
     """The images of a whole scene by its name or its folder; :class:`UsageError` if there are none."""
     scene = _parts(scene)[0]
+    if YARD.fullmatch(scene):
+        return read_scene(yard_folder(int(scene.rpartition("-")[2])), scene)
     folder = Path(scene)
     named = {} if scene in IMAGE_SCENES or not folder.is_dir() else {scene: str(folder)}
     if scene not in IMAGE_SCENES and not named:
