@@ -179,7 +179,7 @@ class FakeDense:
 
     confirmed: bool = True
 
-    def prepare(self, images, reconstruction, *, threads=1):
+    def prepare(self, images, reconstruction, *, depth_range=None, threads=1):
         CALLS.append("prepare dense")
         P = reconstruction.P
         views = {

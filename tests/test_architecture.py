@@ -29,7 +29,9 @@ FOUNDATIONS = {
     "geometry",
     "numerics",
 }
-COMPOSERS = {"__init__", "config", "api", "pipeline", "view_interpolation", "view_synthesis"}
+COMPOSERS = {
+    "__init__", "config", "api", "dense_model", "pipeline", "view_interpolation", "view_synthesis",
+}  # fmt: skip
 """Only these may import several stages: they pass to a stage what it needs of another one."""
 CORE = {"numpy", "scipy", "numba", "PIL", "trimesh", "jinja2", "plotly", "rich", "typer"}
 OPTIONAL = {"runtime": {"dask", "distributed"}}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.test_dense_model import example
 from thesisrecon import Camera, Reconstruction, Tracks, bundle_adjust
 
 NOISE = 0.4
@@ -118,6 +119,18 @@ def test_arrays_lists_of_observations_and_reconstructions_give_the_same():
     ):
         np.testing.assert_allclose(again.X, found.X, rtol=0, atol=1e-7)
         np.testing.assert_allclose(again.point_covariance, found.point_covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_the_example_states_the_standard_deviations(capsys):
+    cameras, X, xy = _scene()
+    K, R, t = (np.array([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t"))
+    given = {"K": K[0], "R": R, "t": t, "X": X, "xy": xy}
+    exec(example("bundle adjustment"), given)
+    assert capsys.readouterr().out.startswith("focal length 9")
+    seen = np.isfinite(xy[:, :, 0]).sum(axis=0)
+    assert 0.0 < given["point_std"][seen > 2].max() < 0.1
+    assert (np.isinf(given["point_std"]) == (seen < 2)).all()
+    assert 0.0 < given["centre_std"].min() < given["centre_std"].max() < 0.1
 
 
 @pytest.mark.parametrize(

@@ -13,19 +13,21 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [  # noqa: F405
-    "BundleAdjustment", "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison",
-    "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh",
-    "Tracks", "TwoView", "UsageError", "__version__", "absolute_dual_quadric", "align_to_positions",
-    "bundle_adjust", "cheirality", "compare_models", "draw_epipolar_lines", "epipolar_lines",
-    "estimate_fundamental", "estimate_homography", "estimate_trifocal", "export", "interpolate_view",
-    "kruppa", "load", "match_pair", "match_rectified", "plane_at_infinity", "reconstruct",
-    "reconstruct_from_colmap", "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render",
-    "resect", "scaled", "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "BundleAdjustment", "Camera", "DepthMap", "DisparityMap", "FundamentalFit", "Image",
+    "ModelComparison", "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure",
+    "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__", "absolute_dual_quadric",
+    "align_to_positions", "bundle_adjust", "cheirality", "compare_models", "depth_maps",
+    "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental", "estimate_homography",
+    "estimate_trifocal", "export", "fuse_depth_maps", "interpolate_view", "kruppa", "load", "match_pair",
+    "match_rectified", "plane_at_infinity", "read_cameras", "reconstruct", "reconstruct_from_colmap",
+    "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render", "resect", "scaled",
+    "self_calibrate", "synthesize_view", "texture", "triangulate", "upgrade_affine", "write_mesh",
 ]  # fmt: skip
 
 _HOMES = {
     "BundleAdjustment": "bundle_adjustment",
     "Camera": "camera",
+    "DepthMap": "records",
     "ModelComparison": "comparison",
     "Reconstruction": "records",
     "RunResult": "results",
@@ -33,18 +35,23 @@ _HOMES = {
     "Tracks": "records",
     "UsageError": "errors",
     "align_to_positions": "alignment",
-    "cheirality": "geometry.camera_matrix",
     "bundle_adjust": "bundle_adjustment",
+    "cheirality": "geometry.camera_matrix",
     "compare_models": "comparison",
+    "depth_maps": "dense_model",
     "epipolar_lines": "geometry.two_view",
     "estimate_fundamental": "epipolar.estimation",
     "estimate_homography": "epipolar.homography",
     "estimate_trifocal": "epipolar.trifocal_estimation",
     "export": "model_export",
+    "fuse_depth_maps": "dense_model",
     "kruppa": "selfcalibration.kruppa",
+    "read_cameras": "io._models",
     "resect": "geometry.robust_resection",
     "scaled": "alignment",
+    "texture": "dense_model",
     "triangulate": "geometry.triangulation",
+    "write_mesh": "io._meshes",
 }
 """Modules of what needs no configuration, whose import takes longest; the others are in `api`."""
 

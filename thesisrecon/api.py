@@ -12,6 +12,7 @@ from thesisrecon.calibration import absolute_dual_quadric, plane_at_infinity, se
 from thesisrecon.camera import Camera
 from thesisrecon.comparison import ModelComparison, compare_models
 from thesisrecon.config import PipelineConfig
+from thesisrecon.dense_model import depth_maps, fuse_depth_maps, texture
 from thesisrecon.epipolar.drawing import draw_lines
 from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
@@ -21,6 +22,8 @@ from thesisrecon.geometry.camera_matrix import cheirality
 from thesisrecon.geometry.robust_resection import resect
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import epipolar_lines
+from thesisrecon.io._meshes import write_mesh
+from thesisrecon.io._models import read_cameras
 from thesisrecon.model_export import export
 from thesisrecon.pipeline._image_pair import ImageInput, match_pair
 from thesisrecon.pipeline._loading import load
@@ -31,6 +34,7 @@ from thesisrecon.pipeline.from_matches import (
 )
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import (
+    DepthMap,
     DisparityMap,
     FundamentalFit,
     Image,
@@ -48,14 +52,15 @@ from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
-    "BundleAdjustment", "Camera", "DisparityMap", "FundamentalFit", "Image", "ModelComparison",
-    "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure", "TexturedMesh",
-    "Tracks", "TwoView", "UsageError", "absolute_dual_quadric", "align_to_positions", "bundle_adjust",
-    "cheirality", "compare_models", "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental",
-    "estimate_homography", "estimate_trifocal", "export", "interpolate_view", "kruppa", "load",
-    "match_pair", "match_rectified", "plane_at_infinity", "reconstruct", "reconstruct_from_colmap",
+    "BundleAdjustment", "Camera", "DepthMap", "DisparityMap", "FundamentalFit", "Image",
+    "ModelComparison", "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure",
+    "TexturedMesh", "Tracks", "TwoView", "UsageError", "absolute_dual_quadric", "align_to_positions",
+    "bundle_adjust", "cheirality", "compare_models", "depth_maps", "draw_epipolar_lines",
+    "epipolar_lines", "estimate_fundamental", "estimate_homography", "estimate_trifocal", "export",
+    "fuse_depth_maps", "interpolate_view", "kruppa", "load", "match_pair", "match_rectified",
+    "plane_at_infinity", "read_cameras", "reconstruct", "reconstruct_from_colmap",
     "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render", "resect", "scaled",
-    "self_calibrate", "synthesize_view", "triangulate", "upgrade_affine",
+    "self_calibrate", "synthesize_view", "texture", "triangulate", "upgrade_affine", "write_mesh",
 ]  # fmt: skip
 
 

@@ -313,9 +313,17 @@ class DepthEstimator(StereoMatcher, Protocol):
     """Estimate depth maps one view at a time (2.5); ``scene`` has all or the ``required_views``."""
 
     def prepare(
-        self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
+        self,
+        images: Sequence[Image],
+        reconstruction: Reconstruction,
+        *,
+        depth_range: F64 | None = None,
+        threads: int = 1,
     ) -> MultiViewScene:
         """Undistort the images of a metric reconstruction and select the neighbours of each.
+
+        The depths to search are ``depth_range`` (V, 2), nearest and farthest, else follow from the points of
+        the reconstruction, else from the cameras.
 
         Returns
         -------

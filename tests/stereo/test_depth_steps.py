@@ -17,11 +17,11 @@ from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _s
 from thesisrecon.stereo.depth import (
     _complete_depths,
     _confirm_depths,
-    _pinhole_view,
     _region_sizes,
     _select_neighbours,
     _shared_projections,
     _sparse_points,
+    pinhole_view,
 )
 
 
@@ -32,7 +32,7 @@ def walled():
 
 def views_of(walled, **options):
     return {
-        i: _pinhole_view(image, walled.reconstruction, i, **options) for i, image in enumerate(walled.images)
+        i: pinhole_view(image, walled.reconstruction, i, **options) for i, image in enumerate(walled.images)
     }
 
 
@@ -43,7 +43,7 @@ def test_an_undistorted_view_equals_the_view_without_distortion(walled):
         assert 0.8 < view.seen.mean() <= 1.0
         apart = view.rgb.astype(float) - straight.images[i].rgb
         assert np.median(np.abs(apart[view.seen])) < 2.0
-        plain = _pinhole_view(straight.images[i], straight.reconstruction, i)
+        plain = pinhole_view(straight.images[i], straight.reconstruction, i)
         assert (plain.rgb == straight.images[i].rgb).all()
 
 
@@ -58,9 +58,9 @@ def test_a_smaller_view_has_the_camera_of_its_pixels(walled):
 def test_views_are_refused_with_a_sentence(walled):
     image, reconstruction = walled.images[0], walled.reconstruction
     with pytest.raises(ValueError, match="metric"):
-        _pinhole_view(image, replace(reconstruction, K=None), 0)
+        pinhole_view(image, replace(reconstruction, K=None), 0)
     with pytest.raises(ValueError, match="px; got"):
-        _pinhole_view(image, replace(reconstruction, sizes=reconstruction.sizes + 1), 0)
+        pinhole_view(image, replace(reconstruction, sizes=reconstruction.sizes + 1), 0)
 
 
 def test_neighbours_are_on_both_sides_and_do_not_depend_on_the_scale(walled):

@@ -251,7 +251,9 @@ def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:
         raise UsageError(f"{out} holds no run; create one with thesisrecon reconstruct IMAGES -o {out}")
     if not (out / MODEL).is_file():
         raise UsageError(_missing_model(out))
-    return read_mesh(out / MODEL), list(read_cameras(out / CAMERAS).values())
+    mesh = read_mesh(out / MODEL)
+    # Views are rendered without lens distortion.
+    return mesh, [replace(camera, distortion=None) for camera in read_cameras(out / CAMERAS).values()]
 
 
 def _missing_model(out: Path) -> str:

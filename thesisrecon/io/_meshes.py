@@ -111,11 +111,31 @@ def _require_tree(nodes: list[dict[str, Any]]) -> None:
         raise ValueError("its nodes are not a tree")
 
 
-def write_mesh(path: Path, mesh: TexturedMesh) -> None:
+def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     """Write a mesh as GLB, with its texture, or its vertex colours if it has none, and float32 coordinates.
 
-    It is rotated by 180 degrees about x, since the y axis of glTF points up and that of cameras down.
+    Parameters
+    ----------
+    path, mesh : str or Path, TexturedMesh
+        File, which is replaced, and mesh. It is rotated by 180 degrees about x, since the y axis of glTF
+        points up and that of cameras down.
+
+    Raises
+    ------
+    UsageError, OutputError
+        If the name does not end in .glb; if the file cannot be written.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from thesisrecon import TexturedMesh, write_mesh
+    >>> mesh = TexturedMesh(np.array([[-1.0, -1, 2], [1, -1, 2], [0, 1, 2]]), np.array([[0, 1, 2]]))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_mesh(folder + "/triangle.glb", mesh)
     """
+    path = Path(path)
+    if path.suffix.lower() != ".glb":
+        raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
     import trimesh
     from trimesh.visual import material as materials
     from trimesh.visual import texture as textures

@@ -69,18 +69,45 @@ def _with_views(model: SparseModel, views: list[SparseView]) -> SparseModel:
     return replace(model, views=views, view_index=place[kept], point_index=point, xy=xy)
 
 
-def read_cameras(path: Path) -> dict[str, Camera]:
-    """Read the cameras of a run by file name, in original pixels and without lens distortion.
+def read_cameras(path: str | Path) -> dict[str, Camera]:
+    """Read the cameras of a run, a ``cameras.json`` or a COLMAP model by image name.
 
-    UsageError if the file is absent, damaged or empty, or a K or R is invalid.
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a run or of a COLMAP model, or a ``cameras.json``: {"cameras": [...]} with name, K, R, t or
+        C, width, height and perhaps three radial coefficients "distortion" each, or a table by name.
+
+    Returns
+    -------
+    dict of str to Camera
+        In pixels of the original images, (0, 0) = centre of the top-left pixel.
+
+    Raises
+    ------
+    UsageError
+        If there is no such file, it is damaged or empty, a camera has no K or size, or its lens is neither
+        a pinhole nor radial.
+
+    Examples
+    --------
+    >>> from thesisrecon import read_cameras
+    >>> from thesisrecon.io._images import demo_images
+    >>> cameras = read_cameras(demo_images()[0].parents[1] / "cameras.json")
+    >>> cameras["0000.jpg"].size
+    (1024, 768)
     """
-    if not path.is_file():
+    path = Path(path)
+    if not path.exists():
         raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
     cameras = {}
-    for view in _read_views(path):
+    for view in read_model(path).views:
         if view.K is None or view.size is None:
-            raise UsageError(f"{path} gives {view.name} no width and height; a run is needed")
-        cameras[view.name] = Camera(view.K, view.R, view.t, view.size)
+            raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
+        if view.distortion is None:
+            advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
+            raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
+        cameras[view.name] = Camera(view.K, view.R, view.t, view.size, view.distortion)
     return cameras
 
 

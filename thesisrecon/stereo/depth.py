@@ -17,6 +17,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link_sequence, pixel_transfer
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
+from thesisrecon.stereo._frustum_samples import frustum_samples
 from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
 from thesisrecon.stereo._resampling import undistort_image
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
@@ -29,10 +30,11 @@ MIN_ANGLE_DEG, MIN_POINTS = 1.0, 12
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points of a metric reconstruction."""
+    """Points of a metric reconstruction, or samples of the common frusta."""
 
     X: F64  #: (N, 3)
     seen: B8  #: (V, N) whether a view observes a point
+    sampled: bool = False  #: samples: only those that both views show limit the disparities of a pair
 
 
 def _sparse_points(reconstruction: Reconstruction) -> SparsePoints:
@@ -51,7 +53,8 @@ def _shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) ->
 
     Points that only one view observes count too: the depth range must cover the whole visible scene.
     """
-    X = points.X[points.seen[a.view] | points.seen[b.view]]
+    seen = points.seen[a.view], points.seen[b.view]
+    X = points.X[seen[0] & seen[1] if points.sampled else seen[0] | seen[1]]
     keep = np.ones(len(X), dtype=bool)
     places = []
     for view in (a, b):
@@ -112,13 +115,23 @@ def _weights(points: SparsePoints, centres: Mapping[int, F64], view: int, other:
     return weights
 
 
-def _pinhole_view(
+def pinhole_view(
     image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
 ) -> PinholeView:
-    """Undistort an image of a metric reconstruction, its longest side at most ``max_side`` pixels.
+    """Undistort an image of a metric reconstruction.
 
-    The third coordinate of its camera is the depth. Pixels outside the original image are black and not
-    ``seen``.
+    Parameters
+    ----------
+    image, reconstruction, view : Image, Reconstruction, int
+        Image of this view, in the size of the reconstruction (else ``ValueError``).
+    max_side : int
+        Limit of the longest side of the result in pixels.
+
+    Returns
+    -------
+    PinholeView
+        The third coordinate of its camera is the depth. Pixels outside the original image are black and not
+        ``seen``.
     """
     K = reconstruction.K
     if reconstruction.stratum != "metric" or K is None:
@@ -269,7 +282,7 @@ class MultiViewScene:
             {i: view for i, view in given.items() if i in numbers} for given in (self.views, self.matched)
         )
         seen = self.points.seen[sorted(numbers)].any(axis=0)
-        points = SparsePoints(self.points.X[seen], self.points.seen[:, seen])
+        points = replace(self.points, X=self.points.X[seen], seen=self.points.seen[:, seen])
         return MultiViewScene(views, points, self.neighbours, matched)
 
 
@@ -309,21 +322,29 @@ class MultiViewStereo:
         return self.pairs.match_two_views(image1, image2, F, xy1, xy2, planar=planar)
 
     def prepare(
-        self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
+        self,
+        images: Sequence[Image],
+        reconstruction: Reconstruction,
+        *,
+        depth_range: F64 | None = None,
+        threads: int = 1,
     ) -> MultiViewScene:
         """See `thesisrecon.config.DepthEstimator.prepare`."""
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
-        points = _sparse_points(reconstruction)
         registered = np.flatnonzero(reconstruction.registered).tolist()
 
         def undistorted(view: int) -> list[PinholeView]:
             sides = self.max_side, min(self.match_side, self.max_side)
-            return [_pinhole_view(images[view], reconstruction, view, max_side=side) for side in sides]
+            return [pinhole_view(images[view], reconstruction, view, max_side=side) for side in sides]
 
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             made = dict(zip(registered, pool.map(undistorted, registered), strict=True))
         views, matched = ({i: pair[k] for i, pair in made.items()} for k in (0, 1))
+        if depth_range is None and reconstruction.valid.any():
+            points = _sparse_points(reconstruction)
+        else:
+            points = SparsePoints(*frustum_samples(views, len(images), depth_range), sampled=True)
         chosen = {i: _select_neighbours(points, views, i, self.max_neighbours) for i in views}
         return MultiViewScene(views, points, chosen, matched)
 

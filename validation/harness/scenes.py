@@ -44,8 +44,8 @@ def has_images(name: str, options: ReportOptions) -> bool:
 def load_images(name: str, options: ReportOptions) -> Scene:
     """Return the images of a scene with their truth, if known.
 
-    A folder of the user holds images, or images/ with them; its truth is ``cameras.json`` (as in
-    fixtures) or a COLMAP model in ``sparse/0``. Raises ``ValueError`` if a scene has no images.
+    A folder of the user holds images, or images/ with them; its truth is ``cameras.json`` in the folder
+    (as in fixtures) or a COLMAP model in ``sparse/0``. Raises ``ValueError`` if a scene has no images.
     """
     if name in options.folders:
         return _own_scene(Path(options.folders[name]), name)
@@ -68,5 +68,7 @@ def _own_scene(folder: Path, name: str) -> Scene:
         if not paths:
             raise ValueError(f"there are no images in {folder}")
         scene = Scene(name, paths)
+        if (folder / "cameras.json").is_file():
+            scene = with_truth(scene, folder / "cameras.json")
     model = folder / "sparse" / "0"
     return scene if scene.has_truth or not model.is_dir() else with_truth(scene, model, complete=False)

@@ -9,6 +9,8 @@ from PIL import Image
 from PIL import Image as PillowImage
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project
+from validation.harness.records import ReportOptions
+from validation.harness.scenes import load_images
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import SIZE as CUBE_SIZE
 from validation.scenes.cube import make_cube
@@ -421,3 +423,17 @@ def test_bricks_have_joints_and_layers_blend():
     assert len(np.unique(label)) > 20
     mortar, brick = material(np.zeros((100, 200))), material(np.ones((100, 200)))
     assert np.array_equal(over(mortar, brick, smooth(edge, 0.004, 0.013)).height, smooth(edge, 0.004, 0.013))
+
+
+def test_cameras_beside_flat_images_are_their_truth(scene, tmp_path):
+    for name in ("0004.jpg", "0007.jpg"):
+        (tmp_path / name).symlink_to(FOLDER / "images" / name)
+    options = ReportOptions(tmp_path / "out", ("own",), (), folders={"own": str(tmp_path)})
+    assert not load_images("own", options).has_truth
+    (tmp_path / "cameras.json").symlink_to(FOLDER / "cameras.json")
+    np.testing.assert_array_equal(load_images("own", options).C, scene.C[[4, 7]])
+    (tmp_path / "other.jpg").symlink_to(FOLDER / "images" / "0009.jpg")
+    with pytest.raises(
+        ValueError, match=r"must have a camera with K for every image; it lacks \['other.jpg'"
+    ):
+        load_images("own", options)

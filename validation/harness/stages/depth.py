@@ -15,7 +15,7 @@ from thesisrecon.config import preset
 from thesisrecon.io._files import write_text
 from thesisrecon.io._images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
-from thesisrecon.stereo.depth import MultiViewStereo, _pinhole_view
+from thesisrecon.stereo.depth import MultiViewStereo, pinhole_view
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, each, row
 from validation.harness.scenes import load_images
@@ -117,7 +117,7 @@ def views_of(scene: Scene, options: ReportOptions) -> dict[int, PinholeView]:
     """Return undistorted images at depth-map size, by view."""
     model = our_model(scene, options)
     return {
-        i: _pinhole_view(image, model, i, max_side=side_of(options))
+        i: pinhole_view(image, model, i, max_side=side_of(options))
         for i, image in enumerate(images_of(scene))
         if model.registered[i]
     }
@@ -183,7 +183,7 @@ def _pictures(
     images, place = images_of(scene), options.place(DepthStage.name, scene.name)
     pictures = []
     for view in chosen:
-        rgb = _pinhole_view(images[view], model, view, max_side=side_of(options)).rgb
+        rgb = pinhole_view(images[view], model, view, max_side=side_of(options)).rgb
         maps = {name: of_method[view] for name, of_method in found.items()}
         limits = depth_range([m.depth for m in maps.values()])
         rows = [[rgb, *(depth_colours(m.depth, limits) for m in maps.values())]]

@@ -1,0 +1,140 @@
+"""Depth maps, surface and texture of known cameras without tracks, against true depth; bad input."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import thesisrecon
+from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
+from thesisrecon import Camera, Reconstruction, StageFailure, depth_maps, fuse_depth_maps, texture, write_mesh
+from thesisrecon.errors import UsageError
+from thesisrecon.geometry.camera_matrix import decompose_camera
+from validation.scenes.real import load_fixture_depth
+
+ROOT = Path(__file__).parent.parent
+ANGLES = (-14.0, -5.0, 4.0, 13.0)
+
+
+def example(title):
+    """Return the code of docs/api.md that begins with this title."""
+    blocks = re.findall(
+        r"```python\n# example: (.*?)```", (ROOT / "docs" / "api.md").read_text("utf-8"), re.DOTALL
+    )
+    return next("#" + block for block in blocks if block.startswith(title))
+
+
+def _cameras(lens=(0.0, 0.0, 0.0)):
+    return [Camera(*decompose_camera(P), SIZE, np.array(lens)) for P in on_arc(ANGLES)]
+
+
+@pytest.fixture(scope="module")
+def walled():
+    return make_walled(on_arc(ANGLES), lens=RADIAL)
+
+
+def _errors(maps, scene):
+    """Relative errors of all known depths, and the share of known pixels."""
+    off = np.array([one.depth / depth - 1.0 for one, depth in zip(maps, scene.depth, strict=True)])
+    return np.abs(off[np.isfinite(off)]), float(np.isfinite(off).mean())
+
+
+@pytest.mark.parametrize("given", [None, (4.0, 9.0)])
+def test_depth_of_known_cameras_is_true_without_points(walled, given):
+    images = [image.rgb for image in walled.images]
+    maps = depth_maps(images, _cameras(RADIAL), depth_range=given)
+    error, known = _errors(maps, walled)
+    assert np.median(error) < 0.003
+    assert np.mean(error < 0.02) > 0.97
+    assert known > 0.6
+    if given is not None:
+        assert all(given[0] <= np.nanmin(one.depth) <= np.nanmax(one.depth) <= given[1] for one in maps)
+
+
+def test_arrays_of_cameras_and_reconstructions_give_the_same_maps():
+    scene = make_walled(on_arc(ANGLES[:3]))
+    images, cameras = [image.rgb for image in scene.images], _cameras()[:3]
+    one = depth_maps(images, cameras, depth_range=(4.0, 9.0), max_size=120)
+    arrays = [np.array([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t")]
+    model = Reconstruction.from_cameras(*arrays, sizes=SIZE)
+    for given, sizes in ((tuple(arrays), SIZE), (model, None)):
+        same = depth_maps(images, given, sizes=sizes, depth_range=np.array([[4.0, 9.0]] * 3), max_size=120)
+        assert same[0].depth.shape == (90, 120)
+        np.testing.assert_allclose(same[1].P, one[1].P, rtol=0, atol=1e-9)
+        # The last digits of the cameras change depths within their noise.
+        assert np.nanmedian(np.abs(same[1].depth - one[1].depth)) < 0.01
+    # With points, these give the range.
+    error, known = _errors(depth_maps(scene.images, scene.reconstruction), scene)
+    assert np.median(error) < 0.003
+    assert known > 0.5
+
+
+def test_a_surface_of_plain_depths_has_them(walled):
+    cameras = _cameras()
+    depths = [np.where(np.isfinite(depth), depth, np.nan) for depth in walled.depth]
+    mesh = fuse_depth_maps(depths, cameras)
+    seen = thesisrecon.render(mesh, cameras[1])
+    off = np.abs(seen.depth / depths[1] - 1.0)
+    assert np.nanmedian(off) < 0.002
+    assert np.isfinite(off).mean() > 0.9
+    small = fuse_depth_maps([depth[::2, ::2] for depth in depths], cameras)
+    assert np.nanmedian(np.abs(thesisrecon.render(small, cameras[1]).depth / depths[1] - 1.0)) < 0.01
+
+
+def test_the_example_makes_a_glb_of_the_courtyard(tmp_path, monkeypatch):
+    source = ROOT / "fixtures" / "courtyard"
+    (tmp_path / "images").mkdir()
+    for name in ("0004.jpg", "0005.jpg", "0006.jpg"):
+        shutil.copy(source / "images" / name, tmp_path / "images")
+    shutil.copy(source / "cameras.json", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    made = {}
+    exec(example("depth to GLB"), made)
+    assert (tmp_path / "model.glb").read_bytes()[:4] == b"glTF"
+    depth, _ = load_fixture_depth(5)
+    # A pixel of the quarter image covers 4 x 4 pixels, 2 x 2 samples of the true depth.
+    true = depth.reshape(192, 2, 256, 2).mean(axis=(1, 3))
+    off = np.abs(made["view"].depth / true - 1.0)
+    assert np.nanmedian(off) < 0.005
+    assert np.isfinite(off).mean() > 0.6
+    # The rendered view is the image.
+    image = thesisrecon.api.read_pixels(source / "images" / "0005.jpg")
+    small = image.reshape(192, 4, 256, 4, 3).mean(axis=(1, 3))
+    apart = np.abs(made["view"].color.astype(float) - small)[made["view"].valid]
+    assert np.median(apart) < 12.0
+
+
+def test_wrong_input_gets_one_sentence(walled, tmp_path):
+    images, cameras = [image.rgb for image in walled.images], _cameras()
+    turned = [Camera(c.K, c.R, c.t, SIZE[::-1]) for c in cameras]
+    for call, words in (
+        (lambda: depth_maps(images, cameras[:3]), "needs a camera per image; got 3 and 4"),
+        (
+            lambda: depth_maps(images, turned),
+            r"has \(width, height\) \(240, 180\), its camera is for \(180, 240\)",
+        ),
+        (lambda: depth_maps(images, cameras, depth_range=(4.0,)), r"needs shape \(2,\) or \(4, 2\)"),
+        (lambda: depth_maps(images, cameras, depth_range=(4.0, 2.0)), "0 < nearest < farthest"),
+        (lambda: depth_maps(images, {"a.jpg": cameras[0]}), "no camera for"),
+        (lambda: depth_maps(images, (1, 2, 3)), "needs sizes"),
+        (
+            lambda: texture(fuse_depth_maps([np.ones((180, 240))], cameras[:1]), images, [1]),
+            "thesisrecon.Camera",
+        ),
+        (lambda: fuse_depth_maps([np.ones((180, 240))]), "needs the cameras"),
+        (lambda: fuse_depth_maps([np.ones((100, 240))], cameras[:1]), "needs a camera of its shape"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()
+    away = [
+        Camera(c.K, np.diag([-1.0, 1, -1]) @ c.R if i % 2 else c.R, c.t, SIZE)
+        for i, c in enumerate(cameras[:2])
+    ]
+    with pytest.raises(StageFailure, match="no depth was found"):
+        depth_maps(images[:2], away)
+    with pytest.raises(StageFailure, match="no depths"):
+        fuse_depth_maps([np.full((180, 240), np.nan)], cameras[:1])
+    with pytest.raises(UsageError, match=r"ending \.glb"):
+        write_mesh(tmp_path / "model.ply", fuse_depth_maps([np.ones((180, 240))], cameras[:1]))

@@ -1,0 +1,295 @@
+"""Depth maps, surface and texture of known cameras in one call each (thesis, sections 2.5 and 2.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from thesisrecon._camera_input import CameraInput, as_cameras
+from thesisrecon._settings import Config, as_config
+from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.camera import Camera
+from thesisrecon.errors import StageFailure, UsageError, counted
+from thesisrecon.io._images import list_images, read_image
+from thesisrecon.pipeline._image_pair import ImageInput
+from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks
+from thesisrecon.stereo.depth import pinhole_view
+from thesisrecon.surface.model import SurfaceModel
+
+ImagesInput = str | Path | Sequence[ImageInput]
+"""A folder, or images as files or uint8 arrays."""
+
+
+def depth_maps(
+    images: ImagesInput,
+    cameras: CameraInput,
+    *,
+    sizes: I64 | None = None,
+    depth_range: F64 | tuple[float, float] | None = None,
+    max_size: int | None = None,
+    config: Config | None = None,
+    threads: int = 1,
+) -> tuple[DepthMap, ...]:
+    """Estimate the depth maps of images with known cameras; no tracks or points are needed (2.5).
+
+    Parameters
+    ----------
+    images : path or sequence of paths or ndarray (H, W) or (H, W, 3) uint8
+        A folder (files in order of their names), or V >= 2 images.
+    cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
+        Their cameras in pixels of the images (arrays with ``sizes``); of a reconstruction with points these
+        give the depth range and the neighbours.
+    sizes : array_like (V, 2) or (2,), optional
+        Image width and height, for plain arrays.
+    depth_range : array_like (2,) or (V, 2), optional
+        Nearest and farthest depth. None: from the cameras, see Notes.
+    max_size : int, optional
+        Larger images are reduced to this long side; None: ``config.images``.
+    config, threads : PipelineConfig, str or Path, int
+        ``config.dense`` is the method; number of threads, on which the result does not depend.
+
+    Returns
+    -------
+    tuple of DepthMap
+        Per image ``depth`` (H, W), NaN where unknown, its ``std``, and ``P`` = K [R t] for its pixels, which
+        are undistorted and may be fewer than those of the image.
+
+    Raises
+    ------
+    ValueError
+        If a camera is missing or is not of its image's size, or the range is not 0 < nearest < farthest.
+    StageFailure
+        If no two images show common space, or no depth is found.
+
+    Notes
+    -----
+    Without points and range, a pair is searched at the depths at which both images contain a point and its
+    rays meet at 0.5 to 40 degrees. Neighbours are the views with most of the common space at about 10
+    degrees. A range that is known saves time and errors.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from thesisrecon import Camera, depth_maps
+    >>> wall = gaussian_filter(np.random.default_rng(0).uniform(-900, 1100, (96, 200)), 1.5)
+    >>> wall = np.clip(wall, 0, 255).astype(np.uint8)
+    >>> K = np.array([[120.0, 0, 63.5], [0, 120, 47.5], [0, 0, 1]])
+    >>> shift = np.array([0, 12, 24])  # a plane at depth 10, seen from x = 0, 1, 2
+    >>> images = [wall[:, s : s + 128] for s in shift]
+    >>> cameras = [Camera(K, np.eye(3), np.array([-s / 12.0, 0, 0]), (128, 96)) for s in shift]
+    >>> maps = depth_maps(images, cameras, depth_range=(5, 20))
+    >>> round(float(np.nanmedian(maps[1].depth)), 1)
+    10.0
+    """
+    method = as_config(config)
+    read, model = _scene("depth_maps", images, cameras, sizes, max_size or method.images.max_size_px)
+    limits = None if depth_range is None else _limits(depth_range, len(read))
+    dense = method.dense
+    scene = dense.prepare(read, model, depth_range=limits, threads=threads)
+    order = sorted(scene.views)
+    if not any(scene.neighbours[view] for view in order):
+        rule = "no two images contain common points whose rays meet at an angle that gives depth"
+        advice = "give R world to camera and t = -R centre, images with more overlap, or a depth_range"
+        raise StageFailure("no depth was found", rule, advice)
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        found = dict(zip(order, pool.map(lambda i: dense.depth_map(scene, i), order), strict=True))
+        maps = list(pool.map(lambda i: dense.confirm(scene, found, i), order))
+    if limits is not None:
+        maps = [_within(one, limits[one.view]) for one in maps]
+    if not any(np.isfinite(one.depth).any() for one in maps):
+        evidence = f"none of {counted(len(maps), 'view')} agrees with another on any surface"
+        raise StageFailure("no depth was found", evidence, "check the cameras, or give a wider depth_range")
+    return tuple(maps)
+
+
+def fuse_depth_maps(
+    depth_maps: Sequence[DepthMap] | Sequence[F32 | F64],
+    cameras: CameraInput | None = None,
+    *,
+    sizes: I64 | None = None,
+    config: Config | None = None,
+    threads: int = 1,
+) -> TexturedMesh:
+    """Fuse depth maps to one surface (2.6).
+
+    Parameters
+    ----------
+    depth_maps : sequence of DepthMap or ndarray (H, W)
+        Of :func:`depth_maps`, or plain depths z in the camera frame, NaN where unknown, of images without
+        distortion; their standard deviation is then taken as the size of a pixel.
+    cameras, sizes : sequence of Camera, tuple (K, R, t) or Reconstruction, array_like
+        For plain depths: their cameras; for maps of another size they are scaled, (x + 0.5) s - 0.5.
+    config, threads : PipelineConfig, str or Path, int
+        ``config.model`` is the method; number of threads, on which the result does not depend.
+
+    Returns
+    -------
+    TexturedMesh
+        Vertices and faces without colours, for :func:`texture`.
+
+    Raises
+    ------
+    ValueError, UsageError, StageFailure
+        If depths and cameras do not fit together; if ``config.model`` has another kind; if there is no depth.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Camera, fuse_depth_maps
+    >>> K = np.array([[100.0, 0, 49.5], [0, 100, 49.5], [0, 0, 1]])
+    >>> mesh = fuse_depth_maps([np.full((100, 100), 2.0)], [Camera(K, np.eye(3), np.zeros(3), (100, 100))])
+    >>> mesh.vertices[:, 2].round(2).min(), mesh.vertices[:, 2].round(2).max()
+    (np.float64(2.0), np.float64(2.0))
+    """
+    model = as_config(config).model
+    if not isinstance(model, SurfaceModel):
+        raise UsageError(f"fuse_depth_maps needs a SurfaceModel as config.model; got {type(model).__name__}")
+    if all(isinstance(one, DepthMap) for one in depth_maps):
+        return model.surface_of(depth_maps, threads=threads)  # type: ignore[arg-type]
+    if cameras is None:
+        raise ValueError("fuse_depth_maps needs the cameras of plain depths")
+    views = as_cameras("fuse_depth_maps", cameras, sizes)
+    if len(views) != len(depth_maps):
+        raise ValueError(
+            f"fuse_depth_maps needs a camera per depth map; got {len(views)} and {len(depth_maps)}"
+        )
+    given = enumerate(zip(depth_maps, views, strict=True))
+    return model.surface_of([_plain(i, depth, view) for i, (depth, view) in given], threads=threads)  # type: ignore[arg-type]
+
+
+def texture(
+    mesh: TexturedMesh,
+    images: ImagesInput,
+    cameras: CameraInput,
+    *,
+    sizes: I64 | None = None,
+    max_size: int | None = None,
+    config: Config | None = None,
+    threads: int = 1,
+) -> TexturedMesh:
+    """Texture a surface by images with known cameras (2.6).
+
+    Parameters
+    ----------
+    mesh : TexturedMesh
+        Vertices and faces; faces anticlockwise seen from the cameras.
+    images, cameras, sizes, max_size, config, threads
+        As for :func:`depth_maps`; ``config.model`` is the method.
+
+    Returns
+    -------
+    TexturedMesh
+        For :func:`thesisrecon.render` and :func:`thesisrecon.write_mesh`.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        If a camera is missing or is not of its image's size; if no view sees the surface.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Camera, TexturedMesh, texture
+    >>> square = np.array([[-1.0, -1, 4], [1, -1, 4], [1, 1, 4], [-1, 1, 4]])
+    >>> mesh = TexturedMesh(square, np.array([[0, 2, 1], [0, 3, 2]]))
+    >>> K = np.array([[100.0, 0, 49.5], [0, 100, 49.5], [0, 0, 1]])
+    >>> camera = Camera(K, np.eye(3), np.zeros(3), (100, 100))
+    >>> image = np.zeros((100, 100, 3), np.uint8)
+    >>> image[:50], image[50:] = (200, 0, 0), (0, 0, 200)
+    >>> texture(mesh, [image], [camera]).texture.dtype
+    dtype('uint8')
+    """
+    method = as_config(config)
+    read, model = _scene("texture", images, cameras, sizes, max_size or method.images.max_size_px)
+    views = [pinhole_view(image, model, i) for i, image in enumerate(read)]
+    return method.model.color(mesh, views, threads=threads)
+
+
+def _scene(
+    caller: str, images: ImagesInput, cameras: CameraInput, sizes: I64 | None, max_size: int
+) -> tuple[list[Image], Reconstruction]:
+    """Images at working size, and their cameras for it, with the points of a reconstruction."""
+    listed = list_images(Path(images)) if isinstance(images, str | Path) else list(images)
+    read = [read_image(one, max_size_px=max_size).images[0] for one in listed]
+    names = [
+        Path(one).name if isinstance(one, str | Path) else image.name
+        for one, image in zip(listed, read, strict=True)
+    ]
+    views = as_cameras(caller, cameras, sizes, names)
+    if len(views) != len(read):
+        raise ValueError(f"{caller} needs a camera per image; got {len(views)} and {len(read)}")
+    for name, image, view in zip(names, read, views, strict=True):
+        if image.original_size != view.size:
+            what = f"image {name} has (width, height) {image.original_size}, its camera is for {view.size}"
+            raise ValueError(f"{what}; give cameras in pixels of the images, or Camera.scaled(...)")
+    scaled = [_scaled(view, image.scale, image.size) for view, image in zip(views, read, strict=True)]
+    model = _model(scaled)
+    if isinstance(cameras, Reconstruction) and cameras.valid.any():
+        kept = cameras.registered[cameras.tracks.view_index]
+        t, number = cameras.tracks, np.cumsum(cameras.registered) - 1
+        tracks = Tracks(number[t.view_index[kept]], t.point_index[kept], t.xy[kept], len(read), t.n_points)
+        model = replace(model, X=cameras.X, valid=cameras.valid, inlier=cameras.inlier[kept], tracks=tracks)
+    return read, model
+
+
+def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
+    """The camera of an image reduced by one scale along both axes."""
+    S = np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
+    return Camera(S @ camera.K, camera.R, camera.t, size, camera.distortion)
+
+
+def _model(views: Sequence[Camera]) -> Reconstruction:
+    """The cameras without points; ``ValueError`` if distortion has more than three coefficients."""
+    n, distortion = len(views), np.zeros((len(views), 3))
+    for row, view in zip(distortion, views, strict=True):
+        lens = np.zeros(0) if view.distortion is None else view.distortion
+        if np.any(lens[3:]):
+            raise ValueError(f"depth of known cameras takes k1, k2, k3; got {len(lens)} coefficients")
+        row[: len(lens[:3])] = lens[:3]
+    none = np.zeros(0, dtype=np.int64)
+    K, P = (np.array([getattr(view, name) for view in views]).reshape(n, 3, -1) for name in ("K", "P"))
+    return Reconstruction(
+        "metric", P, np.zeros((0, 4)), np.ones(n, dtype=bool), np.zeros(0, dtype=bool),
+        np.zeros(0, dtype=bool), Tracks(none, none, np.zeros((0, 2)), n, 0),
+        np.array([view.size for view in views]).reshape(n, 2), 1.0, ("",) * n, K, distortion,
+    )  # fmt: skip
+
+
+def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
+    limits = np.asarray(depth_range, dtype=np.float64)
+    if limits.shape not in ((2,), (n, 2)):
+        raise ValueError(
+            f"depth_range needs shape (2,) or ({n}, 2), nearest and farthest; got {limits.shape}"
+        )
+    limits = np.broadcast_to(limits, (n, 2))
+    if not (np.isfinite(limits).all() and (limits[:, 0] > 0.0).all() and (limits[:, 1] > limits[:, 0]).all()):
+        raise ValueError(f"depth_range needs 0 < nearest < farthest, both finite; got {depth_range}")
+    return limits
+
+
+def _within(one: DepthMap, limits: F64) -> DepthMap:
+    keep = (one.depth >= limits[0]) & (one.depth <= limits[1])
+    depth, std = (np.where(keep, part, np.float32(np.nan)) for part in (one.depth, one.std))
+    return replace(one, depth=depth, std=std, views=np.where(keep, one.views, np.uint8(0)))
+
+
+def _plain(number: int, depth: F32 | F64, camera: Camera) -> DepthMap:
+    """The depth map of an array of the camera's size or smaller."""
+    z: F32 = np.array(depth, dtype=np.float32)
+    z[~(z > 0.0)] = np.nan
+    if z.ndim != 2 or not camera.is_pinhole:
+        raise ValueError(f"plain depths need (H, W) and a camera without distortion; got {z.shape}")
+    height, width = z.shape
+    if abs(width / camera.size[0] - height / camera.size[1]) > 1.0 / min(camera.size):
+        raise ValueError(
+            f"depth map {number} of {width} x {height} px needs a camera of its shape; got {camera.size}"
+        )
+    own = (
+        camera if (width, height) == camera.size else _scaled(camera, width / camera.size[0], (width, height))
+    )
+    return DepthMap(number, own.P, z, z / np.float32(own.K[0, 0]), np.isfinite(z).astype(np.uint8))
