@@ -139,6 +139,7 @@ def test_the_example_states_the_standard_deviations(capsys):
         ({"free": ("focus",)}, "focal"),
         ({"prior": {"k2": 0.1}}, "not among the free intrinsics"),
         ({"prior": {"focal": 0.0}}, "must be above 0"),
+        ({"sigma_px": 0.0}, "must be positive"),
         ({"loss": "l1"}, "huber, squared"),
         ({"shared": [0, 1]}, "camera number per view"),
         ({"xy": np.zeros((6, 119, 2))}, r"needs xy \(6, 120, 2\)"),

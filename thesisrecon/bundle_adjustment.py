@@ -159,10 +159,11 @@ def bundle_adjust(
     start = _start(views, shared, chosen)
     knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
     _check(start, X, observed, chosen, bool(prior))
-    fit, noise = None, sigma_px or 1.0
+    fit, noise = None, 1.0 if sigma_px is None else sigma_px
     # Without a given noise the first pass finds it: it weights the prior and places the turn of the loss.
     for last in (True,) if sigma_px is not None else (False, True):
-        turn = np.inf if loss == "squared" else loss_px or _HUBER_SIGMAS * noise
+        turn = _HUBER_SIGMAS * noise if loss_px is None else loss_px
+        turn = np.inf if loss == "squared" else turn
         options = BundleOptions(
             sigma_px=noise,
             loss_px=turn,
