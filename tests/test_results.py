@@ -85,3 +85,12 @@ def test_cameras_of_an_earlier_stage_are_refused_with_the_reason(run, tmp_path):
     )
     with pytest.raises(AttributeError, match="the run ended before the metric stage"):
         result.cameras  # noqa: B018
+
+
+def test_the_reconstruction_in_original_pixels_has_the_cameras_and_observations(run):
+    result = run[1]
+    r = result.reconstruction
+    assert np.allclose(r.P[3], result.cameras[3].P)
+    assert np.allclose(r.K[3], result.cameras[3].K)
+    here = r.inlier & (r.tracks.view_index == 3)
+    assert np.array_equal(r.tracks.xy[here], result.observations(3).xy)

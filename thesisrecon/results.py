@@ -170,6 +170,26 @@ class RunResult:
         X = r.X[r.valid]
         return np.asarray(X[:, :3] / X[:, 3:])
 
+    @property
+    def reconstruction(self) -> Reconstruction:
+        """The metric reconstruction in original pixels; ``metric.reconstruction`` is in working ones."""
+        r = self._metric_result("cameras").reconstruction
+        assert r.K is not None
+        scale = np.array([image.scale for image in self.images])
+        to_original = np.tile(np.eye(3), (len(scale), 1, 1))
+        to_original[:, [0, 1], [0, 1]] = 1.0 / scale[:, None]
+        to_original[:, :2, 2] = (0.5 / scale - 0.5)[:, None]
+        view = r.tracks.view_index
+        xy = (r.tracks.xy + 0.5) / scale[view][:, None] - 0.5
+        return replace(
+            r,
+            P=to_original @ r.P,
+            K=np.where(r.registered[:, None, None], to_original @ r.K, 0.0),
+            tracks=replace(r.tracks, xy=xy),
+            sizes=np.array([image.original_size for image in self.images], dtype=np.int64),
+            sigma_px=r.sigma_px / float(np.median(scale)),
+        )
+
     def observations(self, image: str | int) -> SeenPoints:
         """Return the inlier observations of one image.
 
