@@ -109,6 +109,15 @@ def test_bundle_adjustment_gives_covariances(place, monkeypatch):
     assert np.isfinite(names["adjusted"].point_covariance).all()
 
 
+@pytest.mark.usefixtures("finished")
+def test_known_cameras_give_a_model_and_four_exports(place, monkeypatch):
+    names = run("Depth to GLB from known cameras, and four exports", place, monkeypatch)
+    assert len(names["mesh"].faces) > 2000
+    assert (place / "model.glb").stat().st_size > 50_000
+    written = {path.relative_to(place / "exported").parts[0] for path in (place / "exported").rglob("*.*")}
+    assert written == {"colmap-undistorted", "nerfstudio", "openmvs", "bundler"}
+
+
 def test_an_own_variant_is_compared(place, monkeypatch, capsys):
     run("An ablation with an own variant", place, monkeypatch)
     said = capsys.readouterr().out
