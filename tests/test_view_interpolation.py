@@ -20,6 +20,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
+from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.views.interpolation import InterpolatedPair
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
@@ -113,10 +114,12 @@ def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
     F = cross_matrix(np.array([1.0, 0.0, 0.0]))
     pair = SimpleNamespace(F=F, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
     monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
-    config = SimpleNamespace(dense=Dense())
+    config = PipelineConfig()
+    monkeypatch.setattr(MultiViewStereo, "match_two_views", Dense.match_two_views)
+    monkeypatch.setattr(MultiViewStereo, "failure", Dense.failure, raising=False)
     with pytest.raises(StageFailure, match=r"too distorted; a number; take the images side by side"):
         between.prepare_pair(photograph(0), photograph(1), config=config)
-    Dense.failure = StageFailure("no parallax")
+    monkeypatch.setattr(MultiViewStereo, "failure", StageFailure("no parallax"))
     refuses(StageFailure, "no parallax", between.prepare_pair, photograph(0), photograph(1), config=config)
 
 

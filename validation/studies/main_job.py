@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.records import Reconstruction
 from validation.harness.process import Process, own_cores, run_process
 from validation.harness.scenes import truth_of
@@ -157,7 +157,7 @@ def _read_ours(scene: Scene, out: Path, process: Process) -> Outcome:
     model, failure = None, ""
     try:
         model = read_colmap_model(out / "sparse" / "0", names)
-    except StageFailure as missing:
+    except UsageError as missing:
         failure = str(summary.get("failure") or f"exit code {process.code}: {missing}")
     return Outcome(
         model,
