@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from thesisrecon.errors import StageFailure
 from validation.metrics.record import Metric
 from validation.studies.runner import Part, text_table
 
@@ -40,9 +41,9 @@ class Compilation(event.Listener):
 event.register("numba:compile", Compilation())
 from thesisrecon import reconstruct
 from thesisrecon.io._images import demo_images
-from thesisrecon.pipeline import reconstruction
+from thesisrecon.pipeline import _steps
 
-reconstruction.precompile = lambda *_: None  # this process compiles
+_steps.precompile = lambda *_: None  # this process compiles
 out, until, report = sys.argv[1:]
 reconstruct(demo_images(), out, until=until, threads=1)
 with open(report, "w") as file:
@@ -59,6 +60,8 @@ def compile_time_study(until: str = "model", functions: int = 25) -> Iterator[Pa
         subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
         measured = json.loads(report.read_text(encoding="utf-8"))
     seconds: dict[str, float] = measured["seconds"]
+    if not seconds:
+        raise StageFailure("no kernel was compiled in the process that was measured")
     versions: dict[str, int] = measured["versions"]
     modules: dict[str, float] = {}
     for name, value in seconds.items():
