@@ -17,15 +17,16 @@ class Image:
 
     Parameters
     ----------
-    name, rgb : str, ndarray (H, W, 3) uint8
-        File name and pixels.
-    original_size : tuple of int
-        (width, height) of the file after EXIF rotation.
+    name, rgb, original_size : str, ndarray (H, W, 3) uint8, tuple of int
+        File name, pixels, and (width, height) of the file after EXIF rotation.
+    mask : ndarray (H, W) of bool, optional
+        Pixels to use; None: all.
     """
 
     name: str
     rgb: NDArray[np.uint8]
     original_size: tuple[int, int]
+    mask: B8 | None = None
 
     @classmethod
     def without_pixels(cls, name: str, size: tuple[int, int]) -> Image:
@@ -433,7 +434,7 @@ class PinholeView:
     view: int
     P: F64  #: K [R t]
     rgb: NDArray[np.uint8]  #: (H, W, 3)
-    seen: B8  #: (H, W) pixels inside the original image
+    seen: B8  #: (H, W) pixels inside the original image and its mask
 
 
 @dataclass(frozen=True)

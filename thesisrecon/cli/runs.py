@@ -47,6 +47,12 @@ def reconstruct(
         Path | None,
         typer.Option("--images", help="With --from: the folder of the images, for colours and the model."),
     ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            "--masks", parser=parse_folder, metavar="DIR", help="Folder of masks: black pixels are left out."
+        ),
+    ] = None,
     preset: Annotated[
         Literal["default", "thesis"] | None,
         typer.Option("--preset", help="Pipeline to start from (default: default)."),
@@ -102,11 +108,15 @@ def reconstruct(
             raise UsageError(
                 "give the folder of the images, or --from DATABASE|SPARSE with or without --images"
             )
-        _run(images, out, seed, chosen | options)
+        _run(images, out, seed, chosen | options | {"masks": masks})
         return
     if images is not None or chosen.pop("pairs") is not None:
         raise UsageError(
             "with --from the images are given by --images, and the pairs are those of the source"
+        )
+    if masks is not None:
+        raise UsageError(
+            "--masks applies to features that are detected in images; with --from the source has its own"
         )
     _run_from(source, out, seed, chosen | options | {"images": images_folder})
 

@@ -12,11 +12,11 @@ import stat
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from itertools import chain, count
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import PIL.Image
@@ -63,6 +63,7 @@ def demo_images() -> list[Path]:
     )
 
 
+T = TypeVar("T")
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
 
 # Raw and HEIC files are listed so that they are refused by name, not overlooked.
@@ -88,7 +89,7 @@ _budget = MemoryBudget(MAX_DECODED_BYTES)
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """An image at working size, a hash of its pixels and original size, and a warning for the user or "".
+    """An image at working size, a hash of its pixels, mask and original size, and a warning or "".
 
     ``exif_focal_px`` is the focal length from EXIF in original pixels, NaN = unknown.
     """
@@ -233,7 +234,7 @@ def _names(names: Iterable[str]) -> list[str]:
 def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
     """Read an image, refuse small and blank ones, and hash the content."""
     if isinstance(item, Path):
-        decoded = _decode(name, item, max_size_px)
+        decoded = decode_file(item, partial(_decoded_image, name, max_size_px))
     elif isinstance(item, Image):
         decoded = DecodedImage(item, "")
     else:
@@ -251,12 +252,23 @@ def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
         )
     if np.ptp(rgb.reshape(-1, 3), axis=0).max() < BLANK_RANGE:
         raise UnusableImage("is blank: all its pixels have nearly the same colour")
+    return with_digest(decoded)
+
+
+def with_digest(decoded: DecodedImage) -> DecodedImage:
+    """Set the digest of the content; ValueError if the mask has another size."""
+    rgb, mask = decoded.image.rgb, decoded.image.mask
     content = hashlib.sha256(repr((rgb.shape, decoded.image.original_size)).encode())
     content.update(np.ascontiguousarray(rgb).data)
+    if mask is not None:
+        if np.shape(mask) != rgb.shape[:2] or mask.dtype != np.bool_:
+            raise ValueError(f"a mask must be {rgb.shape[:2]} bool; got {np.shape(mask)} {mask.dtype}")
+        content.update(np.packbits(mask).data)
     return replace(decoded, digest=content.hexdigest()[:32])
 
 
-def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
+def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
+    """Apply ``use`` to an opened image file; UnusableImage with the reason if it cannot be decoded."""
     # Special files are refused: reading a pipe or a device may never end.
     try:
         found = path.stat()
@@ -275,7 +287,7 @@ def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
             if needed > MAX_DECODED_BYTES:
                 raise UnusableImage(_too_large(file, needed))
             with _budget.reserve(needed), closing(file):
-                return _decode_open_file(name, file, max_size_px)
+                return use(file)
     except UnusableImage:
         raise
     except PIL.Image.DecompressionBombError:
@@ -292,10 +304,10 @@ def _decode(name: str, path: Path, max_size_px: int) -> DecodedImage:
         ) from None
 
 
-def _decode_open_file(name: str, file: PIL.Image.Image, max_size_px: int) -> DecodedImage:
+def _decoded_image(name: str, max_size_px: int, file: PIL.Image.Image) -> DecodedImage:
     # Cameras store a preview as a second frame of a JPEG (MPO).
     several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
-    focal_35mm, transform = _exif(file)
+    focal_35mm, transform = read_exif(file)
     file.load()
     stored = StoredImage(file, transform)
     known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
@@ -320,7 +332,7 @@ def _formats() -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in PIL.Image.OPEN)
 
 
-def _exif(file: PIL.Image.Image) -> tuple[float, PIL.Image.Transpose | None]:
+def read_exif(file: PIL.Image.Image) -> tuple[float, PIL.Image.Transpose | None]:
     """Return the 35 mm focal length (0 = unknown) and the transform to the upright image."""
     try:
         exif = file.getexif()

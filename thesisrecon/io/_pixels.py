@@ -17,7 +17,7 @@ import numpy as np
 import PIL.Image
 from PIL.Image import Transpose
 
-from thesisrecon.arrays import F64, U8
+from thesisrecon.arrays import B8, F64, U8
 
 _STRIPE_ROWS = 256
 """Rows converted at a time."""
@@ -100,6 +100,11 @@ class StoredImage:
     def stripes(self, height: int = _STRIPE_ROWS) -> Iterator[tuple[int, int]]:
         """(start, stop) of stripes of rows of the upright image."""
         return ((start, min(start + height, self.size[1])) for start in range(0, self.size[1], height))
+
+    def nonblack(self) -> B8:
+        """Pixels (H, W) of the upright image whose grey level is not 0, whatever their transparency."""
+        grey = self.stored if self._deep else self.stored.convert("L")
+        return np.asarray(np.asarray(grey if self.transform is None else grey.transpose(self.transform)) != 0)
 
     def _stored_part(self, start: int, stop: int) -> PIL.Image.Image:
         width, height = self.stored.size

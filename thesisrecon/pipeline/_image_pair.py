@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import scipy
 
 from thesisrecon._settings import Config, as_config
+from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._images import read_image
+from thesisrecon.matching._prepared import select_matches
 from thesisrecon.plug_ins import FunctionMatcher, matches_of
-from thesisrecon.records import Image, Matches, TwoView
+from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 from thesisrecon.runtime._run import stream
 
 OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
 ImageInput = str | Path | np.ndarray | Image
 """A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
+MASK_REACH = 4.0
+"""Half width, in pixels of its scale, of the window that determines the position of a corner."""
+Found = TypeVar("Found", Features, Seeds)
 
 
 def match_pair(
@@ -58,15 +65,48 @@ def match_pair(
     config = as_config(config)
     size = config.images.max_size_px
     images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
-    views = [config.matching.prepare(image, config.features.detect(image)) for image in images]
-    pair = match_views(config, views[0], views[1], (0, 1), seed)
+    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+    masks = images[0].mask, images[1].mask
+    pair = match_views(config, views[0], views[1], (0, 1), seed, masks)
     if not pair.accepted:
         raise StageFailure("the two images do not match", pair.reason)
     return pair
 
 
-def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int) -> TwoView:
-    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason."""
+def detect_features(config: PipelineConfig, image: Image) -> Features:
+    """Detect the features of an image; those with a masked pixel within ``MASK_REACH`` are dropped."""
+    found = config.features.detect(image)
+    if image.mask is None or image.mask.all():
+        return found
+    clear = scipy.ndimage.distance_transform_cdt(image.mask, "chessboard")
+    corners = _unmasked(found, clear)
+    return corners if found.seeds is None else replace(corners, seeds=_unmasked(found.seeds, clear))
+
+
+def _unmasked(found: Found, clear: Any) -> Found:
+    keep = _at(clear, found.xy) > MASK_REACH * found.scale
+    arrays = {field.name: getattr(found, field.name) for field in fields(found)}
+    return replace(found, **{name: a[keep] for name, a in arrays.items() if isinstance(a, np.ndarray)})
+
+
+def _at(pixels: Any, xy: Any) -> Any:
+    """Values (N,) of an array (H, W) at the nearest pixels."""
+    x, y = (np.clip(np.rint(xy[:, k]).astype(np.int64), 0, pixels.shape[1 - k] - 1) for k in (0, 1))
+    return pixels[y, x]
+
+
+def match_views(
+    config: PipelineConfig,
+    view1: Any,
+    view2: Any,
+    pair: tuple[int, int],
+    seed: int,
+    masks: tuple[B8 | None, B8 | None] = (None, None),
+) -> TwoView:
+    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason.
+
+    Matches in masked pixels are dropped, since not every matcher uses the features.
+    """
     rng = stream(seed, "matches", *pair)
     try:
         matches = config.matching.match(
@@ -76,6 +116,9 @@ def match_views(config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int,
             matches = matches_of(config.matching, matches, pair, (view1, view2))
     except StageFailure as failure:
         return _rejected_pair(pair, 0, str(failure))
+    for mask, side in zip(masks, ("xy1", "xy2"), strict=True):
+        if mask is not None:
+            matches = select_matches(matches, _at(mask, getattr(matches, side)))
     return verify_matches(config, matches, seed, rng)
 
 

@@ -15,7 +15,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.pipeline._image_pair import match_views
+from thesisrecon.pipeline._image_pair import detect_features, match_views
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
 from thesisrecon.records import (
     DepthMap,
@@ -65,7 +65,7 @@ def find_features(state: PipelineState) -> None:
 
 
 def _detect(config: PipelineConfig, image: Image) -> list[Features]:
-    return [config.features.detect(image)]
+    return [detect_features(config, image)]
 
 
 def select_pairs(state: PipelineState) -> None:
@@ -138,9 +138,9 @@ def _prepared(state: PipelineState) -> Sequence[Any]:
 
 
 def _match_all(
-    config: PipelineConfig, views: Sequence[Any], pairs: Sequence[tuple[int, int]], seed: int
+    config: PipelineConfig, views: PreparedViews, pairs: Sequence[tuple[int, int]], seed: int
 ) -> list[TwoView]:
-    return [match_views(config, views[i], views[j], (i, j), seed) for i, j in pairs]
+    return [match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j)) for i, j in pairs]
 
 
 def build_tracks(state: PipelineState) -> None:
@@ -322,7 +322,7 @@ def estimate_depth_maps(state: PipelineState) -> None:
     with run.clock("dense"):
         scene = state.config.dense.prepare(result.images, reconstruction, threads=run.workers.threads)
     order = sorted(scene.views)
-    r, pixels = reconstruction, [image.rgb for image in result.images]
+    r, pixels = reconstruction, [(image.rgb, image.mask) for image in result.images]
     given = [r.P, r.K, r.distortion, r.X, r.registered, r.valid, r.inlier, pixels]
     keys = {f"{i:05d}": run.key("dense", run.variant_key("dense"), given, i) for i in order}
 

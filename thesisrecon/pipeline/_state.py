@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.arrays import B8
 from thesisrecon.config import Matcher, PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
@@ -59,6 +60,10 @@ class PreparedViews(Sequence[Any]):
             while self._bytes > CACHE_BYTES and len(self._kept) > 2:
                 self._bytes -= self._kept.popitem(last=False)[1][1]
         return made
+
+    def masks(self, i: int, j: int) -> tuple[B8 | None, B8 | None]:
+        """Masks of two views, None: all pixels."""
+        return self._given[i][0].mask, self._given[j][0].mask
 
     def subset(self, views: Iterable[int]) -> PreparedViews:
         """The same for some views, with an empty cache."""

@@ -12,6 +12,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
+from thesisrecon.io._masks import add_masks, check_masks_folder
 from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline._outputs import RESULT_FILES
 from thesisrecon.pipeline._state import PipelineState
@@ -30,6 +31,7 @@ def reconstruct(
     cameras: str | None = None,
     pairs: Pairs | None = None,
     set: Settings = (),
+    masks: str | Path | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
@@ -54,6 +56,9 @@ def reconstruct(
         "all", "overlap", "window:N", a file of pairs, or pairs of file names.
     set : mapping or list of str
         Single settings: ``{"matching.ratio": 0.7}`` or ``["matching.ratio=0.7"]``.
+    masks : path, optional
+        Folder of masks: the black pixels of ``NAME.png``, or of a file like the image with any suffix, give
+        no features, no depth and no texture. Images without one are used as a whole.
     seed : int
         Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
         workers.
@@ -100,10 +105,12 @@ def reconstruct(
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
         run.title = scene_name(Path(images)) or run.title
     run.images_folder = images_folder(images)
+    if masks is not None:
+        check_masks_folder(Path(masks), run.images_folder)
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
     with claimed(run, overwrite=overwrite):
-        inputs = _read_inputs(run, images)
+        inputs = _read_inputs(run, images, None if masks is None else Path(masks))
         listed = run.config.pairs
         if isinstance(listed, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
@@ -113,17 +120,23 @@ def reconstruct(
         return run_steps(state, STEPS[until], surface_required=surface_required)
 
 
-def _read_inputs(run: Run, images: ImageSource) -> ImageSet:
+def _read_inputs(run: Run, images: ImageSource, masks: Path | None) -> ImageSet:
     with run.clock("images"):
         size = run.config.images.max_size_px
         inputs = read_images(images, max_size_px=size, map_all=run.workers.map_all)
+        unused: list[str] = []
+        if masks is not None:
+            inputs, unused = add_masks(inputs, masks, map_all=run.workers.map_all)
     found, refused = len(inputs.decoded), len(inputs.refused)
     if found + refused == 0:
         raise UsageError("no images")
     warnings = [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
     warnings += [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
+    warnings += [f"{name} is a mask of no image" for name in unused]
     warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
-    run.finish("images", counts={"read": found, "refused": refused}, warnings=warnings)
+    masked = sum(image.mask is not None for image in inputs.images)
+    counts = {"read": found, "refused": refused} | ({"masked": masked} if masked else {})
+    run.finish("images", counts=counts, warnings=warnings)
     return inputs
 
 

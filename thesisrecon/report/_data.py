@@ -224,6 +224,8 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
         "observations": len(distances),
         "reprojection_rms_px": _rms(distances),
     }
+    if image.mask is not None:
+        view["masked_fraction"] = float(1.0 - image.mask.mean())
     if registered and result.metric is not None:
         for name, working in result.metric.intrinsics[i].items():
             interval = in_original_pixels(name, working, image.scale)

@@ -142,10 +142,12 @@ def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]
     return out[:, :, 0] if image.ndim == 2 else out
 
 
-def undistort_image(rgb: U8, K: F64, distortion: F64, pinhole_K: F64, size: tuple[int, int]) -> tuple[U8, B8]:
+def undistort_image(
+    rgb: U8, K: F64, distortion: F64, pinhole_K: F64, size: tuple[int, int], *, mask: B8 | None = None
+) -> tuple[U8, B8]:
     """Resample an image (H, W, 3) with radial distortion into a pinhole camera of (width, height).
 
-    Returns the image, black outside the original, and the mask of pixels inside.
+    Returns the image, black outside the original and its ``mask``, and which pixels are inside.
     """
     inverse = np.linalg.inv(pinhole_K)
 
@@ -155,7 +157,10 @@ def undistort_image(rgb: U8, K: F64, distortion: F64, pinhole_K: F64, size: tupl
         xy = distort(dehomogenize(rays), distortion) @ K[:2, :2].T + K[:2, 2]
         return np.asarray(xy.reshape(*x.shape, 2))
 
-    pixels = warp_image(rgb.astype(np.float32), lookup, size)
+    given = rgb.astype(np.float32)
+    if mask is not None:
+        given[~mask] = np.nan
+    pixels = warp_image(given, lookup, size)
     seen = np.asarray(np.isfinite(pixels).all(axis=2))
     return np.clip(np.rint(np.where(seen[:, :, None], pixels, 0.0)), 0.0, 255.0).astype(np.uint8), seen
 

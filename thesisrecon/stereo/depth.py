@@ -130,8 +130,8 @@ def pinhole_view(
     Returns
     -------
     PinholeView
-        The third coordinate of its camera is the depth. Pixels outside the original image are black and not
-        ``seen``.
+        The third coordinate of its camera is the depth. Pixels outside the original image or its mask are
+        black and not ``seen``.
     """
     K = reconstruction.K
     if reconstruction.stratum != "metric" or K is None:
@@ -146,9 +146,9 @@ def pinhole_view(
     distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
     P = reconstruction.P[view]
     P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
-    if not distortion.any() and size == image.size:
+    if not distortion.any() and size == image.size and image.mask is None:
         return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
-    rgb, seen = undistort_image(image.rgb, K[view], distortion, S @ K[view], size)
+    rgb, seen = undistort_image(image.rgb, K[view], distortion, S @ K[view], size, mask=image.mask)
     return PinholeView(view, P, rgb, seen)
 
 
