@@ -60,6 +60,12 @@ class Image:
         return max(self.size) / max(self.original_size)
 
     @property
+    def original_from_working(self) -> F64:
+        """Transform of homogeneous pixels (3, 3), (x + 0.5) / scale - 0.5."""
+        offset = 0.5 / self.scale - 0.5
+        return np.array([[1 / self.scale, 0.0, offset], [0.0, 1 / self.scale, offset], [0.0, 0.0, 1.0]])
+
+    @property
     def gray(self) -> F32:
         """(H, W) float32 luminance, 0 to 255 (ITU-R BT.601 weights)."""
         weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)

@@ -54,34 +54,36 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
     return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)
 
 
+def _number_of(image: str | int, images: tuple[Image, ...]) -> int:
+    """The number of an image by its name or number, which may count from the end; ``KeyError`` if none."""
+    if isinstance(image, str):
+        numbers = [i for i, one in enumerate(images) if one.name == image]
+        if not numbers:
+            raise KeyError(f"there is no image {image!r}; the first of {len(images)} is {images[0].name!r}")
+        return numbers[0]
+    if not -len(images) <= int(image) < len(images):
+        raise KeyError(f"there is no image {image}; {len(images)} were read")
+    return int(image) % len(images)
+
+
 class Cameras(Mapping[str, Camera]):
     """The registered cameras by image name, or by the number of the image among all that were read."""
 
     def __init__(self, images: tuple[Image, ...], metric: MetricResult) -> None:
         self._images, self._metric = images, metric
-        self._number = {image.name: i for i, image in enumerate(images)}
 
     def __getitem__(self, image: str | int) -> Camera:
-        i = self._number.get(image, -1) if isinstance(image, str) else int(image)
-        if isinstance(image, str) and i < 0:
-            raise KeyError(f"there is no image {image!r}; the first of {len(self._images)} is {self._some!r}")
-        if not -len(self._images) <= i < len(self._images):
-            raise KeyError(f"there is no image {i}; {len(self._images)} were read")
+        i = _number_of(image, self._images)
         r = self._metric.reconstruction
         if not r.registered[i]:
             raise KeyError(f"image {self._images[i].name!r} is not registered: {r.reasons[i]}")
         assert r.K is not None
         assert r.distortion is not None
-        scale, intrinsics = self._images[i].scale, self._metric.intrinsics[i]
-        offset = 0.5 / scale - 0.5
-        K = np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]]) @ r.K[i]
+        one, intrinsics = self._images[i], self._metric.intrinsics[i]
         Rt = np.linalg.solve(r.K[i], r.P[i])
-        std = {name: in_original_pixels(name, interval, scale).std for name, interval in intrinsics.items()}
-        return Camera(K, Rt[:, :3], Rt[:, 3], self._images[i].original_size, r.distortion[i], std)
-
-    @property
-    def _some(self) -> str:
-        return self._images[0].name
+        std = {name: in_original_pixels(name, value, one.scale).std for name, value in intrinsics.items()}
+        K = one.original_from_working @ r.K[i]
+        return Camera(K, Rt[:, :3], Rt[:, 3], one.original_size, r.distortion[i], std)
 
     def __iter__(self) -> Iterator[str]:
         registered = self._metric.reconstruction.registered
@@ -176,9 +178,7 @@ class RunResult:
         r = self._metric_result("cameras").reconstruction
         assert r.K is not None
         scale = np.array([image.scale for image in self.images])
-        to_original = np.tile(np.eye(3), (len(scale), 1, 1))
-        to_original[:, [0, 1], [0, 1]] = 1.0 / scale[:, None]
-        to_original[:, :2, 2] = (0.5 / scale - 0.5)[:, None]
+        to_original = np.array([image.original_from_working for image in self.images])
         view = r.tracks.view_index
         xy = (r.tracks.xy + 0.5) / scale[view][:, None] - 0.5
         return replace(
@@ -204,10 +204,7 @@ class RunResult:
             ``xy`` (M, 2) in original pixels and ``point`` (M,), the rows of ``points``.
         """
         r = self._metric_result("observations").reconstruction
-        names = [one.name for one in self.images]
-        if image not in names and not (isinstance(image, int) and -len(names) <= image < len(names)):
-            raise KeyError(f"there is no image {image!r}")
-        i = names.index(image) if isinstance(image, str) else image % len(names)
+        i = _number_of(image, self.images)
         view, point = r.tracks.view_index, r.tracks.point_index
         used = r.inlier & r.registered[view] & r.valid[point] & (view == i)
         row = np.cumsum(r.valid) - 1

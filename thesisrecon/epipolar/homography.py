@@ -19,12 +19,12 @@ from thesisrecon.geometry.two_view import (
     unit_norm,
 )
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics.noise import noise_from_distances
+from thesisrecon.numerics.noise import VARIANCE_OF_INLIERS, next_inlier_limit
 
 _SAMPLE, _PARAMETERS = 4, 8
 _BATCH, _MAX_BATCHES, _SCORED = 128, 16, 1000
-# Residual of an inlier in standard deviations, the variance of residuals within it, and rounds to find it.
-_INLIER_SIGMAS, _TRIMMED_VARIANCE, _ROUNDS = 3.0, 0.9494, 8
+# Rounds to find the inliers.
+_ROUNDS = 8
 # Residuals in units of the frame below which they are rounding errors.
 _EXACT = 1e-9
 # Ratio of singular values of the equations below which they are dependent.
@@ -110,11 +110,7 @@ def estimate_homography(
             if k == 0:
                 limit = max(noise_width(np.abs(r[:, 0]), gate, parameters=_PARAMETERS), gate)
             else:
-                # The median of the inliers alone would be too small, since their limit cuts off the noise.
-                near = distance <= max(2.0 * limit, float(np.median(distance[inliers])))
-                limit = _INLIER_SIGMAS * noise_from_distances(distance[near])
-                fitted = 2.0 * int(inliers.sum())
-                limit *= np.sqrt(fitted / max(fitted - _PARAMETERS, 1.0))
+                limit = next_inlier_limit(distance, inliers, limit, unknowns=_PARAMETERS)
             inliers = distance <= max(limit, _EXACT)
             if inliers.sum() < _SAMPLE:
                 raise _undetermined(f"{inliers.sum()} of {len(points)} are within {threshold_px:g} px")
@@ -122,7 +118,7 @@ def estimate_homography(
                 break
             H, inverse = _refine(H, points[inliers])
     r = homography_sampson_residuals(H, points[inliers, :2], points[inliers, 2:])
-    left = (r.size - _PARAMETERS) * (1.0 if threshold_px is None else _TRIMMED_VARIANCE)
+    left = (r.size - _PARAMETERS) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(r**2) / left)) if left else float("nan")
     h = frame.homography_to_pixels @ H.ravel()
     norm = np.linalg.norm(h)

@@ -12,7 +12,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, depth, project
 from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes, whitening_transform
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
-from thesisrecon.numerics.noise import noise_from_distances
+from thesisrecon.numerics.noise import VARIANCE_OF_INLIERS, next_inlier_limit
 from thesisrecon.numerics.partial_bundle import refine_camera, refine_pose
 
 _SAMPLE = 6
@@ -21,8 +21,8 @@ _BATCH, _MAX_BATCHES = 64, 12
 _SAMPLES = 300
 # Search threshold if all points are inliers.
 _ANY_PX = 1e4
-# Residual of an inlier in standard deviations, the variance of residuals within it, and rounds to find it.
-_INLIER_SIGMAS, _TRIMMED_VARIANCE, _ROUNDS = 3.0, 0.9494, 6
+# Rounds to find the inliers.
+_ROUNDS = 6
 # Residuals below this are rounding errors, not noise.
 _EXACT_PX = 1e-6
 # Ratio of extents below which points lie in one plane.
@@ -130,14 +130,11 @@ def resect(
         used = inliers
         if threshold_px is None:
             break
-        # The median of the inliers alone would be too small, since their limit cuts off the noise.
-        sigma = noise_from_distances(distance[distance <= max(2.0 * limit, np.median(distance[used]))])
-        fitted = 2.0 * int(used.sum())
-        limit = max(_INLIER_SIGMAS * sigma * np.sqrt(fitted / max(fitted - unknown, 1.0)), _EXACT_PX)
+        limit = max(next_inlier_limit(distance, used, limit, unknowns=unknown), _EXACT_PX)
         inliers = distance <= limit
         if np.array_equal(inliers, used):
             break
-    left = (2 * int(used.sum()) - unknown) * (1.0 if threshold_px is None else _TRIMMED_VARIANCE)
+    left = (2 * int(used.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(distance[used] ** 2) / left)) if left > 0 else float("nan")
     return replace(fit, inliers=used, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
 

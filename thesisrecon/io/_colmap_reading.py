@@ -15,12 +15,11 @@ import scipy
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
+from thesisrecon.io.colmap import PIXEL_CENTRE, POINT_2D
 from thesisrecon.sparse_model import SparseModel, SparseView
 
 _FILES = ("cameras", "images", "points3D")
 _MAX_BYTES = 2**32
-_PIXEL_CENTRE = 0.5
-_POINT_2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _NO_POINT = str(2**64 - 1)
 _KINDS = (
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8),
@@ -126,9 +125,9 @@ def _binary_image(data: bytes, at: int) -> tuple[_Image, int]:
     _, *pose, camera = struct.unpack_from("<I7dI", data, at)
     at, end = at + 64, data.index(b"\0", at + 64)
     (count,) = struct.unpack_from("<Q", data, end + 1)
-    seen = np.frombuffer(data, _POINT_2D, count, end + 9) if count else np.empty(0, _POINT_2D)
+    seen = np.frombuffer(data, POINT_2D, count, end + 9) if count else np.empty(0, POINT_2D)
     name = data[at:end].decode("utf-8", "surrogateescape")
-    return _image(camera, name, pose, seen["xy"], seen["point"]), end + 9 + _POINT_2D.itemsize * count
+    return _image(camera, name, pose, seen["xy"], seen["point"]), end + 9 + POINT_2D.itemsize * count
 
 
 def _binary_point(data: bytes, at: int) -> tuple[_Point, int]:
@@ -185,7 +184,7 @@ def _view(image: _Image, cameras: dict[int, _Camera]) -> SparseView:
         # The last focal length, of one or two.
         focal = 0 if kind.startswith(("SIMPLE_", "RADIAL")) else 1
         K = np.diag([params[0], params[focal], 1.0])
-        K[:2, 2] = params[focal + 1 : focal + 3] - _PIXEL_CENTRE
+        K[:2, 2] = params[focal + 1 : focal + 3] - PIXEL_CENTRE
         places = _RADIAL.get(kind)
         if places is not None and not np.delete(params, places)[focal + 3 :].any():
             distortion = np.array([*params[list(places)], 0.0, 0.0, 0.0][:3])
@@ -203,7 +202,7 @@ def _observations(images: Sequence[_Image], ids: I64) -> tuple[I64, I64, F64]:
             raise UsageError(f"image {image.name!r} of the COLMAP model refers to a missing point")
         points.append(order[np.searchsorted(ids[order], image.point[seen])])
         views.append(np.full(len(points[-1]), i))
-        xy.append(image.xy[seen] - _PIXEL_CENTRE)
+        xy.append(image.xy[seen] - PIXEL_CENTRE)
     view, point = np.concatenate(views), np.concatenate(points)
     _, first = np.unique(point * len(images) + view, return_index=True)
     return view[first], point[first], np.concatenate(xy)[first]

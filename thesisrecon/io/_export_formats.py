@@ -17,10 +17,9 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.io._exports import write_point_cloud
 from thesisrecon.io._files import write_atomically, write_json, write_text
-from thesisrecon.io.colmap import colors_of
+from thesisrecon.io.colmap import PIXEL_CENTRE, colors_of
 from thesisrecon.sparse_model import SparseModel, SparseView
 
-_PIXEL_CENTRE = 0.5
 _LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
 """From axes x right, y down, z forward to x right, y up, z back."""
 _MVS_VERSION = 2
@@ -49,7 +48,7 @@ def write_nerfstudio(folder: Path, model: SparseModel) -> Path:
 
 def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
     K, (width, height) = _calibration(view)
-    cx, cy = K[0, 2] + _PIXEL_CENTRE, K[1, 2] + _PIXEL_CENTRE
+    cx, cy = K[0, 2] + PIXEL_CENTRE, K[1, 2] + PIXEL_CENTRE
     values = {
         "fl_x": K[0, 0],
         "fl_y": K[1, 1],

@@ -53,7 +53,7 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
                 "name": image.name,
                 "width": image.original_size[0],
                 "height": image.original_size[1],
-                "K": _original_from_working(image.scale) @ K,
+                "K": image.original_from_working @ K,
                 "distortion": reconstruction.distortion[i],
                 "R": Rt[:, :3],
                 "t": Rt[:, 3],
@@ -65,12 +65,6 @@ def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> 
         "(0, 0) is the centre of the top-left pixel"
     )
     return {"convention": convention, "cameras": cameras}
-
-
-def _original_from_working(scale: float) -> F64:
-    """Return the (3, 3) map from working to original pixels, (x + 0.5) / scale - 0.5."""
-    offset = 0.5 / scale - 0.5
-    return np.array([[1 / scale, 0.0, offset], [0.0, 1 / scale, offset], [0.0, 0.0, 1.0]])
 
 
 def write_image(path: Path, rgb: U8) -> None:

@@ -22,12 +22,12 @@ from thesisrecon.io._files import write_atomically
 from thesisrecon.records import Reconstruction
 from thesisrecon.sparse_model import SparseModel
 
-_PIXEL_CENTRE = 0.5
+PIXEL_CENTRE = 0.5
 _SKEW_REL = 1e-9
 """Skew below this fraction of the focal length is rounding."""
 _MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 6}
 _CAMERA_SENSOR = 0
-_POINT_2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+POINT_2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _TRACK_ENTRY = np.dtype([("image", "<u4"), ("row", "<u4")])
 
 
@@ -90,7 +90,7 @@ def write_colmap_model(
         here = view == i
         seen = project_camera(r.K[i], R, t, _points(r.X[point[here]]), distortion=r.distortion[i])
         distance[here] = np.linalg.norm((seen - xy[here]) * scales[i], axis=1)
-    observed = _Observations(view, point, (xy + _PIXEL_CENTRE) * scales[view, None], distance)
+    observed = _Observations(view, point, (xy + PIXEL_CENTRE) * scales[view, None], distance)
     _write(Path(folder), posed, observed, np.unique(point), (r.X, colors))
     return 0
 
@@ -117,7 +117,7 @@ def write_sparse_model(folder: str | Path, model: SparseModel, *, pinhole: bool 
         X = model.X[model.point_index[here]]
         seen = project_camera(view.K, view.R, view.t, X, distortion=view.distortion)
         distance[here] = np.linalg.norm(seen - model.xy[here], axis=1)
-    observed = _Observations(model.view_index, model.point_index, model.xy + _PIXEL_CENTRE, distance)
+    observed = _Observations(model.view_index, model.point_index, model.xy + PIXEL_CENTRE, distance)
     Xh = np.column_stack([model.X, np.ones(len(model.X))])
     _write(Path(folder), posed, observed, np.arange(len(Xh)), (Xh, colors_of(model)))
 
@@ -161,7 +161,7 @@ def _write(
         here = np.flatnonzero(view == i)
         row[here] = np.arange(len(here))
         quaternion = np.roll(scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True), 1)
-        observations = np.empty(len(here), dtype=_POINT_2D)
+        observations = np.empty(len(here), dtype=POINT_2D)
         observations["xy"], observations["point"] = xy[here], point[here] + 1
         image = struct.pack("<I7dI", i + 1, *quaternion, *t, cameras[camera])
         encoded = name.encode("utf-8", "surrogateescape") + b"\0"
@@ -206,7 +206,7 @@ def _camera_params(
 ) -> tuple[str, tuple[float, ...]]:
     """Return the smallest COLMAP camera model for K and (k1, k2, k3), with parameters in original pixels."""
     fx, fy = float(K[0, 0] * scale), float(K[1, 1] * scale)
-    centre = tuple(float(value) for value in (K[:2, 2] + _PIXEL_CENTRE) * scale)
+    centre = tuple(float(value) for value in (K[:2, 2] + PIXEL_CENTRE) * scale)
     k1, k2, k3 = distortion.tolist()
     if k2 or k3:
         return "FULL_OPENCV", (fx, fy, *centre, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)

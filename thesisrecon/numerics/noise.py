@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import B8, F64
 
 
 def huber(s: F64, delta: float) -> tuple[F64, F64]:
@@ -45,6 +45,8 @@ def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
 # 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75), which is not consistent.
 MAD_FACTOR = 1.4826022185056018
 _RAYLEIGH_MEDIAN = 1.1774
+INLIER_SIGMAS, VARIANCE_OF_INLIERS = 3.0, 0.9494
+"""Residual of an inlier in standard deviations, and the variance of residuals within it."""
 _HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 
 
@@ -62,6 +64,28 @@ def noise_from_distances(distances: F64) -> float:
         Median / 1.1774, the median of a Rayleigh variable.
     """
     return float(np.median(distances)) / _RAYLEIGH_MEDIAN
+
+
+def next_inlier_limit(distance: F64, inliers: B8, limit: float, *, unknowns: int) -> float:
+    """Return ``INLIER_SIGMAS`` standard deviations of the noise around a fit, for its next inliers.
+
+    Parameters
+    ----------
+    distance, inliers : ndarray (N,), ndarray (N,) of bool
+        Lengths of two-dimensional residuals, and what the fit was made of.
+    limit, unknowns : float, int
+        The limit before, and the number of fitted parameters.
+
+    Returns
+    -------
+    float
+    """
+    # The median of the inliers alone would be too small, since their limit cuts off the noise.
+    near = distance <= max(2.0 * limit, float(np.median(distance[inliers])))
+    fitted = 2.0 * int(inliers.sum())
+    return float(
+        INLIER_SIGMAS * noise_from_distances(distance[near]) * np.sqrt(fitted / max(fitted - unknowns, 1.0))
+    )
 
 
 def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> float:

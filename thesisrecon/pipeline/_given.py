@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -15,7 +15,7 @@ from thesisrecon.pipeline._image_pair import verify_matches
 from thesisrecon.pipeline._stages import finish_matches, finish_tracks, require_accepted_pair
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import Features, Matches, PairChoice, Tracks, TwoView
-from thesisrecon.runtime._run import Batch
+from thesisrecon.runtime._run import Batch, stream
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def take_corners(given: Given, state: PipelineState) -> None:
     run.finish("features", counts=report)
     # Tracks are built from the corners alone.
     state.prepared = [SimpleNamespace(features=features) for features in found]
-    state.result = state.with_result(features=tuple(found))
+    state.result = replace(state.result, features=tuple(found))
 
 
 def take_pairs(given: Given, state: PipelineState) -> None:
@@ -52,7 +52,7 @@ def take_pairs(given: Given, state: PipelineState) -> None:
         run.key("pairs", "given", pairs),
         partial(PairChoice, pairs, "the pairs with matches"),
     )
-    state.result = state.with_result(pair_choice=choice)
+    state.result = replace(state.result, pair_choice=choice)
     run.finish("pairs", counts={"possible": views * (views - 1) // 2, "compared": 0, "chosen": len(pairs)})
 
 
@@ -74,7 +74,7 @@ def verify_pairs(given: Given, state: PipelineState) -> None:
 
 
 def _verify(config: PipelineConfig, matches: Matches, seed: int) -> list[TwoView]:
-    return [verify_matches(config, matches, seed)]
+    return [verify_matches(config, matches, stream(seed, "matches", matches.i, matches.j))]
 
 
 def take_tracks(given: Given, state: PipelineState) -> None:

@@ -191,9 +191,8 @@ def given_tracks(tracks: Tracks, views: Views) -> Given:
     view, point = np.asarray(tracks.view_index), np.asarray(tracks.point_index)
     if tracks.n_views != count or len(view) == 0 or view.max() >= count:
         raise UsageError(f"the tracks are of {tracks.n_views} images, the sizes of {count}")
-    order = np.lexsort((point, view))
-    _, first = np.unique(np.stack([point[order], view[order]]), axis=1, return_index=True)
-    kept = np.sort(order[first])
+    # One observation of a point in a view, sorted by point and view.
+    _, kept = np.unique(np.asarray(point, dtype=np.int64) * count + view, return_index=True)
     kept = kept[np.bincount(point[kept], minlength=tracks.n_points)[point[kept]] >= 2]
     view, point, xy = view[kept], point[kept], np.asarray(tracks.xy, dtype=np.float64)[kept]
     here = [np.flatnonzero(view == i) for i in range(count)]
@@ -208,10 +207,8 @@ def given_tracks(tracks: Tracks, views: Views) -> Given:
         raise UsageError(
             f"no two images share {MIN_COMMON_POINTS} of the {counted(tracks.n_points, 'point')}"
         )
-    order = np.lexsort((view, point))
-    _, number = np.unique(point[order], return_inverse=True)
-    sorted_tracks = Tracks(view[order], number, xy[order], count, int(number.max()) + 1)
-    return Given(corners, found, sorted_tracks)
+    _, number = np.unique(point, return_inverse=True)
+    return Given(corners, found, Tracks(view, number, xy, count, int(number.max()) + 1))
 
 
 def at_working_size(given: Given, images: Sequence[Image]) -> Given:

@@ -119,20 +119,16 @@ def match_views(
     for mask, side in zip(masks, ("xy1", "xy2"), strict=True):
         if mask is not None:
             matches = select_matches(matches, _at(mask, getattr(matches, side)))
-    return verify_matches(config, matches, seed, rng)
+    return verify_matches(config, matches, rng)
 
 
-def verify_matches(
-    config: PipelineConfig, matches: Matches, seed: int, rng: np.random.Generator | None = None
-) -> TwoView:
+def verify_matches(config: PipelineConfig, matches: Matches, rng: np.random.Generator) -> TwoView:
     """Estimate F of matches and verify them; a pair without F is rejected with a reason."""
-    pair = matches.i, matches.j
-    rng = rng or stream(seed, "matches", *pair)
     try:
         fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
         return config.verification.verify(matches, fit, rng)
     except StageFailure as failure:
-        return _rejected_pair(pair, len(matches.xy1), str(failure))
+        return _rejected_pair((matches.i, matches.j), len(matches.xy1), str(failure))
 
 
 def _rejected_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:

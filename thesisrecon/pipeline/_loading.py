@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from thesisrecon.arrays import I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_json
 from thesisrecon.pipeline._outputs import SUMMARY, with_image_names
-from thesisrecon.pipeline._stages import best_attempt
+from thesisrecon.pipeline._stages import best_result
 from thesisrecon.records import Image
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import FOLDERS
@@ -87,13 +88,15 @@ def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) ->
         failure=summary["failure"] or "",
     )
     attempts = [
-        {name: stages[stage].get(item) for stage, name in _ATTEMPTS.items()} for item in stages["projective"]
+        replace(
+            result,
+            projective=stages["projective"][item],
+            calibration=stages["selfcalibration"].get(item),
+            metric=stages["metric"].get(item),
+        )
+        for item in stages["projective"]
     ]
-    return with_image_names(best_attempt(result, attempts))
-
-
-_ATTEMPTS = {"projective": "projective", "selfcalibration": "calibration", "metric": "metric"}
-"""Stages that are tried from several initial pairs, and their fields of the result."""
+    return with_image_names(best_result(attempts or [result]))
 
 
 def _keys(folder: Path) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -259,16 +259,16 @@ def reconstruct_metric(state: PipelineState) -> None:
         tried.append(state.result)
         if trusted:
             break
-    state.result = max(tried, key=_quality)
+    state.result = best_result(tried)
     if state.result.metric is None:
         raise failures[0]
     if len(tried) > 1:
         state.run.warnings.append(f"{len(tried)} initial pairs were tried; the best result is used")
 
 
-def best_attempt(result: RunResult, attempts: Sequence[Mapping[str, Any]]) -> RunResult:
-    """The result with the fields of the attempt that the rule of :func:`reconstruct_metric` chooses."""
-    return max((replace(result, **fields) for fields in attempts), key=_quality, default=result)
+def best_result(tried: Sequence[RunResult]) -> RunResult:
+    """The result of the attempt that counts: metric, trusted, with most cameras, then most points."""
+    return max(tried, key=_quality)
 
 
 def _quality(result: RunResult) -> tuple[bool, bool, int, int]:

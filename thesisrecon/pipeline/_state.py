@@ -6,7 +6,7 @@ import re
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -103,10 +103,6 @@ class PipelineState:
     result: RunResult
     until: str
     prepared: Sequence[Any] | None = None
-
-    def with_result(self, **fields: Any) -> RunResult:
-        """The result with other values of some fields."""
-        return replace(self.result, **fields)
 
     @property
     def config(self) -> PipelineConfig:

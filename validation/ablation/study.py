@@ -23,7 +23,7 @@ class Measure:
     """A number that rows report.
 
     ``better`` is "less" or "more". With ``ratio`` values are compared by quotients, for errors of different
-    magnitude above zero; a quotient within ``negligible`` of 1 matters to nobody.
+    magnitude above zero; a quotient within ``negligible`` of 1 is called negligible.
     """
 
     name: str
