@@ -20,7 +20,6 @@ from thesisrecon.geometry.camera_matrix import compose_camera, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import epipolar_lines, fundamental_from_cameras, plane_homography
 from thesisrecon.intrinsics import IntrinsicsOptions
-from thesisrecon.io._exports import _original_from_working
 from thesisrecon.records import Image, TexturedMesh, Tracks
 from thesisrecon.report._data import point_colors
 from thesisrecon.runtime._run import stream
@@ -116,7 +115,9 @@ def test_pixels_go_back_to_the_original_as_they_came():
     scale = 0.4
     original = np.array([123.0, 45.0])
     working = (original + 0.5) * scale - 0.5
-    np.testing.assert_allclose(_original_from_working(scale) @ [*working, 1.0], [*original, 1.0])
+    image = Image("x", np.zeros((80, 160, 3), np.uint8), (400, 200))
+    assert image.scale == scale
+    np.testing.assert_allclose(image.original_from_working @ [*working, 1.0], [*original, 1.0])
 
 
 def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path):
