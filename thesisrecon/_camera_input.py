@@ -17,10 +17,7 @@ CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | R
 def as_cameras(
     caller: str, cameras: CameraInput, sizes: I64 | None = None, names: Sequence[str] = ()
 ) -> list[Camera]:
-    """The cameras in order, of a reconstruction those of its registered views; ``ValueError`` for others.
-
-    ``sizes`` (V, 2) or (2,) belong to plain arrays; with ``names`` a table gives the cameras of these images.
-    """
+    """The cameras in order, of a reconstruction the registered ones; with ``names`` those of these images."""
     if isinstance(cameras, Reconstruction):
         return _of_reconstruction(caller, cameras)
     if isinstance(cameras, Mapping):

@@ -31,22 +31,12 @@ _NOTED = {"_abc_impl", "_is_protocol", "_is_runtime_protocol"}
 
 
 def code_digest(*values: Any) -> str:
-    """Digest of functions, classes or objects and of all code that they refer to.
+    """SHA-256 digest of functions, classes or objects and of all code that they refer to.
 
     Followed are constants, defaults, closures, base classes, methods, fields and imports inside functions.
     Code of installed libraries counts by its name only, unless a value belongs to it. Comments, docstrings
     and line numbers do not enter. Objects count by their pickled state; one that cannot be pickled, as an
     object of a C++ library, gives another digest each time, so that nothing stored is used for it.
-
-    Parameters
-    ----------
-    *values : callable, type or object
-        Kernels, functions, classes, or instances with their fields.
-
-    Returns
-    -------
-    str
-        SHA-256 digest in hexadecimal digits.
     """
     walk = _Walk({OWN, *(_package_of(value) for value in values)} - _BY_NAME)
     digest = hashlib.sha256()

@@ -340,10 +340,7 @@ def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, ba
 
 
 def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
-    """Convert a plain value to an annotated type; ``current`` is the base of a dataclass.
-
-    An int is accepted for a float, never the reverse; text is never accepted for a number.
-    """
+    """Convert a plain value to an annotated type (an int to a float, never text to a number)."""
     value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):

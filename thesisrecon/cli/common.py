@@ -109,10 +109,7 @@ def interruptible(advice: str) -> Iterator[None]:
 
 
 def exit_code_of(command: Callable[[], object]) -> int:
-    """Run a command and turn errors into one sentence on stderr and an exit code.
-
-    0 = done, 1 = internal error, 2 = usage, 3 = data that cannot be reconstructed, 130 = interrupted.
-    """
+    """Run a command and turn errors into one sentence on stderr and an exit code."""
     try:
         code = command()
         return code if isinstance(code, int) else DONE

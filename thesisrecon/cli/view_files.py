@@ -44,10 +44,7 @@ _BEYOND = 0.5
 
 @dataclass(frozen=True)
 class ViewSequence:
-    """Views that are computed on demand, with numbers for ``frames.json``.
-
-    ``draw`` takes the number of a view and of threads; ``notes`` are sentences about the whole sequence.
-    """
+    """Views that ``draw`` computes from their number and the threads, with numbers for ``frames.json``."""
 
     captions: list[str]
     draw: Callable[[int, int], U8]
@@ -59,11 +56,7 @@ class ViewSequence:
 def interpolated_sequence(
     images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int
 ) -> ViewSequence:
-    """Interpolate from the first image to the second and, of three, across their triangle (section 1.2).
-
-    With three images the path leads half way to the second image and from there to the third: the view half
-    way is matched with the third image, so its pixels are resampled twice.
-    """
+    """Interpolate from the first image to the second and, of three, across their triangle (section 1.2)."""
     require_comparable_images(images)
     path = np.linspace(0.0, 1.0, frames).tolist() if frames > 1 else [_MIDWAY]
     legs = [prepare_pair(images[0], images[1], config=config, seed=seed)]
@@ -150,11 +143,7 @@ def render_run(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> str:
-    """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence on them.
-
-    Frames of an earlier call that this one does not replace are removed. The files do not depend on
-    ``threads``. ``size`` None is that of the first image, at most 1000 px.
-    """
+    """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence."""
     mesh, cameras = _read_run(out)
     _claim(folder)
     size = size or cameras[0].scaled(min(1.0, _DEFAULT_SIDE_PX / max(cameras[0].size))).size
@@ -193,11 +182,7 @@ def interpolate_images(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> str:
-    """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``.
-
-    Returns a sentence about the files, which do not depend on ``threads``. Nothing is written before the
-    images have been matched.
-    """
+    """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``."""
     _check_images(paths)
     _claim(folder)
     config = PipelineConfig()

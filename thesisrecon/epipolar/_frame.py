@@ -17,10 +17,7 @@ MAX_PX, MIN_PX = 1e15, 1e-50
 
 
 def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
-    """Matches as contiguous float64 arrays (N, 2).
-
-    A ValueError if the shapes differ or coordinates are complex, not finite or beyond 1e15 px.
-    """
+    """Matches as contiguous float64 arrays (N, 2); ValueError if shapes or coordinates are impossible."""
     if np.iscomplexobj(xy1) or np.iscomplexobj(xy2):
         raise ValueError("a fundamental matrix needs real pixel coordinates; got complex ones")
     xy1, xy2 = np.ascontiguousarray(xy1, dtype=np.float64), np.ascontiguousarray(xy2, dtype=np.float64)
@@ -36,10 +33,7 @@ def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
 
 def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
-    """As :func:`as_matches`; a StageFailure if the matches cannot determine an F.
-
-    There are fewer than ``needed``, or the points of an image are equal or collinear.
-    """
+    """As :func:`as_matches`; StageFailure if the matches are too few, equal or collinear."""
     xy1, xy2 = as_matches(xy1, xy2)
     if len(xy1) < needed:
         raise StageFailure(
@@ -61,11 +55,7 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class PairFrame:
-    """Coordinates of both images about their centroids (2,) with one common scale, units per pixel.
-
-    The common factor keeps Sampson distances proportional to pixels; one factor per image would weight the
-    images differently.
-    """
+    """Coordinates about the centroids; one common scale keeps Sampson distances proportional to pixels."""
 
     centroid1: F64
     centroid2: F64

@@ -69,10 +69,7 @@ def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, 
 
 
 def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
-    """Estimate the standard deviation by 1.4826 (1 + 5 / (n - p)) median |r| (Rousseeuw and Leroy 1987).
-
-    Less than half of the residuals may be wrong; p ``parameters`` were fitted to them.
-    """
+    """1.4826 (1 + 5 / (n - p)) median |r|, for less than half wrong residuals (Rousseeuw and Leroy 1987)."""
     n = len(residuals)
     if n <= parameters or not np.isfinite(residuals).all():
         raise ValueError(f"noise_scale needs more than {parameters} finite residuals; got {n}")
@@ -98,10 +95,7 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
 
 
 def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
-    """Estimate the standard deviation by the root mean square of the residuals >= 0 within 2.5 of it.
-
-    Returns ``start`` if too few residuals are left.
-    """
+    """The root mean square of the residuals >= 0 within 2.5 of it; ``start`` if too few are left."""
     sigma = start
     for _ in range(_TRIM_ROUNDS):
         kept = residuals[residuals <= _TRIM * sigma]
@@ -128,10 +122,7 @@ class NoiseMixture:
 
     @classmethod
     def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> NoiseMixture:
-        """Fit to residuals in ascending order by expectation-maximisation (McLachlan and Peel, 2000).
-
-        ``sigma`` is an initial value, ``spread`` the standard deviation of wrong residuals in the prior.
-        """
+        """Fit to ascending residuals by expectation-maximisation; ``spread`` is the prior of wrong ones."""
         step = max(len(residuals) // _QUANTILES, 1)
         some = np.ascontiguousarray(residuals[step // 2 :: step])
         share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
@@ -194,9 +185,6 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
 
 
 def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
-    """Probability that a wrong match lies within a Sampson distance of any F.
-
-    Area of a band of width 2 sqrt(2) band_px across the bounding box of the matches, relative to the box.
-    """
+    """Probability that a wrong match lies within the band of any F, of width 2 sqrt(2) band_px."""
     narrow = min(float(np.ptp(xy)) for xy in (*xy1.T, *xy2.T))
     return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))

@@ -198,10 +198,7 @@ def count_transferred(H: F64, xy1: F64, xy2: F64, tolerance: float) -> I64:
 def find_dominant_plane(
     f: F64, points: F64, inliers: B8, *, sigma: float, rng: Generator
 ) -> tuple[F64, F64] | None:
-    """Plane h (9,) of F with most of its inliers, and squared distances (N,) in sigma^2; None without one.
-
-    Least squares over the inliers within 5 sigma of the best of 100 sampled planes.
-    """
+    """Plane h (9,) of F with most of its inliers, and squared distances (N,) in sigma^2; None without one."""
     mine = points[inliers]
     if len(mine) < 4:
         return None
@@ -286,10 +283,6 @@ def _fundamentals_of_plane(h: F64, points: F64, columns: F64, pairs: I64, gate: 
 
 
 def fundamentals_of_plane(h: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
-    """Compute [e2]x H with the epipole of each pair of matches off the plane (plane plus parallax).
-
-    For ``weights`` (M, N) and ``pairs`` (S, 2): F (S, 9), inliers (S, N) as 0 or 1, sums (S, M) of their
-    weights.
-    """
+    """[e2]x H of pairs off the plane: F (S, 9), inliers (S, N) as 0 or 1, sums (S, M) of their weights."""
     F, agree = _fundamentals_of_plane(h, points, np.ascontiguousarray(points.T), pairs, gate)
     return F, agree, agree @ weights.T

@@ -76,10 +76,7 @@ def _rotation_homography(parameters: F64) -> F64:
 
 
 def _rotation_test(H: F64, xy1: F64, xy2: F64) -> float:
-    """Squared residuals of the best K R K^-1 minus those of H, relative to their limit by an F-test.
-
-    At most 1 for a rotation. ``H`` is the least-squares homography of the matches.
-    """
+    """Squared residuals of the best K R K^-1 minus those of H over their limit; at most 1 for a rotation."""
 
     def residuals(parameters: F64) -> F64:
         return homography_sampson_residuals(_rotation_homography(parameters), xy1, xy2).ravel()

@@ -132,11 +132,7 @@ class _CompetingModel:
         return (self.lost - self.gained) / float(np.sqrt(max(self.lost + self.gained, 1.0)))
 
     def differs(self, relevant: float) -> bool:
-        """Whether the estimate is wrong if this model is right.
-
-        A model that explains all inliers of the estimate must explain much more, since a wrong match or two
-        that it gains are far from it.
-        """
+        """Whether the estimate is wrong if this model is right; wrong matches that it gains count little."""
         return self.apart > relevant or (self.error > relevant and self.margin < -MIN_MARGIN)
 
 

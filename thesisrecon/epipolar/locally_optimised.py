@@ -244,10 +244,7 @@ def _best_and_competing(ends: list[tuple[float, F64]], same: float) -> tuple[F64
 
 
 def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
-    """Refine ``f`` in place with the loss fitted to its residuals; return the noise and the loss.
-
-    The noise is None if fewer than eight residuals belong to it.
-    """
+    """Refine ``f`` in place with the loss fitted to its residuals; return the noise (None) and the loss."""
     loss = (0.0, 0.0)
     for k in range(NOISE_REFINEMENTS + 1):
         r = np.sort(sampson_distances(f, points))

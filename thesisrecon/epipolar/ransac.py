@@ -94,10 +94,7 @@ class _SampleConsensus:
         n: int,
         rng: Generator,
     ) -> tuple[F64, B8, int] | None:
-        """Return the best model of n data, its inliers (n,) and the number of samples; None without a model.
-
-        ``solve`` gives the models of some data by their indices, ``residuals`` the distances (n,) of a model.
-        """
+        """Return the best model of n data, its inliers (n,) and the number of samples, or None."""
         best: tuple[F64, B8] | None = None
         best_rank, drawn = (-np.inf, 0.0), 0
         sample = np.empty(sample_size, dtype=np.int64)

@@ -180,10 +180,7 @@ def _epipolar_inliers(points: F64, threshold_px: float, rng: Generator) -> B8:
 
 
 def _minimize_algebraic_error(equations: _TensorEquations, start: F64) -> F64:
-    """Conditioned T (3, 3, 3) with cameras and the least |A t| near a start.
-
-    The epipoles are the six parameters; all other entries follow from them.
-    """
+    """Conditioned T (3, 3, 3) with cameras and the least |A t| near a start, over the two epipoles."""
 
     def tensor(epipoles: F64) -> F64:
         e2, e3 = epipoles[:3], epipoles[3:]

@@ -124,10 +124,7 @@ class MultiScaleCorners:
 
 
 def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> tuple[list[F32], list[F64]]:
-    """Levels of a pyramid, each 1/sqrt(2) of the one before: sizes, and image pixels per pixel (x, y).
-
-    No side is below 16. Halving drops an odd row, so its scale is 2.
-    """
+    """Levels of a pyramid, each 1/sqrt(2) of the one before: sizes, and image pixels per pixel (x, y)."""
     height, width = plane.shape
     sizes = [resample(plane, 2 * width, 2 * height) if doubled else plane]
     scales = [np.array([width / sizes[0].shape[1], height / sizes[0].shape[0]])]
@@ -147,10 +144,7 @@ def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> tuple[list[F32]
 
 
 def _dominant_direction(blurred: F32, xy: F64) -> F32:
-    """Direction (N,) rad of the gradient at ``xy``, averaged over about nine pixels; never exactly 0.
-
-    The image is smoothed with sigma 2; the mean over a 5 x 5 grid of spacing 2 gives about sigma 4.
-    """
+    """Direction (N,) rad of the gradient at ``xy``, averaged with sigma of about 4 px; never exactly 0."""
     around = sample_patches(blurred, xy, np.zeros(len(xy), np.float32), 7, 2.0).reshape(-1, 7, 7)
     gx = (around[:, 1:-1, 2:] - around[:, 1:-1, :-2]).sum(axis=(1, 2))
     gy = (around[:, 2:, 1:-1] - around[:, :-2, 1:-1]).sum(axis=(1, 2))

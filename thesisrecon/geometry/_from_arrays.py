@@ -50,10 +50,7 @@ def checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tupl
 def checked_points(
     P: F64, sizes: I64, X: F64 | None, xy: F64 | None, *, finite: bool
 ) -> tuple[F64, I64, I64, F64]:
-    """Points (N, 4), zeros where unknown, and view, point and pixels (K,), (K,), (K, 2) of the observations.
-
-    ``finite``: the last coordinate of the points is 1.
-    """
+    """Points (N, 4), zeros where unknown, and view, point and pixels (K,), (K,), (K, 2) of observations."""
     caller = "Reconstruction.from_cameras"
     if xy is None:
         xy = np.full((len(P), 0 if X is None else len(X), 2), np.nan)

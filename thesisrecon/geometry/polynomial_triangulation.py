@@ -283,10 +283,7 @@ def _intersect_rays(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: 
 
 
 def _conditioning(xy: F64) -> tuple[float, F64, F64]:
-    """Return scale, centre (2, 2) and the transforms (2, 3, 3) to ``scale (x - centre)`` of pixels (2, N, 2).
-
-    Pixels are centred on the points of each view and scaled equally in both, so that costs compare.
-    """
+    """Scale (one for both views), centre (2, 2) and the transforms (2, 3, 3) to ``scale (x - centre)``."""
     scale, centre, T = 1.0, np.zeros((2, 2)), np.zeros((2, 3, 3))
     seen = np.isfinite(xy).all(axis=(0, 2))
     if seen.any():

@@ -28,10 +28,7 @@ class Database:
 
 
 def read_database(path: Path) -> Database:
-    """Read the keypoints and the verified matches, or the raw matches if none are verified.
-
-    Raises ``UsageError`` if it is no COLMAP database or holds no matches.
-    """
+    """Read the keypoints and the verified matches, or the raw matches if none are verified."""
     if not path.is_file():
         raise UsageError(f"there is no COLMAP database or model at {path}")
     try:

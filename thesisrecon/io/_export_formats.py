@@ -27,11 +27,7 @@ _MVS_VERSION = 2
 
 
 def write_nerfstudio(folder: Path, model: SparseModel) -> Path:
-    """Write ``transforms.json`` and ``points.ply`` of pinhole views; cx, cy are ours plus 0.5.
-
-    ``transform_matrix`` is camera-to-world with OpenGL axes; the intrinsics stand at the top if all views
-    share them, else in each frame.
-    """
+    """Write ``transforms.json`` (camera-to-world with OpenGL axes) and ``points.ply`` of pinhole views."""
     cameras = [_nerfstudio_camera(view) for view in model.views]
     shared = all(camera == cameras[0] for camera in cameras)
     frames = []
@@ -63,11 +59,7 @@ def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
 
 
 def write_openmvs(folder: Path, model: SparseModel) -> Path:
-    """Write ``scene.mvs``, OpenMVS's interface format ("MVSI", version 2), of pinhole views.
-
-    One platform has all cameras at its origin and one pose (R, centre) per image. Pixels are as ours; points
-    are float32, colours BGR.
-    """
+    """Write ``scene.mvs`` ("MVSI", version 2): one platform with all cameras, one pose per image."""
     cameras, number = _distinct_cameras(model)
     still = _matrices(np.eye(3), np.zeros(3))
     parts = [b"MVSI", struct.pack("<II", _MVS_VERSION, 0), _count(1), _text("platform"), _count(len(cameras))]
@@ -103,10 +95,7 @@ def _matrices(*values: F64) -> bytes:
 
 
 def write_bundler(folder: Path, model: SparseModel) -> Path:
-    """Write ``bundle.out`` (v0.3) and ``list.txt`` of pinhole views of one focal length and a centred image.
-
-    The origin of pixels is the image centre, ours ((w - 1) / 2, (h - 1) / 2), with y up.
-    """
+    """Write ``bundle.out`` (v0.3) and ``list.txt`` of pinhole views with one focal, centred, y up."""
     lines = ["# Bundle file v0.3", f"{len(model.views)} {len(model.X)}"]
     centre = np.zeros((len(model.views), 2))
     for i, view in enumerate(model.views):
@@ -135,10 +124,7 @@ def _keys(model: SparseModel) -> list[int]:
 
 
 def write_opencv(folder: Path, model: SparseModel) -> Path:
-    """Write OpenCV FileStorage YAML: ``camera_N.yml`` of each camera, and ``poses.yml`` of the images.
-
-    Pixels are as ours, and ``distortion_coefficients`` are k1, k2, p1, p2, k3 with p1 = p2 = 0.
-    """
+    """Write OpenCV FileStorage YAML: ``camera_N.yml`` of each camera, and ``poses.yml`` of the images."""
     cameras, number = _distinct_cameras(model)
     head = "%YAML:1.0\n---\n"
     for i, view in enumerate(cameras):
@@ -163,11 +149,7 @@ def _matrix(name: str, values: F64) -> str:
 
 
 def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
-    """Write ``camchain.yaml`` with one pinhole-radtan camera per distinct camera, not a rig: no T_cn_cnm1.
-
-    Pixels are as ours. The model has no k3: the best k1 and k2 replace the three coefficients, and the
-    returned notes state the largest difference in the image.
-    """
+    """Write ``camchain.yaml`` of pinhole-radtan cameras without k3, and note the largest difference."""
     lines, notes = list[str](), list[str]()
     for i, view in enumerate(_distinct_cameras(model)[0]):
         K, (width, height) = _calibration(view)

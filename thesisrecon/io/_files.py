@@ -138,10 +138,7 @@ def read_json(path: Path) -> Any:
 
 
 def link(source: Path, target: Path) -> None:
-    """Give a file a second name, by a hard link if possible, else by a copy.
-
-    Files of a run are only replaced, never changed in place, so that sharing them is safe.
-    """
+    """Give a file a second name, by a hard link if possible, else by a copy."""
     # Several programs may link the same target in a shared folder at one time.
     partial = target.with_name(f".{target.name}.{os.getpid()}{_PARTIAL}")
     try:
@@ -161,11 +158,7 @@ def link(source: Path, target: Path) -> None:
 
 
 def read_pairs(path: Path) -> list[tuple[str, str]]:
-    """Read image pairs: two file names per line, as in COLMAP's pair lists; UsageError names a wrong line.
-
-    A name with blanks is quoted, or the names are separated by a tab. Empty lines and lines that begin with #
-    are ignored.
-    """
+    """Read pairs of file names, one per line, separated by blanks (then quoted if needed) or a tab."""
     pairs = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -181,10 +174,7 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
 
 
 def read_positions(path: Path) -> dict[str, tuple[float, float, float]]:
-    """Read camera positions: one "name,x,y,z" per line; UsageError names a wrong line.
-
-    The first line may be a header. Empty lines and lines that begin with # are ignored.
-    """
+    """Read camera positions, one "name,x,y,z" per line, perhaps after a header."""
     positions: dict[str, tuple[float, float, float]] = {}
     first = True
     for number, line in enumerate(read_text(path).splitlines(), start=1):

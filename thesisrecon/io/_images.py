@@ -40,18 +40,7 @@ DEMO_IMAGES = 6
 
 
 def demo_images() -> list[Path]:
-    """Locate the demo images, in the installed package or in the source tree around it.
-
-    Returns
-    -------
-    list of Path
-        ``DEMO_IMAGES`` files, sorted by name.
-
-    Raises
-    ------
-    UsageError
-        If they are in neither place.
-    """
+    """Locate the demo images, sorted by name, in the installed package or in the source tree around it."""
     package = Path(str(files("thesisrecon")))
     for home in (package, package.parent / "fixtures"):
         found = sorted((home / "courtyard" / "images").glob("*.jpg"))[:DEMO_IMAGES]
@@ -89,10 +78,7 @@ _budget = MemoryBudget(MAX_DECODED_BYTES)
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """An image at working size, a hash of its pixels, mask and original size, and a warning or "".
-
-    ``exif_focal_px`` is the focal length from EXIF in original pixels, NaN = unknown.
-    """
+    """An image at working size, a hash of all that decides it, a warning, and the focal length from EXIF."""
 
     image: Image
     digest: str

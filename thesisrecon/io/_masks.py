@@ -33,11 +33,7 @@ def add_masks(
     *,
     map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
 ) -> tuple[ImageSet, list[str]]:
-    """Set the masks of the images that have one in a folder; return also the names of the other masks.
-
-    A file belongs to an image if it is named like it, plus a suffix (COLMAP's rule) or with any suffix.
-    ``UsageError`` if no file belongs to any image, or a mask cannot be used.
-    """
+    """Set the masks of images named like files in a folder; return also the names of the other files."""
     files: dict[str, list[Path]] = {}
     for path in list_images(folder):
         files.setdefault(printable(path.stem), []).append(path)

@@ -162,11 +162,7 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
 
 
 def read_mesh(path: Path) -> TexturedMesh:
-    """Read a GLB of :func:`write_mesh` in its original coordinates; UsageError if that fails.
-
-    Vertices that were split at texture seams are merged again, in their old order; unused ones are dropped.
-    Memory stays within a multiple of the sizes of the file and its texture.
-    """
+    """Read a GLB of :func:`write_mesh`; vertices that were split at texture seams are merged again."""
     if not path.is_file():
         raise UsageError(f"there is no mesh {path}")
     import trimesh

@@ -54,10 +54,7 @@ class MemoryBudget:
 
 
 def decoding_bytes(file: PIL.Image.Image) -> int:
-    """Estimate the peak memory of decoding an opened file.
-
-    A progressive JPEG holds all its coefficients, two bytes each, beside its pixels.
-    """
+    """Estimate the peak memory of decoding; a progressive JPEG also holds all its coefficients."""
     each = _DECODED_BYTES_OF.get(file.format or "", _DECODED_BYTES)
     if file.info.get("progressive"):
         each += _COEFFICIENT_BYTES * len(file.getbands())
@@ -148,10 +145,7 @@ def _rgb(part: PIL.Image.Image) -> PIL.Image.Image:
 
 
 def resized_to(image: StoredImage, max_size_px: int) -> U8:
-    """Reduce an image to a long side by one exact scale s along both axes, (x + 0.5) s - 0.5.
-
-    It is never enlarged. Raises UnusableImage if the short side would vanish.
-    """
+    """Reduce an image to a long side by one exact scale s along both axes, (x + 0.5) s - 0.5."""
     width, height = image.size
     scale = max_size_px / max(width, height)
     if scale >= 1:

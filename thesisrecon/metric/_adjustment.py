@@ -87,11 +87,7 @@ class BundleAdjustment:
     def run(
         self, model: MetricEstimate, *, free: B8 | None = None, iterations: int
     ) -> tuple[MetricEstimate, MetricBundleResult]:
-        """Adjust the model to its inliers and measure the noise again.
-
-        Only the intrinsics ``free`` (8,) move, by default all that the prior leaves open. Raises StageFailure
-        if fewer than ``MIN_OBSERVATIONS`` inliers are left.
-        """
+        """Adjust the model to its inliers, by default all that the prior leaves ``free``; measure noise."""
         prior, moves = self.row_prior(model), self.free(model)
         result = refine_metric_bundle(
             model.cameras,
@@ -147,19 +143,13 @@ def _inlier_observations(model: MetricEstimate) -> Observations:
 
 
 def tail_width(norms: F64, sigma: float) -> float:
-    """Tail width, 1 to 3, of residual lengths px relative to normal noise, from their 90 % quantile.
-
-    Correct matches have a tail wider than their core suggests: a gate in sigmas of the core would reject it.
-    """
+    """Tail width, 1 to 3, of residual lengths px relative to normal noise, from their 90 % quantile."""
     wide = float(np.quantile(norms, 0.9)) / RAYLEIGH_90
     return float(np.clip(wide / sigma, 1.0, 3.0))
 
 
 def with_initial_gate(model: MetricEstimate) -> MetricEstimate:
-    """Widen loss and gates to the residuals before the first adjustment.
-
-    ``sigma_px`` stays: a larger one would give the prior too much weight.
-    """
+    """Widen loss and gates, but not ``sigma_px`` (the weight of the prior), to the residuals at the start."""
     norms = residual_norms(model)
     norms = norms[np.isfinite(norms)]
     if not len(norms):

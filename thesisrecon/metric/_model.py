@@ -141,10 +141,7 @@ def residual_norms(model: MetricEstimate) -> F64:
 
 
 def truncated_cost(model: MetricEstimate, gate_px: float) -> float:
-    """Truncated quadratic cost, mean of min(r^2, gate^2) / gate^2 over all observations.
-
-    Observations without a camera or a point cost 1, so that a model cannot win by rejecting observations.
-    """
+    """Mean of min(r^2, gate^2) / gate^2 over all observations, those without camera or point included."""
     squared = np.ones(len(model.tracks.xy))
     squared[model.inlier] = np.minimum(residual_norms(model) ** 2 / gate_px**2, 1.0)
     return float(squared.mean())

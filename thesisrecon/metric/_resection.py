@@ -61,10 +61,7 @@ def _pose_and_focal(
 def register_missing_cameras(
     model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator
 ) -> tuple[MetricEstimate, dict[int, str]]:
-    """Register missing cameras, and those again that disagree with the rest.
-
-    Returns the complete model, and view -> reason for every view that was not registered.
-    """
+    """Register missing and contradicting cameras; return the model, and view -> reason where that failed."""
     model, rejected = _grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
     suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)
     if suspects.any() and (model.registered & ~suspects).sum() >= 3:

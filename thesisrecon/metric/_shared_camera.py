@@ -117,10 +117,7 @@ class _SharedGroup:
 
 
 def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) -> SharedCameraTest:
-    """Test shared focals, and shared or known principal points, against the images.
-
-    A chi-square test of the decrease in cost with own values per view, for sets of at least three views.
-    """
+    """Test shared focals and principal points of three views or more by the decrease in cost (chi-square)."""
     views = np.flatnonzero(model.registered)
     focal_std = np.full(len(model.registered), np.nan)
     focals, centres = _sets(model, adjustment, views, FOCAL), _sets(model, adjustment, views, CENTRE[0])
@@ -235,10 +232,7 @@ def _untestable(std: float) -> str:
 
 
 def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustment) -> list[str]:
-    """Test given focal lengths against an adjustment without them.
-
-    Returns a sentence for each that differs by more than ``MAX_SIGMAS`` of both uncertainties.
-    """
+    """A sentence for each given focal length that differs from an adjustment without them."""
     prior = adjustment.prior
     given = np.flatnonzero(prior.focal_known & model.registered)
     if len(given) == 0:
@@ -286,10 +280,7 @@ def inconsistent_principal_point(
 
 
 def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment) -> tuple[F64, F64, I64]:
-    """Focals (V,) without prior, relative standard deviations, and numbers: equal ones share their focal.
-
-    Known focals of one value share a number.
-    """
+    """Focals (V,) without prior, relative standard deviations, and numbers: equal ones share their focal."""
     cameras = model.cameras
     assert cameras.shared is not None
     prior, shared = adjustment.row_prior(model), cameras.shared.copy()

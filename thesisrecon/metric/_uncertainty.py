@@ -54,10 +54,7 @@ _COLUMNS = {
 
 
 def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
-    """Evidence for an inexact camera or noise model: 0 for normal noise only, 1 for certain lack of fit.
-
-    It is 1 too if too few blocks of the scene measure it; ``tail`` is the tail width of the residuals.
-    """
+    """Evidence for an inexact camera or noise model: 0 for normal noise, 1 if certain or not measurable."""
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(scatter.overdispersion):
         return 1.0
     measured = [(scatter.overdispersion, OVERDISPERSION_RANGE), (tail, TAIL_RANGE)]
@@ -89,10 +86,7 @@ class PerCameraEstimates:
 def per_camera_estimates(
     model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter
 ) -> PerCameraEstimates:
-    """Intrinsics of each camera of a model that was adjusted without hierarchical prior.
-
-    Cameras without a registered view have kind -1.
-    """
+    """Intrinsics of each camera of a model that was adjusted without hierarchical prior."""
     group = model.cameras.group
     first = np.unique(group, return_index=True)[1]
     value = model.cameras.intrinsics.copy()
@@ -220,10 +214,7 @@ def intrinsic_intervals(
     scatter: BlockScatter,
     shrinkage: FocalShrinkage,
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
-    """Value, standard deviation and source of each intrinsic of each view; empty where not registered.
-
-    +- 1.96 std is a 95 % interval: the inflation contains Student's t for the number of blocks.
-    """
+    """Value, standard deviation and source of each intrinsic of each view; +- 1.96 std is a 95 % interval."""
     floors, prior = _std_floor(model, scatter), adjustment.row_prior(model)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for view in range(len(model.registered)):
@@ -263,10 +254,7 @@ def intrinsic_intervals(
 def widen_unverified_focals(
     intervals: Sequence[Mapping[str, IntrinsicInterval]], focal_std: F64
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
-    """Widen the intervals of shared focal lengths that the images cannot verify.
-
-    ``focal_std`` (V,) is the relative standard deviation if the focal lengths differ a little, NaN elsewhere.
-    """
+    """Widen the intervals of shared focals by the ``focal_std`` (V,) that the images cannot exclude."""
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own, rel in zip(intervals, focal_std, strict=True):
         focal = own.get("focal_px")

@@ -107,11 +107,7 @@ class MetricRefinement:
 def _start(
     reconstruction: Reconstruction, upgrade: Upgrade, adjustment: BundleAdjustment
 ) -> MetricEstimate | None:
-    """Upgrade the core cameras and adjust them on the inliers of the projective stage.
-
-    Projective inliers fit any principal point: all are kept at first, the principal point is free, and
-    the gate narrows as the residuals shrink.
-    """
+    """Upgrade the core cameras and adjust them on projective inliers while the gate narrows."""
     model = upgraded_model(reconstruction, upgrade, adjustment.prior, MAX_ROTATION_RESIDUAL)
     if model is None:
         return None

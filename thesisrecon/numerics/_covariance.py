@@ -25,11 +25,7 @@ MIN_KEPT = 0.1
 
 
 def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
-    """Estimate the standard deviation of one image coordinate from residuals (K, 2); 0 if unknown.
-
-    The root mean square within 2.5 sigma, corrected for the trimming, of the residuals scaled up by their
-    remaining variance: points absorb ``leverage`` (K, 2) of it, ``dof`` camera unknowns the same of all.
-    """
+    """Standard deviation of a coordinate from residuals (K, 2) within 2.5 sigma, over what fits absorb."""
     if not len(residual):
         return 0.0
     kept = 1.0 - leverage - max(dof, 0) / residual.size
@@ -125,21 +121,14 @@ def _dense_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64)
 
 
 def invert_in_inner_gauge(information: F64, N: F64) -> F64:
-    """Invert an information matrix that is singular along the orthonormal gauge directions N (D, 7).
-
-    (S + w N N')^-1 is the generalised inverse of S with variance 1 / w along N, which is then removed.
-    """
+    """Invert an information matrix, singular along orthonormal N (D, 7): (S + w N N')^-1 - N N' / w."""
     weight = float(np.median(np.diag(information)))
     C = invert_information(information + weight * N @ N.T)
     return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
 
 
 def _band_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
-    """Return the blocks of :func:`camera_blocks` from a banded factor.
-
-    Seven coordinates fix the frame; Baarda's S-transformation (I - N N') Q (I - N N') changes to the inner
-    gauge.
-    """
+    """The blocks of :func:`camera_blocks` from a banded factor, by Baarda's S-transformation."""
     b, C, e = reduced.sums.border.shape
     _fix_gauge(reduced, R, t)
     factored = order_views(reduced.row, reduced.column, b).factor(reduced)

@@ -150,10 +150,7 @@ class _BandedFactor:
 
 @dataclass(frozen=True)
 class BandedCholesky:
-    """Banded factorisation by LAPACK, the border by its Schur complement.
-
-    Views have positions ``place`` (b,), neighbours at most ``reach`` apart.
-    """
+    """Banded factorisation by LAPACK, the border by its Schur complement."""
 
     place: I64
     reach: int

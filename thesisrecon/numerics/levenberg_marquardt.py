@@ -19,10 +19,7 @@ _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
 
 
 class _LinearSystem(Protocol[StepOut]):
-    """Normal equations at one state; ``solve`` returns the damped step and its predicted gain of cost.
-
-    None if the damped system is not positive.
-    """
+    """Normal equations at one state; ``solve`` gives the damped step and its predicted gain, or None."""
 
     @property
     def cost(self) -> float: ...

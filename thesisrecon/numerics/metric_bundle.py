@@ -114,11 +114,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _MetricProblem:
-    """Reprojection in units of sigma plus the priors.
-
-    The columns of a view are its pose and the intrinsics that no other view shares; other unknowns are common
-    columns.
-    """
+    """Reprojection in units of sigma plus the priors."""
 
     layout: BundleLayout
     columns: IntrinsicColumns

@@ -41,10 +41,7 @@ _ROUNDING = 1e-15
 
 
 class _PointOptions(NamedTuple):
-    """``patience`` consecutive relative gains below ``tolerance`` end the refinement.
-
-    ``keep_cheirality`` rejects steps that change the number of views a point lies behind.
-    """
+    """``patience`` gains below ``tolerance`` end it; no step may change the views a point lies behind."""
 
     delta: float
     iterations: int

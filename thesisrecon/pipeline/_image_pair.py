@@ -103,10 +103,7 @@ def match_views(
     seed: int,
     masks: tuple[B8 | None, B8 | None] = (None, None),
 ) -> TwoView:
-    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason.
-
-    Matches in masked pixels are dropped, since not every matcher uses the features.
-    """
+    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason."""
     rng = stream(seed, "matches", *pair)
     try:
         matches = config.matching.match(

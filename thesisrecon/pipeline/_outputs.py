@@ -52,10 +52,7 @@ def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
 
 
 def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFailure | None) -> RunResult:
-    """Write all results of a run; return it with warnings, reports and summary.
-
-    A run with an earlier last stage keeps the files of a longer one in the folder.
-    """
+    """Write all results of a run; return it with warnings, reports and summary."""
     result = with_image_names(result)
     later = _later_end(run.directory.path, until) if failure is None else None
     if later is None:

@@ -242,10 +242,7 @@ def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) ->
 
 
 def reconstruct_metric(state: PipelineState) -> None:
-    """Reconstruct, calibrate and refine; try other initial pairs if the self-check fails.
-
-    The first trusted result is used, else the one with most cameras, then most points.
-    """
+    """Reconstruct, calibrate and refine, from other initial pairs until a result is trusted."""
     tried: list[RunResult] = []
     failures: list[StageFailure] = []
     start = state.result
@@ -288,10 +285,7 @@ def _middle_view(views: Sequence[PinholeView]) -> PinholeView:
 
 
 def _compare_held_out(state: PipelineState, mesh: TexturedMesh) -> HeldOut | None:
-    """Compare the middle view with the model textured without it; None if they cannot be compared.
-
-    The rendering is exposure-matched, one factor per channel.
-    """
+    """Compare the middle view with the model textured without it; None if they cannot be compared."""
     views, threads = state.result.views, state.run.workers.threads
     if len(views) < MIN_VIEWS or not len(mesh.faces):
         return None

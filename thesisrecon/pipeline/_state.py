@@ -28,10 +28,7 @@ BATCHES_PER_WORKER = 8
 
 
 class PreparedViews(Sequence[Any]):
-    """Views prepared for matching on demand, in a least-recently-used cache of ``CACHE_BYTES``.
-
-    Pickled without the cache; :meth:`subset` reduces what is sent to a worker.
-    """
+    """Views prepared for matching on demand, in a least-recently-used cache that is never pickled."""
 
     def __init__(self, matching: Matcher, given: Mapping[int, tuple[Image, Features]]) -> None:
         self._matching, self._given = matching, dict(given)
@@ -82,10 +79,7 @@ def _size_of(value: Any) -> int:
 def batch_pairs(
     pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None
 ) -> list[list[int]]:
-    """Divide the numbers of pairs into batches, so that consecutive pairs share views (Morton order).
-
-    Several batches per worker; ``workers`` None: one pair each.
-    """
+    """Divide the numbers of pairs into batches of consecutive pairs that share views (Morton order)."""
     size = 1
     if workers is not None:
         size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)

@@ -94,10 +94,7 @@ class ProjectiveModel:
 
 
 def retriangulate_points(model: ProjectiveModel, sigmas: float, *, points: B8 | None = None) -> None:
-    """Triangulate the ``points`` (N,), or all, from all registered views and update the inliers (6.3).
-
-    A point with a wrong observation is triangulated again from :func:`consistent_observations`.
-    """
+    """Triangulate the ``points`` (N,), or all, from all registered views and update the inliers (6.3)."""
     t = model.tracks
     near = model.registered[t.view_index]
     if points is not None:
@@ -190,10 +187,7 @@ def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
 def adjust_locally(
     model: ProjectiveModel, view: int, iterations: int, sigmas: float, *, n_views: int
 ) -> None:
-    """Run bundle adjustment of one view, the ``n_views`` that share most points with it, and their points.
-
-    The other cameras that see these points are fixed and define the frame.
-    """
+    """Adjust one view, the ``n_views`` that share most points with it, and their points; others are fixed."""
     t, used = model.tracks, model.used
     its = np.bincount(t.point_index[used & (t.view_index == view)], minlength=t.n_points) > 0
     shared = np.bincount(t.view_index[used & its[t.point_index]], minlength=t.n_views)

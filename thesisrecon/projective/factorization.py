@@ -69,11 +69,7 @@ def depths_from_fundamentals(xy: F64, F: Mapping[Edge, F64], tree: Sequence[Edge
 
 
 def _balance_depths(depths: F64, sizes: F64) -> F64:
-    """Return depths (V, N) rescaled by views and points until all views and all points have equal weight.
-
-    ``sizes`` (V, N) are the norms of the vectors that the depths multiply. Only the weights of the residuals
-    change.
-    """
+    """Depths (V, N) scaled by views and points to equal weights; ``sizes`` (V, N) are of their vectors."""
     views, points = depths.shape
     squared = (depths * sizes) ** 2
     a, b = np.ones(views), np.ones(points)
@@ -247,10 +243,7 @@ def _complete_tracks(xy: F64, tree: Sequence[Edge]) -> tuple[F64, list[Edge]]:
 
 
 def _is_planar(xy: F64, edges: Sequence[Edge], threshold_px: float) -> bool:
-    """Return whether a homography explains nearly all points (V, N, 2) in every pair of ``edges``.
-
-    Then the scene is planar or the camera only rotated: rank 4 would be fitted to noise.
-    """
+    """Whether a homography explains nearly all points (V, N, 2) in every pair: rank 4 would fit noise."""
     if xy.shape[1] < _MIN_POINTS:
         return False
     shares = []

@@ -37,10 +37,7 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
 def _projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
-    """Return the standard deviations (N,) px of projections under the covariance (12, 12) of a camera.
-
-    The root of half the trace of J C J'; inf near the principal plane.
-    """
+    """Standard deviations (N,) px of projections by a camera's covariance (12, 12); inf if undetermined."""
     xh = X @ P.T
     with np.errstate(divide="ignore", invalid="ignore"):
         uv = xh[:, :2] / xh[:, 2:]

@@ -85,10 +85,7 @@ def used_observations(reconstruction: Reconstruction) -> I64:
 
 
 def reprojection_distances(reconstruction: Reconstruction) -> list[F64]:
-    """Residual lengths |observed - reprojected| (px) per view, empty if it is not registered.
-
-    Points on the principal plane of a view are left out.
-    """
+    """Residual lengths |observed - reprojected| (px) per view, empty if it is not registered."""
     used = used_observations(reconstruction)
     views = reconstruction.tracks.view_index[used]
     return [_distances_in_view(reconstruction, i, used[views == i]) for i in range(len(reconstruction.P))]
@@ -126,10 +123,7 @@ def _median(distances: F64) -> float | None:
 
 
 def summarize(result: RunResult) -> dict[str, Any]:
-    """Content of ``summary.json`` without times and settings; None for stages that did not run.
-
-    Lengths are in original pixels, (x + 0.5) / scale - 0.5; ``..._working_px`` are in pixels at working size.
-    """
+    """Content of ``summary.json``, in original pixels; None for stages that did not run."""
     best = result.best_reconstruction
     working = reprojection_distances(best) if best is not None else [np.zeros(0) for _ in result.images]
     original = [d / image.scale for d, image in zip(working, result.images, strict=True)]

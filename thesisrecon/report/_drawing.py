@@ -77,11 +77,7 @@ def _sampled(image: Image) -> PillowImage.Image:
 
 
 def draw_pair(pair: TwoView, first: Image, second: Image) -> EmbeddedImage:
-    """Draw two images side by side with their verified matches and epipolar lines.
-
-    Every match is a dot; a few well-spread ones are numbered and shown with the epipolar line of their
-    partner, F x1 in the second image and F' x2 in the first.
-    """
+    """Draw two images side by side with their matches, some of them with their epipolar lines."""
     chosen = _spread_matches(pair.xy1, len(HUES))
     left = _draw_half(first, pair.xy1, chosen, pair.xy2[chosen] @ pair.F[:2] + pair.F[2])
     right = _draw_half(second, pair.xy2, chosen, pair.xy1[chosen] @ pair.F[:, :2].T + pair.F[:, 2])
@@ -190,10 +186,7 @@ def depth_side(how_many: int) -> int:
 
 
 def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedImage, EmbeddedImage, EmbeddedImage]:
-    """Draw the held-out image, the model in its place and their mean difference (dark = equal).
-
-    Pixels that are not compared are grey in the last two.
-    """
+    """Draw the held-out image, the model in its place and their mean difference (dark = equal)."""
     difference = np.abs(held_out.real.astype(np.float64) - held_out.rendered).mean(axis=2)
     difference = np.where(held_out.compared, difference / DIFFERENCE_LIMIT, np.nan)
     rendered = np.where(held_out.compared[..., None], held_out.rendered, np.array(UNKNOWN, np.uint8))

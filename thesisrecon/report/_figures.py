@@ -46,10 +46,7 @@ class Scene:
 
 
 def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS) -> Scene | None:
-    """3D view of a metric or affine reconstruction, in its own unit of length; None without a camera.
-
-    Points beyond four times the 80 % distance from the median are left out, the others thinned evenly.
-    """
+    """3D view of a metric or affine reconstruction, thinned and without far points; None without a camera."""
     views = np.flatnonzero(reconstruction.registered).astype(np.int64)
     if len(views) == 0:
         return None
@@ -186,10 +183,7 @@ def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
 
 
 def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:
-    """Matrix of verified matches on a logarithmic scale, rejected pairs in red.
-
-    More than 200 views are grouped into blocks of neighbours, each with its strongest pair.
-    """
+    """Matrix of verified matches on a logarithmic scale, rejected pairs in red, of many views by blocks."""
     block = max(1, -(-len(names) // MAX_MATRIX))
     labels = [_block_label(first, block, names) for first in range(0, len(names), block)]
     accepted, refused = (_count_matrix(pairs, len(labels), block, wanted) for wanted in (True, False))
@@ -261,11 +255,7 @@ def _count_bar() -> Figure:
 
 
 def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
-    """Draw histograms of distances (px) on one scale as SVG paths in boxes of this size.
-
-    Returns the upper end (px), which contains 98 % of all distances, and the path data; the last bin of each
-    histogram includes all larger distances.
-    """
+    """Upper end of the distances (px, 98 % of them) and their histograms as SVG paths in equal boxes."""
     limit_px = _common_limit_px(np.concatenate([np.zeros(0), *distances]))
     shares = [_histogram_shares(d, limit_px) for d in distances]
     tallest = max((float(s.max()) for s in shares if len(s)), default=1.0)

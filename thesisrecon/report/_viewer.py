@@ -106,11 +106,7 @@ def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
 def _viewpoints(
     mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Compute the viewpoints of the registered images, in the axes of the viewer.
-
-    ``target`` is the point of the optical axis at the median depth of the visible vertices, ``field`` the
-    tangents of half the horizontal and vertical field of view.
-    """
+    """The viewpoints of the registered images, in the axes of the viewer, with target and field of view."""
     found = []
     for i in np.flatnonzero(reconstruction.registered).tolist():
         K, R, t = decompose_camera(reconstruction.P[i])

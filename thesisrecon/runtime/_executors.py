@@ -168,10 +168,7 @@ def available_threads() -> int:
 
 @dataclass
 class Workers:
-    """Workers for independent tasks; as a context manager it keeps them between calls of :meth:`run`.
-
-    With a cluster or a custom executor ``threads`` counts the threads of this process for small tasks.
-    """
+    """Workers for independent tasks; as a context manager it keeps them between calls of :meth:`run`."""
 
     threads: int
     executor: str | futures.Executor = "local"  #: one of ``NAMES``, or an executor, which is not shut down
@@ -216,10 +213,7 @@ class Workers:
         return self.threads if self._remote is None else self._remote.parallel()
 
     def run(self, function: Callable[..., Any], tasks: Iterable[Task], finished: Finished) -> None:
-        """Call a function (importable by the workers) for all tasks, taken as workers become free.
-
-        ``finished`` is called with (number, result) in this thread. The first error cancels the rest.
-        """
+        """Call a function for all tasks; ``finished`` gets (number, result) in this thread."""
         if self.executor == "local" and self.threads == 1:
             for n, given in enumerate(tasks):
                 finished(n, function(*given))

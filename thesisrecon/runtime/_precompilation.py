@@ -70,17 +70,7 @@ def _tuple_of(kind: str, *parts: Any) -> Any:
 
 
 def precompile(until: str, workers: int, progress: Callable[[str, int, int], None]) -> None:
-    """Compile the kernels of the stages up to one with several processes, unless that was done before.
-
-    Parameters
-    ----------
-    until : str
-        The last stage.
-    workers : int
-        Maximum number of processes; fewer are started if there are few kernels.
-    progress : callable
-        Called with ("kernels", done, total).
-    """
+    """Compile the kernels of the stages up to one with several processes, unless that was done before."""
     lines = listed_kernels(until)
     done = cache_folder() / f"complete-{_code_and_machine(lines)}"
     if done.exists() or not lines or vars(numba.config)["DISABLE_JIT"]:

@@ -140,10 +140,7 @@ class Run:
         function: Callable[..., Sequence[Any]],
         batches: Callable[[Sequence[int]], Iterable[Batch]],
     ) -> list[Any]:
-        """Return the records of all items (item -> key) of a stage, missing ones computed by the workers.
-
-        ``function`` computes the records of a batch; ``batches`` divides the missing items into batches.
-        """
+        """The records of all items (item -> key) of a stage, missing ones computed by the workers."""
         with self.clock(stage) as log:
             log.keys.update(keys)
             folder = self.directory.stage(FOLDERS[stage])

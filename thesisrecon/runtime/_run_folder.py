@@ -144,19 +144,13 @@ def _json_value(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class StageFolder:
-    """The folder of one stage: a file per item, and a readable manifest.
-
-    ``shared`` is the folder of the results of several runs, named by their keys.
-    """
+    """The folder of a stage: a file per item and a manifest; ``shared`` holds results of several runs."""
 
     path: Path
     shared: Path | None = None
 
     def load(self, item: str, key: str) -> Any:
-        """Return the record of an item, from this run or the shared folder; None if it must be computed.
-
-        Raises ``ChangedRecord`` if its file was changed or damaged.
-        """
+        """The record of an item, from this run or the shared folder; None if it must be computed."""
         own, changed = self.path / f"{item}.npz", None
         for place in [own] if self.shared is None else [own, self.shared / f"{key}.npz"]:
             try:
@@ -222,10 +216,7 @@ class RunDirectory:
 
     @contextmanager
     def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
-        """Lock the folder for a run; ``identity`` is what is known of it before the images are read.
-
-        A ``UsageError`` if it cannot be written, is in use, or holds other files or another run.
-        """
+        """Lock the folder for a run of this identity, so far as that is known before the images are read."""
         with _locked(self.path):
             self._check(identity, overwrite)
             yield

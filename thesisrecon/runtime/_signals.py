@@ -33,11 +33,7 @@ _starting = threading.RLock()
 
 
 def install_signal_handlers(program: str, advice: str = "repeat the command to resume") -> None:
-    """Let SIGINT and SIGTERM end this process at once, with an exit code of :data:`CODES`.
-
-    Call it once, from the main thread of a program (not of a library). Signals that the process ignores
-    (``nohup``, background jobs) stay ignored.
-    """
+    """Let SIGINT and SIGTERM, unless ignored, end this program at once with an exit code of :data:`CODES`."""
     _advice.append(advice)
     pipe, written = os.pipe()
     # A signal handler must not block.

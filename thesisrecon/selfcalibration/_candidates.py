@@ -48,10 +48,7 @@ class Candidate:
 
 
 def as_stage_failure(calibrate: Callable[P, SelfCalibration]) -> Callable[P, SelfCalibration]:
-    """Wrap a ``calibrate`` method so that a failed decomposition raises ``StageFailure``.
-
-    Overflow is silenced: it gives hypotheses of non-finite cost, which are never selected.
-    """
+    """Wrap a ``calibrate`` method so that a failed decomposition raises ``StageFailure``."""
 
     @wraps(calibrate)
     def inner(*args: P.args, **kwargs: P.kwargs) -> SelfCalibration:
@@ -77,11 +74,7 @@ def square_pixel_calibrations(log_f: F64) -> F64:
 
 
 def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
-    """Return the log focal lengths (B, G) that planes (B, 3) imply, given those of the reference (B,).
-
-    From w*_i = H_i K_r K_r' H_i': f_i^2 = (w11 + w22) / (2 w33); a group takes the median of its cameras, the
-    group of the reference camera its own focal length.
-    """
+    """Log focals (B, G) by w*_i = H_i K_r K_r' H_i' of planes (B, 3), medians of the cameras of a group."""
     f = np.clip(f_reference, *FOCAL_LIMITS)
     H = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
     H[..., :2] *= f[:, None, None, None]
@@ -96,11 +89,7 @@ def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) ->
 
 
 def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
-    """Return planes (2 B, 3) from focal lengths (B,) of the reference and another camera.
-
-    For both signs of the other camera, since a projective camera has none (R. Gherardi, A. Fusiello,
-    "Practical autocalibration", ECCV 2010).
-    """
+    """Planes (2 B, 3) from focals (B,) of the reference and of another camera, for both of its signs."""
     K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
     K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
     t = frame.a[other] / K2
@@ -213,10 +202,7 @@ def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction,
 
 
 def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_std: F64) -> F64:
-    """Return the standard deviations (V, 3, 3) of K: the candidate's, else of focal lengths and prior.
-
-    NaN for entries without either.
-    """
+    """Standard deviations (V, 3, 3) of K: the candidate's, else of focal lengths and prior, else NaN."""
     if candidate.K_std is not None:
         unit = frame.pixel_from_unit[frame.views]
         K_std = np.zeros_like(K)

@@ -106,11 +106,7 @@ def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
 
 
 def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
-    """Return the nearest critical motion of some measures, and its largest measure over its tolerance.
-
-    Below 1 the motion is critical. Of several motions within tolerance the first in order of what they leave
-    undetermined is chosen; between pure rotation and pure translation the nearer one.
-    """
+    """The nearest critical motion of some measures, and its largest measure over its tolerance."""
     near: dict[str, float] = {}
     for name, needed in _MEASURES_OF.items():
         if all(key in measures for key in needed):
@@ -129,11 +125,7 @@ def _tolerance_ratio(measures: Mapping[str, float], key: str) -> float:
 
 
 def _infinite_homography_shift(H: F64, *, roll: bool) -> float:
-    """Return the rms shift (long sides) of points at infinity beyond zoom and, with ``roll``, roll.
-
-    Each H (V, 3, 3) is compared with the nearest diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]].
-    The shift is 0 without rotation (beyond roll), whatever the focal lengths.
-    """
+    """Rms shift (long sides) of points at infinity by H (V, 3, 3) beyond zoom and, with ``roll``, roll."""
     template = np.zeros_like(H)
     template[:, 0, 0] = template[:, 1, 1] = (H[:, 0, 0] + H[:, 1, 1]) / 2.0
     template[:, 2, 2] = H[:, 2, 2]
@@ -175,11 +167,7 @@ def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
 
 
 def _common_rotation_axis(R: F64) -> tuple[F64, float, float]:
-    """Return the direction (3,) nearest to all rotation axes, the largest rotation and the axis spread.
-
-    In degrees; the spread is the rms rotation across the axis: root of the second eigenvalue of mean(r r')
-    over the rotation vectors r of all pairs in world coordinates.
-    """
+    """Direction (3,) nearest to all rotation axes, the largest rotation and the axis spread (degrees)."""
     i, j = np.triu_indices(len(R), 1)
     relative = R[j].swapaxes(1, 2) @ R[i]
     vectors = scipy.spatial.transform.Rotation.from_matrix(relative).as_rotvec()
@@ -208,11 +196,7 @@ def _rms(vectors: F64) -> float:
 
 
 def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
-    """Return the rms distance of the centres from a common circular motion about one line along ``axis``.
-
-    On a turntable R_i (C_i - c) is the same for all views, apart from its part along R_i axis; the point c of
-    the line is found by least squares.
-    """
+    """Rms distance of the centres from a common circular motion about one line along ``axis``."""
     seen = metric.R @ (np.eye(3) - np.outer(axis, axis))
     places = np.einsum("vab,vb->va", seen, metric.C)
     coefficients, right = seen - seen.mean(axis=0), places - places.mean(axis=0)
@@ -221,10 +205,7 @@ def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
 
 
 def _planarity_ratio(X: F64) -> float:
-    """Return the rms thickness of points (N, 3) about their best plane over their rms extent in it.
-
-    95 % of the points are kept, nearest to the centre and then to the plane.
-    """
+    """Rms thickness of 95 % of the points (N, 3) about their best plane over their rms extent in it."""
 
     def nearest(distance: F64) -> I64:
         return np.argsort(distance, kind="stable")[: max(int(0.95 * len(distance)), 4)]

@@ -61,10 +61,7 @@ def rank_three(Q: F64) -> tuple[F64, F64]:
 
 
 def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
-    """Return finite planes at infinity (B', 3) and reference focal lengths (B',) of linear quadrics.
-
-    From normalizing focal lengths (B,), which also replace those of a w* that is not positive.
-    """
+    """Planes at infinity (B', 3) and reference focals (B',) of linear quadrics from focals (B,)."""
     try:
         Q, null = rank_three(linear_quadric(frame, focals))
     except np.linalg.LinAlgError:

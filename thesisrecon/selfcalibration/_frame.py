@@ -69,11 +69,7 @@ class ReferenceFrame:
 def build_frame(
     reconstruction: Reconstruction, prior: IntrinsicsPrior, *, unit: F64 | None = None
 ) -> ReferenceFrame:
-    """Transform the registered cameras to a reference frame with a median baseline of 1.
-
-    The reference is the view with the most observations; ``unit`` (V, 3, 3) are pixels from unit-free
-    coordinates, by default centred with the long side as unit.
-    """
+    """Transform the registered cameras to a reference frame with a median baseline of 1."""
     views = np.flatnonzero(reconstruction.registered)
     unit = pixel_from_unit(reconstruction.sizes) if unit is None else unit
     P = np.linalg.inv(unit[views]) @ reconstruction.P[views]

@@ -148,11 +148,7 @@ def identifiability_without_calibration(
 
 
 def _excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
-    """Count the equations beyond the 8 that self-calibration needs: m n_known + (m - 1) n_constant - 8.
-
-    Pollefeys et al. 1999, for any pattern of sharing: five intrinsics of each of m views minus the number of
-    unknown values (a standard deviation makes a value known).
-    """
+    """Equations beyond the 8 needed: m n_known + (m - 1) n_constant - 8 (Pollefeys et al. 1999)."""
     unknown = 0
     for column in range(5):
         open_ = registered & ~np.isfinite(prior.std[:, column])
@@ -162,11 +158,7 @@ def _excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Bundle adjustment of the registered ``views``, each with its own row of intrinsics.
-
-    ``share`` is the fraction of observations used, ``longest`` (V,) the long side in pixels,
-    ``projective_px`` the noise that the projective cameras leave in the same observations.
-    """
+    """Adjustment of the ``views`` with own intrinsics, to a ``share`` of their observations."""
 
     cameras: MetricCameras
     X: F64
@@ -189,10 +181,7 @@ class _Problem:
         )  # fmt: skip
 
     def with_free_intrinsics(self, fit: MetricBundleResult) -> _Problem:
-        """Return the problem at the solution ``fit`` with a free aspect and principal point per focal.
-
-        Large finite standard deviations keep the system regular.
-        """
+        """The problem at the solution ``fit`` with a free aspect and principal point per focal."""
         std = np.full_like(self.prior.std, _FREE_STD)
         std[:, 3:5] *= self.longest.max()
         shared = np.array(fit.cameras.shared)
@@ -206,10 +195,7 @@ class _Problem:
 
 
 def _with_virtual_points(reconstruction: Reconstruction, upgrade: Upgrade) -> Reconstruction:
-    """Add exact observations of a cloud of points where the optical axes meet, for cameras without points.
-
-    Their covariance, at the noise floor, says how well the motion of the cameras determines the calibration.
-    """
+    """Add exact observations of points where the optical axes meet, for cameras without points."""
     G, views = np.linalg.inv(upgrade.metric_from_projective), np.flatnonzero(reconstruction.registered)
     P = reconstruction.P[views] @ G
     P *= np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
@@ -370,10 +356,7 @@ def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
 
 
 def _rotation_significance(R: F64, covariance: F64 | None) -> float:
-    """Return the rms rotation of the optical axes in units of its standard deviation, 0 without covariances.
-
-    Without such rotations (pure translation, or roll only) the focal length is undetermined.
-    """
+    """Rms rotation of the optical axes in units of its standard deviation, 0 without covariances."""
     if covariance is None:
         return 0.0
     mean = R[:, 2].mean(axis=0)
@@ -385,11 +368,7 @@ def _rotation_significance(R: F64, covariance: F64 | None) -> float:
 def _sentences(
     motion: str, evidence: Mapping[str, float], *, identifiable: bool, focal_std: float
 ) -> tuple[str, ...]:
-    """Return what was found, what it means and what to do; empty for a general motion.
-
-    ``focal_std`` is the largest standard deviation of the given focal lengths, inf if one was not given.
-    Clauses without a capital or full stop, which the report and the summary join.
-    """
+    """What was found, what it means and what to do, as clauses; empty for a general motion."""
     is_critical = bool(motion) and evidence["critical_motion_distance"] < 1.0
     calibrated = "focal_std_rel" in evidence
     sentences = []

@@ -20,19 +20,7 @@ _ANY_NEIGHBOUR = np.ones((3, 3), dtype=np.int64)
 
 @dataclass(frozen=True)
 class LineSegments:
-    """Detector of straight line segments.
-
-    Parameters
-    ----------
-    sigma_px : float
-        Standard deviation of the smoothing.
-    min_gradient : float
-        Minimum gradient in grey levels per pixel.
-    min_length : float
-        Minimum length as a share of the long side.
-    max_rms_px : float
-        Largest rms distance of the edge points from the line.
-    """
+    """Detector of straight line segments; ``min_length`` is a share of the long side."""
 
     sigma_px: float = 1.0
     min_gradient: float = 3.0
@@ -84,10 +72,7 @@ def _label_bins(bins: I64, strong: B8) -> I64:
 
 
 def _edge_points(gx: F32, gy: F32, size: F32, region: I64) -> tuple[F64, I64]:
-    """Return edge points (E, 2) px of the regions with their region numbers.
-
-    The maximum along the nearest of eight directions to the gradient, on a parabola through three pixels.
-    """
+    """Edge points (E, 2) px, maxima along the gradient between pixels, with their region numbers."""
     h, w = region.shape
     y, x = np.nonzero(region)
     inside = (x > 0) & (y > 0) & (x < w - 1) & (y < h - 1)
@@ -103,10 +88,7 @@ def _edge_points(gx: F32, gy: F32, size: F32, region: I64) -> tuple[F64, I64]:
 
 
 def _fit_segments(xy: F64, region: I64) -> tuple[F64, F64]:
-    """Return total-least-squares segments (S, 4) of the regions and rms distances (S,) of their points.
-
-    Regions of fewer than five points have none.
-    """
+    """Total-least-squares segments (S, 4) of regions of five points or more, and their rms distances (S,)."""
     n = np.bincount(region)
     regions = np.flatnonzero(n >= 5)
     place = np.full(len(n), -1)

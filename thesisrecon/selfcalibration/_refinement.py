@@ -34,10 +34,7 @@ def quadratic_rows(x: F64, y: F64) -> F64:
 
 
 def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -> F64:
-    """Return the entries (B, R, 6) of K K' / |K K'| - P Q P' / |P Q P'| (Pollefeys et al., IJCV 32(1), 1999).
-
-    For cameras [A | a], unit-free K (B, R, 3, 3) with those of the reference (B, 3, 3), and planes (B, 3).
-    """
+    """Entries (B, R, 6) of K K' / |K K'| - P Q P' / |P Q P'| of unit-free cameras (IJCV 32(1), 1999)."""
     C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
     difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
     return _weighted_entries(difference)
@@ -50,17 +47,7 @@ def _unit(conic: F64) -> F64:
 
 @dataclass(frozen=True)
 class RotationCriterion:
-    """Robust distance of the upgraded cameras from scaled rotations.
-
-    Parameters
-    ----------
-    scale : float
-        Residual norm of a camera beyond which it counts linearly (soft L1).
-    focal_log_mean, focal_log_std, focal_weight : float
-        Weak prior of log focal lengths (in long sides) without one of their own.
-    noise : float
-        Residual of a good camera, against which known focal lengths are weighted.
-    """
+    """Robust distance of upgraded cameras from scaled rotations, linear beyond ``scale``, and priors."""
 
     scale: float = 0.05
     focal_log_mean: float = 0.2
@@ -119,10 +106,7 @@ def _descend(
     normal_equations: Callable[[F64], tuple[F64, F64]], cost_of: Callable[[F64], F64],
     project: Callable[[F64], F64], x: F64, iterations: int, schedule: _Schedule,
 ) -> tuple[F64, F64]:  # fmt: skip
-    """Run Levenberg-Marquardt on all rows of x (B, D) until every row has finished; return x and costs (B,).
-
-    ``normal_equations`` returns J'J (B, D, D) and the gradient (B, D); ``project`` moves a trial into bounds.
-    """
+    """Levenberg-Marquardt on all rows of x (B, D) until every row has finished; return x and costs (B,)."""
     cost, damping = cost_of(x), np.full(len(x), schedule.damping)
     for _ in range(iterations):
         N, g = normal_equations(x)
@@ -173,11 +157,7 @@ def refine_hypotheses(
 
 
 def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> F64:
-    """Estimate the standard deviations (G,) of the log focal lengths at a minimum (p, log f) (3 + G,).
-
-    From (J'J)^-1 with the noise of the residuals (five independent entries per camera, minus the unknowns);
-    inf if J'J is singular to rounding.
-    """
+    """Standard deviations (G,) of the log focals at a minimum (p, log f) by (J'J)^-1; inf if singular."""
     r, J = (part[0] for part in criterion._linearized(frame, theta[None]))
     dof = max(5 * len(frame.views) - len(theta), 1)
     noise = float(np.sqrt(np.sum(r**2) / dof))
@@ -191,10 +171,7 @@ def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -
 def minimize_batch(
     residuals: Callable[[F64], F64], starts: F64, *, iterations: int, loss_scale: float = np.inf
 ) -> tuple[F64, F64]:
-    """Minimize residuals, (B, D) to (B, M) row by row, from many starts; return minima and mean losses (B,).
-
-    Rows with NaN are rejected. The soft-L1 loss is linear beyond ``loss_scale``; inf for least squares.
-    """
+    """Minimize residuals, (B, D) to (B, M) row by row, from many starts; return minima and mean losses."""
 
     def normal_equations(x: F64) -> tuple[F64, F64]:
         r, J = residuals(x), numerical_jacobian(residuals, x)

@@ -140,11 +140,7 @@ def _apply_known_values(unknown: SolverUnknowns, K: F64) -> F64:
 
 
 def _largest_rotation(H: F64) -> tuple[float, F64]:
-    """Return the largest rotation (degrees) between the reference view and the others, and its axis.
-
-    An infinite homography of a constant K is conjugate to a rotation: its trace is 1 + 2 cos(angle), its real
-    eigenvector the vanishing point of the axis.
-    """
+    """Largest rotation (degrees) from the reference, and its axis; H ~ rotation, trace 1 + 2 cos(angle)."""
     cosine = (np.trace(H, axis1=1, axis2=2) - 1.0) / 2.0
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     value, vector = np.linalg.eig(H[angle.argmax()])

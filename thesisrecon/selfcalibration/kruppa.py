@@ -83,10 +83,7 @@ def _overlapping_pairs(frame: ReferenceFrame, reconstruction: Reconstruction, mi
 
 
 def _kruppa_residuals(F: F64, dual_i: F64, dual_j: F64) -> F64:
-    """Return cross products (B, M, 3) of the unit triples, for F (M, 3, 3) and dual conics (B, M, 3, 3).
-
-    At most two entries are independent.
-    """
+    """Cross products (B, M, 3) of the unit triples, for F (M, 3, 3) and dual conics (B, M, 3, 3)."""
     U, s, Vt = np.linalg.svd(F)
     left = s[:, :2, None] * Vt[:, :2]
     # In the basis U, [e]x rotates by 90 degrees: (u1, u2) -> (u2, -u1) up to sign.
@@ -131,10 +128,7 @@ def _minimize_kruppa(
 
 
 def _residual_and_focal_std(pairs: _Pairs, K: F64) -> tuple[float, float]:
-    """Return the rms residual of calibrations K (R, 3, 3), and the standard deviation of log f from it.
-
-    By the change of the residuals with a common factor of all focal lengths.
-    """
+    """Rms residual of K (R, 3, 3), and the deviation of log f by its change with all focal lengths."""
     scaled = np.repeat(K[None], 3, axis=0)
     scaled[:, :, :2, :2] *= np.exp([-_STEP, 0.0, _STEP])[:, None, None, None]
     lower, middle, upper = _pair_residuals(pairs, scaled)
@@ -198,10 +192,7 @@ class KruppaEquations:
         return select_candidate(frame, reconstruction, self.criterion, candidates)
 
     def _solutions(self, pairs: _Pairs, unknown: SolverUnknowns, n: int) -> list[tuple[F64, F64, float]]:
-        """Return K (n, 3, 3), its standard deviations and rms residual of minima, best first.
-
-        Only those that determine the focal length; ``StageFailure`` if there is none.
-        """
+        """K (n, 3, 3), standard deviations and rms residual of minima that determine the focal."""
         found, weakest = [], np.inf
         for log_f in self._scan(pairs, n):
             start = unknown.from_log_focals(np.full((1, n), log_f))[0]
@@ -231,10 +222,7 @@ class KruppaEquations:
 
 
 def _plane_for_focals(frame: ReferenceFrame, criterion: RotationCriterion, log_f: F64) -> tuple[F64, float]:
-    """Return the best plane (3,) for known log focal lengths (G,) and its cost; NaN and inf if there is none.
-
-    Starts from the reference with every other camera and both signs.
-    """
+    """The best plane (3,) for known log focal lengths (G,) and its cost; NaN and inf if there is none."""
     f = np.exp(log_f[frame.group])
     reference = np.array([f[frame.reference]])
     others = np.delete(np.arange(len(f)), frame.reference)

@@ -41,10 +41,7 @@ def _adjugate(M: F64) -> F64:
 
 
 def _modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
-    """Return residuals -l2 / (l3 c) - l1 / (l3 c^2) (B, M) of planes (B, 3), and the mean of both terms.
-
-    The mean is 1 + 2 cos(angle) at a solution, so at most 3 in size.
-    """
+    """Residuals -l2 / (l3 c) - l1 / (l3 c^2) (B, M) of planes (B, 3), and the mean of both terms."""
     values = np.einsum("mkc,bc->bmk", coefficients[..., :3], planes) + coefficients[..., 3]
     l0, l1, l2, l3 = np.moveaxis(values, -1, 0)
     l3 = np.where(np.abs(l3) < 1e-12, 1e-12, l3)

@@ -99,10 +99,7 @@ def _propose_vanishing_points(
 
 
 def _triangulate_directions(P: F64, v: F64) -> F64:
-    """Return space points (B, 4) of unit norm from image points v (B, n, 3) in cameras P (B, n, 3, 4).
-
-    Least squares of v x P X = 0; points may be at infinity.
-    """
+    """Space points (B, 4) of unit norm by v x P X = 0 for v (B, n, 3) in P (B, n, 3, 4)."""
     rows = np.cross(v[..., None], P, axisa=-2, axisb=-2, axisc=-2)
     normal = np.einsum("bnri,bnrj->bij", rows, rows)
     return np.asarray(np.linalg.eigh(normal)[1][:, :, 0])

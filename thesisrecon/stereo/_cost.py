@@ -45,10 +45,7 @@ def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
 
 
 def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[tuple[int, int, int, int]]:
-    """Divide the rows of an image into the fewest strips that fit the memory, margins included.
-
-    A strip (first, last, from, to) computes rows [first, last) from rows [from, to).
-    """
+    """Fewest strips (first, last, from, to) of rows that fit the memory; ``from`` and ``to`` have margins."""
     fitting = int(memory_bytes // max(bytes_per_row, 1))
     if height <= fitting:
         return [(0, height, 0, height)]

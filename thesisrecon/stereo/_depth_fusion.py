@@ -86,11 +86,7 @@ def _filtered(chain: Sequence[int], views: Mapping[int, PinholeView], correspond
 
 
 def _concatenated(first: Correspondence, second: Correspondence) -> Correspondence:
-    """Correspondence of view i in k from those of i in j and of j in k.
-
-    The positions of the four pixels around in j are interpolated if they are consistent, else that of the
-    nearest is shifted. Variances add up.
-    """
+    """Correspondence of view i in k from those of i in j and of j in k; variances add up."""
     limits = np.array(second.sigma.shape[::-1])
     inside = np.all((first.xy > -0.5) & (first.xy < limits - 0.5), axis=2)
     place = np.where(inside[..., None], first.xy, 0.0).astype(np.float32)
@@ -112,10 +108,7 @@ def _measured(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
 
 
 def pixel_transfer(P: F64, P_other: F64) -> tuple[F64, F64]:
-    """Homography H (3, 3) of the plane at infinity and epipole e (3,); the third row of P gives the depth.
-
-    A pixel (x, y, 1) of inverse depth rho is at H (x, y, 1) + rho e in the other view.
-    """
+    """H (3, 3) and e (3,) that take a pixel (x, y, 1) of inverse depth rho to H (x, y, 1) + rho e."""
     centre = camera_centre(P)
     return P_other[:, :3] @ np.linalg.inv(P[:, :3]), P_other @ (centre / centre[3])
 

@@ -123,10 +123,7 @@ class EpipolarPencil:
 
 @dataclass(frozen=True)
 class HalfLines:
-    """Half epipolar lines of a view in normalised coordinates.
-
-    d(z - e) grows along the ``direction``, or falls if the third coordinate of the ``epipole`` is negative.
-    """
+    """Half epipolar lines of a view in normalised coordinates; d(z - e) grows along the ``direction``."""
 
     foot: F64  #: (N, 2) nearest to the image centre
     direction: F64  #: (N, 2) unit vectors
@@ -191,11 +188,7 @@ class EpipolarPair:
 
 
 def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
-    """Prepare a pair with known F and matches, see :func:`thesisrecon.stereo.rectification.rectify_pair`.
-
-    The direction of disparities follows from cameras with a usual focal length (quasi-Euclidean frame) with
-    the points in front.
-    """
+    """Prepare a pair with known F and matches, see :func:`thesisrecon.stereo.rectification.rectify_pair`."""
     matches = _checked_call(xy1, xy2, size1, size2)
     F = np.asarray(F, dtype=np.float64)
     if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
@@ -394,11 +387,7 @@ def frame_size(extent: F64, pair: EpipolarPair) -> tuple[int, int]:
 
 
 def common_crop(samples: Sequence[F64], matches: Sequence[F64]) -> tuple[F64, F64]:
-    """Least and greatest rectified coordinates (2, 2) that both images see, one row per image.
-
-    Along the rows each image is cut to what the other can show at the disparities of the matches, two arrays
-    (N, 2) of rectified positions as the ``samples`` of the images.
-    """
+    """Least and greatest rectified coordinates (2, 2) that both images see, one row per image."""
     low, high = (np.stack([f(xy, axis=0) for xy in samples]) for f in (np.min, np.max))
     low[:, 1], high[:, 1] = low[:, 1].max(), high[:, 1].min()
     if len(matches[0]):
@@ -410,9 +399,6 @@ def common_crop(samples: Sequence[F64], matches: Sequence[F64]) -> tuple[F64, F6
 
 
 def disparity_bounds(disparities: F64, *, margin: float) -> tuple[float, float]:
-    """1 % and 99 % quantiles of disparities (N,), widened at both ends by a share of the range.
-
-    A few matches are wrong along their epipolar lines.
-    """
+    """1 % and 99 % quantiles of disparities (N,), widened at both ends by a share of the range."""
     low, high = np.quantile(disparities, [0.01, 0.99])
     return float(low - margin * (high - low)), float(high + margin * (high - low))

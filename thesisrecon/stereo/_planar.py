@@ -40,10 +40,7 @@ MAX_LOG_SCALE, MAX_SHEAR = 0.05, 0.06
 
 @dataclass(frozen=True)
 class PlanarRectification(Rectification):
-    """Two homographies ``H`` (2, 3, 3) to a common rectified frame, which may be rotated against the images.
-
-    They are scaled so that the third coordinate of visible points is positive.
-    """
+    """Homographies ``H`` (2, 3, 3) to a common rectified frame, with a positive third coordinate."""
 
     H: F64
     size: tuple[int, int]
@@ -208,10 +205,7 @@ def _loop_zhang_line(pair: EpipolarPair) -> float:
 
 
 def _pencil_rows(pair: EpipolarPair, phi: float, infinite: float | None = None) -> F64:
-    """Second and third rows (2, 2, 3) of both homographies in normalised coordinates.
-
-    ``phi`` becomes row 0 of the frame; the line of ``infinite``, phi + pi/2 by default, is sent to infinity.
-    """
+    """Rows 1 and 2 (2, 2, 3) of both homographies; the line of ``infinite`` is sent to infinity."""
     v, w = plane_from_angle(np.array([phi, phi + 0.5 * np.pi if infinite is None else infinite]))
     return np.stack([np.stack([-L @ v, L @ w]) for L in pair.pencil.lines])
 
@@ -258,10 +252,7 @@ def _affine_rows(pair: EpipolarPair, rows: F64) -> F64:
 
 
 def _homographies_of_rows(pair: EpipolarPair, first: F64, rows: F64) -> F64:
-    """Homographies of pixels (2, 3, 3) from first rows (2, 3) and other rows (2, 2, 3), normalised.
-
-    They are rotated by 180 degrees if the pencil is flipped.
-    """
+    """Homographies of pixels (2, 3, 3) from first rows (2, 3) and other rows (2, 2, 3), normalised."""
     H = np.concatenate([first[:, None], rows], axis=1) @ pair.pencil.normalization
     if pair.pencil.flipped:
         H[:, :2] *= -1.0

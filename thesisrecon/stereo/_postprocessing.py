@@ -275,10 +275,7 @@ QUANTISATION = float(1.0 / np.sqrt(12.0))
 
 
 def texture_of(image: StereoImage, noise: float) -> F32:
-    """Squared horizontal gradient (H, W) relative to that of pure noise: 1 = no texture, NaN = no pixel.
-
-    ``noise`` is its standard deviation in grey levels.
-    """
+    """Squared horizontal gradient (H, W) relative to that of ``noise``: 1 = no texture, NaN = no pixel."""
     out = np.empty(image.valid.shape, np.float32)
     _squared_gradient(image.channels, TEXTURE_RADIUS, out)
     out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, QUANTISATION) ** 2)

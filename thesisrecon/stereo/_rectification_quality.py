@@ -31,10 +31,7 @@ class RectificationQuality:
 
     @property
     def distortion(self) -> float:
-        """Root of the sum of squares of ``log stretch`` and half the ``disparity_slope``.
-
-        A slope s stretches windows of one image against the other by s, to first order s / 2 in each.
-        """
+        """Root of the sum of squares of ``log stretch`` and half the ``disparity_slope``."""
         slope = self.disparity_slope if np.isfinite(self.disparity_slope) else 0.0
         return float(np.hypot(np.log(self.stretch), 0.5 * slope))
 
@@ -66,10 +63,7 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
 
 
 def jacobians(rectification: Rectification, side: int, xy: F64) -> F64:
-    """Numerical derivatives (N, 2, 2) of the map from pixels (N, 2) of an image to the frame.
-
-    NaN at the first and last row of a polar frame.
-    """
+    """Numerical derivatives (N, 2, 2) of the map from pixels (N, 2) of an image to the frame."""
     columns = []
     for axis in np.eye(2):
         ahead = rectification.rectified_from_original(side, xy + STEP_PX * axis, within=False)
@@ -103,10 +97,7 @@ def matches_in_frame(
 
 
 def disparity_gradients(left: F64, right: F64) -> F64:
-    """Gradients (M, 2) of a quadratic polynomial fitted to the disparities of matches (N, 2), M <= 300.
-
-    They measure the relative stretch, shear and bending of both images without relief.
-    """
+    """Gradients (M, 2) of a quadratic polynomial fitted to the disparities of matches (N, 2), M <= 300."""
     every = max(len(left) // MAX_MATCHES, 1)
     left, right = left[::every], right[::every]
     middle = 0.5 * (left + right)

@@ -122,11 +122,7 @@ def _sample_image(image: F32, xy: F64, out: F32) -> None:
 
 
 def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]) -> F32:
-    """Resample an image (H, W) or (H, W, C) into a frame of (width, height) by cubic convolution.
-
-    ``lookup`` returns the positions (len(rows), width, 2) in the image of a range of rows of the frame. NaN
-    outside the image.
-    """
+    """Resample an image into a frame of (width, height) by cubic convolution, NaN outside the image."""
     pixels = np.ascontiguousarray(image, dtype=np.float32)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     width, height = size
@@ -145,10 +141,7 @@ def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]
 def undistort_image(
     rgb: U8, K: F64, distortion: F64, pinhole_K: F64, size: tuple[int, int], *, mask: B8 | None = None
 ) -> tuple[U8, B8]:
-    """Resample an image (H, W, 3) with radial distortion into a pinhole camera of (width, height).
-
-    Returns the image, black outside the original and its ``mask``, and which pixels are inside.
-    """
+    """Resample an image with distortion into a pinhole camera; return it and which pixels are inside."""
     inverse = np.linalg.inv(pinhole_K)
 
     def lookup(rows: range) -> F64:
@@ -179,10 +172,7 @@ def bilinear_samples(values: F32, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]
 
 
 class Rectification(ABC):
-    """Maps between two images (side 0 is the left one) and a common frame whose rows are epipolar lines.
-
-    x_right = x_left - d with larger d for nearer points.
-    """
+    """Maps between two images (side 0 is the left one) and a frame whose rows are epipolar lines."""
 
     size: tuple[int, int]
 
@@ -197,10 +187,7 @@ class Rectification(ABC):
         """Positions (len(rows), width, 2) of rows of the frame in an image."""
 
     def original_from_rectified(self, side: int, xy: F64, *, within: bool = True) -> F64:
-        """Map positions (N, 2) of the frame to pixels, NaN beyond the epipole or the line sent to infinity.
-
-        NaN outside the frame too if ``within``.
-        """
+        """Map positions (N, 2) of the frame to pixels, NaN if there is none, or ``within`` the frame only."""
         return self._original(side, self._within(xy) if within else xy)
 
     def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:

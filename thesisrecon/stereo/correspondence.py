@@ -133,10 +133,7 @@ def _searched_range(frame: Rectification, xy1: F64, xy2: F64) -> tuple[int, int]
 
 
 def _sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
-    """Disparity and confidence (N,) at positions (N, 2) of the rectified frame, NaN where unknown.
-
-    Bilinear if the four pixels around lie on one surface, else the nearest pixel.
-    """
+    """Disparity and confidence (N,) at positions (N, 2) of the rectified frame, NaN where unknown."""
     height, width = found.disparity.shape
     inside: B8 = np.asarray(np.isfinite(places).all(axis=1))
     x, y = np.clip(np.where(inside[:, None], places, 0.0), 0.0, (width - 1.0, height - 1.0)).T
@@ -149,10 +146,7 @@ def _sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
 
 
 def _brightness_gain(reference: U8, other: U8, xy1: F64, xy2: F64) -> F32:
-    """Gain (3,) that makes ``other`` as bright as ``reference``: median ratio of patch means at matches.
-
-    It compensates exposure and white balance; 1 with fewer than 8 usable points.
-    """
+    """Gain (3,) that makes ``other`` as bright as ``reference``: median ratio of patch means at matches."""
     levels = [_patch_means(rgb, xy) for rgb, xy in ((reference, xy1), (other, xy2))]
     good = np.isfinite(levels[0]).all(axis=1) & np.isfinite(levels[1]).all(axis=1)
     good &= np.minimum(levels[0], levels[1]).min(axis=1) > 8.0

@@ -49,10 +49,7 @@ def _sparse_points(reconstruction: Reconstruction) -> SparsePoints:
 
 
 def _shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> tuple[F64, F64]:
-    """Pixels (N, 2) in two views of the points that one of them observes, if inside both images.
-
-    Points that only one view observes count too: the depth range must cover the whole visible scene.
-    """
+    """Pixels (N, 2) in two views of the points that at least one of them observes, if inside both images."""
     seen = points.seen[a.view], points.seen[b.view]
     X = points.X[seen[0] & seen[1] if points.sampled else seen[0] | seen[1]]
     keep = np.ones(len(X), dtype=bool)
@@ -202,10 +199,7 @@ def _transfer(P: F64, P_other: F64) -> F64:
 
 
 def _region_sizes(depth: F32, step: float) -> F64:
-    """(H, W) pixels of each pixel's connected region, 0 where unknown.
-
-    Neighbours are connected if their depths differ by at most the share ``step``.
-    """
+    """(H, W) pixels of each pixel's region of depths that differ by at most the share ``step``, 0 if none."""
     number = np.arange(depth.size).reshape(depth.shape)
     log = np.log(depth)
     pairs = []
@@ -389,11 +383,7 @@ class MultiViewStereo:
         return frozenset({*linked, *scene.neighbours[view], *self._comparison_views(scene, view)})
 
     def _comparison_views(self, scene: MultiViewScene, view: int) -> list[int]:
-        """Views whose depth maps are compared with that of a view.
-
-        Its neighbours, the views it is a neighbour of, and up to ``min_comparison_views`` those with the most
-        common points.
-        """
+        """Neighbours of a view, views that it is a neighbour of, and those with the most common points."""
         mutual = {j for j, chosen in scene.neighbours.items() if view in chosen}
         near = (mutual | set(scene.neighbours[view])) - {view}
         seen = scene.points.seen

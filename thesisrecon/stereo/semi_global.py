@@ -150,10 +150,7 @@ class SemiGlobalMatching:
         return np.array([of_bit, of_level, cap], np.int16)
 
     def _postprocess(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
-        """Check, filter and smooth the disparities (H, W) of the left image; ``left`` is overwritten.
-
-        Values propagated into regions without ``texture`` get low ``confidence``, which is overwritten.
-        """
+        """Check, filter and smooth the disparities (H, W) of the left image; inputs are overwritten."""
         limits = np.array([LEFT_RIGHT_PX, MIN_CONFIDENCE], np.float32)
         check_left_right(left, right, confidence, limits)
         remove_speckles(left, texture > TEXTURED, STEP_PX, MIN_REGION_PX)

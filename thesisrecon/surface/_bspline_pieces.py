@@ -130,10 +130,7 @@ def evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int,
 
 
 class Domain(NamedTuple):
-    """Pixels with a surface and with depths that are used.
-
-    ``joined``: whether neighbours below (H - 1, W) and to the right (H, W - 1) belong to one surface.
-    """
+    """Pixels with a surface and with used depths; ``joined`` to the pixel below and to the right."""
 
     covered: B8
     reliable: B8
@@ -155,11 +152,7 @@ class SplinePieces:
 
 
 def domain_of(depth_map: DepthMap, *, least: int, reach: float) -> Domain:
-    """Connect the depths of a map to surfaces.
-
-    Connected regions of fewer than ``least`` pixels are unreliable; within ``reach`` px of the nearest
-    surface they are covered by it.
-    """
+    """Connect the depths of a map to surfaces of ``least`` pixels, which cover what is within ``reach``."""
     depth, std = depth_map.depth.astype(np.float64), depth_map.std.astype(np.float64)
     slope = max_depth_slope(depth_map.P, GRAZING_DEG)
     known = np.isfinite(depth) & (depth > 0.0) & (std > 0.0) & np.isfinite(std)
@@ -199,11 +192,7 @@ def _alike(depth: F64, std: F64, slope: F64, axis: int) -> B8:
 
 
 def _steps(rho: F64, deviation: F64, axis: int) -> B8:
-    """Whether the inverse depth has a step to the next pixel: a difference unlike those before and after.
-
-    Differences are equal on a plane. A step differs on both sides by ``STEP`` standard deviations, or by
-    ``STEP`` typical differences if these are larger.
-    """
+    """Whether the inverse depth has a step to the next pixel: a difference unlike those before and after."""
     rho, deviation = np.moveaxis(rho, axis, 0), np.moveaxis(deviation, axis, 0)
     step = np.diff(rho, axis=0)
     padded = np.pad(step, ((1, 1), (0, 0)), constant_values=np.nan)

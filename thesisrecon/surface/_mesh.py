@@ -85,21 +85,10 @@ def remove_small_parts(mesh: TexturedMesh) -> TexturedMesh:
 
 
 def simplify_mesh(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
-    """Simplify a mesh by vertex clustering.
+    """Merge vertices in cells of a grid, enlarged until the faces are few enough, to ``max_faces``.
 
-    Vertices that are connected within a cell of a cubic grid are merged (Rossignac and Borrel 1993) at the
-    point with the least squared distance to the planes of their faces (Lindstrom 2000), which preserves edges
-    and corners. Cells are enlarged until the faces are few enough.
-
-    Parameters
-    ----------
-    mesh, max_faces : TexturedMesh, int
-        Any mesh, and the largest number of faces.
-
-    Returns
-    -------
-    TexturedMesh
-        The simplified mesh without texture; the mesh itself if it has no more faces.
+    Each cluster (Rossignac and Borrel 1993) becomes the point with the least squared distance to the planes
+    of its faces (Lindstrom 2000), which preserves edges and corners.
     """
     if max_faces < 1:
         raise ValueError(f"max_faces must be at least 1; got {max_faces}")
@@ -128,10 +117,7 @@ def _clusters(mesh: TexturedMesh, cell: float) -> I64:
 
 
 def _distinct_faces(faces: I64) -> I64:
-    """Faces (M', 3) with three different corners, without duplicates, in their first order.
-
-    Two faces on the same corners with opposite orientation are the sides of a sheet and both stay.
-    """
+    """Faces (M', 3) with three corners, in their first order; both sides of a sheet stay."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     first = np.argmin(faces, axis=1)
@@ -140,10 +126,7 @@ def _distinct_faces(faces: I64) -> I64:
 
 
 def _cluster_places(mesh: TexturedMesh, cluster: I64, cell: float) -> F64:
-    """(C, 3) point of each cluster that is nearest to the planes of its faces.
-
-    Undetermined directions keep the mean of the vertices, as do points farther than a cell from it.
-    """
+    """(C, 3) point nearest to the planes of the faces of each cluster, undetermined: the mean vertex."""
     mean = _means(cluster, mesh.vertices)
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)

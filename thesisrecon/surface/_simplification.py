@@ -349,24 +349,9 @@ def _dot(a: F64, b: F64) -> float:
 def simplify_surface(
     mesh: TexturedMesh, limit: F64, *, longest: float, threads: int = 1, overwrite: bool = False
 ) -> TexturedMesh:
-    """Collapse edges while the planes of the original faces stay near.
+    """Collapse edges while the rms distance to the planes of the original faces is within ``limit`` (N,).
 
-    Parameters
-    ----------
-    mesh : TexturedMesh
-        Mesh without colours and texture.
-    limit : ndarray (N,)
-        Largest root mean square distance of a vertex to the planes of the faces that it replaces.
-    longest : float
-        Longest new side of a face.
-    threads : int
-        Number of threads; the result does not depend on it.
-    overwrite : bool
-        Whether the arrays of the mesh may be used for the computation, which saves memory.
-
-    Returns
-    -------
-    TexturedMesh
+    New sides are at most ``longest``. ``overwrite`` uses the arrays of the mesh, which saves memory.
     """
     size, centre = len(mesh.vertices), mesh.vertices.mean(axis=0)
     points = np.subtract(mesh.vertices, centre, out=mesh.vertices if overwrite else None)
@@ -423,20 +408,7 @@ def _sort_into_blocks(state: MeshState, axis: int) -> I64:
 
 
 def reduce_faces(mesh: TexturedMesh, max_faces: int, *, threads: int = 1) -> TexturedMesh:
-    """Simplify a mesh to a number of faces, first by collapsing edges, then by clustering vertices.
-
-    Parameters
-    ----------
-    mesh, max_faces : TexturedMesh, int
-        Any mesh, and the largest number of faces.
-    threads : int
-        Number of threads; the result does not depend on it.
-
-    Returns
-    -------
-    TexturedMesh
-        The simplified mesh without colours and texture; the mesh itself if it has no more faces.
-    """
+    """Simplify a mesh to a number of faces, first by collapsing edges, then by clustering vertices."""
     if len(mesh.faces) <= max_faces:
         return mesh
     mesh = replace(mesh, colors=None, uv=None, texture=None, untextured=None)

@@ -219,10 +219,7 @@ def blend_colors(views: Sequence[ViewSurface], points: F64, normals: F64) -> tup
 def _points_of_rows(
     mesh: TexturedMesh, normals: F64, faces: tuple[I64, F64], rows: slice, width: int
 ) -> tuple[I64, F64, F64]:
-    """Texels (N, 2) as row and column, points and normals (N, 3) of some rows of the texture.
-
-    ``faces``: numbers (M',) and texels (M', 3, 2) of the faces there.
-    """
+    """Texels (N, 2), points and normals (N, 3) of rows of the texture and of the ``faces`` there."""
     some, uv = faces
     corners = np.concatenate([uv, np.ones((len(some), 3, 1))], axis=2)
     corners[..., 1] -= rows.start - RIM_TEXELS
@@ -262,10 +259,7 @@ def _prepared(mesh: TexturedMesh, view: PinholeView) -> ViewSurface:
 
 
 def _equalizing_gains(weight: F32, color: F32) -> F32:
-    """Gains (V, 3) that equalise the brightness of the views, with geometric mean 1.
-
-    Least squares over the median log ratios of all pairs of views at points that both show.
-    """
+    """Gains (V, 3) of geometric mean 1 that equalise the median colours of all pairs of views."""
     views = len(weight)
     usable = (weight[..., None] > 0.0) & (color > DARK) & (color < BRIGHT)
     log = np.log(np.maximum(color, 1.0))

@@ -48,10 +48,7 @@ def _basis(u: F64, derivative: int = 0) -> F64:
 
 
 def _energies() -> tuple[F64, F64]:
-    """Integrals (16, 16) of f_xx^2 + 2 f_xy^2 + f_yy^2 and of the squared gradient over a unit cell.
-
-    Node (i, j) has the index 4 i + j.
-    """
+    """Integrals (16, 16) of f_xx^2 + 2 f_xy^2 + f_yy^2 and of the squared gradient over a unit cell."""
     nodes, weights = np.polynomial.legendre.leggauss(4)
     values = [_basis(0.5 * (nodes + 1.0), d) for d in (0, 1, 2)]
     M0, M1, M2 = (np.einsum("n,ni,nj->ij", 0.5 * weights, v, v) for v in values)
@@ -61,10 +58,7 @@ def _energies() -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class _NormalEquations:
-    """Normal equations of a spline in ``pieces`` with ``cell`` px between knots.
-
-    ``rows``, ``starts``: pattern of the sparse matrix; ``place`` (N, 256): index of each piece's entries.
-    """
+    """Normal equations of a spline in ``pieces`` with ``cell`` px between knots, and their pattern."""
 
     pieces: SplinePieces
     cell: int

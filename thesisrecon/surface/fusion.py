@@ -55,10 +55,7 @@ LONGEST_VOXELS = 16.0
 
 @dataclass(frozen=True)
 class _Grid:
-    """Sparse voxel grid: ``origin`` (3,) of the first voxel centre and ``voxel`` size.
-
-    ``blocks`` (B, 3): grid positions, in order; ``place`` (X, Y, Z): block number at each position or -1.
-    """
+    """Sparse voxel grid; ``place`` (X, Y, Z): block number at each position or -1."""
 
     origin: F64
     voxel: float

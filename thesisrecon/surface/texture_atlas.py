@@ -141,10 +141,7 @@ def _rectangles(xy: F64, label: I64, chart: I64, views: Sequence[PinholeView]) -
 
 
 def _pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
-    """Positions (C, 2) of rectangles of ``sizes`` (C, 2), and (width, height) of their bounding box.
-
-    They are packed on shelves of decreasing height; the bounding box is roughly square.
-    """
+    """Positions (C, 2) of rectangles on shelves of decreasing height, and (width, height) of their box."""
     width = max(
         int(np.ceil(1.05 * np.sqrt(float(sizes.prod(axis=1).sum())))), int(sizes[:, 0].max(initial=1))
     )
@@ -171,10 +168,7 @@ def _fill(
 
 
 def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
-    """Append patches with the colours of unseen faces: those of the nearest seen faces along the surface.
-
-    Faces of similar colour share a patch, and neighbours among them their vertices.
-    """
+    """Append patches with the colours of unseen faces: those of the nearest seen faces along the surface."""
     unseen = np.flatnonzero(label < 0)
     if not len(unseen):
         return uv, texture

@@ -328,10 +328,7 @@ def forward_map(
 
 
 def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
-    """Sample an image (h, w, C) at pixels (H, W, 2) by cubic convolution, bilinear beside the border and NaN.
-
-    Samples are NaN at NaN positions and more than half a pixel outside.
-    """
+    """Sample an image (h, w, C) at pixels (H, W, 2) by cubic convolution, NaN outside."""
     levels = np.ascontiguousarray(image, dtype=np.float32)
     out = np.empty((*source_xy.shape[:2], levels.shape[2]), dtype=np.float32)
     run_in_strips(lambda rows: _sample_at(levels, source_xy, rows, out), len(out), threads)

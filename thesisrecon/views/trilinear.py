@@ -345,11 +345,7 @@ class VirtualTensor:
         return VirtualTensor(T, self.P2, K)
 
     def _perpendicular_lines(self, xy1: F64, xy2: F64) -> F64:
-        """Lines (..., 3) through x2, perpendicular to the epipolar lines of x1; zero at the epipole.
-
-        Of all lines through x2 these carry the most information: an x2 off its epipolar line acts as its
-        nearest point on the line.
-        """
+        """Lines (..., 3) through x2, perpendicular to the epipolar lines of x1; zero at the epipole."""
         epipolar = unit_normals(np.cross(self.P2[:, 3], homogenize(xy1) @ self.P2[:, :3].T))
         along = np.stack([epipolar[..., 1], -epipolar[..., 0]], axis=-1)
         return np.concatenate([along, -np.sum(along * xy2, axis=-1, keepdims=True)], axis=-1)
