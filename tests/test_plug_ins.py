@@ -16,6 +16,7 @@ import pytest
 from tests.conftest import refuses
 from tests.fake_stages import photographs
 from thesisrecon import match_pair, reconstruct
+from thesisrecon._plug_ins import FunctionFundamental, FunctionMatcher
 from thesisrecon._settings import build_config, config_from_toml, tables_from_config, toml_from_config
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
@@ -25,7 +26,6 @@ from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.matching.pair_selection import OverlapEstimate
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
-from thesisrecon.plug_ins import FunctionFundamental, FunctionMatcher
 from thesisrecon.records import Features
 
 COURTYARD = Path(__file__).parents[1] / "fixtures" / "courtyard" / "images"

@@ -18,11 +18,11 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from thesisrecon._plug_ins import NOT_IN_A_FILE, is_reference, load_reference, text_of
 from thesisrecon.config import KINDS, PRESETS, PipelineConfig
 from thesisrecon.config import preset as _preset
 from thesisrecon.errors import UsageError, in_words, unknown_setting, unknown_word
 from thesisrecon.io._files import read_pairs, read_text
-from thesisrecon.plug_ins import NOT_IN_A_FILE, is_reference, load_reference, text_of
 
 T = TypeVar("T")
 Table = dict[str, Any]

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from thesisrecon._plug_ins import FunctionMatcher, as_method
 from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
@@ -28,7 +29,6 @@ from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, MapAll, O
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.plug_ins import FunctionMatcher, as_method
 from thesisrecon.projective.factorization import Factorization
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.projective.sequential import SequentialProjective
@@ -418,7 +418,7 @@ class PipelineConfig:
         How images are read, and prior knowledge of the cameras.
     features, pairs, matching, ... : Detector, PairSelector, Matcher, ...
         The method of each stage: any object with the methods of its ``Protocol``. The stages ``features``,
-        ``pairs``, ``matching`` and ``epipolar`` also take a plain function (:mod:`thesisrecon.plug_ins`).
+        ``pairs``, ``matching`` and ``epipolar`` also take a plain function (:mod:`thesisrecon._plug_ins`).
 
         A method that does not fit is a ``UsageError``.
 

@@ -15,11 +15,11 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.io import _export_formats as formats
+from thesisrecon.io._colmap_writing import has_skew, write_sparse_model
 from thesisrecon.io._export_formats import coefficients
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import find_images, read_image
-from thesisrecon.io.colmap import has_skew, write_sparse_model
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._executors import available_threads
 from thesisrecon.sparse_model import SparseModel, SparseView

@@ -26,7 +26,7 @@ from thesisrecon.geometry.polynomial_triangulation import (
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
 from thesisrecon.geometry.triangulation import _jacobi_least, triangulate, triangulate_observations
 from thesisrecon.geometry.two_view import epipolar_distances, fundamental_from_cameras
-from thesisrecon.numerics.partial_bundle import minimize_reprojection
+from thesisrecon.numerics._partial_bundle import minimize_reprojection
 
 METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]
 

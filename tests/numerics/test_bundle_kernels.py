@@ -12,11 +12,11 @@ from thesisrecon.numerics import _metric_kernels, _schur
 from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
 from thesisrecon.numerics._elimination import ReducedSums, revert_crossing_points, sum_leverages
+from thesisrecon.numerics._noise import huber
 from thesisrecon.numerics._schur import BundleSystem, build_layout
 from thesisrecon.numerics._small_solvers import floored_diagonal
 from thesisrecon.numerics.block_scatter import block_scatter
 from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.noise import huber
 from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
 
 

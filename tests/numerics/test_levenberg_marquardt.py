@@ -5,9 +5,9 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 
+from thesisrecon.numerics._noise import best_huber_width, effective_noise, huber, soft_l1
 from thesisrecon.numerics._small_solvers import solve_positive
 from thesisrecon.numerics.levenberg_marquardt import invert_information, minimize_residuals
-from thesisrecon.numerics.noise import best_huber_width, effective_noise, huber, soft_l1
 from thesisrecon.numerics.observations import morton_pair_order
 
 

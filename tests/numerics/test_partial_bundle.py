@@ -4,7 +4,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block
-from thesisrecon.numerics.partial_bundle import refine_camera, refine_points, refine_pose
+from thesisrecon.numerics._partial_bundle import refine_camera, refine_points, refine_pose
 
 NONE = np.zeros(6, dtype=bool)
 

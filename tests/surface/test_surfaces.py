@@ -11,7 +11,7 @@ from tests.conftest import refuses
 from tests.surface.sphere import SHAPE, K, looking_at_origin, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.zbuffer import rasterize
+from thesisrecon.geometry._zbuffer import rasterize
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface import fusion
 from thesisrecon.surface._mesh import connected_parts, face_areas, remove_small_parts

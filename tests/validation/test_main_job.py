@@ -8,7 +8,7 @@ from PIL import Image
 pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
-from thesisrecon.io.colmap import write_colmap_model
+from thesisrecon.io._colmap_writing import write_colmap_model
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.references.colmap import read_run, reconstruct_with_pycolmap

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
-from thesisrecon.views.image_similarity import GREY
+from thesisrecon.views._image_similarity import GREY
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection, rotation_errors_deg
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
 from validation.metrics.pictures import psnr_db, ssim

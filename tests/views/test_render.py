@@ -14,7 +14,7 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import RenderedView, TexturedMesh
 from thesisrecon.surface.linear import surface_from_depth
 from thesisrecon.surface.texture_atlas import TextureAtlas
-from thesisrecon.views.image_similarity import GREY, _ssim_map, covered_pixels, match_exposure, psnr_db, ssim
+from thesisrecon.views._image_similarity import GREY, _ssim_map, covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import Light, Shading, render
 
 K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])

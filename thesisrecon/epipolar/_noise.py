@@ -9,7 +9,7 @@ import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.kernels import kernel
-from thesisrecon.numerics.noise import MAD_FACTOR
+from thesisrecon.numerics._noise import MAD_FACTOR
 
 # Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise.
 TAIL, _SEPARATION = 4.0, 12.0

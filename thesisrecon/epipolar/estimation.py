@@ -9,9 +9,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from thesisrecon.epipolar._degeneracy import assess_degeneracy
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._refinement import fundamental_covariance
-from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure, unknown_word
 from thesisrecon.records import FundamentalFit
@@ -47,7 +47,7 @@ def estimate_fundamental(
         Random seed, or the generator to draw from; the same seed gives the same result.
     check_degeneracy : bool
         Also test whether the matches determine F
-        (:func:`~thesisrecon.epipolar.degeneracy.assess_degeneracy`); many inliers alone do not show it.
+        (:func:`~thesisrecon.epipolar._degeneracy.assess_degeneracy`); many inliers alone do not show it.
 
     Returns
     -------

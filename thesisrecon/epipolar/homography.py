@@ -18,8 +18,8 @@ from thesisrecon.geometry.two_view import (
     homography_sampson_residuals,
     unit_norm,
 )
+from thesisrecon.numerics._noise import VARIANCE_OF_INLIERS, next_inlier_limit
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics.noise import VARIANCE_OF_INLIERS, next_inlier_limit
 
 _SAMPLE, _PARAMETERS = 4, 8
 _BATCH, _MAX_BATCHES, _SCORED = 128, 16, 1000

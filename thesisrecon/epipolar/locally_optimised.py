@@ -13,7 +13,7 @@ from thesisrecon.epipolar._noise import NoiseMixture, noise_scale, noise_width
 from thesisrecon.epipolar._refinement import SAMPSON, fundamental_covariance, refine
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.errors import StageFailure
-from thesisrecon.numerics.noise import best_huber_width, effective_noise
+from thesisrecon.numerics._noise import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit
 
 BATCH = 512

@@ -28,13 +28,13 @@ from thesisrecon.geometry.three_view import (
     tensor_from_cameras,
     unit_tensor,
 )
+from thesisrecon.numerics._noise import huber
 from thesisrecon.numerics.levenberg_marquardt import (
     DenseSystem,
     invert_information,
     minimize_residuals,
     run_levenberg_marquardt,
 )
-from thesisrecon.numerics.noise import huber
 
 # Seven points, thirteen lines, or a mixture (HZ 16.1).
 NEEDED_EQUATIONS = 26

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.epipolar._degeneracy import assess_degeneracy
 from thesisrecon.epipolar._planes import SUBSET, count_transferred, induced_homography
 from thesisrecon.epipolar.configuration import MINIMUM, Configuration, classify_configuration
-from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_residuals, unit_norm
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features._kernels import sample_patches
 from thesisrecon.features.harris import CornerMeasure, select_spread
-from thesisrecon.geometry.image_filters import halve, resample, smooth
+from thesisrecon.geometry._image_filters import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
 

@@ -9,6 +9,6 @@
 3.6.3                 ``three_view``: the trifocal tensor
 6.3                   ``triangulation``, ``optimal_triangulation`` (two views)
 6.4                   ``resection``
-images, meshes        ``raster`` resamples images, ``zbuffer`` renders meshes
+images, meshes        ``raster`` resamples images, ``_zbuffer`` renders meshes
 ===================== ============================================================================
 """

@@ -17,8 +17,8 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.kernels import copy_to, empty, kernel, zeros
+from thesisrecon.numerics._partial_bundle import minimize_reprojection
 from thesisrecon.numerics._small_solvers import orthogonalize_columns, shortest_column
-from thesisrecon.numerics.partial_bundle import minimize_reprojection
 
 _PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""

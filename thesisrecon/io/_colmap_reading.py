@@ -14,8 +14,8 @@ import scipy
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
+from thesisrecon.io._colmap_writing import PIXEL_CENTRE, POINT_2D
 from thesisrecon.io._files import read_bytes
-from thesisrecon.io.colmap import PIXEL_CENTRE, POINT_2D
 from thesisrecon.sparse_model import SparseModel, SparseView
 
 _FILES = ("cameras", "images", "points3D")

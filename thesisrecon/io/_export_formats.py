@@ -15,9 +15,9 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import undistort
+from thesisrecon.io._colmap_writing import PIXEL_CENTRE, colors_of
 from thesisrecon.io._exports import write_point_cloud
 from thesisrecon.io._files import write_atomically, write_json, write_text
-from thesisrecon.io.colmap import PIXEL_CENTRE, colors_of
 from thesisrecon.sparse_model import SparseModel, SparseView
 
 _LOOKS_BACK = np.diag([1.0, -1.0, -1.0])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
-from thesisrecon.geometry.image_filters import halve, resample
+from thesisrecon.geometry._image_filters import halve, resample
 from thesisrecon.kernels import kernel, zeros
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 

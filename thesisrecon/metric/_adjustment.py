@@ -10,9 +10,9 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
+from thesisrecon.numerics._noise import best_huber_width, noise_from_distances
 from thesisrecon.numerics.block_scatter import BlockScatter, block_scatter
 from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics.noise import best_huber_width, noise_from_distances
 from thesisrecon.numerics.observations import Observations
 
 MIN_OBSERVATIONS = 40

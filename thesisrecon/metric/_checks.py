@@ -14,8 +14,8 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.metric._model import MetricEstimate, inlier_mask, reproject_observations, residual_norms
 from thesisrecon.metric._uncertainty import USUAL_INFLATION
-from thesisrecon.numerics.noise import MAD_FACTOR, noise_from_distances
-from thesisrecon.numerics.partial_bundle import refine_pose
+from thesisrecon.numerics._noise import MAD_FACTOR, noise_from_distances
+from thesisrecon.numerics._partial_bundle import refine_pose
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 
 OWN = 2

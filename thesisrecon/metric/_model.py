@@ -11,7 +11,7 @@ from thesisrecon.geometry.camera_matrix import distort, undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics.partial_bundle import refine_points
+from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.records import Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.

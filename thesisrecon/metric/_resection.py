@@ -20,7 +20,7 @@ from thesisrecon.metric._model import (
     normalized_observations,
     retriangulate_tracks,
 )
-from thesisrecon.numerics.partial_bundle import refine_pose
+from thesisrecon.numerics._partial_bundle import refine_pose
 
 ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 """Factors tried on the focal length of a camera that shares it with no registered view."""

@@ -42,8 +42,8 @@ from thesisrecon.metric._uncertainty import (
     per_camera_estimates,
     widen_unverified_focals,
 )
+from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.numerics.block_scatter import BlockScatter
-from thesisrecon.numerics.noise import noise_from_distances
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Upgrade
 
 MIN_CHANGE = 0.002

@@ -9,13 +9,13 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy
 
+from thesisrecon._plug_ins import FunctionMatcher, matches_of
 from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._images import read_image
 from thesisrecon.matching._prepared import select_matches
-from thesisrecon.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 from thesisrecon.runtime._run import stream
 

@@ -15,10 +15,10 @@ from thesisrecon import __version__
 from thesisrecon._settings import toml_from_config
 from thesisrecon.arrays import F32, U8
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.io._colmap_writing import write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import read_json, write_atomically, write_json, write_text
 from thesisrecon.io._meshes import write_mesh
-from thesisrecon.io.colmap import write_colmap_model
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, point_colors, summarize

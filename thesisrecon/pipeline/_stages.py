@@ -35,7 +35,7 @@ from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Batch, stream
 from thesisrecon.selfcalibration.stratified import with_images
 from thesisrecon.stereo.depth import MultiViewScene
-from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
+from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 
 MIN_CORNERS = 16

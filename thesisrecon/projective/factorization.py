@@ -17,7 +17,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import orient_signs
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_sampson_residuals
-from thesisrecon.numerics.noise import noise_from_distances
+from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.projective._model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
 from thesisrecon.projective._track_selection import (
     NO_PARALLAX,

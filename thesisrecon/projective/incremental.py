@@ -16,7 +16,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.robust_resection import resect_projective
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
-from thesisrecon.numerics.partial_bundle import refine_camera
+from thesisrecon.numerics._partial_bundle import refine_camera
 from thesisrecon.projective._model import (
     LOSS_SIGMAS,
     ProjectiveModel,

@@ -21,8 +21,8 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import pixel_from_unit, require_finite, require_shapes
 from thesisrecon.geometry.two_view import fundamental_from_cameras, unit_norm
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics._noise import soft_l1
 from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics.noise import soft_l1
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
     Candidate,

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.geometry._image_filters import cubic_weights
 from thesisrecon.geometry.camera_matrix import distort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.image_filters import cubic_weights
 from thesisrecon.kernels import empty, kernel
 
 MAX_TAPS = 24

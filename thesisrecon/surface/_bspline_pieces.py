@@ -15,7 +15,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty, full, kernel
-from thesisrecon.numerics.noise import MAD_FACTOR
+from thesisrecon.numerics._noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._mesh import components
 from thesisrecon.surface.linear import GRAZING_DEG, max_depth_slope, same_surface

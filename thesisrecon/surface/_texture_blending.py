@@ -11,7 +11,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.geometry.zbuffer import rasterize, rasterize_corners
+from thesisrecon.geometry._zbuffer import rasterize, rasterize_corners
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface._mesh import components, vertex_normals
 from thesisrecon.surface._texture_kernels import (

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64, U8
-from thesisrecon.geometry.image_filters import weighted_median
+from thesisrecon.geometry._image_filters import weighted_median
 from thesisrecon.kernels import empty, kernel, zeros
 
 

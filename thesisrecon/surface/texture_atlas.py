@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.image_filters import resample, smooth
+from thesisrecon.geometry._image_filters import resample, smooth
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface._mesh import face_neighbours
 from thesisrecon.surface._texture_blending import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F32, F64
-from thesisrecon.geometry.image_filters import weighted_median
+from thesisrecon.geometry._image_filters import weighted_median
 from thesisrecon.kernels import empty, kernel
 
 ONE_SURFACE_PX = 1.0

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, F64, I16, I32
-from thesisrecon.geometry.image_filters import cubic_weights
-from thesisrecon.geometry.zbuffer import run_in_strips
+from thesisrecon.geometry._image_filters import cubic_weights
+from thesisrecon.geometry._zbuffer import run_in_strips
 from thesisrecon.kernels import empty, kernel
 
 SLACK = 1e-7

@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.geometry.zbuffer import Raster, rasterize, run_in_strips, sample_texture
+from thesisrecon.geometry._zbuffer import Raster, rasterize, run_in_strips, sample_texture
 from thesisrecon.kernels import empty, kernel
 from thesisrecon.records import RenderedView, TexturedMesh
 

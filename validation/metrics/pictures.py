@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import U8
-from thesisrecon.views import image_similarity as likeness
+from thesisrecon.views import _image_similarity as likeness
 from validation.metrics.record import Metric
 
 BORDER_PX = 5

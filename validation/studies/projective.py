@@ -21,7 +21,7 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.config import ProjectiveReconstructor
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.numerics.partial_bundle import refine_points
+from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.numerics.projective_bundle import refine_projective_bundle
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.projective.factorization import Factorization, depths_from_fundamentals, factorize

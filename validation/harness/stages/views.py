@@ -14,7 +14,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
 from thesisrecon.surface._texture_blending import prepare_views
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.views.image_similarity import covered_pixels, match_exposure, psnr_db, ssim
+from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, each, row

@@ -157,15 +157,10 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """Refined calibrated camera.
+    """Refined pose and row of intrinsics, their covariance for noise of 1 px, and the residuals (M, 2).
 
-    Parameters
-    ----------
-    R, t, intrinsics : ndarray (3, 3), (3,), (6,) or (8,)
-        Pose, world-to-camera, and row of ``MetricCameras.intrinsics``.
-    covariance, residual_px : ndarray (6 + F, 6 + F), (M, 2)
-        For noise of 1 px: rotation vector (rad) and translation of x -> exp(w) x + d of the camera frame, F
-        free intrinsics, the focal length as log f; and projection minus observation.
+    The covariance (6 + F, 6 + F) is of rotation vector (rad) and translation of x -> exp(w) x + d in the
+    camera frame, and of the F free intrinsics, the focal length as log f.
     """
 
     R: F64
@@ -178,24 +173,11 @@ class PoseRefinement:
 def refine_points(
     P: F64, X: F64, view_index: I64, point_index: I64, xy: F64, *, loss_px: float = 1.0, iterations: int = 5
 ) -> F64:
-    """Refine each point with the cameras fixed: least sum of rho(|x - P X|^2), Huber's loss.
+    """Refine each point (N, 4) with the cameras fixed: least sum of rho(|x - P X|^2), Huber's loss.
 
     Damped Gauss-Newton in the tangent space of the whitened unit 4-vector. The cost of no point rises and no
-    point crosses the focal plane of a view that observes it.
-
-    Parameters
-    ----------
-    P, X : ndarray (V, 3, 4), (N, 4)
-        Cameras and starting points.
-    view_index, point_index, xy : ndarray (K,) of int, (K,) of int, (K, 2)
-        View, point and pixels of each observation.
-    loss_px, iterations : float, int
-        Turning point of Huber's loss, px, and steps per point.
-
-    Returns
-    -------
-    ndarray (N, 4)
-        Points of unchanged norms and signs; unchanged if zero, not finite or observed less than twice.
+    point crosses the focal plane of a view that observes it. Norms and signs stay, and points that are zero,
+    not finite or observed less than twice.
     """
     o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
@@ -205,20 +187,10 @@ def refine_points(
 
 
 def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
-    """Move each point to its least sum of squared reprojection errors (a local minimum), cameras fixed.
+    """Move each point to a minimum of its squared reprojection errors; points may cross focal planes.
 
     Works in a frame in which the cameras' rows are orthonormal and repeats until two steps bring no gain
-    above rounding; points may cross focal planes.
-
-    Parameters
-    ----------
-    P, X, view_index, point_index, xy
-        As in :func:`refine_points`.
-
-    Returns
-    -------
-    ndarray (N, 4)
-        Points as in :func:`refine_points`.
+    above rounding.
     """
     o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
@@ -294,22 +266,10 @@ def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
 
 
 def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> tuple[F64, F64]:
-    """Refine one projective camera with the points fixed: resection (section 6.4), 11 unknowns, Huber's loss.
+    """Refine one projective camera by fixed points (6.4); return P and the covariance (12, 12) for 1 px.
 
-    Too few points or points on one plane raise nothing: the covariance shows them.
-
-    Parameters
-    ----------
-    P, X, xy : ndarray (3, 4), (M, 4), (M, 2)
-        Start, homogeneous points and their pixels.
-    loss_px, iterations : float, int
-        Turning point of Huber's loss, px, and maximum number of linear solves.
-
-    Returns
-    -------
-    P, covariance : ndarray (3, 4), (12, 12)
-        Camera at the norm and sign of its start, and covariance of its row-major entries for noise of 1 px,
-        without a part along P (the scale); huge variances in undetermined directions.
+    P keeps the norm and sign of its start. The covariance of its row-major entries has no part along P (the
+    scale), and huge variances in undetermined directions, as for too few points or points on one plane.
     """
     size = float(np.linalg.norm(P))
     T, M = pixel_conditioning(xy), whitening_transform(X)
@@ -364,24 +324,7 @@ class _PoseProblem:
 def refine_pose(
     R: F64, t: F64, intrinsics: F64, X: F64, xy: F64, *, free: B8, loss_px: float = 1.0, iterations: int = 20
 ) -> PoseRefinement:
-    """Refine one pose and its free intrinsics with the points fixed, Huber's loss.
-
-    Parameters
-    ----------
-    R, t, intrinsics : ndarray (3, 3), (3,), (6,) or (8,)
-        Start: pose world-to-camera, and a row of ``MetricCameras.intrinsics``.
-    X, xy : ndarray (M, 3), (M, 2)
-        Points and their pixels.
-    free : ndarray (6,) or (8,) of bool
-        Intrinsics that move.
-    loss_px, iterations : float, int
-        Turning point of Huber's loss, px, and maximum number of linear solves.
-
-    Returns
-    -------
-    PoseRefinement
-        Pose with its covariance.
-    """
+    """Refine a pose and its ``free`` intrinsics, a row of ``MetricCameras``, with the points fixed."""
     columns = np.flatnonzero(free)
     R = np.ascontiguousarray(R)
     # With centred and scaled points the pose unknowns are well conditioned.

@@ -192,27 +192,6 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     pure translation is determined. Wrong matches as coherent as a surface (a whole facade shifted by one
     window) cannot be detected.
 
-    Parameters
-    ----------
-    fit : FundamentalFit
-        The estimate.
-    xy1, xy2 : array_like (N, 2)
-        All matches with their outliers, N >= 8, px.
-    rng : numpy.random.Generator
-        Source of the samples.
-
-    Returns
-    -------
-    DegeneracyReport
-        Whether F is determined, with the evidence and the reasons if not.
-
-    Raises
-    ------
-    ValueError
-        If the inlier flags do not fit the matches, or these are not finite (N, 2) arrays.
-    StageFailure
-        If there are too few or collinear matches.
-
     Examples
     --------
     >>> import numpy as np

@@ -34,17 +34,7 @@ NOT_IN_A_FILE = " (defined in a running program, not in a file)"
 
 
 def name_of(value: Any) -> str:
-    """Return the name of a function or class, or of the class of an object.
-
-    Parameters
-    ----------
-    value : object
-        Any value.
-
-    Returns
-    -------
-    str
-    """
+    """The name of a function or class, or of the class of an object."""
     if isinstance(value, FunctionAdapter):
         value = value.function
     return str(getattr(value, "__name__", None) or type(value).__name__)
@@ -106,18 +96,7 @@ class _Check:
 
 
 def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence[Any]) -> Matches:
-    """Check what an object from outside returned as matches: the kernels behind it check nothing.
-
-    Parameters
-    ----------
-    matching, found, pair, views : object, object, tuple of int, sequence of object
-        The matcher, what its ``match`` returned (``Matches``, or ``xy1, xy2[, score]``), the numbers of the
-        views, and the two prepared views.
-
-    Returns
-    -------
-    Matches
-    """
+    """Check what an object from outside returned as matches: the kernels behind it check nothing."""
     check = _Check(
         f"the method match of {type(matching).__name__}", f"Matches, or {FUNCTIONS['matching'][2]}"
     )
@@ -145,13 +124,7 @@ def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence
 
 @dataclass(frozen=True)
 class FunctionAdapter:
-    """A plain function as the method of a stage.
-
-    Parameters
-    ----------
-    function : callable
-        The function. It is called from several threads unless the run has ``threads=1``.
-    """
+    """A plain function as the method of a stage; several threads call it unless ``threads=1``."""
 
     # No setting in text, where the function names the adapter.
     function: Callable[..., Any] = field(metadata={"given": True})
@@ -164,10 +137,7 @@ class FunctionAdapter:
 
 @dataclass(frozen=True)
 class FunctionDetector(FunctionAdapter):
-    """Features by a function ``f(image) -> xy[, scale, response]`` of an array (H, W, 3) uint8.
-
-    Corners are ordered by response. They have no seeds: match them by a function or by ``StrengthOfMatch``.
-    """
+    """Features without seeds by a function ``f(image) -> xy[, scale, response]`` of an array (H, W, 3)."""
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
@@ -213,13 +183,7 @@ class FunctionPairs(FunctionAdapter):
 
 @dataclass(frozen=True)
 class FunctionView:
-    """An image with its features, as prepared for a matching function.
-
-    Parameters
-    ----------
-    rgb, features : ndarray (H, W, 3) uint8, Features
-        Pixels at working size, and the features of the stage before.
-    """
+    """Pixels at working size and features of an image, as prepared for a matching function."""
 
     rgb: U8
     features: Features
@@ -254,10 +218,7 @@ class FunctionMatcher(FunctionAdapter):
 
 @dataclass(frozen=True)
 class FunctionFundamental(FunctionAdapter):
-    """F by a function ``f(xy1, xy2) -> F, inliers`` of arrays (N, 2) px; a mask (N,) marks the inliers.
-
-    F is made singular. Noise and covariance are computed from the Sampson distances of the inliers.
-    """
+    """F, made singular, by a function ``f(xy1, xy2) -> F, inliers`` of arrays (N, 2) px and of a mask."""
 
     def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""
@@ -306,23 +267,7 @@ FUNCTIONS: Mapping[str, tuple[type[FunctionAdapter], tuple[str, ...], str]] = {
 
 
 def as_method(stage: str, value: Any, protocol: type[Any]) -> Any:
-    """Return a method of a stage: a function in its adapter, an object as it is.
-
-    Parameters
-    ----------
-    stage, value, protocol : str, object, type
-        Field of the config, what the user gave for it, and the ``Protocol`` that states its methods.
-
-    Returns
-    -------
-    object
-        An object with the methods of the protocol.
-
-    Raises
-    ------
-    UsageError
-        If a method is missing or cannot be called with the arguments of the stage.
-    """
+    """A method of a stage: a function in its adapter, an object whose methods take what they must."""
     needed = {name: member for name, member in vars(protocol).items() if isinstance(member, FunctionType)}
     needed = {name: member for name, member in needed.items() if not name.startswith("_")}
     takes = f"{stage} takes an object with the method{'s' * (len(needed) > 1)} {' and '.join(needed)}"
@@ -368,19 +313,7 @@ def _check_arguments(function: Callable[..., Any], fixed: Sequence[inspect.Param
 
 
 def text_of(value: Any) -> str:
-    """Return the text form of a method: ``file.py:name`` with the absolute path where it can be loaded again.
-
-    Parameters
-    ----------
-    value : object
-        A function in its adapter, or an object.
-
-    Returns
-    -------
-    str
-        File and name of a function or object at the top of a file, or of the class of a frozen dataclass;
-        else the name of the function with a remark, or of the class.
-    """
+    """``file.py:name`` with the absolute path of a method that can be loaded again, else its name."""
     is_function = isinstance(value, FunctionAdapter)
     made = value.function if is_function else value
     home = sys.modules.get(str(getattr(made, "__module__", "")))
@@ -406,38 +339,12 @@ def text_of(value: Any) -> str:
 
 
 def is_reference(kind: Any) -> bool:
-    """Whether a text names something in a file: ``file.py:name``.
-
-    Parameters
-    ----------
-    kind : object
-        Any value.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a text names something in a file: ``file.py:name``."""
     return isinstance(kind, str) and kind.rpartition(":")[0].endswith(".py")
 
 
 def load_reference(reference: str, where: str) -> Any:
-    """Load what ``file.py:name`` names; running the file defines it.
-
-    Parameters
-    ----------
-    reference, where : str
-        The text, and the setting that holds it.
-
-    Returns
-    -------
-    object
-        A function, class or object.
-
-    Raises
-    ------
-    UsageError
-        If there is no such file or name, or the file fails.
-    """
+    """Load what ``file.py:name`` names; running the file defines it."""
     file, _, name = reference.rpartition(":")
     path = Path(file).expanduser().resolve()
     if not path.is_file():

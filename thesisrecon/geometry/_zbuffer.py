@@ -126,19 +126,7 @@ def _interpolate(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> 
 
 @kernel
 def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
-    """Sample a texture bilinearly, clamped to its border.
-
-    Parameters
-    ----------
-    texture : ndarray (TH, TW, 3)
-        Texture, uint8 or float32.
-    uv : ndarray (H, W, 2) of float32
-        Texture coordinates of each pixel, px.
-    drawn : ndarray (H, W) of int
-        Pixels with values >= 0 are filled.
-    out : ndarray (H, W, 3) of float32
-        Output.
-    """
+    """Sample a texture bilinearly, clamped to its border, at ``uv`` (H, W, 2) where ``drawn`` >= 0."""
     height, width = texture.shape[:2]
     for y in range(uv.shape[0]):
         for x in range(uv.shape[1]):
@@ -159,31 +147,14 @@ def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
 
 @dataclass(frozen=True)
 class Raster:
-    """Visible faces of a mesh.
-
-    Parameters
-    ----------
-    depth, face, weights : ndarray (H, W), (H, W) and (H, W, 2)
-        Depth, inf for none; face of each pixel, -1 for none; barycentric coordinates of its corners 1 and 2.
-    """
+    """Visible faces (-1 for none), their depth (inf) and barycentric coordinates of corners 1 and 2."""
 
     depth: F32
     face: I64
     weights: F32
 
     def interpolate(self, values: F64 | F32, faces: I64 | None = None) -> F32:
-        """Interpolate values of mesh vertices, or of face corners, at each pixel.
-
-        Parameters
-        ----------
-        values, faces : ndarray (N, C) or (M, 3, C); ndarray (M, 3) of int, optional
-            Values of vertices with the vertices of each face, or values of the corners of all faces.
-
-        Returns
-        -------
-        ndarray (H, W, C) of float32
-            0 without a face.
-        """
+        """Values (H, W, C) of mesh vertices (N, C), or of face corners (M, 3, C), at each pixel; else 0."""
         if faces is None:
             faces, values = np.arange(3 * len(values)).reshape(-1, 3), values.reshape(-1, values.shape[2])
         out = np.zeros((*self.face.shape, values.shape[1]), dtype=np.float32)
@@ -196,19 +167,7 @@ class Raster:
 
 
 def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) -> Raster:
-    """Find the face seen at the centre of each pixel.
-
-    Parameters
-    ----------
-    vertices, faces, camera : ndarray (N, 3) and (M, 3) of int, Camera
-        Mesh, visible from both sides, and camera without distortion.
-    threads : int
-        Threads; each draws a strip of rows. The result does not depend on their number.
-
-    Returns
-    -------
-    Raster
-    """
+    """Find the face, seen from any side, at the centre of each pixel of a camera without distortion."""
     if not camera.is_pinhole:
         raise ValueError("Rendering needs a camera without distortion: undistort the image first")
     width, height = camera.size
@@ -218,19 +177,7 @@ def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) ->
 
 
 def rasterize_corners(corners: F64, near: float, shape: tuple[int, int], *, threads: int = 1) -> Raster:
-    """Find the face seen at the centre of each pixel from the image points of the face corners.
-
-    Parameters
-    ----------
-    corners, near : ndarray (M, 3, 3), float
-        Three image points K (R X + t) of each face, whose last entry is the depth; nearest depth drawn.
-    shape, threads : (int, int), int
-        Height and width, px; number of threads.
-
-    Returns
-    -------
-    Raster
-    """
+    """Find the face at the centre of each pixel from the image points K (R X + t) (M, 3, 3) of corners."""
     corners = np.ascontiguousarray(corners)
     depth = np.full(shape, np.inf, dtype=np.float32)
     face = np.full(shape, -1, dtype=np.int64)
@@ -240,15 +187,7 @@ def rasterize_corners(corners: F64, near: float, shape: tuple[int, int], *, thre
 
 
 def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
-    """Call a function for strips of rows in parallel.
-
-    Parameters
-    ----------
-    work : callable
-        Called with the first and last + 1 row of each strip.
-    height, threads : int
-        Number of rows, and of strips and threads.
-    """
+    """Call a function for strips (first row, last + 1) of rows in parallel."""
     edges = np.linspace(0, height, max(threads, 1) + 1).round().astype(int)
     strips = [(int(a), int(b)) for a, b in pairwise(edges)]
     if len(strips) == 1:

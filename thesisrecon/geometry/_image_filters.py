@@ -62,19 +62,7 @@ def _halve_image(image: F32) -> F32:
 
 @kernel(fastmath=FAST)
 def resample(image: F32, width: int, height: int) -> F32:
-    """Resize an image by bilinear interpolation; smooth it before if it shrinks.
-
-    Parameters
-    ----------
-    image : ndarray (H, W) of float32
-        Image.
-    width, height : int
-        New size, px.
-
-    Returns
-    -------
-    ndarray (height, width) of float32
-    """
+    """Resize an image (H, W) by bilinear interpolation; smooth it before if it shrinks."""
     scale_x, scale_y = image.shape[1] / width, image.shape[0] / height
     out = empty((height, width), np.float32)
     left = empty(width, np.int64)
@@ -99,17 +87,7 @@ def resample(image: F32, width: int, height: int) -> F32:
 
 
 def gaussian_taps(sigma_px: float) -> F32:
-    """Return samples of a Gaussian of sum 1 over three sigma to each side.
-
-    Parameters
-    ----------
-    sigma_px : float
-        Standard deviation, px.
-
-    Returns
-    -------
-    ndarray (2 r + 1,) of float32
-    """
+    """Samples (2 r + 1,) of a Gaussian of sum 1 over three sigma to each side."""
     radius = max(1, int(np.ceil(3.0 * sigma_px)))
     x = np.arange(-radius, radius + 1)
     taps = np.exp(-0.5 * (x / sigma_px) ** 2)
@@ -117,33 +95,12 @@ def gaussian_taps(sigma_px: float) -> F32:
 
 
 def smooth(image: F32, sigma_px: float) -> F32:
-    """Smooth an image with a Gaussian, the border pixels repeated.
-
-    Parameters
-    ----------
-    image, sigma_px : ndarray (H, W) of float32, float
-        Image and standard deviation, px.
-
-    Returns
-    -------
-    ndarray (H, W) of float32
-    """
+    """Smooth an image (H, W) with a Gaussian, the border pixels repeated."""
     return _convolve_separable(image, gaussian_taps(sigma_px))
 
 
 def halve(image: F32) -> F32:
-    """Reduce an image to half its size (rounded down), low-passed by (1, 3, 3, 1) / 8.
-
-    Parameters
-    ----------
-    image : ndarray (H, W) of float32
-        Image of at least 2 x 2 pixels.
-
-    Returns
-    -------
-    ndarray (H // 2, W // 2) of float32
-        x is mapped to (x + 0.5) / 2 - 0.5.
-    """
+    """Reduce an image to half its size (rounded down), low-passed by (1, 3, 3, 1) / 8."""
     if min(image.shape) < 2:
         raise ValueError(f"halve needs at least 2 x 2 pixels; got shape {image.shape}")
     return _halve_image(image)
@@ -151,19 +108,7 @@ def halve(image: F32) -> F32:
 
 @kernel
 def cubic_weights(fraction: float, weights: NDArray[Any]) -> None:
-    """Fill in the weights of four pixels for cubic convolution with a = -1/2.
-
-    Parameters
-    ----------
-    fraction : float
-        Position between the second and third pixel, in [0, 1].
-    weights : ndarray (>= 4,)
-        Output; the first four entries are overwritten.
-
-    References
-    ----------
-    Keys, "Cubic convolution interpolation for digital image processing", IEEE Trans. ASSP 29, 1981.
-    """
+    """Fill in four weights of cubic convolution with a = -1/2 (Keys, IEEE Trans. ASSP 29, 1981)."""
     weights[0] = ((-0.5 * fraction + 1.0) * fraction - 0.5) * fraction
     weights[1] = (1.5 * fraction - 2.5) * fraction * fraction + 1.0
     weights[2] = ((-1.5 * fraction + 2.0) * fraction + 0.5) * fraction
@@ -172,21 +117,7 @@ def cubic_weights(fraction: float, weights: NDArray[Any]) -> None:
 
 @kernel
 def weighted_median(values: F32, weights: F64, order: I64, half: float) -> float:
-    """Return the smallest value up to which the weights sum to ``half``.
-
-    Parameters
-    ----------
-    values, weights : ndarray (N,)
-        Values, float32, and their weights.
-    order : ndarray (M,) of int
-        Indices of the values in ascending order, M >= 1.
-    half : float
-        Half of the sum of the weights for the lower weighted median.
-
-    Returns
-    -------
-    float
-    """
+    """The smallest value, in ascending ``order``, up to which the weights sum to ``half``."""
     total = 0.0
     for k in order:
         total += weights[k]

@@ -41,35 +41,12 @@ def write_colmap_model(
     scales: F64,
     original_sizes: I64,
 ) -> int:
-    """Write a metric reconstruction as a binary COLMAP model in original pixels.
+    """Write a metric reconstruction as a binary COLMAP model in original pixels; return 0.
 
     It contains the registered views and the valid points with at least two inlier observations in them; view
     i is image i + 1 and point j is point j + 1. The error of a point is its mean distance in original pixels.
-
-    Parameters
-    ----------
-    folder : path
-        Created if necessary; the same reconstruction gives the same bytes.
-    reconstruction : Reconstruction
-        Metric, with K and distortion.
-    names : sequence of str
-        V file names.
-    colors : ndarray (N, 3) uint8
-        RGB of the points.
-    groups : ndarray (V,)
-        Views of one group share a camera if their intrinsics and sizes are equal.
-    scales, original_sizes : ndarray (V,) and (V, 2)
-        Original over working size, and (width, height) of the originals.
-
-    Returns
-    -------
-    int
-        Number of views whose K has skew, for which COLMAP has no camera: nothing is written then.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be written.
+    Views of one of the ``groups`` share a camera if their intrinsics and sizes are equal. COLMAP has no
+    camera with skew: then nothing is written, and the number of such views is returned.
     """
     r = reconstruction
     assert r.K is not None
@@ -96,16 +73,7 @@ def write_colmap_model(
 
 
 def write_sparse_model(folder: str | Path, model: SparseModel, *, pinhole: bool = False) -> None:
-    """Write a sparse model as a binary COLMAP model; views of equal intrinsics share a camera.
-
-    Parameters
-    ----------
-    folder, model : path, SparseModel
-        Views with K, size and known distortion, without skew; view i becomes image i + 1, and point j,
-        observed or not, point j + 1.
-    pinhole : bool
-        Use the camera model PINHOLE also for one focal length; no view has distortion.
-    """
+    """Write a sparse model, without skew, as a binary COLMAP model; ``pinhole`` uses PINHOLE throughout."""
     posed, distance = dict[int, _PosedImage](), np.zeros(len(model.xy))
     for i, view in enumerate(model.views):
         assert view.K is not None

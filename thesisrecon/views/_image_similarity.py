@@ -20,32 +20,12 @@ FLOOR_LUMINANCE, FLOOR_CONTRAST = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 
 
 def covered_pixels(rendered: RenderedView) -> B8:
-    """Return the pixels (H, W) whose eight neighbours are covered too; others blend with the background.
-
-    Parameters
-    ----------
-    rendered : RenderedView
-        A rendered view.
-
-    Returns
-    -------
-    ndarray (H, W) of bool
-    """
+    """The pixels (H, W) whose eight neighbours are covered too; others blend with the background."""
     return np.asarray(scipy.ndimage.binary_erosion(rendered.valid, np.ones((3, 3))))
 
 
 def match_exposure(real: U8, rendered: U8, compared: B8) -> U8:
-    """Match the exposure of a rendered image to a real one by one factor per channel (least squares).
-
-    Parameters
-    ----------
-    real, rendered, compared : ndarray
-        Images and the pixels to compare.
-
-    Returns
-    -------
-    ndarray (H, W, 3) of uint8
-    """
+    """Match the exposure of a rendered image to a real one by one factor per channel (least squares)."""
     _check(real, rendered, compared)
     a, b = real[compared].astype(np.float64), rendered[compared].astype(np.float64)
     factor = (a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1.0)
@@ -53,17 +33,7 @@ def match_exposure(real: U8, rendered: U8, compared: B8) -> U8:
 
 
 def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
-    """Return the peak signal-to-noise ratio of two images over all channels; infinite for equal images.
-
-    Parameters
-    ----------
-    real, rendered, compared : ndarray
-        Images and the pixels to compare.
-
-    Returns
-    -------
-    float
-    """
+    """Peak signal-to-noise ratio over all channels; infinite for equal images."""
     _check(real, rendered, compared)
     apart = (real.astype(np.float64) - rendered)[compared]
     mean_square = float(np.mean(apart**2))
@@ -71,19 +41,7 @@ def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
 
 
 def ssim(real: U8, rendered: U8, compared: B8) -> float:
-    """Return the mean structural similarity of two images (Wang, Bovik, Sheikh and Simoncelli 2004).
-
-    Luma in Gaussian windows of 1.5 px with the constants 0.01 and 0.03. Windows use compared pixels only.
-
-    Parameters
-    ----------
-    real, rendered, compared : ndarray
-        Images and the pixels to compare.
-
-    Returns
-    -------
-    float
-    """
+    """Mean structural similarity of the luma (Wang, Bovik, Sheikh and Simoncelli 2004)."""
     _check(real, rendered, compared)
     return float(np.mean(_ssim_map(real, rendered, compared)[compared]))
 
