@@ -387,6 +387,7 @@ class MetricResult:
     trusted: bool  #: whether the self-check passed
     failed_checks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  #: about a trusted result, such as focals that rest on other cameras
+    limitations: tuple[str, ...] = ()  #: where images differ from the simplest camera model
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def doubts_of(model, scene):
         for g in model.cameras.group
     ]
     calibration = SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
-    return self_check(model, calibration, intervals, sigmas=SIGMAS)
+    return self_check(model, calibration, intervals, sigmas=SIGMAS)[:2]
 
 
 def setting(**known):
@@ -244,3 +244,18 @@ def test_crops_are_detected_under_any_prior(options):
     assert "principal point" in failed_checks[0] or "shared focal length" in failed_checks[0]
     right = settled(scene, **options)
     assert check_shared_cameras(*right).failed_checks == ()
+
+
+def test_a_blurred_image_is_named_and_trusted():
+    scene = make_scene(sigma_px=0.3, points=500, seed=3)
+    blurred = scene.tracks.view_index == 4
+    noise = np.random.default_rng(0).normal(0.0, 1.5, scene.tracks.xy.shape)
+    scene = replace(scene, tracks=replace(scene.tracks, xy=scene.tracks.xy + blurred[:, None] * noise))
+    model = replace(true_model(scene, prior_for(projective_reconstruction(scene))), sigma_px=1.0)
+    model = retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
+    focal = {"focal_px": IntrinsicInterval(1500.0, 1.0, "")}
+    calibration = SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
+    _, failed_checks, limitations = self_check(model, calibration, [focal] * 8, sigmas=SIGMAS)
+    assert failed_checks == []
+    assert len(limitations) == 1
+    assert limitations[0].startswith("Image #4: reprojection noise")

@@ -50,6 +50,8 @@ def test_the_assessment_is_honest():
     data = made_up_run(points=100)
     assert data.metric is not None
     assert _assessment.assess(data).word == "Trusted, but incomplete"
+    phone = replace(data.metric, limitations=("image #1 is blurred",))
+    assert _assessment.assess(replace(data, metric=phone)).reasons == ("Image #1 is blurred.",)
     doubt = replace(data.metric, trusted=False, failed_checks=("pure rotation",))
     assessment = _assessment.assess(replace(data, metric=doubt))
     assert (assessment.level, assessment.reasons) == ("doubt", ("Pure rotation.",))

@@ -177,6 +177,7 @@ def summary_text(summary: Mapping[str, Any], out: Path) -> str:
     if summary.get("model"):
         lines.append(f"model with {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
     lines += [f"not registered: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
+    lines += [f"camera model: {text}" for text in summary.get("limitations", ())]
     lines += [f"warning: {warning}" for warning in summary["warnings"]]
     if summary["failure"]:
         lines.append(f"failed: {summary['failure']}")

@@ -35,8 +35,9 @@ _MAX_PRINCIPAL_SHIFT = 0.15
 _MAX_FOCAL_CHANGE = 0.25
 MIN_INLIER_RATIO = 0.5
 """Inlier ratio of a view, wrong matches included."""
-MIN_CONFIRMED_RATIO = 0.7
-"""The same for points that others determine: correct cameras reach 0.9, wrong ones stay below 0.5."""
+MIN_CONFIRMED_RATIO = 0.6
+"""The same for points that others determine: correct cameras reach 0.9 (of blurred phone
+images 0.63), wrong ones stay below 0.5."""
 MAX_BEHIND = 0.05
 MAX_NOISE_RATIO = 3.0
 MAX_OWN_FOCAL = 0.03
@@ -173,9 +174,10 @@ def self_check(
     intervals: Sequence[Mapping[str, IntrinsicInterval]],
     *,
     sigmas: float,
-) -> tuple[dict[str, float], list[str]]:
-    """Check a metric model: measured numbers by name, and a sentence for each failed check (none: trusted).
+) -> tuple[dict[str, float], list[str], list[str]]:
+    """Check a metric model: numbers by name, sentences for failed checks (none: trusted) and for limitations.
 
+    A limitation is what the camera model does not describe although the cameras are right.
     ``intervals`` are the intrinsics of each view as in ``MetricResult``; ``sigmas`` is the gate of inliers.
     """
     views = np.flatnonzero(model.registered).tolist()
@@ -209,11 +211,15 @@ def self_check(
     for name, (values, edge) in worst.items():
         check[name] = float(edge(values)) if np.isfinite(values).any() else np.nan
     failed = [] if calibration.identifiable else list(calibration.reasons)
-    return check, [*failed, *_failed_views(each, model), *_failed_model(check)]
+    failed_views, limitations = _failed_views(each, model)
+    return check, [*failed, *failed_views, *_failed_model(check)], limitations
 
 
-def _failed_views(views: PerViewChecks, model: MetricEstimate) -> list[str]:
-    """A sentence for the views that fail a check; each view is reported once, for its most severe failure."""
+def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str], list[str]]:
+    """A sentence for the views that fail a check, and one for those that are only noisy.
+
+    Each view is reported once, for its most severe failure.
+    """
     left = model.registered.copy()
 
     def take(bad: B8) -> I64:
@@ -242,10 +248,15 @@ def _failed_views(views: PerViewChecks, model: MetricEstimate) -> list[str]:
             f"{'longer' if off > 0.0 else 'shorter'} than the model's: it is from another camera or zoomed, "
             "or the model is deformed"
         )
-    if len(wrong := take(views.noise_ratio > MAX_NOISE_RATIO)):
-        ratio = views.noise_ratio[wrong].max()
-        failed.append(f"{_named(wrong)}: reprojection noise is {ratio:.1f} times that of the other images")
-    return failed
+    limitations = []
+    if len(noisy := take(views.noise_ratio > MAX_NOISE_RATIO)):
+        # Blur and moving scenes are noise too; a wrong camera loses matches or asks for another focal.
+        ratio = views.noise_ratio[noisy].max()
+        limitations.append(
+            f"{_named(noisy)}: reprojection noise is {ratio:.1f} times that of the other images, as with "
+            "blur, motion or a rolling shutter"
+        )
+    return failed, limitations
 
 
 def _named(views: I64) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, WIDTH, MetricEstimate
@@ -93,18 +93,24 @@ def _adjust_per_view(
 
 @dataclass(frozen=True)
 class SharedCameraTest:
-    """A sentence for each set of views that contradicts a shared value, and for each that cannot be tested.
+    """Contradictions of shared values, with advice, and sentences on sets of views that cannot be tested.
 
     ``focal_std`` (V,) is the relative standard deviation of focal lengths whose sharing cannot be tested, NaN
-    elsewhere.
+    elsewhere; ``contradicted`` (8,) are the intrinsics that differ from view to view.
     """
 
-    failed_checks: tuple[str, ...]
+    found: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
     focal_std: F64
+    contradicted: B8
+
+    @property
+    def failed_checks(self) -> tuple[str, ...]:
+        """A sentence for each contradiction."""
+        return tuple(f"{fact}. {advice}" for fact, advice in self.found)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _SharedGroup:
     """Registered views (``places`` in their list) that share a value, or whose value is ``known``."""
 
@@ -120,16 +126,18 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
     """Test shared focals and principal points of three views or more by the decrease in cost (chi-square)."""
     views = np.flatnonzero(model.registered)
     focal_std = np.full(len(model.registered), np.nan)
+    contradicted = np.zeros(WIDTH, dtype=bool)
     focals, centres = _sets(model, adjustment, views, FOCAL), _sets(model, adjustment, views, CENTRE[0])
     if not focals and not centres:
-        return SharedCameraTest((), (), focal_std)
+        return SharedCameraTest((), (), focal_std, contradicted)
     freed: tuple[int, ...] = (FOCAL,) if focals else ()
-    failed_checks, warnings = list[str](), list[str]()
+    found, warnings = list[tuple[str, str]](), list[str]()
     before = _adjust_per_view(model, adjustment, ())
     if focals:
         alone = _adjust_per_view(model, adjustment, freed)
         apart = [s for s in _contradicted(before, alone, focals, 1) if _focals_apart(alone, s)]
-        failed_checks += [_focals_differ(views, alone, s) for s in apart]
+        found += [_focals_differ(views, alone, s) for s in apart]
+        contradicted[FOCAL] = bool(apart)
         for s in [s for s in focals if s not in apart and _focal_std(alone, s).max() > MAX_OWN_FOCAL_STD]:
             focal_std[views[s.places]] = _std_of_a_kind(model, adjustment, s)
             warnings.append(_untestable(float(_focal_std(alone, s).max())))
@@ -141,8 +149,9 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
         for s in _contradicted(before, both, centres, 2):
             off = _centres_off(model, adjustment, views, both, s)
             if np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
-                failed_checks.append(_centres_differ(s, off))
-    return SharedCameraTest(tuple(failed_checks), tuple(warnings), focal_std)
+                found.append(_centres_differ(s, off))
+                contradicted[list(CENTRE)] |= not s.known
+    return SharedCameraTest(tuple(found), tuple(warnings), focal_std, contradicted)
 
 
 def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, column: int) -> list[_SharedGroup]:
@@ -198,28 +207,29 @@ def _centres_off(
     return np.asarray(off if s.known else off - np.median(off, axis=0))
 
 
-def _focals_differ(views: I64, alone: MetricBundleResult, s: _SharedGroup) -> str:
+def _focals_differ(views: I64, alone: MetricBundleResult, s: _SharedGroup) -> tuple[str, str]:
     focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s)
     low, high = int(focal.argmin()), int(focal.argmax())
     return (
         f"The images contradict a shared focal length: that of image #{views[s.places[high]]} is "
         f"{focal[high] / focal[low] - 1.0:.1%} longer than that of image #{views[s.places[low]]} (1 sigma: "
-        f"{max(std[low], std[high]):.1%}). Use one camera per image (cameras = per-image), or leave the "
-        "zoomed images out"
+        f"{max(std[low], std[high]):.1%})",
+        "Use one camera per image (cameras = per-image), or leave the zoomed images out",
     )
 
 
-def _centres_differ(s: _SharedGroup, off: F64) -> str:
+def _centres_differ(s: _SharedGroup, off: F64) -> tuple[str, str]:
     if s.known:
         return (
             "The images contradict the given principal point: those of "
-            f"{len(s.places)} views are up to {np.abs(off).max():.1%} of the long side away. Leave it out, "
-            "or use one camera per image (cameras = per-image) if the images were cropped individually"
+            f"{len(s.places)} views are up to {np.abs(off).max():.1%} of the long side away",
+            "Leave it out, or use one camera per image (cameras = per-image) if the images were cropped "
+            "individually",
         )
     return (
         f"The images contradict a shared principal point: those of {len(s.places)} views are "
-        f"up to {np.ptp(off, axis=0).max():.1%} of the long side apart, as in individually cropped images. "
-        "Use one camera per image (cameras = per-image)"
+        f"up to {np.ptp(off, axis=0).max():.1%} of the long side apart",
+        "Use one camera per image (cameras = per-image) if the images were cropped individually",
     )
 
 

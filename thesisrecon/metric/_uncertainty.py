@@ -45,6 +45,7 @@ MIN_SPREAD = 1e-6
 MIN_SPREAD_SIGMAS = 0.3
 """Lower bound of tau in units of the noise: a few values can agree by chance."""
 UNVERIFIED_SHARING = "shared focal length that the images cannot verify: small zoom differences allowed for"
+CAMERA_MODEL = "bundle adjustment; the interval contains the difference to a richer camera model"
 NORMAL_95 = 1.959964
 _COLUMNS = {
     "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
@@ -260,6 +261,20 @@ def widen_unverified_focals(
         focal = own.get("focal_px")
         if focal is not None and np.isfinite(rel) and rel * focal.value > focal.std:
             own = {**own, "focal_px": IntrinsicInterval(focal.value, rel * focal.value, UNVERIFIED_SHARING)}
+        answer.append(own)
+    return tuple(answer)
+
+
+def widen_by_camera_model(
+    intervals: Sequence[Mapping[str, IntrinsicInterval]], difference: float
+) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+    """Add the relative ``difference`` to a richer camera model to the std of the focal lengths."""
+    answer: list[Mapping[str, IntrinsicInterval]] = []
+    for own in intervals:
+        focal = own.get("focal_px")
+        if focal is not None and focal.std > 0.0:
+            std = float(np.hypot(focal.std, difference * focal.value))
+            own = {**own, "focal_px": IntrinsicInterval(focal.value, std, CAMERA_MODEL)}
         answer.append(own)
     return tuple(answer)
 

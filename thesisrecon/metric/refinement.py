@@ -14,6 +14,14 @@ import numpy as np
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import FOCAL_AND_CENTRE, BundleAdjustment, with_initial_gate
+from thesisrecon.metric._camera_model import (
+    MAX_REMAINING,
+    camera_differences,
+    differences_of_images,
+    remaining_cost,
+    richer_models,
+    with_own_values,
+)
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
@@ -29,6 +37,7 @@ from thesisrecon.metric._model import (
 )
 from thesisrecon.metric._resection import register_missing_cameras
 from thesisrecon.metric._shared_camera import (
+    SharedCameraTest,
     check_shared_cameras,
     contradicted_focal_priors,
     inconsistent_principal_point,
@@ -40,6 +49,7 @@ from thesisrecon.metric._uncertainty import (
     focal_shrinkage,
     intrinsic_intervals,
     per_camera_estimates,
+    widen_by_camera_model,
     widen_unverified_focals,
 )
 from thesisrecon.numerics._noise import noise_from_distances
@@ -61,6 +71,10 @@ UNDETERMINED_REL = 0.1
 """Focal lengths that their own matches determine worse than this (95 %, relative) are reported."""
 LAST_ITERATIONS = 25
 """Zoomed images lie in a long valley of the cost: the last adjustment must reach its bottom."""
+NOT_EXPLAINED = (
+    "Values of each image do not predict other observations better, so the shared ones stay; the interval of "
+    "the focal length contains the difference"
+)
 NO_COMMON_POINTS = "shares no points with the model"
 
 
@@ -89,19 +103,22 @@ class MetricRefinement:
             "" if model.registered[v] else rejected.get(v, reconstruction.reasons[v] or NO_COMMON_POINTS)
             for v in range(len(model.registered))
         )
-        model, adjustment, own, scatter = _finish(model, adjustment)
-        model = select_inliers(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
-        sharing = check_shared_cameras(model, adjustment)
+        final, sharing, enlarged, difference = _with_camera_model(_finish(model, adjustment))
+        model, adjustment, own, scatter = final
         shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
-        check, failed_checks = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
+        if difference > 0.0:
+            intervals = widen_by_camera_model(intervals, difference)
+        check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
         views = np.flatnonzero(model.registered).tolist()
         warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
-        final = _as_reconstruction(model, reasons)
-        return MetricResult(final, intervals, check, not failed_checks, tuple(failed_checks), warnings)
+        return MetricResult(
+            _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
+            warnings, (*enlarged, *limitations),
+        )  # fmt: skip
 
 
 def _start(
@@ -122,9 +139,36 @@ def _start(
     return select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
 
 
-def _finish(
-    model: MetricEstimate, adjustment: BundleAdjustment
-) -> tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]:
+_Finished = tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]
+
+
+def _with_camera_model(
+    simple: _Finished,
+) -> tuple[_Finished, SharedCameraTest, tuple[str, ...], float]:
+    """Settle intrinsics that the images contradict.
+
+    They become values of each image if that predicts held-out observations far better. Contradictions that
+    no richer model explains are limitations if such a model hardly changes the cameras: the relative
+    difference of the focal lengths then widens their intervals.
+    """
+    chosen, sharing = simple, check_shared_cameras(*simple[:2])
+    limitations, difference = tuple[str, ...](), 0.0
+    for columns in richer_models(sharing.contradicted, simple[1].prior):
+        if not sharing.failed_checks:
+            break
+        rich = _finish(*with_own_values(*simple[:2], columns))
+        if remaining_cost(chosen[:2], rich[:2]) < MAX_REMAINING:
+            chosen, sharing = rich, check_shared_cameras(*rich[:2])
+            limitations, difference = (differences_of_images(rich[0], columns),), 0.0
+        elif (change := camera_differences(chosen[0], rich[0])).harmless:
+            difference = max(difference, change.focal)
+    if sharing.failed_checks and difference > 0.0:
+        limitations += tuple(f"{fact}. {NOT_EXPLAINED}" for fact, _ in sharing.found)
+        sharing = replace(sharing, found=())
+    return chosen, sharing, limitations, difference
+
+
+def _finish(model: MetricEstimate, adjustment: BundleAdjustment) -> _Finished:
     """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
     model = _iterate_inliers(model, adjustment)
     scatter = adjustment.scatter(model)
@@ -132,13 +176,17 @@ def _finish(
     assert model.cameras.shared is not None
     hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
     if hierarchical is None:
-        return model, adjustment, own, scatter
+        return _selected(model), adjustment, own, scatter
     inflation = float(np.sqrt(max(scatter.median_ratio, 1.0)))
     model, adjustment = apply_hierarchical_prior(
         model, replace(adjustment, inflation=inflation), hierarchical
     )
     model = _iterate_inliers(model, adjustment)
-    return model, adjustment, own, adjustment.scatter(model)
+    return _selected(model), adjustment, own, adjustment.scatter(model)
+
+
+def _selected(model: MetricEstimate) -> MetricEstimate:
+    return select_inliers(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
 
 
 def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:

@@ -53,7 +53,7 @@ class BlockScatter:
         return float(np.median(known)) if len(known) else 1.0
 
 
-def _point_blocks(X: F64, used: B8) -> I64:
+def point_blocks(X: F64, used: B8) -> I64:
     """Divide points into blocks of neighbours by median splits along the longest axis; -1 if not used."""
     block = np.where(used, 0, -1)
     count = 1
@@ -127,7 +127,7 @@ def block_scatter(
     C = _covariance(S, frame, views)
     poses = np.arange(0, first, max(first // _MAX_POSES, 1))
     tested = np.concatenate([poses, np.arange(first, len(C))])
-    block = _point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
+    block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
     ratio = curvature * _block_ratio(system, C[tested], C, block)
     alone = curvature * _point_ratio(system, C[tested])

@@ -71,8 +71,12 @@ def with_image_names(result: RunResult) -> RunResult:
 
     metric, calibration = result.metric, result.calibration
     if metric is not None:
-        failed = named(metric.failed_checks)
-        metric = replace(metric, failed_checks=failed, warnings=named(metric.warnings))
+        metric = replace(
+            metric,
+            failed_checks=named(metric.failed_checks),
+            warnings=named(metric.warnings),
+            limitations=named(metric.limitations),
+        )
     if calibration is not None:
         calibration = replace(calibration, reasons=named(calibration.reasons))
         if (report := calibration.identifiability) is not None:

@@ -62,9 +62,12 @@ def assess(data: ReportData) -> Assessment:
     if not data.metric.trusted:
         reasons = tuple(_sentence(check) for check in data.metric.failed_checks or ("the self-check failed",))
         return Assessment("doubt", "Not trusted", f"{found} Inspect the result before you use it.", reasons)
-    if registered < total:
-        return Assessment("good", "Trusted, but incomplete", f"{found} They passed the self-check.")
-    return Assessment("good", "Trusted", f"{found} The result passed the self-check.")
+    passed = f"{found} The result passed the self-check."
+    word = "Trusted, but incomplete" if registered < total else "Trusted"
+    if data.metric.limitations:
+        passed += " The images differ from the camera model; the stated intervals allow for it."
+        word = "Trusted, simple camera model" if registered == total else word
+    return Assessment("good", word, passed, tuple(_sentence(text) for text in data.metric.limitations))
 
 
 def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:

@@ -141,6 +141,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "reprojection_median_working_px": _median(np.concatenate([np.zeros(0), *working])),
         "trusted": result.metric.trusted if result.metric is not None else None,
         "failed_checks": list(result.metric.failed_checks) if result.metric is not None else [],
+        "limitations": list(result.metric.limitations) if result.metric is not None else [],
         "identifiable": result.calibration.identifiable if result.calibration is not None else None,
         "motion": _motion(result),
         "self_check": dict(result.metric.self_check) if result.metric is not None else {},

@@ -1,0 +1,141 @@
+"""A richer camera model where the images contradict the shared one.
+
+Optical stabilisation and crops move the principal point, focus and zoom change the focal length. Shared
+values that the images contradict become values of each image, and the richer model is kept if it predicts
+observations far better that neither model was adjusted to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows, reproject_observations
+from thesisrecon.numerics.block_scatter import point_blocks
+
+FOLDS = 5
+"""One of so many blocks of the scene is held out in each view."""
+MIN_HELD_OUT = 30
+MAX_REMAINING = 0.25
+"""Share of the cost of held-out observations that a richer model may leave to be adopted."""
+ITERATIONS = 25
+MAX_CHANGE = 0.05
+"""Relative change of centres and focal lengths up to which a model is right although it is too simple."""
+
+RICHER: tuple[tuple[int, ...], ...] = (CENTRE, (FOCAL,), (FOCAL, *CENTRE))
+"""Columns of intrinsics with values of each image, from the simplest model on."""
+
+
+def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[int, ...]]:
+    """Columns to free: every model that has all ``contradicted`` (8,) columns; known ones stay known."""
+    if not contradicted.any():
+        return
+    unknown = np.flatnonzero((prior.std > 0.0).all(axis=0))
+    for columns in RICHER:
+        if np.isin(np.flatnonzero(contradicted), columns).all():
+            yield tuple(column for column in columns if column in unknown)
+
+
+def with_own_values(
+    model: MetricEstimate, adjustment: BundleAdjustment, columns: tuple[int, ...]
+) -> tuple[MetricEstimate, BundleAdjustment]:
+    """The model with values of each image in some columns of the intrinsics, without hierarchical prior."""
+    shared = adjustment.prior.shared.copy()
+    shared[:, columns] = np.arange(len(shared))[:, None]
+    prior = replace(adjustment.prior, shared=shared)
+    group, table = camera_rows(prior)
+    first = np.unique(group, return_index=True)[1]
+    intrinsics = model.cameras.intrinsics[model.cameras.group[first]]
+    cameras = replace(model.cameras, intrinsics=intrinsics, group=group, shared=table)
+    return replace(model, cameras=cameras), replace(adjustment, prior=prior, hierarchical=None, inflation=1.0)
+
+
+def held_out_observations(model: MetricEstimate) -> I64:
+    """Inliers of every ``FOLDS``-th block of neighbouring points, other blocks in each view.
+
+    Correlated errors would carry over from the nearest neighbours; points keep two or more observations.
+    """
+    t = model.tracks
+    count = np.bincount(t.point_index[model.inlier], minlength=t.n_points)
+    block = point_blocks(model.X, count > 0)
+    held = model.inlier & ((block[t.point_index] + t.view_index) % FOLDS == 0)
+    left = count - np.bincount(t.point_index[held], minlength=t.n_points)
+    return np.flatnonzero(held & (left >= 2)[t.point_index])
+
+
+def remaining_cost(
+    simple: tuple[MetricEstimate, BundleAdjustment], rich: tuple[MetricEstimate, BundleAdjustment]
+) -> float:
+    """Cost of held-out observations, richer over simple model; 1 if there are few."""
+    model = simple[0]
+    held = held_out_observations(replace(model, inlier=model.inlier & rich[0].inlier))
+    if len(held) < MIN_HELD_OUT:
+        return 1.0
+    return float(_held_out_cost(*rich, held, model).mean() / _held_out_cost(*simple, held, model).mean())
+
+
+def _held_out_cost(
+    model: MetricEstimate, adjustment: BundleAdjustment, held: I64, unit: MetricEstimate
+) -> F64:
+    """Huber's loss of held-out observations, in the noise and the loss of the model ``unit``."""
+    inlier = model.inlier.copy()
+    inlier[held] = False
+    model = adjustment.run(replace(model, inlier=inlier), iterations=ITERATIONS)[0]
+    t = model.tracks
+    xy, _ = reproject_observations(model, t.view_index[held], t.point_index[held])
+    size = np.linalg.norm(np.nan_to_num(xy, nan=np.inf) - t.xy[held], axis=1) / unit.sigma_px
+    size, loss = np.minimum(size, 100.0), unit.loss_sigmas
+    return np.asarray(np.where(size < loss, 0.5 * size**2, loss * (size - 0.5 * loss)))
+
+
+def differences_of_images(model: MetricEstimate, columns: tuple[int, ...]) -> str:
+    """A sentence on the richer model and how much its values differ between images."""
+    views = np.flatnonzero(model.registered)
+    rows = model.cameras.intrinsics[model.cameras.group[views]]
+    longest = model.sizes[views].max(axis=1, keepdims=True)
+    centre = (rows[:, CENTRE] - (model.sizes[views] - 1) / 2) / longest
+    apart = f"principal points up to {np.ptp(centre, axis=0).max():.1%} of the long side apart"
+    if FOCAL not in columns:
+        return (
+            f"Each image has its own principal point: the images contradict a shared one ({apart}, as with "
+            "optical stabilisation or images cropped one by one)"
+        )
+    focal = rows[:, FOCAL] / longest[:, 0]
+    return (
+        f"Each image has its own intrinsics: the images contradict shared ones (focal lengths up to "
+        f"{focal.max() / focal.min() - 1.0:.1%} and {apart}, as with focus, zoom or several cameras)"
+    )
+
+
+@dataclass(frozen=True)
+class CameraDifferences:
+    """How much two camera models change the cameras.
+
+    The largest one of the ``centre``, relative to the RMS radius of the camera path, and of the ``focal``,
+    relative.
+    """
+
+    centre: float
+    focal: float
+
+    @property
+    def harmless(self) -> bool:
+        """Whether the cameras hardly depend on the camera model."""
+        return max(self.centre, self.focal) < MAX_CHANGE
+
+
+def camera_differences(a: MetricEstimate, b: MetricEstimate) -> CameraDifferences:
+    """Differences between the cameras of two estimates after a similarity alignment of their centres."""
+    v = np.flatnonzero(a.registered & b.registered)
+    A, B = (-np.einsum("vba,vb->va", m.cameras.R[v], m.cameras.t[v]) for m in (a, b))
+    move = estimate_similarity(B, A)
+    off = np.linalg.norm(A - move.apply(B), axis=1)
+    radius = np.sqrt(np.mean(np.sum((A - A.mean(axis=0)) ** 2, axis=1)))
+    f, g = (m.cameras.intrinsics[m.cameras.group[v], FOCAL] for m in (a, b))
+    return CameraDifferences(float(off.max() / radius), float(np.abs(np.log(g / f)).max()))
