@@ -103,7 +103,7 @@ class MetricRefinement:
             "" if model.registered[v] else rejected.get(v, reconstruction.reasons[v] or NO_COMMON_POINTS)
             for v in range(len(model.registered))
         )
-        final, sharing, enlarged, difference = _with_camera_model(_finish(model, adjustment))
+        final, sharing, enlarged, difference = settle_camera_model(finish_metric(model, adjustment))
         model, adjustment, own, scatter = final
         shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
@@ -142,7 +142,7 @@ def _start(
 _Finished = tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]
 
 
-def _with_camera_model(
+def settle_camera_model(
     simple: _Finished,
 ) -> tuple[_Finished, SharedCameraTest, tuple[str, ...], float]:
     """Settle intrinsics that the images contradict.
@@ -156,7 +156,7 @@ def _with_camera_model(
     for columns in richer_models(sharing.contradicted, simple[1].prior):
         if not sharing.failed_checks:
             break
-        rich = _finish(*with_own_values(*simple[:2], columns))
+        rich = finish_metric(*with_own_values(*simple[:2], columns))
         if remaining_cost(chosen[:2], rich[:2]) < MAX_REMAINING:
             chosen, sharing = rich, check_shared_cameras(*rich[:2])
             limitations, difference = (differences_of_images(rich[0], columns),), 0.0
@@ -168,7 +168,7 @@ def _with_camera_model(
     return chosen, sharing, limitations, difference
 
 
-def _finish(model: MetricEstimate, adjustment: BundleAdjustment) -> _Finished:
+def finish_metric(model: MetricEstimate, adjustment: BundleAdjustment) -> _Finished:
     """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
     model = _iterate_inliers(model, adjustment)
     scatter = adjustment.scatter(model)

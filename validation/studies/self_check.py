@@ -22,7 +22,8 @@ from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
-from thesisrecon.metric._shared_camera import check_shared_cameras, contradicted_focal_priors
+from thesisrecon.metric._shared_camera import contradicted_focal_priors
+from thesisrecon.metric.refinement import finish_metric, settle_camera_model
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 from thesisrecon.results import RunResult
 from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
@@ -72,17 +73,13 @@ def is_wrong(model: MetricEstimate, right: MetricEstimate) -> bool:
 
 
 def is_doubted(model: MetricEstimate, calibration: SelfCalibration, adjustment: BundleAdjustment) -> bool:
-    """Return whether the self-check doubts a model with narrow intervals."""
+    """Return whether the self-check doubts a model with narrow intervals, sharing aside."""
     said = [
         {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 0.0, "")}
         for g in model.cameras.group
     ]
     failed_checks = self_check(model, calibration, said, sigmas=LATE)[1]
-    return bool(
-        failed_checks
-        or contradicted_focal_priors(model, adjustment)
-        or check_shared_cameras(model, adjustment).failed_checks
-    )
+    return bool(failed_checks or contradicted_focal_priors(model, adjustment))
 
 
 def judge(
@@ -91,7 +88,12 @@ def judge(
     settled = settle(model, adjustment)
     if settled is None:
         return None
-    return Outcome(is_wrong(settled, right), is_doubted(settled, calibration, adjustment))
+    try:
+        (model, adjustment, *_), sharing, *_ = settle_camera_model(finish_metric(settled, adjustment))
+    except StageFailure:
+        return None
+    doubted = bool(sharing.failed_checks) or is_doubted(model, calibration, adjustment)
+    return Outcome(is_wrong(model, right), doubted)
 
 
 def spoiled_outcomes(
