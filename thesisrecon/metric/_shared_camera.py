@@ -163,7 +163,7 @@ def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, colum
     sets = [_SharedGroup(np.flatnonzero((number == k) & ~known)) for k in np.unique(number)]
     if column != FOCAL:
         sets.append(_SharedGroup(np.flatnonzero(known), known=True))
-    return [s for s in sets if len(s.places) >= 3]
+    return [s for s in sets if len(s.places) >= 2]
 
 
 def _contradicted(
