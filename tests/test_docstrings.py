@@ -48,16 +48,17 @@ def test_the_examples_in_docstrings_run():
     names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in paths}
     exported = [getattr(thesisrecon, name) for name in thesisrecon.__all__ if name != "__version__"]
     names |= {e.__module__ for e in exported}
-    # Examples of chapter 7 continue that of self_calibrate.
-    projective = {}
-    for example in doctest.DocTestParser().get_examples(thesisrecon.self_calibrate.__doc__):
-        exec(example.source, projective)
-    projective = {"projective": projective["projective"]}
+    # Examples of chapter 7 continue that of self_calibrate, and others that of reconstruct_from_matches.
+    shared = {}
+    for function in (thesisrecon.self_calibrate, thesisrecon.reconstruct_from_matches):
+        for example in doctest.DocTestParser().get_examples(function.__doc__):
+            exec(example.source, shared)
+    shared = {name: shared[name] for name in ("projective", "keypoints", "result")}
     finder, tried, output = doctest.DocTestFinder(), 0, io.StringIO()
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     with redirect_stdout(output):
         for name in sorted(names):
-            for example in finder.find(importlib.import_module(name), name, extraglobs=projective):
+            for example in finder.find(importlib.import_module(name), name, extraglobs=shared):
                 tried += len(example.examples)
                 runner.run(example)
     assert runner.failures == 0, output.getvalue()

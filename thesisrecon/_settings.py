@@ -7,6 +7,7 @@ or dataclasses. ``None`` is written as the word ``none``, since TOML has no null
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import re
 import tomllib
@@ -21,7 +22,7 @@ import numpy as np
 from thesisrecon._plug_ins import NOT_IN_A_FILE, is_reference, load_reference, text_of
 from thesisrecon.config import KINDS, PRESETS, PipelineConfig
 from thesisrecon.config import preset as _preset
-from thesisrecon.errors import UsageError, in_words, unknown_setting, unknown_word
+from thesisrecon.errors import UsageError, in_words, unknown_word
 from thesisrecon.io._files import read_pairs, read_text
 
 T = TypeVar("T")
@@ -195,7 +196,7 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
     names = _settings_of(variant)
     for key in fields:
         if key not in names:
-            raise unknown_setting(stage, key, [_KIND, *names])
+            raise _unknown_setting(stage, key, [_KIND, *names])
     return dataclass_from_table(variant, fields, stage, None if isinstance(method, type) else method)
 
 
@@ -330,13 +331,20 @@ def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, ba
     changes = {}
     for key, value in table.items():
         if key not in names:
-            raise unknown_setting(where, key, names)
+            raise _unknown_setting(where, key, names)
         current = None if base is None else getattr(base, key)
         changes[key] = _coerce(value, hints[key], f"{where}.{key}", current)
     try:
         return kind(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
     except (ValueError, TypeError) as error:
         raise UsageError(f"[{where}] {error}") from None
+
+
+def _unknown_setting(where: str, key: str, names: Sequence[str]) -> UsageError:
+    near = difflib.get_close_matches(key, names, n=3, cutoff=0.6)
+    known = " or ".join(f"{where}.{name}" for name in near)
+    hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
+    return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint}")
 
 
 def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:

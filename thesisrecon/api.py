@@ -13,7 +13,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.comparison import ModelComparison, compare_models
 from thesisrecon.config import PipelineConfig
 from thesisrecon.dense_model import depth_maps, fuse_depth_maps, texture
-from thesisrecon.epipolar.drawing import draw_lines
+from thesisrecon.epipolar._drawing import draw_lines
 from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
 from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal
@@ -22,6 +22,7 @@ from thesisrecon.geometry.camera_matrix import cheirality
 from thesisrecon.geometry.robust_resection import resect
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import epipolar_lines
+from thesisrecon.io._images import read_pixels
 from thesisrecon.io._meshes import write_mesh
 from thesisrecon.io._models import read_cameras
 from thesisrecon.model_export import export
@@ -47,7 +48,7 @@ from thesisrecon.records import (
 from thesisrecon.results import RunResult
 from thesisrecon.selfcalibration.kruppa import kruppa
 from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range, rectify_pair
-from thesisrecon.view_interpolation import interpolate_view, read_pixels
+from thesisrecon.view_interpolation import interpolate_view
 from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 

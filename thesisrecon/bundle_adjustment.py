@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon._camera_input import CameraInput, as_cameras
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import unknown_word
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+from thesisrecon.geometry._conditioning import require_finite, require_shapes
+from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.observations import Observations, sort_observations
+from thesisrecon.numerics._observations import Observations, sort_observations
 from thesisrecon.records import Reconstruction, Tracks
 
 COLUMNS: Mapping[str, tuple[int, ...]] = {
@@ -255,13 +255,9 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
         if number.shape != (n,) or number.dtype.kind not in "iu":
             raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {number}")
     table = np.zeros((n, len(STD_NAMES)))
-    for row, view in zip(table, views, strict=True):
-        lens = np.zeros(0) if view.distortion is None else view.distortion
-        if np.any(lens[3:]):
-            raise ValueError(f"bundle_adjust knows distortion by k1, k2, k3; got {len(lens)} coefficients")
-        K = view.K
+    for row, K in zip(table, (view.K for view in views), strict=True):
         row[:5] = K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2]
-        row[5 : 5 + len(lens[:3])] = lens[:3]
+    table[:, 5:] = radial_coefficients("bundle_adjust", views)
     R, t = (np.array([getattr(view, name) for view in views]) for name in ("R", "t"))
     sharing = np.where(free, number[:, None], np.arange(n)[:, None])
     return MetricCameras(R, t, table, np.arange(n), sharing)

@@ -10,7 +10,8 @@ from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
-from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit, require_shapes
+from thesisrecon.geometry._conditioning import pixel_from_unit, require_shapes
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
 from thesisrecon.runtime._run import stream

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.geometry._conditioning import require_finite, require_shapes
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, project_camera, undistort
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes
 
 _ORTHOGONAL = 2e-4
 """Largest deviation of R'R from the identity; four printed digits leave at most 2 sqrt(3) 5e-5."""

@@ -15,7 +15,7 @@ from thesisrecon.alignment import as_sparse_model
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words
-from thesisrecon.geometry.homogeneous import scene_frame
+from thesisrecon.geometry._conditioning import scene_frame
 from thesisrecon.geometry.similarity import Similarity, estimate_similarity, rotation_errors_deg
 from thesisrecon.results import RunResult
 from thesisrecon.sparse_model import SparseModel, SparseView

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon._camera_input import CameraInput, as_cameras
 from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure, UsageError, counted
+from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients
 from thesisrecon.io._images import list_images, read_image
 from thesisrecon.pipeline._image_pair import ImageInput
 from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks
-from thesisrecon.stereo.depth import pinhole_view
+from thesisrecon.stereo._resampling import pinhole_view
 from thesisrecon.surface.model import SurfaceModel
 
 ImagesInput = str | Path | Sequence[ImageInput]
@@ -245,18 +245,13 @@ def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
 
 def _model(views: Sequence[Camera]) -> Reconstruction:
     """The cameras without points; ``ValueError`` if distortion has more than three coefficients."""
-    n, distortion = len(views), np.zeros((len(views), 3))
-    for row, view in zip(distortion, views, strict=True):
-        lens = np.zeros(0) if view.distortion is None else view.distortion
-        if np.any(lens[3:]):
-            raise ValueError(f"depth of known cameras takes k1, k2, k3; got {len(lens)} coefficients")
-        row[: len(lens[:3])] = lens[:3]
+    n, lenses = len(views), radial_coefficients("depth of known cameras", views)
     none = np.zeros(0, dtype=np.int64)
     K, P = (np.array([getattr(view, name) for view in views]).reshape(n, 3, -1) for name in ("K", "P"))
     return Reconstruction(
         "metric", P, np.zeros((0, 4)), np.ones(n, dtype=bool), np.zeros(0, dtype=bool),
         np.zeros(0, dtype=bool), Tracks(none, none, np.zeros((0, 2)), n, 0),
-        np.array([view.size for view in views]).reshape(n, 2), 1.0, ("",) * n, K, distortion,
+        np.array([view.size for view in views]).reshape(n, 2), 1.0, ("",) * n, K, lenses,
     )  # fmt: skip
 
 

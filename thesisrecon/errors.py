@@ -64,24 +64,6 @@ def in_words(value: Any) -> str:
     return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
 
 
-def unknown_setting(where: str, key: str, names: Iterable[str]) -> UsageError:
-    """Return the error for an unknown key of a table, with the nearest known ones.
-
-    Parameters
-    ----------
-    where, key, names : str, str, iterable of str
-        Dotted name of the table, the key, and the known keys.
-
-    Returns
-    -------
-    UsageError
-    """
-    near = difflib.get_close_matches(key, names := list(names), n=3, cutoff=0.6)
-    known = " or ".join(f"{where}.{name}" for name in near)
-    hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
-    return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint}")
-
-
 def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
     """Return a message about an unknown word with the nearest known ones, or all.
 

@@ -13,12 +13,13 @@ from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
-from thesisrecon.io._images import read_image
+from thesisrecon.geometry._homography import require_parallax_of_matches
+from thesisrecon.geometry.two_view import epipoles
+from thesisrecon.io._images import read_pixels
 from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo._planar import PlanarRectification
-from thesisrecon.stereo.semi_global import match_both_sides
+from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right
 
 _COARSE = 4
@@ -116,25 +117,6 @@ def prepare_rectified_pair(
         if shape != shapes[0]:
             raise ValueError(f"disparities must have the shape of the images {shapes[0]}; got {shape}")
     return InterpolatedPair(images, np.stack([np.eye(3)] * 2), *maps)
-
-
-def read_pixels(side: Any) -> U8:
-    """Return a file at full size, or a checked array, as RGB.
-
-    Parameters
-    ----------
-    side : str, Path or ndarray (H, W) or (H, W, 3) uint8
-        The image.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8
-    """
-    if not isinstance(side, np.ndarray):
-        return read_image(side, max_size_px=int(np.iinfo(np.int32).max)).images[0].rgb
-    if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] != 3):
-        raise ValueError(f"an image must be a uint8 array (H, W, 3); got {side.dtype} {side.shape}")
-    return side if side.ndim == 3 else np.repeat(side[:, :, None], 3, axis=2)
 
 
 def _as_map(disparity: DisparityMap | F32) -> DisparityMap:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,13 @@ import PIL.Image
 import pytest
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
-from tests.synthetic import reconstruction_of
+from thesisrecon.camera import Camera
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import render_run
-from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.io._exports import cameras_table
 from thesisrecon.io._files import write_json
 from thesisrecon.io._meshes import write_mesh
-from thesisrecon.records import Image, TexturedMesh
+from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
@@ -26,11 +26,9 @@ COUNT = 8
 
 def write_cameras(out):
     """``cameras.json`` by the writer of runs."""
-    P = np.array([depth_map.P for depth_map in ring_of(COUNT)])
-    K = np.array([decompose_camera(p)[0] for p in P])
-    reconstruction = reconstruction_of(P, SIZE, K=K, registered=np.arange(COUNT) != 3)
-    images = tuple(Image(f"{k}.jpg", np.zeros((*SHAPE, 3), np.uint8), SIZE) for k in range(COUNT))
-    write_json(out / "cameras.json", cameras_table(reconstruction, images))
+    views = [Camera.from_matrix(depth_map.P, SIZE) for depth_map in ring_of(COUNT)]
+    cameras = {f"{k}.jpg": replace(view, distortion=np.zeros(3)) for k, view in enumerate(views) if k != 3}
+    write_json(out / "cameras.json", cameras_table(cameras))
 
 
 @pytest.fixture(scope="module")

@@ -14,10 +14,10 @@ from thesisrecon.epipolar.configuration import (
 from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._homography import homography_residuals, homography_sampson_residuals
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.two_view import homography_residuals, homography_sampson_residuals
-from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
+from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
 from validation.scenes.two_views import make_two_views
 
 

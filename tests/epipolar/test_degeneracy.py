@@ -13,15 +13,13 @@ from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.two_view import (
-    epipoles,
+from thesisrecon.geometry._conditioning import unit_norm
+from thesisrecon.geometry._homography import (
     homography_linear,
     homography_residuals,
     homography_sampson_residuals,
-    sampson_residuals,
-    symmetric_residuals,
-    unit_norm,
 )
+from thesisrecon.geometry.two_view import epipoles, sampson_residuals, symmetric_residuals
 from thesisrecon.records import FundamentalFit
 
 RELIEF = FacadeMaker(matches=500, relief=0.03, off_plane=0.15, wrong=0.2, repeated=0.2, sigma_px=0.3)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.epipolar.pairs import angle_between, make_pair
 from thesisrecon.geometry import two_view
+from thesisrecon.geometry._homography import homography_linear, homography_residuals
 from thesisrecon.geometry.homogeneous import cross_matrix
 
 seeds = st.integers(0, 2**31)
@@ -101,14 +102,14 @@ def test_residuals_depend_neither_on_the_scale_of_f_nor_on_the_order_of_the_imag
 @given(seeds, st.integers(4, 30))
 def test_a_plane_is_seen_through_one_homography(seed, n):
     pair = make_pair(n, np.random.default_rng(seed), planar=True)
-    H = two_view.homography_linear(pair.xy1, pair.xy2)
-    assert two_view.homography_residuals(H, pair.xy1, pair.xy2).max() < 1e-4
+    H = homography_linear(pair.xy1, pair.xy2)
+    assert homography_residuals(H, pair.xy1, pair.xy2).max() < 1e-4
     assert np.linalg.norm(H) == pytest.approx(1.0)
 
 
 def test_homography_residual_is_infinite_where_the_point_goes_to_infinity():
     H = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    residual = two_view.homography_residuals(H, np.array([[0.0, 1.0], [1.0, 1.0]]), np.ones((2, 2)))
+    residual = homography_residuals(H, np.array([[0.0, 1.0], [1.0, 1.0]]), np.ones((2, 2)))
     assert np.isinf(residual[0])
     assert residual[1] == pytest.approx(0.0)
 
@@ -116,7 +117,7 @@ def test_homography_residual_is_infinite_where_the_point_goes_to_infinity():
 @pytest.mark.parametrize("shape", [(3, 2), (5, 3), (5,)])
 def test_homography_refuses_wrong_shapes(shape):
     with pytest.raises(ValueError, match="homography_linear"):
-        two_view.homography_linear(np.zeros(shape), np.zeros(shape))
+        homography_linear(np.zeros(shape), np.zeros(shape))
 
 
 def test_nearest_matrix_of_rank_two():

@@ -5,7 +5,8 @@ import re
 import numpy as np
 
 from thesisrecon.geometry import camera_matrix, conics, strata, three_view, two_view
-from thesisrecon.geometry.homogeneous import normalizing_transform
+from thesisrecon.geometry._conditioning import normalizing_transform
+from thesisrecon.geometry._homography import homography_linear
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.resection import resect_linear
 from thesisrecon.geometry.similarity import estimate_similarity
@@ -42,7 +43,7 @@ def test_numbers_that_are_not_finite_are_rejected():
         calls = [
             (camera_matrix.decompose_camera, spoilt(P, v)),
             (two_view.fundamental_from_cameras, P, spoilt(OTHER, v)), (two_view.epipoles, spoilt(F, v)),
-            (two_view.enforce_rank_two, spoilt(F, v)), (two_view.homography_linear, spoilt(XY, v), XY),
+            (two_view.enforce_rank_two, spoilt(F, v)), (homography_linear, spoilt(XY, v), XY),
             (normalizing_transform, spoilt(XY, v)), (two_view.infinite_homography, P, spoilt(OTHER, v)),
             (two_view.plane_homography, P, OTHER, spoilt(np.ones(4), v)),
             (correct_matches, F, spoilt(XY, v), XY),

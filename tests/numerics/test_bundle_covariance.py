@@ -11,9 +11,9 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import _covariance as bundle_covariance
 from thesisrecon.numerics import _reduced_solvers as kernels
 from thesisrecon.numerics._covariance import robust_sigma
+from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics._observations import Observations
 
 FREE = np.array([True, False, False, True, True, True])
 

@@ -11,13 +11,13 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import _metric_kernels, _schur
 from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
+from thesisrecon.numerics._block_scatter import block_scatter
 from thesisrecon.numerics._elimination import ReducedSums, revert_crossing_points, sum_leverages
+from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._noise import huber
+from thesisrecon.numerics._observations import Jacobians, Observations, Weighting, sort_observations
 from thesisrecon.numerics._schur import BundleSystem, build_layout
 from thesisrecon.numerics._small_solvers import floored_diagonal
-from thesisrecon.numerics.block_scatter import block_scatter
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
 
 
 def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):

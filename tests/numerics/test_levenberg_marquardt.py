@@ -5,10 +5,10 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 
+from thesisrecon.numerics._levenberg_marquardt import invert_information, minimize_residuals
 from thesisrecon.numerics._noise import best_huber_width, effective_noise, huber, soft_l1
+from thesisrecon.numerics._observations import morton_pair_order
 from thesisrecon.numerics._small_solvers import solve_positive
-from thesisrecon.numerics.levenberg_marquardt import invert_information, minimize_residuals
-from thesisrecon.numerics.observations import morton_pair_order
 
 
 def test_normal_residuals_want_least_squares_and_heavy_ones_a_bend():

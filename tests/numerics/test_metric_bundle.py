@@ -6,10 +6,10 @@ from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import _schur
 from thesisrecon.numerics._intrinsic_unknowns import number_unknowns
+from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._reduced_solvers import BandedCholesky
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.observations import Observations
 
 FOCAL = np.array([True, False, False, False, False, False])
 FOCAL_CENTRE_RADIAL = np.array([True, False, False, True, True, True])

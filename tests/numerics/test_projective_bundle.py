@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from tests.numerics.bundle_scenes import make_block
-from thesisrecon.geometry.homogeneous import whitening_transform
-from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.geometry._conditioning import whitening_transform
+from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 
 
 def _start(block, *, seed=1, size=0.003):

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.geometry.camera_matrix import project, project_camera
-from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.robust_resection import resect_projective
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.projective._model import ProjectiveModel, consistent_observations, retriangulate_points

@@ -13,7 +13,7 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion

@@ -8,7 +8,7 @@ import pytest
 from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CONSTANT, prior_for, setup
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion, _plane_box
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic

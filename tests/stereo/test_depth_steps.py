@@ -13,6 +13,7 @@ from thesisrecon.stereo._depth_fusion import _concatenated, _measured
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo._planar import common_orientation
 from thesisrecon.stereo._polar import polar
+from thesisrecon.stereo._resampling import pinhole_view
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
 from thesisrecon.stereo.depth import (
     _complete_depths,
@@ -21,7 +22,6 @@ from thesisrecon.stereo.depth import (
     _select_neighbours,
     _shared_projections,
     _sparse_points,
-    pinhole_view,
 )
 
 

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("pycolmap")
 
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres import CeresOptions, refine_with_ceres
 from validation.scenes.streets import SIZE, make_walk

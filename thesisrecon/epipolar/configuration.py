@@ -30,9 +30,9 @@ from thesisrecon.epipolar._planes import (
 )
 from thesisrecon.epipolar._refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.epipolar._sampling import sampson_distances
+from thesisrecon.geometry._homography import homography_sampson_residuals
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.geometry.two_view import homography_sampson_residuals
-from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
+from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
 
 # Initial focal lengths in units of the point spread: fields of view of 150 to 10 degrees.
 FOCALS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -244,10 +244,7 @@ def _excess_errors(case: _InlierData, near: B8, rss_plane: float) -> float:
 
 
 def _eigenvalue_errors(H: F64, covariance: F64) -> float:
-    """abs(trace H - trace H^-1) in standard errors; infinite if the eigenvalues exclude a rotation.
-
-    H of a rotation has eigenvalues 1, exp(+-i angle) for every camera (HZ 13.2; Hartley 1994).
-    """
+    """abs(trace H - trace H^-1) in standard errors, 0 for a rotation (HZ 13.2; Hartley 1994); inf if none."""
     determinant = float(np.cbrt(np.linalg.det(H)))
     if not abs(determinant) > 1e-4 * float(np.linalg.norm(H)):
         return float("inf")

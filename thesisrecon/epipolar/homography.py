@@ -11,15 +11,14 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import noise_width
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes
-from thesisrecon.geometry.two_view import (
+from thesisrecon.geometry._conditioning import require_finite, require_shapes, unit_norm
+from thesisrecon.geometry._homography import (
     homography_linear,
     homography_residuals,
     homography_sampson_residuals,
-    unit_norm,
 )
+from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
 from thesisrecon.numerics._noise import VARIANCE_OF_INLIERS, next_inlier_limit
-from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
 
 _SAMPLE, _PARAMETERS = 4, 8
 _BATCH, _MAX_BATCHES, _SCORED = 128, 16, 1000

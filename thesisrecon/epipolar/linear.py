@@ -7,8 +7,9 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar._frame import MIN_PX, PairFrame, as_matches, check_matches
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
-from thesisrecon.geometry.two_view import enforce_rank_two, unit_norm
+from thesisrecon.geometry._conditioning import normalizing_transform, unit_norm
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.two_view import enforce_rank_two
 from thesisrecon.kernels import empty, kernel
 
 # Ratio of the eighth to the first singular value below which F is undetermined.

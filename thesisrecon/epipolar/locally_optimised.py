@@ -193,10 +193,7 @@ class LocallyOptimisedRansac:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Result of the searches with one gate: ``f`` (9,), residuals (N,) and their noise (None without F).
-
-    ``loss`` holds the residual limit and the width of Huber's loss of the last refinement.
-    """
+    """Result of the searches with one gate, the noise (None without F), and limit and width of the loss."""
 
     f: F64
     samples: int

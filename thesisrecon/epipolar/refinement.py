@@ -21,8 +21,9 @@ from thesisrecon.epipolar._refinement import (
     refine,
     residuals_and_derivatives,
 )
-from thesisrecon.geometry.two_view import epipoles, unit_norm
-from thesisrecon.numerics.levenberg_marquardt import minimize_residuals
+from thesisrecon.geometry._conditioning import unit_norm
+from thesisrecon.geometry.two_view import epipoles
+from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
 
 Criterion = Literal["sampson", "epipolar-distance", "reprojection"]
 Parameters = Literal["orthonormal", "row", "row-and-column"]

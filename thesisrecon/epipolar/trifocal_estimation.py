@@ -15,26 +15,21 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._frame import MAX_PX
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import (
-    homogenize,
-    normalizing_transform,
-    require_finite,
-    require_shapes,
-    unit_normals,
-)
+from thesisrecon.geometry._conditioning import normalizing_transform, require_finite, require_shapes
+from thesisrecon.geometry.homogeneous import homogenize, unit_normals
 from thesisrecon.geometry.three_view import (
     cameras_from_tensor,
     tensor_epipoles,
     tensor_from_cameras,
     unit_tensor,
 )
-from thesisrecon.numerics._noise import huber
-from thesisrecon.numerics.levenberg_marquardt import (
+from thesisrecon.numerics._levenberg_marquardt import (
     DenseSystem,
     invert_information,
     minimize_residuals,
     run_levenberg_marquardt,
 )
+from thesisrecon.numerics._noise import huber
 
 # Seven points, thirteen lines, or a mixture (HZ 16.1).
 NEEDED_EQUATIONS = 26

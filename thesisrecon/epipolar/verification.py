@@ -11,7 +11,9 @@ from thesisrecon.epipolar._degeneracy import assess_degeneracy
 from thesisrecon.epipolar._planes import SUBSET, count_transferred, induced_homography
 from thesisrecon.epipolar.configuration import MINIMUM, Configuration, classify_configuration
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_residuals, unit_norm
+from thesisrecon.geometry._conditioning import unit_norm
+from thesisrecon.geometry._homography import homography_linear, homography_residuals
+from thesisrecon.geometry.two_view import epipoles
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
 # 99 % of a plane's matches: sqrt(chi-square(2)) = 3.03, times sqrt(2) for noise in both images.

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import checked_inverse, checked_unit, require_finite
+from thesisrecon.geometry._conditioning import checked_inverse, checked_unit, require_finite
 
 ABSOLUTE_CONIC = np.eye(3)
 """Omega on the plane at infinity of a metric frame (3.2)."""

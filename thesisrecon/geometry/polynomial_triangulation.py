@@ -17,7 +17,8 @@ import math
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix, require_finite, require_shapes
+from thesisrecon.geometry._conditioning import checked_unit, require_finite, require_shapes
+from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.kernels import empty, kernel
 
 _Two = tuple[float, float]
@@ -298,10 +299,7 @@ def _conditioning(xy: F64) -> tuple[float, F64, F64]:
 
 
 def _balanced(L: F64) -> tuple[F64, F64, F64]:
-    """Return lines L (2, 3, 2) of a pencil in a balanced basis, its change (2, 2) and the forms (2, 3).
-
-    A pencil of (nearly) parallel lines in both images keeps the line at infinity as second member.
-    """
+    """Lines L (2, 3, 2) of a pencil in a balanced basis, its change (2, 2) and the forms (2, 3)."""
     B = np.einsum("vka,vkb->vab", L[:, :2], L[:, :2])
     traces = np.maximum(np.trace(B, axis1=1, axis2=2), 1e-300)
     values, basis = np.linalg.eigh((B / traces[:, None, None]).sum(axis=0))

@@ -9,8 +9,9 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry._conditioning import require_finite, require_shapes, whitening_transform
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, depth, project
-from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes, whitening_transform
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
 from thesisrecon.numerics._noise import VARIANCE_OF_INLIERS, next_inlier_limit
 from thesisrecon.numerics._partial_bundle import refine_camera, refine_pose

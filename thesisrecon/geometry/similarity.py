@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+from thesisrecon.geometry._conditioning import require_finite, require_shapes
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import checked_inverse
+from thesisrecon.geometry._conditioning import checked_inverse
 
 Group = Literal["projective", "affine", "metric", "euclidean"]
 Entity = Literal["points", "planes", "cameras", "conics", "dual conics"]

@@ -10,15 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import (
-    checked_unit,
-    cross_matrix,
-    dehomogenize,
-    homogenize,
-    require_finite,
-)
+from thesisrecon.geometry._conditioning import checked_unit, require_finite, unit_norm
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
-from thesisrecon.geometry.two_view import unit_norm
 
 
 def unit_tensor(T: F64) -> F64:

@@ -14,7 +14,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry.homogeneous import homogenize, require_finite, require_shapes
+from thesisrecon.geometry._conditioning import require_finite, require_shapes
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.kernels import copy_to, empty, kernel, zeros
 from thesisrecon.numerics._partial_bundle import minimize_reprojection

@@ -8,37 +8,14 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import (
+from thesisrecon.geometry._conditioning import (
     checked_unit,
-    cross_matrix,
-    dehomogenize,
-    homogenize,
-    normalizing_transform,
     require_finite,
     require_shapes,
-    unit_normals,
+    unit_norm,
 )
-
-_PARALLAX_PER_NOISE, _MIN_PARALLAX_PX = 3.0, 0.05
-"""Least displacement that no homography explains (90 % quantile), over the epipolar distances and in px."""
-
-
-def unit_norm(F: F64) -> F64:
-    """Scale matrices to unit Frobenius norm; zeros stay zeros.
-
-    Parameters
-    ----------
-    F : ndarray (..., 3, 3)
-        Matrices.
-
-    Returns
-    -------
-    ndarray (..., 3, 3)
-    """
-    norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))
-    return F / np.where(norm > 0.0, norm, 1.0)
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_normals
 
 
 def _check(F: F64, caller: str) -> None:
@@ -246,88 +223,6 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
     return unit_norm(np.asarray(H, dtype=np.float64))
 
 
-def homography_linear(xy1: F64, xy2: F64) -> F64:
-    """Estimate the homography x2 ~ H x1 of unit norm by normalised DLT (HZ algorithm 4.2).
-
-    Parameters
-    ----------
-    xy1, xy2 : ndarray (N, 2)
-        N >= 4 matches, px, not all equal.
-
-    Returns
-    -------
-    ndarray (3, 3)
-
-    Examples
-    --------
-    >>> xy = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    >>> H = homography_linear(xy, 2.0 * xy + 1.0)
-    >>> np.allclose(H / H[2, 2], [[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [0.0, 0.0, 1.0]])
-    True
-    """
-    require_shapes("homography_linear", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    if len(xy1) < 4:
-        raise ValueError(f"homography_linear needs at least 4 matches; got {len(xy1)}")
-    T1, T2 = normalizing_transform(xy1), normalizing_transform(xy2)
-    x1, (u, v) = homogenize(xy1) @ T1.T, (xy2 @ T2[:2, :2].T + T2[:2, 2]).T
-    zero = np.zeros_like(x1)
-    A = np.concatenate([np.hstack([x1, zero, -u[:, None] * x1]), np.hstack([zero, x1, -v[:, None] * x1])])
-    H: F64 = np.linalg.eigh(A.T @ A)[1][:, 0].reshape(3, 3)
-    return unit_norm(np.asarray(np.linalg.solve(T2, H @ T1)))
-
-
-def homography_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
-    """Return the distances |x2 - H x1| in image 2.
-
-    Parameters
-    ----------
-    H, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Homography and matches, px.
-
-    Returns
-    -------
-    ndarray (N,)
-        Inf for points that H maps to infinity.
-    """
-    moved = dehomogenize(homogenize(xy1) @ H.T)
-    with np.errstate(invalid="ignore"):
-        distance = np.linalg.norm(xy2 - moved, axis=1)
-    return np.where(np.isfinite(distance), distance, np.inf)
-
-
-def homography_sampson_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
-    """Return whitened residuals of x2 ~ H x1 (Sampson distance), px.
-
-    Each has to first order the standard deviation of one image coordinate.
-
-    Parameters
-    ----------
-    H, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Homography and matches, px.
-
-    Returns
-    -------
-    ndarray (N, 2)
-
-    References
-    ----------
-    Chum, Pajdla and Sturm, "The geometric error for homographies", CVIU 97(1), 2005.
-    """
-    x1 = homogenize(xy1)
-    u, v, w = (x1 @ H.T).T
-    c = np.stack([u - w * xy2[:, 0], v - w * xy2[:, 1]], axis=1)
-    J = np.zeros((len(x1), 2, 4))
-    J[:, :, :2] = H[None, :2, :2] - xy2[:, :, None] * H[2, :2]
-    J[:, 0, 2] = J[:, 1, 3] = -w
-    # Cholesky factor of J J' (2 x 2).
-    a, b, d = (np.sum(J[:, i] * J[:, j], axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
-    l11 = np.sqrt(a + 1e-300)
-    l21 = b / l11
-    l22 = np.sqrt(np.maximum(d - l21**2, 1e-300))
-    first = c[:, 0] / l11
-    return np.stack([first, (c[:, 1] - l21 * first) / l22], axis=1)
-
-
 def quasi_euclidean_planes(F: F64) -> F64:
     """Return the two v that make the left part of P2 (:func:`canonical_cameras`) nearest to a rotation.
 
@@ -388,44 +283,3 @@ def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -
     plane = quasi_euclidean_planes(F)[0] if plane is None else plane
     P2 = np.hstack([-cross_matrix(e2) @ F + np.outer(e2, plane), scale * e2[:, None]])
     return np.hstack([np.eye(3), np.zeros((3, 1))]), P2
-
-
-def require_parallax_of_matches(
-    F: F64, xy1: F64, xy2: F64, *, at_infinity: F64 | None = None, advice: str = ""
-) -> None:
-    """Raise ``StageFailure`` if one homography explains the matches (section 5.5).
-
-    F is then arbitrary and the images contain no depth: the camera only rotated, or the scene is a plane.
-
-    Parameters
-    ----------
-    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix and N >= 4 of its inliers, px.
-    at_infinity : ndarray (3, 3), optional
-        Homography of the plane at infinity of known cameras; a plane of the scene then has parallax.
-    advice : str
-        Text appended to the advice of the failure.
-    """
-    noise = float(np.quantile(np.abs(sampson_residuals(F, xy1, xy2)), 0.9))
-    if at_infinity is None:
-        what, residuals = "one homography", _homography_residuals(xy1, xy2)
-    else:
-        what, residuals = "a scene at infinity", homography_residuals(at_infinity, xy1, xy2)
-    parallax = float(np.quantile(residuals, 0.9))
-    if parallax > _PARALLAX_PER_NOISE * noise + _MIN_PARALLAX_PX:
-        return
-    raise StageFailure(
-        "the images show no parallax: the camera only rotated, or the scene is a plane or too far away",
-        f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px; the noise is {noise:.2g} px",
-        f"take images from positions farther apart{advice}",
-    )
-
-
-def _homography_residuals(xy1: F64, xy2: F64) -> F64:
-    """Residuals of the homography of most matches: least squares, repeated twice without the worst tenth."""
-    inliers, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
-    for _ in range(3):
-        H = homography_linear(xy1[inliers], xy2[inliers])
-        residuals = homography_residuals(H, xy1, xy2)
-        inliers = residuals <= np.quantile(residuals, 0.9)
-    return residuals

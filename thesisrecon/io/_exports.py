@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,9 @@ import PIL.features
 import PIL.Image
 
 from thesisrecon.arrays import F64, U8
+from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import write_atomically
-from thesisrecon.records import Image, Reconstruction
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 _WEBP_QUALITY = 85
@@ -40,31 +40,18 @@ def write_point_cloud(path: Path, xyz: F64, rgb: U8) -> None:
     write_atomically(path, header.encode("ascii") + vertices.tobytes())
 
 
-def cameras_table(reconstruction: Reconstruction, images: tuple[Image, ...]) -> dict[str, Any]:
-    """Content of ``cameras.json``: the registered views of a metric reconstruction, in original pixels."""
-    assert reconstruction.K is not None
-    assert reconstruction.distortion is not None
-    cameras = []
-    for i in np.flatnonzero(reconstruction.registered).tolist():
-        K, image = reconstruction.K[i], images[i]
-        Rt = np.linalg.solve(K, reconstruction.P[i])
-        cameras.append(
-            {
-                "name": image.name,
-                "width": image.original_size[0],
-                "height": image.original_size[1],
-                "K": image.original_from_working @ K,
-                "distortion": reconstruction.distortion[i],
-                "R": Rt[:, :3],
-                "t": Rt[:, 3],
-                "centre": -Rt[:, :3].T @ Rt[:, 3],
-            }
-        )
+def cameras_table(cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    """Content of ``cameras.json``: cameras by image name."""
+    listed = [
+        {"name": name, "width": camera.size[0], "height": camera.size[1]}
+        | {key: getattr(camera, key) for key in ("K", "distortion", "R", "t", "centre")}
+        for name, camera in cameras.items()
+    ]
     convention = (
         "x ~ K d(R X + t), d(u) = u (1 + k1 |u|^2 + k2 |u|^4 + k3 |u|^6), distortion = (k1, k2, k3); "
         "(0, 0) is the centre of the top-left pixel"
     )
-    return {"convention": convention, "cameras": cameras}
+    return {"convention": convention, "cameras": listed}
 
 
 def write_image(path: Path, rgb: U8) -> None:

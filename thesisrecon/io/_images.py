@@ -22,7 +22,7 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import SPECIAL_FILE, printable
 from thesisrecon.io._pixels import (
@@ -327,3 +327,12 @@ def read_exif(file: PIL.Image.Image) -> tuple[float, PIL.Image.Transpose | None]
         # The pixels may be good even if the header is damaged.
         return 0.0, None
     return focal, EXIF_TRANSFORMS.get(orientation) if isinstance(orientation, int) else None
+
+
+def read_pixels(side: Any) -> U8:
+    """A file at full size, or a checked array, as RGB."""
+    if not isinstance(side, np.ndarray):
+        return read_image(side, max_size_px=int(np.iinfo(np.int32).max)).images[0].rgb
+    if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] != 3):
+        raise ValueError(f"an image must be a uint8 array (H, W, 3); got {side.dtype} {side.shape}")
+    return side if side.ndim == 3 else np.repeat(side[:, :, None], 3, axis=2)

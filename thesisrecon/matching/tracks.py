@@ -14,7 +14,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import PreparedImage
-from thesisrecon.numerics.observations import morton_pair_order
+from thesisrecon.numerics._observations import morton_pair_order
 from thesisrecon.records import Matches, Tracks, TwoView
 
 MERGE_PX = 1.0

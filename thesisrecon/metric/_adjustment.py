@@ -10,10 +10,10 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
+from thesisrecon.numerics._block_scatter import BlockScatter, block_scatter
+from thesisrecon.numerics._metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics._noise import best_huber_width, noise_from_distances
-from thesisrecon.numerics.block_scatter import BlockScatter, block_scatter
-from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics._observations import Observations
 
 MIN_OBSERVATIONS = 40
 MAX_LOSS_SIGMAS = 20.0

@@ -17,7 +17,7 @@ from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows, reproject_observations
-from thesisrecon.numerics.block_scatter import point_blocks
+from thesisrecon.numerics._block_scatter import point_blocks
 
 FOLDS = 5
 """One of so many blocks of the scene is held out in each view."""

@@ -75,11 +75,7 @@ def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
 def retriangulate_tracks(
     model: MetricEstimate, *, sigmas: float, min_angle: float = MIN_ANGLE
 ) -> MetricEstimate:
-    """Triangulate all tracks from the registered views and select the inliers.
-
-    Observations are undistorted first. Points with outliers are triangulated again from their inliers.
-    ``sigmas`` is the gate in noise sigmas, ``min_angle`` the smallest triangulation angle in radians.
-    """
+    """Triangulate all tracks, undistorted, from the registered views and from their inliers again."""
     t = model.tracks
     near = np.flatnonzero(model.registered[t.view_index])
     view, point = t.view_index[near], t.point_index[near]
@@ -156,11 +152,7 @@ def inlier_ratios(model: MetricEstimate) -> F64:
 
 
 def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
-    """Row of intrinsics (V,) of each view, and the table (G, 8) of sharing: equal numbers share the value.
-
-    Views share a row if they share all unknown intrinsics and have the same prior. k2 and k3 are shared as k1
-    is.
-    """
+    """Row of intrinsics (V,) of each view, and the table (G, 8) of sharing: equal numbers share the value."""
     moves = (prior.std > 0.0).any(axis=0)
     knowledge = np.nan_to_num(np.concatenate([prior.mean, prior.std], axis=1), nan=-1.0, posinf=-1.0)
     same = np.unique(knowledge, axis=0, return_inverse=True)[1].reshape(-1, 1)

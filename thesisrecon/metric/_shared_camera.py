@@ -17,10 +17,10 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import BundleAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, WIDTH, MetricEstimate
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
+from thesisrecon.numerics._block_scatter import BlockScatter
+from thesisrecon.numerics._metric_bundle import MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics.block_scatter import BlockScatter
-from thesisrecon.numerics.metric_bundle import MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics._observations import Observations
 
 CENTRE_STD = 0.1
 """Prior of free principal points in long sides; images may be crops."""
@@ -60,11 +60,7 @@ def _adjust_per_view(
     *,
     focal_spread: float = np.inf,
 ) -> MetricBundleResult:
-    """Adjust the registered views with own, unknown values in some columns of intrinsics, with covariances.
-
-    ``focal_spread`` is the relative scatter of the formerly shared focals about their common mean; inf: no
-    prior.
-    """
+    """Adjust the views with own, unknown values in some columns of intrinsics, with covariances."""
     views, adjustment = np.flatnonzero(model.registered), replace(adjustment, hierarchical=None)
     cameras, seen = model.cameras, _subsample_inliers(model)
     assert cameras.shared is not None
@@ -266,10 +262,7 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustmen
 def inconsistent_principal_point(
     model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter
 ) -> list[str]:
-    """Detect a deformed model by its principal point and the disagreement of blocks of the scene.
-
-    Images cropped in the same way move the principal point, but their blocks agree.
-    """
+    """Detect a deformed model: a moved principal point with blocks that disagree, unlike those of crops."""
     views = np.flatnonzero(model.registered)
     if scatter.blocks < MIN_BLOCKS or not scatter.overdispersion > MAX_OVERDISPERSION:
         return []

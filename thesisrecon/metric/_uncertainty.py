@@ -1,7 +1,7 @@
 """Standard deviations of the intrinsics, and the hierarchical prior of cameras of one kind.
 
 The covariance of bundle adjustment assumes independent noise and an exact camera model. It is inflated by the
-disagreement of blocks of the scene (:mod:`thesisrecon.numerics.block_scatter`). Errors common to all blocks
+disagreement of blocks of the scene (:mod:`thesisrecon.numerics._block_scatter`). Errors common to all blocks
 do not show there; a floor stands for them, applied only if the data show lack of fit.
 
 Images of one size are likely of one kind of lens. With own estimates q_i of variance s_i^2 the values of a
@@ -21,7 +21,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.metric._adjustment import BundleAdjustment, HierarchicalPrior
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
-from thesisrecon.numerics.block_scatter import BlockScatter
+from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.records import IntrinsicInterval
 
 USUAL_INFLATION = 4.0
@@ -167,11 +167,7 @@ def apply_hierarchical_prior(
 
 @dataclass(frozen=True)
 class FocalShrinkage:
-    """How much the focal length of each view (V,) was shrunk towards those of its kind.
-
-    ``own_std`` is the relative standard deviation from the view's own matches, model error included;
-    ``weight`` that of the own matches, tau^2 / (tau^2 + s^2); 1 without shrinkage.
-    """
+    """Own relative deviation of each focal, and its weight tau^2 / (tau^2 + s^2); 1 without shrinkage."""
 
     own_std: F64
     weight: F64

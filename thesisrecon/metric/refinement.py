@@ -52,8 +52,8 @@ from thesisrecon.metric._uncertainty import (
     widen_by_camera_model,
     widen_unverified_focals,
 )
+from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._noise import noise_from_distances
-from thesisrecon.numerics.block_scatter import BlockScatter
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Upgrade
 
 MIN_CHANGE = 0.002

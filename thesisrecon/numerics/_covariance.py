@@ -7,10 +7,10 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.numerics._elimination import BlockIndex
+from thesisrecon.numerics._levenberg_marquardt import invert_information
 from thesisrecon.numerics._metric_kernels import FOCAL, POSE_DOF
+from thesisrecon.numerics._observations import Jacobians
 from thesisrecon.numerics._reduced_solvers import ReducedSystem, order_views
-from thesisrecon.numerics.levenberg_marquardt import invert_information
-from thesisrecon.numerics.observations import Jacobians
 
 SIMILARITY_DOF = 7
 # Largest number of unknowns for dense inversion.

@@ -14,8 +14,8 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty, full, kernel
+from thesisrecon.numerics._observations import Jacobians
 from thesisrecon.numerics._small_solvers import invert_cholesky_3x3, multiply_transposed_3x3
-from thesisrecon.numerics.observations import Jacobians
 
 
 class BlockIndex(NamedTuple):

@@ -8,14 +8,22 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
+from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_transform
 from thesisrecon.kernels import empty, kernel
+from thesisrecon.numerics._levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
 from thesisrecon.numerics._metric_kernels import (
     MetricModel,
     linearize_metric,
     metric_cost,
     move_poses,
     project_metric,
+)
+from thesisrecon.numerics._observations import (
+    Jacobians,
+    Observations,
+    SortedObservations,
+    Weighting,
+    sort_observations,
 )
 from thesisrecon.numerics._projective_kernels import (
     UnitState,
@@ -25,14 +33,6 @@ from thesisrecon.numerics._projective_kernels import (
     tangent_step,
 )
 from thesisrecon.numerics._small_solvers import away_from_zero, invert_positive_3x3, loss_value, loss_weight
-from thesisrecon.numerics.levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
-from thesisrecon.numerics.observations import (
-    Jacobians,
-    Observations,
-    SortedObservations,
-    Weighting,
-    sort_observations,
-)
 
 # Iterations of minimize_reprojection; the median point takes four or five.
 _MAX_ITERATIONS = 200

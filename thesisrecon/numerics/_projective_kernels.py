@@ -8,8 +8,8 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.kernels import empty, kernel
+from thesisrecon.numerics._observations import Jacobians, Observations, Weighting
 from thesisrecon.numerics._small_solvers import away_from_zero, loss_value, loss_weight
-from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
 
 
 class UnitState(NamedTuple):

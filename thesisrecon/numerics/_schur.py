@@ -21,6 +21,7 @@ from thesisrecon.numerics._elimination import (
     mark_pairs,
     substitute_points,
 )
+from thesisrecon.numerics._observations import Jacobians, Observations, SortedObservations
 from thesisrecon.numerics._reduced_solvers import (
     BandedCholesky,
     ReducedSystem,
@@ -29,7 +30,6 @@ from thesisrecon.numerics._reduced_solvers import (
     solve_dense,
 )
 from thesisrecon.numerics._small_solvers import floored_diagonal
-from thesisrecon.numerics.observations import Jacobians, Observations, SortedObservations
 
 CHUNK = 16384
 # Every chunk has its own sums: few chunks if these are large.
@@ -81,10 +81,7 @@ class BundleLayout:
 def build_layout(
     observations: SortedObservations, block: I64, *, width: int, common: I64, border: int
 ) -> BundleLayout:
-    """Find the pairs of views with common points, divide the points into chunks and choose a solver.
-
-    ``block`` (V,) is the block of each view and ``common`` (V, F) its border columns, -1 if they do not move.
-    """
+    """Find the pairs of views with common points, divide the points into chunks and choose a solver."""
     seen, start, n = observations.seen, observations.start, int(block.max(initial=-1)) + 1
     marked = np.eye(n, dtype=bool)
     mark_pairs(start, seen.view_index, block, marked)

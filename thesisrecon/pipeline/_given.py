@@ -1,21 +1,34 @@
-"""Steps of Algorithm 1 that take corners, matches or tracks that other programs found."""
+"""Corners, matches and tracks of other programs: checks, and the steps of Algorithm 1 that take them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import UsageError, counted
+from thesisrecon.io._images import DecodedImage, ImageSet, read_image
+from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.pipeline._image_pair import verify_matches
 from thesisrecon.pipeline._stages import finish_matches, finish_tracks, require_accepted_pair
 from thesisrecon.pipeline._state import PipelineState
-from thesisrecon.records import Features, Matches, PairChoice, Tracks, TwoView
-from thesisrecon.runtime._run import Batch, stream
+from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView
+from thesisrecon.runtime._run import Batch, Run, stream
+from thesisrecon.runtime._run_folder import key_of
+
+PairMatches = I64 | tuple[F64, F64]
+"""Matches of a pair: rows (M, 2) of the keypoints of both images, or positions (M, 2) in both images."""
+MAX_OUTSIDE_REL = 0.02
+"""Largest distance of a keypoint from its image, in long sides: detectors may pass the border a little."""
+MIN_COMMON_POINTS = 16
+"""Pairs of images with fewer common tracks are not verified."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +38,209 @@ class Given:
     corners: Sequence[F64]
     matches: Sequence[Matches]
     tracks: Tracks | None = None
+
+
+@dataclass(frozen=True)
+class Views:
+    """Names and original sizes (V, 2) of the images, and the images or where they are."""
+
+    names: list[str]
+    sizes: I64
+    images: Path | Sequence[Any] | None
+
+    def read(self, run: Run, digests: Sequence[str]) -> ImageSet:
+        """The images at working size, or grey ones of original size; each with a digest of its input."""
+        return ImageSet(tuple(self._read(run, i, digest) for i, digest in enumerate(digests)), {})
+
+    def _read(self, run: Run, i: int, digest: str) -> DecodedImage:
+        width, height = (int(side) for side in self.sizes[i])
+        if self.images is None:
+            return DecodedImage(Image.without_pixels(self.names[i], (width, height)), digest)
+        source = self.images / self.names[i] if isinstance(self.images, Path) else self.images[i]
+        (found,) = read_image(source, max_size_px=run.config.images.max_size_px).decoded
+        if found.image.original_size != (width, height):
+            is_now = "{} x {}".format(*found.image.original_size)
+            rule = "width and height must be those of the image after EXIF rotation"
+            raise UsageError(f"image {self.names[i]!r} is {is_now}, not {width} x {height}: {rule}")
+        image = replace(found.image, name=self.names[i])
+        return replace(found, image=image, digest=key_of(digest, found.digest))
+
+
+def views_of(sizes: Any, names: Sequence[str] | None, images: Any) -> Views:
+    try:
+        table = np.asarray(sizes, dtype=np.float64).reshape(len(sizes), 2)
+    except (TypeError, ValueError):
+        raise UsageError("sizes must be (V, 2): width and height of each image in pixels") from None
+    if not (np.isfinite(table).all() and (table >= 1).all() and (table == np.rint(table)).all()):
+        raise UsageError("sizes must be whole numbers of pixels, at least 1")
+    count = len(table)
+    names = [f"image-{i}" for i in range(count)] if names is None else [str(name) for name in names]
+    if len(names) != count or len(set(names)) != count:
+        raise UsageError(f"names must be {count} different names, one for each size; got {len(names)}")
+    if isinstance(images, str | Path):
+        folder = Path(images)
+        missing = [name for name in names if not (folder / name).is_file()]
+        if missing:
+            raise UsageError(
+                f"{missing[0]!r} and {len(missing) - 1} more of {count} images are not in {folder}"
+            )
+        images = folder
+    elif images is not None and len(images) != count:
+        raise UsageError(f"there are {len(images)} images and {count} sizes")
+    return Views(names, table.astype(np.int64), images)
+
+
+def given_matches(
+    keypoints: Sequence[F64] | None, matches: Mapping[tuple[int, int], PairMatches], views: Views
+) -> Given:
+    count = len(views.names)
+    corners = None if keypoints is None else [_positions(xy, i, views) for i, xy in enumerate(keypoints)]
+    if corners is not None and len(corners) != count:
+        raise UsageError(f"there are keypoints of {len(corners)} images and {count} sizes")
+    found: list[Matches] = []
+    for key, given in sorted(matches.items()):
+        i, j = _pair(key, count, matches)
+        pair = (
+            given if isinstance(given, tuple | list) and len(given) == 2 and np.ndim(given[0]) == 2 else None
+        )
+        if pair is not None:
+            xy1, xy2 = _positions(pair[0], i, views), _positions(pair[1], j, views)
+            if len(xy1) != len(xy2):
+                raise UsageError(
+                    f"matches of images {i} and {j}: {len(xy1)} positions and {len(xy2)} positions"
+                )
+            none = np.full(len(xy1), -1)
+            found.append(_match_record((i, j), none, none, xy1, xy2))
+        else:
+            if corners is None:
+                raise UsageError(
+                    f"matches of images {i} and {j} are rows of keypoints, but keypoints is None"
+                )
+            rows = _rows(given, (i, j), corners)
+            xy1, xy2 = corners[i][rows[:, 0]], corners[j][rows[:, 1]]
+            found.append(_match_record((i, j), rows[:, 0], rows[:, 1], xy1, xy2))
+    if not found:
+        raise UsageError("there are no matches")
+    positions = [bool(len(m.xy1) and m.index1[0] < 0) for m in found]
+    if any(positions) and any(len(m.xy1) and not p for m, p in zip(found, positions, strict=True)):
+        raise UsageError("matches must all be rows of keypoints or all be positions")
+    if any(positions) or corners is None:
+        corners, found = corners_from_matches(found, count)
+    return Given(corners, [_forward(m) for m in found])
+
+
+def _pair(key: Any, count: int, matches: Mapping[Any, Any]) -> tuple[int, int]:
+    try:
+        i, j = (int(view) for view in key)
+    except (TypeError, ValueError):
+        raise UsageError(f"a key of matches is (i, j), two image numbers; got {key!r}") from None
+    if i == j or not (0 <= i < count and 0 <= j < count):
+        raise UsageError(
+            f"matches of images {i} and {j}: two different numbers from 0 to {count - 1} are needed"
+        )
+    if i > j and (j, i) in matches:
+        raise UsageError(f"matches of images {j} and {i} are given twice")
+    return i, j
+
+
+def _positions(xy: Any, i: int, views: Views) -> F64:
+    """Checked positions (N, 2) of one image."""
+    found = np.asarray(xy, dtype=np.float64)
+    if found.size == 0:
+        return np.zeros((0, 2))
+    name = views.names[i]
+    if found.ndim != 2 or found.shape[1] != 2 or not np.isfinite(found).all():
+        raise UsageError(f"keypoints of {name!r} must be (N, 2) finite positions; got shape {found.shape}")
+    size = views.sizes[i]
+    outside = np.maximum(-found, found - size + 1).max()
+    if outside > MAX_OUTSIDE_REL * size.max():
+        x, y = found.max(axis=0)
+        advice = "sizes are (width, height), positions (x, y)"
+        raise UsageError(
+            f"keypoints of {name!r} reach ({x:.0f}, {y:.0f}), {outside:.0f} px outside "
+            f"{size[0]} x {size[1]} px: {advice}"
+        )
+    return found
+
+
+def _rows(given: Any, pair: tuple[int, int], corners: Sequence[F64]) -> I64:
+    """Checked rows (M, 2) of keypoints, each keypoint at most once: the first match counts."""
+    rows = np.asarray(given)
+    if rows.size == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    where = f"matches of images {pair[0]} and {pair[1]}"
+    if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
+        raise UsageError(
+            f"{where} must be (M, 2) whole numbers, rows of keypoints; got {rows.shape} {rows.dtype}"
+        )
+    limits = [len(corners[view]) for view in pair]
+    if rows.min() < 0 or (rows.max(axis=0) >= limits).any():
+        raise UsageError(
+            f"{where} point to a keypoint that does not exist ({limits[0]} and {limits[1]} are given)"
+        )
+    rows = rows.astype(np.int64)
+    # Detectors repeat a position with another orientation or scale.
+    for side, view in enumerate(pair):
+        same = np.unique(corners[view], axis=0, return_inverse=True)[1].ravel()
+        first = np.full(len(same), -1)
+        first[same[::-1]] = np.arange(len(same))[::-1]
+        rows[:, side] = first[same[rows[:, side]]]
+        rows = rows[np.sort(np.unique(rows[:, side], return_index=True)[1])]
+    return rows
+
+
+def _match_record(pair: tuple[int, int], index1: I64, index2: I64, xy1: F64, xy2: F64) -> Matches:
+    score, affine = np.ones(len(xy1), dtype=np.float32), np.tile(np.eye(2), (len(xy1), 1, 1))
+    return Matches(*pair, index1, index2, xy1, xy2, score, affine)
+
+
+def _forward(m: Matches) -> Matches:
+    """The matches with i < j."""
+    return m if m.i < m.j else _match_record((m.j, m.i), m.index2, m.index1, m.xy2, m.xy1)
+
+
+def given_tracks(tracks: Tracks, views: Views) -> Given:
+    """The matches of all pairs of images that share enough points."""
+    count = len(views.names)
+    view, point = np.asarray(tracks.view_index), np.asarray(tracks.point_index)
+    if tracks.n_views != count or len(view) == 0 or view.max() >= count:
+        raise UsageError(f"the tracks are of {tracks.n_views} images, the sizes of {count}")
+    # One observation of a point in a view, sorted by point and view.
+    _, kept = np.unique(np.asarray(point, dtype=np.int64) * count + view, return_index=True)
+    kept = kept[np.bincount(point[kept], minlength=tracks.n_points)[point[kept]] >= 2]
+    view, point, xy = view[kept], point[kept], np.asarray(tracks.xy, dtype=np.float64)[kept]
+    here = [np.flatnonzero(view == i) for i in range(count)]
+    corners = [_positions(xy[rows], i, views) for i, rows in enumerate(here)]
+    found: list[Matches] = []
+    for i in range(count):
+        for j in range(i + 1, count):
+            _, a, b = np.intersect1d(point[here[i]], point[here[j]], return_indices=True)
+            if len(a) >= MIN_COMMON_POINTS:
+                found.append(_match_record((i, j), a, b, corners[i][a], corners[j][b]))
+    if not found:
+        raise UsageError(
+            f"no two images share {MIN_COMMON_POINTS} of the {counted(tracks.n_points, 'point')}"
+        )
+    _, number = np.unique(point, return_inverse=True)
+    return Given(corners, found, Tracks(view, number, xy, count, int(number.max()) + 1))
+
+
+def at_working_size(given: Given, images: Sequence[Image]) -> Given:
+    """The same in pixels at working size."""
+    scales = np.array([image.scale for image in images])
+    if (scales == 1.0).all():
+        return given
+
+    def scaled(xy: F64, scale: Any) -> F64:
+        return np.asarray((xy + 0.5) * scale - 0.5)
+
+    matches = [
+        replace(m, xy1=scaled(m.xy1, scales[m.i]), xy2=scaled(m.xy2, scales[m.j])) for m in given.matches
+    ]
+    tracks = given.tracks
+    if tracks is not None:
+        tracks = replace(tracks, xy=scaled(tracks.xy, scales[tracks.view_index][:, None]))
+    return Given([scaled(xy, s) for xy, s in zip(given.corners, scales, strict=True)], matches, tracks)
 
 
 def take_corners(given: Given, state: PipelineState) -> None:

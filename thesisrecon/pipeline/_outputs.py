@@ -207,7 +207,7 @@ def _write_model(
         )
     X = reconstruction.X[reconstruction.valid]
     write_point_cloud(directory.path / "points.ply", X[:, :3] / X[:, 3:], colors[reconstruction.valid])
-    write_json(directory.path / "cameras.json", cameras_table(reconstruction, result.images))
+    write_json(directory.path / "cameras.json", cameras_table(result.cameras))
     return warnings
 
 

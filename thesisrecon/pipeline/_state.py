@@ -16,7 +16,7 @@ from thesisrecon.config import Matcher, PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
-from thesisrecon.numerics.observations import morton_pair_order
+from thesisrecon.numerics._observations import morton_pair_order
 from thesisrecon.records import Features, Image
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run

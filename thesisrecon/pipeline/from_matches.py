@@ -15,17 +15,21 @@ import numpy as np
 from thesisrecon._settings import Config, Settings, build_config
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
-from thesisrecon.io._colmap_database import read_database
+from thesisrecon.io._colmap_reading import read_database
 from thesisrecon.io._images import images_folder
 from thesisrecon.io._models import read_model
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
-from thesisrecon.pipeline._given import Given, take_corners, take_pairs, take_tracks, verify_pairs
-from thesisrecon.pipeline._given_input import (
+from thesisrecon.pipeline._given import (
+    Given,
     PairMatches,
     Views,
     at_working_size,
     given_matches,
     given_tracks,
+    take_corners,
+    take_pairs,
+    take_tracks,
+    verify_pairs,
     views_of,
 )
 from thesisrecon.pipeline._outputs import RESULT_FILES
@@ -152,17 +156,12 @@ def reconstruct_from_tracks(
 
     Examples
     --------
+    ``keypoints`` as in the example of `thesisrecon.reconstruct_from_matches`:
+
     >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import Camera, Tracks, reconstruct_from_tracks
-    >>> rng = np.random.default_rng(0)
-    >>> K = np.array([[900.0, 0, 319.5], [0, 900, 239.5], [0, 0, 1]])
-    >>> angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5]])
-    >>> X = rng.uniform(-1, 1, (200, 3))
-    >>> R = Rotation.from_euler("xyz", angles).as_matrix()
-    >>> cameras = [Camera(K, r, np.array([0, 0, 6.0]), (640, 480)) for r in R]
-    >>> xy = np.concatenate([camera.project(X) for camera in cameras]) + rng.normal(0, 0.3, (1000, 2))
-    >>> tracks = Tracks(np.repeat(np.arange(5), 200), np.tile(np.arange(200), 5), xy, 5, 200)
+    >>> from thesisrecon import Tracks, reconstruct_from_tracks
+    >>> view, point = np.repeat(np.arange(5), 200), np.tile(np.arange(200), 5)
+    >>> tracks = Tracks(view, point, np.concatenate(keypoints), 5, 200)
     >>> result = reconstruct_from_tracks(tracks, [(640, 480)] * 5)
     >>> bool(abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"])
     True
@@ -205,25 +204,16 @@ def reconstruct_from_colmap(
 
     Examples
     --------
-    The sparse model that a run wrote is calibrated again, from its tracks alone:
+    ``result`` as in the example of `thesisrecon.reconstruct_from_matches`; its sparse model is calibrated
+    again, from its tracks alone:
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import Camera, Tracks, reconstruct_from_colmap, reconstruct_from_tracks
-    >>> rng = np.random.default_rng(0)
-    >>> K = np.array([[900.0, 0, 319.5], [0, 900, 239.5], [0, 0, 1]])
-    >>> angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5]])
-    >>> X = rng.uniform(-1, 1, (200, 3))
-    >>> R = Rotation.from_euler("xyz", angles).as_matrix()
-    >>> cameras = [Camera(K, r, np.array([0, 0, 6.0]), (640, 480)) for r in R]
-    >>> xy = np.concatenate([camera.project(X) for camera in cameras]) + rng.normal(0, 0.3, (1000, 2))
-    >>> tracks = Tracks(np.repeat(np.arange(5), 200), np.tile(np.arange(200), 5), xy, 5, 200)
+    >>> from thesisrecon import reconstruct_from_colmap
     >>> with TemporaryDirectory() as out:
-    ...     first = reconstruct_from_tracks(tracks, [(640, 480)] * 5, out)
-    ...     second = reconstruct_from_colmap(Path(out) / "sparse" / "0")
-    >>> abs(round(float(second.cameras[0].K[0, 0] / first.cameras[0].K[0, 0] - 1), 2))
+    ...     result.save(out)
+    ...     again = reconstruct_from_colmap(Path(out) / "sparse" / "0")
+    >>> abs(round(float(again.cameras[0].K[0, 0] / result.cameras[0].K[0, 0] - 1), 2))
     0.0
     """
     path = Path(path)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import whitening_transform
+from thesisrecon.geometry._conditioning import whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.numerics._partial_bundle import refine_points
-from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.projective._track_selection import observation_cells
 from thesisrecon.records import Reconstruction, Tracks
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
 from thesisrecon.records import Reconstruction, Tracks, TwoView
@@ -118,11 +118,7 @@ def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView]) -> B8:
 
 
 def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int) -> B8:
-    """Select the longest of the ``usable`` tracks (N,), spread over each image.
-
-    Each image is divided into a grid over the extent of its points; longest tracks come first within a cell,
-    and all cells contribute in turn.
-    """
+    """Select the longest ``usable`` tracks (N,), cell by cell of a grid over the points of each image."""
     length = np.bincount(tracks.point_index, minlength=tracks.n_points)
     keep = np.zeros(tracks.n_points, dtype=bool)
     for view in range(tracks.n_views):

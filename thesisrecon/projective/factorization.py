@@ -14,9 +14,11 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry._conditioning import normalizing_transform
+from thesisrecon.geometry._homography import homography_linear, homography_sampson_residuals
 from thesisrecon.geometry.camera_matrix import orient_signs
-from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
-from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_sampson_residuals
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.two_view import epipoles
 from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.projective._model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
 from thesisrecon.projective._track_selection import (
@@ -212,11 +214,7 @@ def _tree_views(tree: Sequence[Edge]) -> list[int]:
 
 
 def _grow_core(seen: B8, pairs: Sequence[TwoView], start: TwoView, *, min_tracks: int) -> list[Edge]:
-    """Return the tree of views (i, j), i before j, that share ``min_tracks``; it begins with ``start``.
-
-    ``seen`` (V, N). The next view leaves most tracks common to all, if an accepted pair connects it; of such
-    pairs the one with most non-planar matches.
-    """
+    """The tree (i, j) of views that share ``min_tracks``, by most common tracks, then non-planar matches."""
     tree, views = [(start.i, start.j)], {start.i, start.j}
     weight: dict[Edge, float] = {}
     for p in pairs:

@@ -53,11 +53,7 @@ def _projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
 def _find_inconsistent_view(
     P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float, min_ratio: float
 ) -> tuple[int, float] | None:
-    """Return the view that agrees least with the verified matches of its pairs, and its inlier ratio.
-
-    An inlier is within ``threshold_px`` (Sampson) of the F of the two cameras. None if all views reach
-    ``min_ratio``. One view at a time: a wrong camera also lowers the ratios of its partners.
-    """
+    """The view that agrees least with the verified matches of its pairs, and its ratio; None if all do."""
     total, agreed = np.zeros(len(P)), np.zeros(len(P))
     for pair in pairs:
         if not (pair.accepted and registered[pair.i] and registered[pair.j]):
@@ -139,11 +135,7 @@ class IncrementalProjective:
     def _best_model(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, starts: Sequence[TwoView], rng: Generator
     ) -> ProjectiveModel:
-        """Return the model with most cameras, then most inliers, over the initial pairs tried.
-
-        Another pair is tried only if it may add a view that was not merely deferred; once half of the views
-        are registered, no other part is larger.
-        """
+        """The model with most cameras, then inliers, of initial pairs that may add a view."""
 
         def rank(model: ProjectiveModel) -> tuple[int, int]:
             return int(model.registered.sum()), int(model.used.sum())

@@ -179,10 +179,7 @@ def render_report(data: ReportData) -> str:
 
 
 def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
-    """Return the figures by element id, and the number of points in the 3D view.
-
-    The ids are not "scene" and "matrix", since plotly.js creates elements called "scene".
-    """
+    """The figures by element id (not "scene", which plotly.js uses), and the number of points in 3D."""
     names = [image.name for image in data.images]
     figures: dict[str, Any] = {}
     scene = build_scene(data.metric.reconstruction) if data.metric is not None else None

@@ -146,10 +146,7 @@ def select_candidate(
     frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion,
     candidates: Sequence[Candidate], *, max_candidates: int = 1, min_in_front_ratio: float = 0.5,
 ) -> SelfCalibration:  # fmt: skip
-    """Select the best candidates with enough points in front and check their identifiability.
-
-    ``StageFailure`` if no candidate places a share ``min_in_front_ratio`` of the observations in front.
-    """
+    """Select the best candidates with enough points in front and check their identifiability."""
     chosen = _distinct_upgrades(frame, reconstruction, candidates, max_candidates, min_in_front_ratio)
     if not chosen:
         raise _no_candidate_failure(frame, reconstruction, len(candidates))

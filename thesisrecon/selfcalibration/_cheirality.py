@@ -22,10 +22,7 @@ _SAME_PLANE = 1e-3
 
 @dataclass(frozen=True)
 class Polytope:
-    """Planes (v, 1) with ``rows`` (M, 4) (v, 1) > 0 in a quasi-affine frame.
-
-    ``quasi_affine`` (4, 4) transforms points of the reference frame there; ``box`` (3, 2) bounds v.
-    """
+    """Planes (v, 1), v in a ``box`` (3, 2), with ``rows`` (M, 4) (v, 1) > 0 in a quasi-affine frame."""
 
     rows: F64
     quasi_affine: F64

@@ -13,10 +13,10 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics._metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics._noise import noise_from_distances
-from thesisrecon.numerics.metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.records import IdentifiabilityReport, Reconstruction, Tracks, Upgrade
 from thesisrecon.selfcalibration._critical_motions import (
     OPTICAL_AXIS,

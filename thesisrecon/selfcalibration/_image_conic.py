@@ -101,10 +101,7 @@ class ImageConic:
 
 
 def solve_conic(H: F64, constraints: ConicConstraints, *, orthogonal: F64 | None = None) -> ImageConic:
-    """Solve for the conic by SVD, reweighted by the estimated focal lengths; H (R, 3, 3) of determinant 1.
-
-    ``orthogonal`` (M, 2, 3) are pairs of vanishing points in the reference view with x' w y = 0.
-    """
+    """Solve for the conic by SVD, reweighted by the estimated focals; x' w y = 0 for ``orthogonal`` pairs."""
     focals = np.ones((1, len(H)))
     conic = ImageConic(np.eye(3), np.zeros(6))
     for _ in range(_REWEIGHTINGS):

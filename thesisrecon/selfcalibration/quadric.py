@@ -79,16 +79,6 @@ class NonlinearQuadric:
         Residual beyond which an entry counts linearly (Huber).
     criterion : RotationCriterion
         Criterion that selects the starts.
-
-    Examples
-    --------
-    ``projective`` as in the example of `thesisrecon.self_calibrate`:
-
-    >>> from thesisrecon import PipelineConfig, self_calibrate
-    >>> from thesisrecon.selfcalibration.quadric import NonlinearQuadric
-    >>> config = PipelineConfig(selfcalibration=NonlinearQuadric())
-    >>> round(self_calibrate(projective, config=config).K[0, 0, 0])
-    800
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)

@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
@@ -48,16 +48,6 @@ class Stratified:
         Required share of observations with positive depth.
     criterion : RotationCriterion
         Criterion for the standard deviations of the focal lengths.
-
-    Examples
-    --------
-    ``projective`` as in the example of `thesisrecon.self_calibrate`:
-
-    >>> from thesisrecon import PipelineConfig, self_calibrate
-    >>> from thesisrecon.selfcalibration.stratified import Stratified
-    >>> config = PipelineConfig(selfcalibration=Stratified())
-    >>> round(self_calibrate(projective, config=config).K[0, 0, 0])
-    800
     """
 
     plane: CheiralitySearch | ModulusConstraint | ParallelLines = field(default_factory=CheiralitySearch)

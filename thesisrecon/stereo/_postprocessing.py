@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, I16, U8, U16
 from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
+from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import LEVELS, StereoImage, add_squares
 
 UNREACHED = np.uint16(65535)
@@ -288,3 +293,15 @@ def disparity_noise(raw: F32, smooth: F32) -> float:
     apart = np.abs(raw[::SUBSAMPLING, ::SUBSAMPLING] - smooth[::SUBSAMPLING, ::SUBSAMPLING])
     known = apart[np.isfinite(apart)]
     return float(np.hypot(1.4826 * np.median(known), LOCKING_PX)) if len(known) else float("nan")
+
+
+def match_both_sides(
+    match: Callable[[Any, Any], DisparityMap], left: NDArray[Any], right: NDArray[Any]
+) -> tuple[DisparityMap, DisparityMap]:
+    """Disparities of both images by a matcher of the left one: the mirrored right image is a left image."""
+
+    def mirrored(image: NDArray[Any]) -> NDArray[Any]:
+        return np.ascontiguousarray(image[:, ::-1])
+
+    found, back = match(left, right), match(mirrored(right), mirrored(left))
+    return found, DisparityMap(mirrored(back.disparity), mirrored(back.confidence), back.sigma_px)

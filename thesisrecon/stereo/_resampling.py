@@ -13,6 +13,7 @@ from thesisrecon.geometry._image_filters import cubic_weights
 from thesisrecon.geometry.camera_matrix import distort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.kernels import empty, kernel
+from thesisrecon.records import Image, PinholeView, Reconstruction
 
 MAX_TAPS = 24
 """Limit of the filter width: reductions by more than 6 alias."""
@@ -202,3 +203,26 @@ class Rectification(ABC):
     def warp(self, image: F32, side: int) -> F32:
         """Resample an image (H, W) or (H, W, C) into the frame, NaN outside."""
         return warp_image(image, partial(self._lookup, side), self.size)
+
+
+def pinhole_view(
+    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
+) -> PinholeView:
+    """Undistort an image of a metric reconstruction, at most ``max_side`` long; P[2] X is the depth."""
+    K = reconstruction.K
+    if reconstruction.stratum != "metric" or K is None:
+        raise ValueError("undistorted views need a metric reconstruction with K")
+    if tuple(reconstruction.sizes[view]) != image.size:
+        raise ValueError(f"image {image.name} must be {reconstruction.sizes[view]} px; got {image.size}")
+    shrink = min(1.0, max_side / max(image.size))
+    size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
+    sx, sy = np.array(size) / np.array(image.size)
+    # (x + 0.5) s - 0.5 along either side.
+    S = np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
+    distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
+    P = reconstruction.P[view]
+    P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
+    if not distortion.any() and size == image.size and image.mask is None:
+        return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
+    rgb, seen = undistort_image(image.rgb, K[view], distortion, S @ K[view], size, mask=image.mask)
+    return PinholeView(view, P, rgb, seen)

@@ -19,7 +19,7 @@ from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo._frustum_samples import frustum_samples
 from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
-from thesisrecon.stereo._resampling import undistort_image
+from thesisrecon.stereo._resampling import pinhole_view
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 
 BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
@@ -110,43 +110,6 @@ def _weights(points: SparsePoints, centres: Mapping[int, F64], view: int, other:
     weights = np.zeros(len(points.X))
     weights[common] = np.where(angle >= MIN_ANGLE_DEG, np.exp(-0.5 * (off / width) ** 2), 0.0)
     return weights
-
-
-def pinhole_view(
-    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
-) -> PinholeView:
-    """Undistort an image of a metric reconstruction.
-
-    Parameters
-    ----------
-    image, reconstruction, view : Image, Reconstruction, int
-        Image of this view, in the size of the reconstruction (else ``ValueError``).
-    max_side : int
-        Limit of the longest side of the result in pixels.
-
-    Returns
-    -------
-    PinholeView
-        The third coordinate of its camera is the depth. Pixels outside the original image or its mask are
-        black and not ``seen``.
-    """
-    K = reconstruction.K
-    if reconstruction.stratum != "metric" or K is None:
-        raise ValueError("undistorted views need a metric reconstruction with K")
-    if tuple(reconstruction.sizes[view]) != image.size:
-        raise ValueError(f"image {image.name} must be {reconstruction.sizes[view]} px; got {image.size}")
-    shrink = min(1.0, max_side / max(image.size))
-    size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
-    sx, sy = np.array(size) / np.array(image.size)
-    # (x + 0.5) s - 0.5 along either side.
-    S = np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
-    distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
-    P = reconstruction.P[view]
-    P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
-    if not distortion.any() and size == image.size and image.mask is None:
-        return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
-    rgb, seen = undistort_image(image.rgb, K[view], distortion, S @ K[view], size, mask=image.mask)
-    return PinholeView(view, P, rgb, seen)
 
 
 SURE = 3.0

@@ -6,12 +6,10 @@ diagonals as well (8 paths). Occlusions are found afterwards by the left-right c
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F32, I16, U8
 from thesisrecon.records import DisparityMap
@@ -172,30 +170,3 @@ def _adapted_P2(image: StereoImage, noise: float) -> U8:
 
 PUBLISHED = SemiGlobalMatching(paths=8, census_share=1.0, support=False, smoothing_radius=0)
 """Semi-global matching as published: eight paths over census costs of single pixels."""
-
-
-def match_both_sides(
-    match: Callable[[Any, Any], DisparityMap], left: NDArray[Any], right: NDArray[Any]
-) -> tuple[DisparityMap, DisparityMap]:
-    """Compute the disparities of both images with a matcher of the left image.
-
-    The second match exchanges the images and mirrors them: the mirrored right image is a left image.
-
-    Parameters
-    ----------
-    match : callable
-        ``match(left, right)`` returns the disparities of the left image.
-    left, right : ndarray (H, W) or (H, W, K)
-        Rectified images.
-
-    Returns
-    -------
-    tuple of DisparityMap
-        Of the left and of the right image, x_right = x_left - d in both.
-    """
-
-    def mirrored(image: NDArray[Any]) -> NDArray[Any]:
-        return np.ascontiguousarray(image[:, ::-1])
-
-    found, back = match(left, right), match(mirrored(right), mirrored(left))
-    return found, DisparityMap(mirrored(back.disparity), mirrored(back.confidence), back.sigma_px)

@@ -17,8 +17,8 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty, full, kernel
 from thesisrecon.numerics._noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
-from thesisrecon.surface._mesh import components
-from thesisrecon.surface.linear import GRAZING_DEG, max_depth_slope, same_surface
+from thesisrecon.surface._mesh import components, max_depth_slope, same_surface
+from thesisrecon.surface.linear import GRAZING_DEG
 
 STEP = 5.0
 """Standard deviations of a significant depth step."""
@@ -139,10 +139,7 @@ class Domain(NamedTuple):
 
 @dataclass(frozen=True)
 class SplinePieces:
-    """Piece (H, W) of each pixel, -1 for none; ``coefficient`` (N, 16) and ``cell`` (N,) of each piece.
-
-    ``shape``: rows and columns of cells; ``count``: number of coefficients.
-    """
+    """Piece (H, W) of each pixel, -1 for none; ``coefficient`` (N, 16) and ``cell`` (N,) of each piece."""
 
     piece: I64
     coefficient: I64

@@ -9,8 +9,11 @@ import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import TexturedMesh
 
+RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
+"""Corners (0 1 above, 2 3 below) of the triangles of a square by its diagonal, the left one first."""
 MIN_PART_SHARE = 0.0005
 """Connected parts below this share of the area are removed."""
 
@@ -150,3 +153,35 @@ def _means(cluster: I64, values: F64 | NDArray[np.uint8]) -> F64:
     """(C, 3) means of ``values`` (N, 3) over each cluster."""
     size = np.bincount(cluster)
     return np.stack([np.bincount(cluster, values[:, d]) / size for d in range(3)], axis=1)
+
+
+def max_depth_slope(P: F64, grazing_deg: float) -> float:
+    """Largest relative depth step between adjacent pixels of a surface seen at ``grazing_deg`` or more."""
+    K = decompose_camera(P)[0]
+    return float(1.0 / (np.sqrt(K[0, 0] * K[1, 1]) * np.tan(np.radians(grazing_deg))))
+
+
+def triangulate_grid(depth: F64, std: F64, slope: float) -> tuple[B8, B8]:
+    """Divide the squares of depths (H, W) into triangles without surface break along a side.
+
+    Returns whether the diagonal, that of the smaller depth step, runs from the lower left to the upper right
+    (H - 1, W - 1), and which of the two triangles exist (H - 1, W - 1, 2).
+    """
+    corner = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
+    z, spread = (np.stack([values[c] for c in corner], axis=-1) for values in (depth, std))
+    falling_step = np.abs(z[..., 0] - z[..., 3])
+    rising = (np.abs(z[..., 1] - z[..., 2]) < falling_step) | np.isnan(falling_step)
+    whole = np.empty((*rising.shape, 2), dtype=bool)
+    for k in range(2):
+        triple = np.where(rising[..., None], RISING[k], FALLING[k])
+        at, std_at = (np.take_along_axis(values, triple, axis=-1) for values in (z, spread))
+        before, std_before = (np.roll(values, 1, axis=-1) for values in (at, std_at))
+        with np.errstate(invalid="ignore"):
+            whole[..., k] = same_surface(at, before, std_at, std_before, np.sqrt(2.0) * slope).all(axis=-1)
+    return rising, whole
+
+
+def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> B8:
+    """Whether two depths differ by at most ``slope`` of the smaller, or three standard deviations."""
+    limit = np.maximum(slope * np.minimum(z1, z2), 3.0 * np.hypot(std1, std2))
+    return np.asarray(np.abs(z1 - z2) <= limit)

@@ -349,10 +349,7 @@ def _dot(a: F64, b: F64) -> float:
 def simplify_surface(
     mesh: TexturedMesh, limit: F64, *, longest: float, threads: int = 1, overwrite: bool = False
 ) -> TexturedMesh:
-    """Collapse edges while the rms distance to the planes of the original faces is within ``limit`` (N,).
-
-    New sides are at most ``longest``. ``overwrite`` uses the arrays of the mesh, which saves memory.
-    """
+    """Collapse edges while the rms distance to the planes of the original faces is within ``limit`` (N,)."""
     size, centre = len(mesh.vertices), mesh.vertices.mean(axis=0)
     points = np.subtract(mesh.vertices, centre, out=mesh.vertices if overwrite else None)
     original = points.astype(np.float32)

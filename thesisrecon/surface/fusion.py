@@ -31,9 +31,9 @@ from thesisrecon.surface._fusion_kernels import (
     place_vertices,
     touched_blocks,
 )
-from thesisrecon.surface._mesh import remove_small_parts, select_faces
+from thesisrecon.surface._mesh import max_depth_slope, remove_small_parts, select_faces, triangulate_grid
 from thesisrecon.surface._simplification import simplify_surface
-from thesisrecon.surface.linear import GRAZING_DEG, max_depth_slope, surface_from_depth, triangulate_grid
+from thesisrecon.surface.linear import GRAZING_DEG, surface_from_depth
 
 MIN_COSINE = 0.1
 """Lower limit of the incidence cosine."""

@@ -6,80 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import DepthMap, TexturedMesh
-from thesisrecon.surface._mesh import remove_unused_vertices
+from thesisrecon.surface._mesh import (
+    FALLING,
+    RISING,
+    max_depth_slope,
+    remove_unused_vertices,
+    triangulate_grid,
+)
 
-RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
-"""Corners (0 1 above, 2 3 below) of the triangles of a square by its diagonal, the left one first."""
 GRAZING_DEG = 10.0
 """Surfaces break where they are seen at a smaller angle."""
-
-
-def max_depth_slope(P: F64, grazing_deg: float) -> float:
-    """Largest relative depth step between adjacent pixels of a surface seen at ``grazing_deg`` or more.
-
-    Parameters
-    ----------
-    P, grazing_deg : ndarray (3, 4), float
-        Camera of the depth map; least angle between surface and ray.
-
-    Returns
-    -------
-    float
-        Relative depth step per pixel.
-    """
-    K = decompose_camera(P)[0]
-    return float(1.0 / (np.sqrt(K[0, 0] * K[1, 1]) * np.tan(np.radians(grazing_deg))))
-
-
-def triangulate_grid(depth: F64, std: F64, slope: float) -> tuple[B8, B8]:
-    """Divide the squares of depths into triangles without surface break along a side.
-
-    Parameters
-    ----------
-    depth, std, slope : ndarray (H, W), ndarray (H, W), float
-        Depths, their standard deviations, and the largest relative depth step.
-
-    Returns
-    -------
-    rising : ndarray (H - 1, W - 1) of bool
-        Whether the diagonal, that of the smaller depth step, runs from the lower left to the upper right.
-    whole : ndarray (H - 1, W - 1, 2) of bool
-        Which of the two triangles exist.
-    """
-    corner = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
-    z, spread = (np.stack([values[c] for c in corner], axis=-1) for values in (depth, std))
-    falling_step = np.abs(z[..., 0] - z[..., 3])
-    rising = (np.abs(z[..., 1] - z[..., 2]) < falling_step) | np.isnan(falling_step)
-    whole = np.empty((*rising.shape, 2), dtype=bool)
-    for k in range(2):
-        triple = np.where(rising[..., None], RISING[k], FALLING[k])
-        at, std_at = (np.take_along_axis(values, triple, axis=-1) for values in (z, spread))
-        before, std_before = (np.roll(values, 1, axis=-1) for values in (at, std_at))
-        with np.errstate(invalid="ignore"):
-            whole[..., k] = same_surface(at, before, std_at, std_before, np.sqrt(2.0) * slope).all(axis=-1)
-    return rising, whole
-
-
-def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> B8:
-    """Whether two depths differ by at most ``slope`` of the smaller, or three standard deviations.
-
-    Parameters
-    ----------
-    z1, z2, std1, std2 : ndarray
-        Depths and their standard deviations.
-    slope : float or ndarray
-        Largest relative depth step.
-
-    Returns
-    -------
-    ndarray of bool
-        Whether the depths can belong to one surface.
-    """
-    limit = np.maximum(slope * np.minimum(z1, z2), 3.0 * np.hypot(std1, std2))
-    return np.asarray(np.abs(z1 - z2) <= limit)
 
 
 def surface_from_depth(

@@ -18,20 +18,11 @@ import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._conditioning import require_finite
+from thesisrecon.geometry._homography import require_parallax_of_matches
 from thesisrecon.geometry.camera_matrix import calibration_matrix, rq
-from thesisrecon.geometry.homogeneous import (
-    cross_matrix,
-    dehomogenize,
-    homogenize,
-    require_finite,
-    unit_normals,
-)
-from thesisrecon.geometry.two_view import (
-    enforce_rank_two,
-    epipoles,
-    require_parallax_of_matches,
-    sampson_residuals,
-)
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
+from thesisrecon.geometry.two_view import enforce_rank_two, epipoles, sampson_residuals
 
 MAX_RESIDUAL = 0.005
 """Median distance of matches from their epipolar lines, per long side, above which F is rejected."""

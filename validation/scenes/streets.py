@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics._observations import Observations
 
 Kind = Literal["street", "loop"]
 SIZE = (1000, 750)

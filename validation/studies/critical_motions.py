@@ -22,7 +22,7 @@ from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.projective._track_selection import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement

@@ -22,7 +22,7 @@ from thesisrecon.config import ProjectiveReconstructor
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.numerics._partial_bundle import refine_points
-from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.projective.factorization import Factorization, depths_from_fundamentals, factorize
 from thesisrecon.projective.incremental import IncrementalProjective

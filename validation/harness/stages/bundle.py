@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
+from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics.metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics.observations import Observations
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.records import Reconstruction
 from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, each, ratio, read_arrays, row

@@ -15,7 +15,8 @@ from thesisrecon.config import preset
 from thesisrecon.io._files import write_text
 from thesisrecon.io._images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
-from thesisrecon.stereo.depth import MultiViewStereo, pinhole_view
+from thesisrecon.stereo._resampling import pinhole_view
+from thesisrecon.stereo.depth import MultiViewStereo
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, each, row
 from validation.harness.scenes import load_images

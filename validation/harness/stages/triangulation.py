@@ -15,7 +15,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
-from thesisrecon.numerics.projective_bundle import refine_projective_bundle
+from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
 from validation.harness.rows import each, plot, read_arrays, row, scatter
 from validation.metrics.record import Metric

@@ -45,24 +45,11 @@ def run_levenberg_marquardt(
     tolerance: float = 1e-7,
     initial_damping: float = 1e-4,
 ) -> tuple[State, float, int]:
-    """Minimise a problem by Levenberg-Marquardt; the cost never rises and singular systems raise nothing.
+    """Minimise a problem by Levenberg-Marquardt; return the final state, its cost and the linear solves.
 
-    The damping multiplies the diagonal (Marquardt 1963), so that units do not matter and gauge freedoms need
-    no other treatment; it follows Nielsen (IMM-REP-1999-05).
-
-    Parameters
-    ----------
-    problem, state : object, State
-        Problem with the methods ``linearize``, ``retract`` and ``cost``, and its initial state.
-    max_iterations : int
-        Maximum number of linear solves.
-    tolerance, initial_damping : float
-        Relative gain of cost, predicted or actual, at convergence, and first damping.
-
-    Returns
-    -------
-    state, cost, iterations : State, float, int
-        Final state, its cost, and number of linear solves.
+    The cost never rises and singular systems raise nothing. The damping multiplies the diagonal (Marquardt
+    1963), so that units do not matter and gauge freedoms need no other treatment; it follows Nielsen
+    (IMM-REP-1999-05). ``tolerance`` is the relative gain of cost, predicted or actual, at convergence.
     """
     system = problem.linearize(state)
     cost = system.cost
@@ -95,31 +82,14 @@ def run_levenberg_marquardt(
 
 @dataclass(frozen=True)
 class DenseSystem:
-    """Normal equations of a small problem, weighted by sqrt(rho').
-
-    Parameters
-    ----------
-    cost, hessian, gradient : float, ndarray (D, D), ndarray (D,)
-        1/2 sum rho, J'J and J'r.
-    """
+    """Normal equations of a small problem, weighted by sqrt(rho'): 1/2 sum rho, J'J and J'r."""
 
     cost: float
     hessian: F64
     gradient: F64
 
     def solve(self, damping: float) -> tuple[F64, float] | None:
-        """Solve the damped system by Cholesky; parameters without effect (zero diagonal) do not move.
-
-        Parameters
-        ----------
-        damping : float
-            Factor of the diagonal.
-
-        Returns
-        -------
-        tuple or None
-            Step (D,) and its predicted gain; None if the damped system is not positive.
-        """
+        """The damped step and its predicted gain by Cholesky, or None; unknowns without effect stay."""
         diagonal = damping * floored_diagonal(np.diag(self.hessian))
         step = solve_positive(self.hessian + np.diag(diagonal), -self.gradient)
         if step is None:
@@ -128,20 +98,10 @@ class DenseSystem:
 
 
 def invert_information(information: F64) -> F64:
-    """Invert an information matrix, eigenvalues floored relative to the largest.
+    """Invert an information matrix, eigenvalues floored relative to the largest; inf if not finite.
 
     Undetermined directions get a huge variance; the matrix is scaled to a unit diagonal, so that units do not
     decide which these are.
-
-    Parameters
-    ----------
-    information : ndarray (D, D)
-        Information matrix.
-
-    Returns
-    -------
-    ndarray (D, D)
-        Covariance; inf if an entry is not finite.
     """
     if len(information) == 0:
         return np.zeros_like(information)
@@ -155,13 +115,7 @@ def invert_information(information: F64) -> F64:
 
 @dataclass(frozen=True)
 class ResidualMinimum:
-    """Result of :func:`minimize_residuals`.
-
-    Parameters
-    ----------
-    x, cost, covariance, residual : ndarray (D,), float, ndarray (D, D), ndarray (M,)
-        Minimum, 1/2 sum rho, sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D), and residuals.
-    """
+    """Minimum x, 1/2 sum rho, sigma^2 (J'J)^-1 with sigma^2 = 2 cost / (M - D), and residuals (M,)."""
 
     x: F64
     cost: float
@@ -214,26 +168,9 @@ def minimize_residuals(
     max_iterations: int = 50,
     tolerance: float = 1e-10,
 ) -> ResidualMinimum:
-    """Minimise 1/2 sum rho(r_m(x)^2) by dense Levenberg-Marquardt.
+    """Minimise 1/2 sum rho(r_m(x)^2) by dense Levenberg-Marquardt, with forward differences by default.
 
-    Parameters
-    ----------
-    residual_fn, x0 : callable, ndarray (D,)
-        (D,) -> (M,), not finite where a state is rejected; and the start.
-    jacobian, loss : callable, optional
-        (D,) -> (M, D), forward differences by default; and the loss of squared residuals with its derivative.
-    max_iterations, tolerance : int, float
-        As in :func:`run_levenberg_marquardt`.
-
-    Returns
-    -------
-    ResidualMinimum
-        Minimum with its covariance.
-
-    Raises
-    ------
-    ValueError
-        If x0 or its residuals are not finite.
+    States with residuals that are not finite are rejected; such a start is a ``ValueError``.
     """
     if not (np.isfinite(x0).all() and np.isfinite(residual_fn(x0)).all()):
         raise ValueError("minimize_residuals needs a start with finite residuals")

@@ -12,12 +12,12 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import scene_frame
+from thesisrecon.geometry._conditioning import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._covariance import gauge_directions, invert_in_inner_gauge
 from thesisrecon.numerics._intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
-from thesisrecon.numerics.observations import Jacobians, Observations, Weighting
+from thesisrecon.numerics._observations import Jacobians, Observations, Weighting
 
 # Number of pose unknowns tested besides all intrinsics.
 _MAX_POSES = 30
@@ -26,18 +26,11 @@ _MAX_BLOCKS, _MIN_BLOCK_POINTS = 32, 12
 
 @dataclass(frozen=True)
 class BlockScatter:
-    """Variances of the intrinsics and their scatter between blocks of points.
+    """Variances of the intrinsics (the focal relative) and their scatter between blocks of points.
 
-    Parameters
-    ----------
-    variance : ndarray (G, C)
-        Variances by the information matrix for the given noise, relative for the focal length.
-    shared_variance, ratio : ndarray (C,), ndarray (G, C)
-        Variances if all views shared one camera, 0 for fixed intrinsics; and scatter between blocks of points
-        over its expectation, NaN for fixed intrinsics.
-    overdispersion, blocks : float, int
-        Scatter between blocks over that between single points, for all unknowns: 1 if the noise of different
-        points is independent, for any distribution; and number of blocks.
+    ``shared_variance`` (C,) holds if all views shared one camera. ``ratio`` (G, C) is the scatter over its
+    expectation, NaN for fixed intrinsics. ``overdispersion`` is the scatter between blocks over that between
+    single points: 1 if the noise of different points is independent, for any distribution.
     """
 
     variance: F64
@@ -70,10 +63,7 @@ def point_blocks(X: F64, used: B8) -> I64:
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Weighted residuals (2K,) at the optimal points, their Jacobian J (2K, D) by the cameras and points.
-
-    ``taken`` (3N, D) is the part of J removed by the elimination of the points.
-    """
+    """Weighted residuals (2K,), their Jacobian J (2K, D), and the part of it ``taken`` by the points."""
 
     residual: F64
     J: scipy.sparse.csr_matrix
@@ -90,27 +80,13 @@ def block_scatter(
     prior: IntrinsicsPrior,
     noise: tuple[float, float],
 ) -> BlockScatter:
-    """Measure the scatter of the intrinsics' gradients between blocks of points.
+    """Measure the scatter of the intrinsics' gradients between blocks of points after an adjustment.
 
     With S_b the information of block b on the cameras (its points eliminated), g_b its gradient and C the
     covariance, the pull of a block on value a is c_a' g_b; without correlation between blocks sum (c_a'
     g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a, and the ratio of the two is 1. Huber's loss
     weights as if its weight were its slope; the ratio of their means corrects the covariance. The matrix of
     all cameras is dense: for a few hundred of them.
-
-    Parameters
-    ----------
-    cameras, X, observations : MetricCameras, ndarray (N, 3), Observations
-        Cameras and points after the adjustment, and their observations.
-    free, prior : ndarray (C,) of bool, IntrinsicsPrior
-        Intrinsics that move, and their prior.
-    noise : tuple of float
-        Sigma and the turning point of Huber's loss, px.
-
-    Returns
-    -------
-    BlockScatter
-        Variances and their scatter.
     """
     o, group = observations, cameras.group
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
@@ -209,11 +185,7 @@ def _shared_variances(S: F64, values: IntrinsicUnknowns, cameras: MetricCameras,
 
 
 def _block_ratio(system: _Linearised, rows: F64, C: F64, block: I64) -> F64:
-    """Return squared pulls of the blocks on some unknowns (``rows`` of C) over their expectation.
-
-    The expectation for independent noise after the fit is the diagonal of sum C (S_b - S_b C S_b) C; NaN if
-    it is 0.
-    """
+    """Squared pulls of the blocks on ``rows`` of C over sum C (S_b - S_b C S_b) C, their expectation."""
     squares, expected = np.zeros(len(rows)), np.zeros(len(rows))
     of_residual, of_point = block[system.point], np.repeat(block, 3)
     for b in range(int(block.max()) + 1):

@@ -7,24 +7,12 @@ import colorsys
 import numpy as np
 
 from thesisrecon.arrays import F64, U8
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+from thesisrecon.geometry._conditioning import require_finite, require_shapes
 from thesisrecon.geometry.two_view import epipolar_lines
 
 
 def draw_lines(image1: U8, image2: U8, F: F64, xy1: F64, xy2: F64, *, max_lines: int) -> tuple[U8, U8]:
-    """Draw the epipolar lines and points of evenly spaced matches into copies of two images.
-
-    Parameters
-    ----------
-    image1, image2 : ndarray (H, W, 3) uint8
-        The images.
-    F, xy1, xy2, max_lines
-        As for `thesisrecon.draw_epipolar_lines`.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8, twice
-    """
+    """Draw the epipolar lines and points of evenly spaced matches into copies of two images."""
     F, xy1, xy2 = (np.asarray(array, dtype=np.float64) for array in (F, xy1, xy2))
     require_shapes("draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_finite("draw_epipolar_lines", F, xy1, xy2)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry.homogeneous import scene_frame
+from thesisrecon.geometry._conditioning import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._covariance import (
     SIMILARITY_DOF,
@@ -23,6 +23,7 @@ from thesisrecon.numerics._intrinsic_unknowns import (
     assign_columns,
     number_unknowns,
 )
+from thesisrecon.numerics._levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.numerics._metric_kernels import (
     POSE_DOF,
     MetricCameras,
@@ -32,15 +33,14 @@ from thesisrecon.numerics._metric_kernels import (
     move_poses,
     project_metric,
 )
-from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
-from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
-from thesisrecon.numerics.observations import (
+from thesisrecon.numerics._observations import (
     Jacobians,
     Observations,
     SortedObservations,
     Weighting,
     sort_observations,
 )
+from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
 
 # Below a relative gain of NEWTON_GAIN, MIN_CURVATURE of the curvature along a residual is kept if its loss
 # bends: reweighting is safe far from the minimum, Newton's method is faster near it.
@@ -52,17 +52,7 @@ _Covariances = tuple[F64, F64 | None, F64 | None]
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """Weighting and end of a metric bundle adjustment.
-
-    Parameters
-    ----------
-    sigma_px, loss_px : float
-        Standard deviation of one image coordinate, the weight of the data against the priors, and turning
-        point of Huber's loss; infinite for least squares.
-    max_iterations, covariance, point_covariance, noise_floor_px : int, bool, bool, float
-        Maximum number of linear solves, whether to compute the covariances of the cameras, and with them
-        those of the points, and the least noise assumed for them.
-    """
+    """Weighting, end and wanted covariances; ``noise_floor_px`` is the least noise assumed for them."""
 
     sigma_px: float = 1.0
     loss_px: float = 1.0
@@ -78,22 +68,12 @@ class BundleOptions:
 
 @dataclass(frozen=True)
 class MetricBundleResult:
-    """Refined cameras and points with their uncertainty.
+    """Refined cameras and points with their uncertainty, in the inner gauge (no camera is exact).
 
-    Parameters
-    ----------
-    cameras, X : MetricCameras, ndarray (N, 3)
-        Refined cameras and points.
-    residual_px, cost : ndarray (K, 2), float
-        Projection minus observation in the caller's order, and 1/2 sum rho in units of the given sigma,
-        priors included.
-    intrinsics_covariance, pose_covariance : ndarray (G, C, C), ndarray (V, 6, 6), optional
-        Zero for entries that do not move, and without ``covariance``; poses as (rotation vector in rad,
-        translation) of x -> exp(w) x + d in each camera frame, in the inner gauge (no camera is exact).
-    sigma_px : float
-        Standard deviation of one image coordinate, estimated from the residuals.
-    point_covariance : ndarray (N, 3, 3), optional
-        In the same gauge; infinite for points in fewer than two views.
+    ``residual_px`` (K, 2) is projection minus observation in the caller's order, ``cost`` 1/2 sum rho in
+    units of the given sigma, priors included. ``intrinsics_covariance`` (G, C, C) is zero for entries that do
+    not move, ``pose_covariance`` (V, 6, 6) that of (rotation vector in rad, translation) of x -> exp(w) x + d
+    in each camera frame, ``point_covariance`` (N, 3, 3) infinite for points in fewer than two views.
     """
 
     cameras: MetricCameras
@@ -182,30 +162,12 @@ def refine_metric_bundle(
     prior: IntrinsicsPrior | None = None,
     options: BundleOptions | None = None,
 ) -> MetricBundleResult:
-    """Minimise reprojection errors and prior deviations over poses, points and intrinsics.
+    """Minimise reprojection errors and prior deviations over poses, points and ``free`` intrinsics.
 
     The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
     Levenberg-Marquardt; the focal length is stepped as log f, the seven gauge freedoms are left to the
-    damping, and the scene is centred and scaled inside. The cost never rises.
-
-    Parameters
-    ----------
-    cameras, X, observations : MetricCameras, ndarray (N, 3), Observations
-        Start, which intrinsics are shared, and observations in any order.
-    free, prior : ndarray (C,) of bool, IntrinsicsPrior, optional
-        Intrinsics that move, and their prior, which may fix single values.
-    options : BundleOptions, optional
-        Weighting and end.
-
-    Returns
-    -------
-    MetricBundleResult
-        Refined cameras and points; views and points without observations are returned unchanged.
-
-    Raises
-    ------
-    ValueError
-        For pixels that are not finite, or views and points beyond the cameras and X.
+    damping, and the scene is centred and scaled inside. The cost never rises; views and points without
+    observations do not change.
     """
     options = options or BundleOptions()
     o = sort_observations(observations, len(cameras.R), len(X))

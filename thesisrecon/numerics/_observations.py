@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry.homogeneous import require_finite, require_shapes
+from thesisrecon.geometry._conditioning import require_finite, require_shapes
 
 
 @dataclass(frozen=True)
@@ -24,38 +24,14 @@ class SortedObservations:
     order: I64
 
     def unsort(self, values: F64) -> F64:
-        """Bring one value per sorted observation to the order of the caller.
-
-        Parameters
-        ----------
-        values : ndarray (K, ...)
-            Values of the sorted observations.
-
-        Returns
-        -------
-        ndarray (K, ...)
-            The values in the caller's order.
-        """
+        """Bring one value (K, ...) per sorted observation to the order of the caller."""
         out = np.empty_like(values)
         out[self.order] = values
         return out
 
 
 def sort_observations(observations: Observations, n_views: int, n_points: int) -> SortedObservations:
-    """Sort observations by point, with the places at which each point begins.
-
-    Parameters
-    ----------
-    observations : Observations
-        Observations in any order.
-    n_views, n_points : int
-        Numbers of views and points.
-
-    Returns
-    -------
-    SortedObservations
-        The observations by point and view.
-    """
+    """Sort observations by point and view, with the places at which each point begins."""
     view = np.ascontiguousarray(observations.view_index, dtype=np.int64)
     point = np.ascontiguousarray(observations.point_index, dtype=np.int64)
     xy = np.ascontiguousarray(observations.xy, dtype=np.float64)
@@ -103,13 +79,7 @@ _MORTON_BITS = 31
 
 
 class Observations(NamedTuple):
-    """Image observations of scene points, in any order; sorted by point is fastest.
-
-    Parameters
-    ----------
-    view_index, point_index, xy : ndarray (K,) of int, (K,) of int, (K, 2)
-        View, point and pixels of each observation.
-    """
+    """View, point and pixels (K, 2) of observations of scene points; sorted by point is fastest."""
 
     view_index: I64
     point_index: I64
@@ -117,19 +87,9 @@ class Observations(NamedTuple):
 
 
 def morton_pair_order(first: ArrayLike, second: ArrayLike) -> I64:
-    """Return an order of view pairs in which cached data of a view are reused.
+    """Indices of view pairs in an order in which cached data of a view are reused.
 
     Ranges of Morton's curve (IBM, 1966) contain few different views: a cache of M of V computes V^2 / M.
-
-    Parameters
-    ----------
-    first, second : array_like (M,) of int
-        Views of each pair.
-
-    Returns
-    -------
-    ndarray (M,) of int
-        Indices of the pairs; a pair and its reverse are adjacent.
     """
     i, j = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
     low, high = np.minimum(i, j), np.maximum(i, j)

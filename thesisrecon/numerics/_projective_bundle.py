@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import pixel_conditioning, whitening_transform
+from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_transform
 from thesisrecon.numerics._elimination import revert_crossing_points
+from thesisrecon.numerics._levenberg_marquardt import run_levenberg_marquardt
+from thesisrecon.numerics._observations import Jacobians, Observations, Weighting, sort_observations
 from thesisrecon.numerics._projective_kernels import (
     UnitState,
     linearize_projective,
@@ -20,23 +22,13 @@ from thesisrecon.numerics._projective_kernels import (
     tangent_step,
 )
 from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, build_layout
-from thesisrecon.numerics.levenberg_marquardt import run_levenberg_marquardt
-from thesisrecon.numerics.observations import Jacobians, Observations, Weighting, sort_observations
 
 _VIEW_DOF = 11
 
 
 @dataclass(frozen=True)
 class ProjectiveBundleResult:
-    """Result of a projective bundle adjustment.
-
-    Parameters
-    ----------
-    P, X : ndarray (V, 3, 4), (N, 4)
-        Cameras and points in the caller's frame, norms and signs.
-    residual_px, cost : ndarray (K, 2), float
-        Projection minus observation in the caller's order, and 1/2 sum rho, px^2.
-    """
+    """Cameras and points in the caller's frame, norms and signs, residuals (K, 2) and 1/2 sum rho, px^2."""
 
     P: F64
     X: F64
@@ -87,31 +79,11 @@ def refine_projective_bundle(
     max_iterations: int = 10,
     fixed_views: B8 | None = None,
 ) -> ProjectiveBundleResult:
-    """Minimise sum rho(|x - P X|^2) over all cameras and points with Huber's loss.
+    """Minimise sum rho(|x - P X|^2) over all points and cameras but ``fixed_views`` with Huber's loss.
 
     Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the
-    damping handles the 15 gauge freedoms (methods 6.7). The cost never rises.
-
-    Parameters
-    ----------
-    P, X : ndarray (V, 3, 4), (N, 4)
-        Cameras and points of any scale and sign, which are kept.
-    view_index, point_index, xy : ndarray (K,) of int, (K,) of int, (K, 2)
-        View, point and pixels of each observation, in any order; sorted by point is fastest.
-    loss_px, max_iterations : float, int
-        Turning point of Huber's loss, px, and maximum number of linear solves.
-    fixed_views : ndarray (V,) of bool, optional
-        Cameras that must not move.
-
-    Returns
-    -------
-    ProjectiveBundleResult
-        Refined cameras and points; views and points without observations are returned unchanged.
-
-    Raises
-    ------
-    ValueError
-        For pixels that are not finite, or views and points beyond P and X.
+    damping handles the 15 gauge freedoms (methods 6.7). The cost never rises; views and points without
+    observations do not change.
     """
     o = sort_observations(Observations(view_index, point_index, xy), len(P), len(X))
     observed = np.bincount(o.seen.view_index, minlength=len(P)) > 0

@@ -1,0 +1,118 @@
+"""Argument checks of the public functions, and transforms that condition image and space points."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thesisrecon.arrays import F64
+
+
+def checked_inverse(G: F64, caller: str) -> F64:
+    """Invert a matrix; a singular one is a ``ValueError`` in the name of the caller."""
+    require_finite(caller, G)
+    try:
+        return np.asarray(np.linalg.inv(G), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(f"{caller} needs an invertible matrix; got a singular one of {G.shape}") from error
+
+
+def checked_unit(array: F64, caller: str) -> F64:
+    """Scale to unit Frobenius norm; zeros are a ``ValueError`` in the name of the caller."""
+    require_finite(caller, array)
+    norm = float(np.linalg.norm(array))
+    if not norm > 0.0:
+        raise ValueError(f"{caller} needs numbers that are not all zero")
+    return array / norm
+
+
+def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]]) -> None:
+    """Raise ``ValueError`` if an array has a wrong shape; equal letters are equal sizes."""
+    sizes: dict[str, int] = {}
+    for array, shape in arrays.values():
+        actual = np.shape(array)
+        expected = (
+            sizes.setdefault(d, n) if isinstance(d, str) else d for d, n in zip(shape, actual, strict=False)
+        )
+        if len(actual) != len(shape) or tuple(expected) != actual:
+            break
+    else:
+        return
+    needed = ", ".join(f"{name} ({', '.join(map(str, shape))})" for name, (_, shape) in arrays.items())
+    got = ", ".join(str(np.shape(array)) for array, _ in arrays.values())
+    raise ValueError(f"{caller} needs {needed}; got {got}")
+
+
+def require_finite(caller: str, *arrays: F64) -> None:
+    """Raise ``ValueError`` if an entry is NaN or infinite."""
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError(f"{caller} needs finite numbers; some are NaN or infinite")
+
+
+def normalizing_transform(xy: F64) -> F64:
+    """Hartley's normalisation: centroid to 0, mean distance to sqrt(2) (PAMI 19(6), 1997)."""
+    require_finite("normalizing_transform", xy)
+    centroid = xy.mean(axis=0)
+    distance = float(np.linalg.norm(xy - centroid, axis=1).mean())
+    if not distance > 1e-12 * max(1.0, float(np.abs(centroid).max())):
+        raise ValueError(f"normalizing_transform needs points that differ; got {len(xy)} equal points")
+    s = np.sqrt(2.0) / distance
+    return np.array([[s, 0.0, -s * centroid[0]], [0.0, s, -s * centroid[1]], [0.0, 0.0, 1.0]])
+
+
+def pixel_from_unit(sizes: NDArray[np.int64]) -> F64:
+    """Transforms (V, 3, 3) to pixels from coordinates about the image centre in units of the longer side."""
+    scale = sizes.max(axis=1).astype(np.float64)
+    T = np.zeros((len(sizes), 3, 3))
+    T[:, 0, 0] = T[:, 1, 1] = scale
+    T[:, :2, 2] = (sizes - 1.0) / 2.0
+    T[:, 2, 2] = 1.0
+    return T
+
+
+def pixel_conditioning(xy: F64) -> F64:
+    """Isotropic transform of the pixels' bounding box to centre 0 and half-diagonal 1."""
+    if len(xy) == 0:
+        return np.eye(3)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    half = 0.5 * float(np.hypot(*(high - low)))
+    s = 1.0 / half if half > 0.0 else 1.0
+    cx, cy = 0.5 * (low + high)
+    return np.array([[s, 0.0, -s * cx], [0.0, s, -s * cy], [0.0, 0.0, 1.0]])
+
+
+def scene_frame(X: F64) -> tuple[F64, float]:
+    """Median (3,) of a point set and 1 / median distance from it; 0 and 1 without points."""
+    if len(X) == 0:
+        return np.zeros(3), 1.0
+    origin = np.median(X, axis=0)
+    size = float(np.median(np.linalg.norm(X - origin, axis=1)))
+    return origin, 1.0 / size if size > 0.0 else 1.0
+
+
+def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
+    """M for which the unit vectors x = M X / |M X| have sum x x' proportional to I (Tyler, Ann. Stat. 1987).
+
+    Every point counts as a direction, so neither homogeneous scales nor a few far points matter. Directions
+    without extent are stretched by at most 1e6. det M > 0, which keeps orientations; I for fewer than 4
+    points.
+    """
+    M = np.eye(4)
+    norms = np.linalg.norm(X, axis=1)
+    X = X[norms > 0.0] / norms[norms > 0.0, None]
+    if len(X) < 4:
+        return M
+    for _ in range(rounds):
+        moved = X @ M.T
+        moved /= np.linalg.norm(moved, axis=1)[:, None]
+        values, vectors = np.linalg.eigh(moved.T @ moved / len(moved))
+        stretch = 1.0 / np.sqrt(np.maximum(4.0 * values, 1e-12))
+        M = (vectors * stretch) @ vectors.T @ M
+        M /= np.linalg.norm(M)
+    return M
+
+
+def unit_norm(F: F64) -> F64:
+    """Scale matrices (..., 3, 3) to unit Frobenius norm; zeros stay zeros."""
+    norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))
+    return F / np.where(norm > 0.0, norm, 1.0)
