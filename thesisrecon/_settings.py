@@ -273,10 +273,7 @@ def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
 
 
 def table_from_dataclass(value: Any) -> Table:
-    """Convert a dataclass to a table; one of several dataclasses gives a table that begins with ``kind``.
-
-    The settings of an object that is no dataclass are not known: its table is empty.
-    """
+    """A dataclass as a table; one of several begins with ``kind``, an object that is none is empty."""
     if not dataclasses.is_dataclass(value):
         return {}
     hints = _hints(type(value))

@@ -212,11 +212,7 @@ def _normalized(view: SparseView, xy: F64) -> F64:
 
 
 def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, int]]:
-    """K without skew and size of the largest pinhole image whose pixels all lie in the original.
-
-    The focal lengths are kept, so that an image without distortion does not change. If ``centred``, there is
-    one focal length, and the principal point is the centre of the image.
-    """
+    """K of the same focal lengths, without skew, and size of the largest pinhole image in the original."""
     assert view.K is not None
     assert view.size is not None
     width, height = view.size

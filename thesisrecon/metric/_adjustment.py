@@ -27,11 +27,7 @@ FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
 
 @dataclass(frozen=True)
 class HierarchicalPrior:
-    """Prior of cameras of one kind: ``kind`` (G,) of each row of intrinsics, -1 for none.
-
-    ``spread`` (G, 8) is the standard deviation of each intrinsic about the mean of its kind (relative for the
-    focal, inf = none).
-    """
+    """``kind`` (G,) of each camera, -1 for none, and ``spread`` (G, 8) about its mean (focal: relative)."""
 
     kind: I64
     spread: F64

@@ -24,12 +24,10 @@ MIN_ANGLE = float(np.radians(0.05))
 
 @dataclass(frozen=True)
 class MetricEstimate:
-    """Metric cameras and points of one adjustment round.
+    """Metric cameras, points (zeros where not ``valid``) and inliers of one adjustment round.
 
-    ``sizes`` (V, 2) = (width, height); ``cameras`` has one entry per view, valid where ``registered`` (V,);
-    points ``X`` (N, 3) are zero where not ``valid`` (N,); ``inlier`` (K,) are inlier observations in
-    registered views of noise ``sigma_px``; ``loss_sigmas`` is the width of Huber's loss in sigmas, ``tail``
-    the width of the residuals' tail relative to normal noise, by which gates are widened.
+    ``loss_sigmas`` is the width of Huber's loss in sigmas, ``tail`` the width of the residuals' tail relative
+    to normal noise, by which gates are widened.
     """
 
     tracks: Tracks

@@ -73,10 +73,7 @@ def _std_floor(model: MetricEstimate, scatter: BlockScatter) -> F64:
 
 @dataclass(frozen=True)
 class PerCameraEstimates:
-    """Intrinsics (G, 8) of each camera from its own matches, without hierarchical prior; the focal as log f.
-
-    ``std`` is due to noise, ``floor`` due to model error; ``kind`` (G,) of each camera, -1 for none.
-    """
+    """Intrinsics (G, 8) of each camera by its own matches (log f), with noise and model error."""
 
     value: F64
     std: F64
@@ -101,11 +98,7 @@ def per_camera_estimates(
 
 
 def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> HierarchicalPrior | None:
-    """Estimate how much the intrinsics of cameras of one kind scatter; None if no intrinsic has such a prior.
-
-    ``shared`` (G, 8): which values the cameras share. Kinds with fewer than ``MIN_MEMBERS`` distinct values
-    get no prior.
-    """
+    """Estimate how much the intrinsics of cameras of one kind scatter; None if no intrinsic has a prior."""
     kinds = own.kind.copy()
     spread = np.full((len(kinds), WIDTH), np.inf)
     outside = np.zeros(len(kinds), dtype=bool)

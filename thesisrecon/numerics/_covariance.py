@@ -56,11 +56,7 @@ def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64)
 
 
 def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
-    """Return covariances of intrinsics (G, C, C) and poses (b, 6, 6), with unit of length 1 / ``scale``.
-
-    ``blocks`` (b, C + e, C + e) are those of each view with itself, ``width`` is C, ``number`` (G, C) is the
-    column of each intrinsic; ``focal`` (G,) converts log f to f.
-    """
+    """Covariances of intrinsics (G, C, C) and poses (b, 6, 6); the unit of length is 1 / ``scale``."""
     intrinsics, edge = np.zeros((*number.shape, number.shape[1])), len(blocks) * width
     if not len(blocks):
         return intrinsics, np.zeros((0, POSE_DOF, POSE_DOF))

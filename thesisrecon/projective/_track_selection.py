@@ -102,11 +102,7 @@ _CELLS = 8
 
 
 def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView]) -> B8:
-    """Select tracks (N,) that are seen from more than one position.
-
-    A pair that a homography explains shows its points without parallax or on one plane: their depths are free
-    and would distort the frame in which cameras are tested. The metric stage adds them again.
-    """
+    """Select tracks (N,) seen from more than one position; free depths of others distort the frame."""
     apart = np.ones((tracks.n_views, tracks.n_views), dtype=np.float32)
     np.fill_diagonal(apart, 0.0)
     for pair in pairs:

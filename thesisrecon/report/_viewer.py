@@ -39,8 +39,8 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
 
     ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
     uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints`` of the
-    images, the most central one as ``start``; ``directions``. Faces farther from the median than 8 times the
-    95 % quantile are left out.
+    images, the most central one as ``start``. Faces beyond 8 times the 95 % quantile from the median are left
+    out.
     """
     mesh = _without_outliers(mesh)
     views = np.flatnonzero(reconstruction.registered).tolist()

@@ -286,11 +286,7 @@ def square_pixel_constraints(frame: ReferenceFrame) -> ConicConstraints:
 
 @dataclass(frozen=True)
 class ProjectiveScene:
-    """Input of the stratified methods: a projective reconstruction in a frame, with its prior knowledge.
-
-    ``orthogonal`` (M, 2, 3) are pairs of unit-free vanishing points in the reference view of orthogonal
-    directions.
-    """
+    """A projective reconstruction in a frame, its prior, and vanishing points of orthogonal pairs."""
 
     reconstruction: Reconstruction
     frame: ReferenceFrame

@@ -41,10 +41,10 @@ class LineSegments:
 
 
 def _support_regions(angle: F32, strong: B8) -> I64:
-    """Return the line-support region (H, W) of each strong pixel, from 1; 0 for none.
+    """Line-support region (H, W) of each strong pixel, from 1; 0 for none.
 
-    Regions are connected pixels whose gradient angles lie in one of eight bins, for two partitions half a bin
-    apart. A pixel votes for the larger of its two regions; regions with most of their pixels' votes are kept.
+    Regions are connected pixels of one of eight bins of gradient angle, for two partitions half a bin apart.
+    A pixel votes for the larger of its two regions; regions with most of their votes are kept.
     """
     width = 2.0 * np.pi / _BINS
     both = [

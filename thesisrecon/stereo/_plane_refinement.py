@@ -81,11 +81,7 @@ def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: 
 def search_planes(
     reference: PinholeView, others: Sequence[PinholeView], rho: F32, *, wanted: B8, sweeps: int
 ) -> tuple[F32, F32, U8]:
-    """Search the planes of ``wanted`` pixels (H, W) from inverse depths ``rho`` (H, W).
-
-    Returns inverse depths, standard deviations and numbers of supporting views (H, W), NaN where no plane is
-    accepted.
-    """
+    """Search the planes of ``wanted`` pixels; return inverse depths, deviations and support (H, W)."""
     search, unknown = _search_arguments(reference, others), np.float32(np.nan)
     # Planes start and arrive from pixels at most one away.
     near = scipy.ndimage.binary_dilation(wanted, np.ones((3, 3)), RADIUS + 1)

@@ -80,9 +80,9 @@ def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: i
 def choose_views(quality: F32, neighbours: I64) -> I64:
     """Choose the view (M,) from which each face is textured, -1 if no view sees it.
 
-    Choosing the best view of each face alone would give many small charts. Shares of the best quality are
-    therefore diffused over faces among the views that see them; small charts then join the
-    neighbour with the longest common border.
+    Shares of the best quality are diffused over faces among the views that see them, and small charts join
+    the neighbour with the longest common border: the best view of each face alone would give many small
+    charts.
     """
     if not quality.size:
         return np.full(len(quality), -1, dtype=np.int64)
