@@ -147,12 +147,17 @@ def test_the_example_states_the_standard_deviations(capsys):
         ({"xy": np.full((6, 120, 2), np.nan)}, "0 views give 0 equations"),
         ({"cameras": (np.eye(3), np.zeros((6, 3, 3)), np.zeros((6, 3)))}, "needs sizes"),
         ({"cameras": "inverse"}, "R is world to camera"),
+        ({"cameras": "run/out"}, "thesisrecon.Camera .result.cameras., .* got a str"),
+        ({"cameras": (np.eye(3) * 0, np.zeros((6, 3, 3)), np.zeros((6, 3))), "sizes": (9, 9)}, "K upper"),
+        ({"cameras": "turned"}, r"sizes are \(width, height\)"),
     ],
 )  # fmt: skip
 def test_wrong_input_gets_one_sentence(change, says):
     cameras, X, xy = _scene()
     given = {"cameras": cameras, "X": X, "xy": xy} | change
-    if isinstance(given["cameras"], str):
+    if given["cameras"] == "turned":
+        given["cameras"] = [Camera(c.K, c.R, c.t, c.size[::-1]) for c in cameras]
+    if given["cameras"] == "inverse":
         given["cameras"] = [Camera(c.K, c.R, c.centre, c.size) for c in cameras]
         given["X"] = X - np.array([0.0, 0, 20])
     with pytest.raises(ValueError, match=says):

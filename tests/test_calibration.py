@@ -159,6 +159,7 @@ def test_the_way_out_of_a_wrong_call_is_named():
     way_out = "its calibration is its field K already; .* result.projective"
     refuses(ValueError, way_out, thesisrecon.self_calibrate, metric)
     refuses(ValueError, "needs the sizes", thesisrecon.self_calibrate, scene.P)
+    refuses(ValueError, "stratum='projective'", thesisrecon.upgrade_affine, scene.P)
     refuses(
         ValueError, "unknown method 'kruppa-equation'; did you mean kruppa-equations",
         thesisrecon.self_calibrate, scene.P, scene.sizes, method="kruppa-equation",

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 
 import thesisrecon
@@ -53,7 +54,7 @@ def test_depth_of_known_cameras_is_true_without_points(walled, given):
         assert all(given[0] <= np.nanmin(one.depth) <= np.nanmax(one.depth) <= given[1] for one in maps)
 
 
-def test_arrays_of_cameras_and_reconstructions_give_the_same_maps():
+def test_arrays_of_cameras_and_reconstructions_give_the_same_maps(tmp_path):
     scene = make_walled(on_arc(ANGLES[:3]))
     images, cameras = [image.rgb for image in scene.images], _cameras()[:3]
     one = depth_maps(images, cameras, depth_range=(4.0, 9.0), max_size=120)
@@ -65,6 +66,11 @@ def test_arrays_of_cameras_and_reconstructions_give_the_same_maps():
         np.testing.assert_allclose(same[1].P, one[1].P, rtol=0, atol=1e-9)
         # The last digits of the cameras change depths within their noise.
         assert np.nanmedian(np.abs(same[1].depth - one[1].depth)) < 0.01
+    # Of a folder, images without a camera (not registered) are left out.
+    for n, image in enumerate(images):
+        PIL.Image.fromarray(image).save(tmp_path / f"{n}.png")
+    found = depth_maps(tmp_path, {"0.png": cameras[0], "1.png": cameras[1]}, depth_range=(4, 9), max_size=120)
+    assert len(found) == 2
     # With points, these give the range.
     error, known = _errors(depth_maps(scene.images, scene.reconstruction), scene)
     assert np.median(error) < 0.003

@@ -1,11 +1,14 @@
 """Matches and tracks of other programs: the same cameras from each form, and one sentence for wrong input."""
 
 import sqlite3
+from dataclasses import replace
 
 import numpy as np
+import PIL.Image
 import pytest
 
 import thesisrecon
+from tests.conftest import refuses
 from tests.given_scene import given_scene
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.cli.main import run_command
@@ -108,6 +111,9 @@ WRONG = {
     "whole numbers, rows": (SCENE.keypoints, {(0, 1): SCENE.matches[0, 1] + 0.5}, SCENE.sizes),
     "keypoints is None": (None, SCENE.matches, SCENE.sizes),
     "there are no matches": (SCENE.keypoints, {}, SCENE.sizes),
+    "keypoints of 5 images and 3 sizes": (SCENE.keypoints, SCENE.matches, SCENE.sizes[:3]),
+    "must be a table .* got a list": (SCENE.keypoints, [SCENE.matches[0, 1]], SCENE.sizes),
+    "take .k.pt for k": (moved(1, lambda _: [object()] * 3), SCENE.matches, SCENE.sizes),
 }
 
 
@@ -122,9 +128,33 @@ def test_the_model_needs_images():
         reconstruct_from_matches(SCENE.keypoints, SCENE.matches, SCENE.sizes, until="model")
 
 
-def test_tracks_of_other_images_are_refused():
-    with pytest.raises(UsageError, match="tracks are of 5 images, the sizes of 4"):
-        reconstruct_from_tracks(SCENE.tracks, SCENE.sizes[:4])
+def test_wrong_tracks_are_refused():
+    for wrong, words in (
+        (replace(SCENE.tracks, n_views=4), "tracks are of 4 images, the sizes of 5"),
+        (replace(SCENE.tracks, view_index=SCENE.tracks.view_index + 1), "beyond the 5 views"),
+        (replace(SCENE.tracks, xy=SCENE.tracks.xy[:9]), r"xy \(K, 2\)"),
+        (np.stack(SCENE.keypoints), "must be thesisrecon.Tracks; got a ndarray"),
+    ):
+        refuses(UsageError, words, reconstruct_from_tracks, wrong, SCENE.sizes)
+
+
+def test_masks_drop_matches_and_observations(tmp_path, from_rows):
+    """The right third of each image is masked; there are no images."""
+    mask = np.full((480, 640), 255, np.uint8)
+    mask[:, 427:] = 0
+    for i in range(5):
+        PIL.Image.fromarray(mask).save(tmp_path / f"image-{i}.png")
+    for given in (
+        (reconstruct_from_matches, SCENE.keypoints, SCENE.matches),
+        (reconstruct_from_tracks, SCENE.tracks),
+    ):
+        result = given[0](*given[1:], SCENE.sizes, masks=tmp_path)
+        focal_is_right(result)
+        assert 0 < len(result.points) < len(from_rows.points)
+        assert max(result.observations(i).xy[:, 0].max() for i in range(5)) < 427
+        assert result.summary["cameras"][0]["masked_fraction"] == pytest.approx(1 / 3, abs=0.01)
+    refuses(UsageError, "no file in .* is named like an image", reconstruct_from_matches,
+            SCENE.keypoints, SCENE.matches, SCENE.sizes, names="abcde", masks=tmp_path)  # fmt: skip
 
 
 def write_database(path, *, verified):

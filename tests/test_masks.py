@@ -150,5 +150,3 @@ def test_the_command_takes_masks_of_images(tmp_path, refused):
         PIL.Image.fromarray(image.rgb).save(folder / f"other{image.name}")
     said = refused(["reconstruct", folder, *out, "--masks", masks])
     assert "no file in" in said
-    said = refused(["reconstruct", "--from", tmp_path, *out, "--masks", masks])
-    assert "--masks applies to features that are detected in images" in said

@@ -35,6 +35,13 @@ def test_a_camera_is_found_by_name_and_by_number_and_has_standard_deviations(run
     assert 0 < camera.std["focal_px"] < 50
 
 
+def test_a_result_is_shown_in_a_line(run):
+    """Notebooks show the value of a cell."""
+    assert repr(run[1]).startswith("RunResult(out='")
+    assert repr(run[1]).endswith("images=5, registered=5, points=200, failure='')")
+    assert repr(run[1].cameras).startswith("Cameras(['image-0', ")
+
+
 def test_unknown_images_are_named(run):
     result = run[1]
     with pytest.raises(KeyError, match="there is no image 'other'"):

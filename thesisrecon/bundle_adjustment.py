@@ -11,7 +11,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import unknown_word
 from thesisrecon.geometry._conditioning import require_finite, require_shapes
-from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients
+from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients, require_inside
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras
@@ -159,6 +159,7 @@ def bundle_adjust(
     start = _start(views, shared, chosen)
     knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
     _check(start, X, observed, chosen, bool(prior))
+    require_inside(observed.view_index, observed.xy, np.array([view.size for view in views]))
     fit, noise = None, 1.0 if sigma_px is None else sigma_px
     # Without a given noise the first pass finds it: it weights the prior and places the turn of the loss.
     for last in (True,) if sigma_px is not None else (False, True):

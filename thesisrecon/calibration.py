@@ -258,13 +258,16 @@ def _projective(
     """The projective reconstruction that was given, or that of plain cameras."""
     if not isinstance(given, Reconstruction):
         if sizes is None:
-            raise ValueError(f"{caller} needs the sizes (width, height) of the images with plain cameras")
+            way = "Reconstruction.from_cameras(P, sizes=sizes, stratum='projective')"
+            raise ValueError(
+                f"{caller} needs the sizes (width, height) of the images with plain cameras: {way}"
+            )
         return Reconstruction.from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
     if given.stratum == "projective":
         return given
     advice = (
         "its calibration is its field K already; to estimate it again pass the projective one, such as "
-        "result.projective, or its cameras as plain P (reconstruction.P, reconstruction.sizes)"
+        "result.projective, or from_cameras(P, sizes=sizes, stratum='projective')"
         if given.stratum == "metric"
         else "pass the projective one that it was made from"
     )

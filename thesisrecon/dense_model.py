@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +39,7 @@ def depth_maps(
     Parameters
     ----------
     images : path or sequence of paths or ndarray (H, W) or (H, W, 3) uint8
-        A folder (files in order of their names), or V >= 2 images.
+        A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
         Their cameras in pixels of the images (arrays with ``sizes``); of a reconstruction with points these
         give the depth range and the neighbours.
@@ -214,7 +214,11 @@ def _scene(
     caller: str, images: ImagesInput, cameras: CameraInput, sizes: I64 | None, max_size: int
 ) -> tuple[list[Image], Reconstruction]:
     """Images at working size, and their cameras for it, with the points of a reconstruction."""
-    listed = list_images(Path(images)) if isinstance(images, str | Path) else list(images)
+    if isinstance(images, str | Path):
+        files = list_images(Path(images))
+        # Images that were not registered have no camera.
+        images = [path for path in files if isinstance(cameras, Mapping) and path.name in cameras] or files
+    listed = list(images)
     read = [read_image(one, max_size_px=max_size).images[0] for one in listed]
     names = [
         Path(one).name if isinstance(one, str | Path) else image.name

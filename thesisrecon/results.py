@@ -92,6 +92,9 @@ class Cameras(Mapping[str, Camera]):
     def __len__(self) -> int:
         return int(self._metric.reconstruction.registered.sum())
 
+    def __repr__(self) -> str:
+        return f"Cameras({list(self)})"
+
 
 @dataclass(frozen=True)
 class RunResult:
@@ -138,6 +141,14 @@ class RunResult:
     warnings: tuple[str, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
     failure: str = ""
+
+    def __repr__(self) -> str:
+        # That of a dataclass prints the pixels and features of all images.
+        best = self.best_reconstruction
+        counts = {"images": len(self.images), "registered": 0 if best is None else int(best.registered.sum())}
+        counts["points"] = 0 if best is None else int(best.valid.sum())
+        text = ", ".join(f"{name}={count}" for name, count in counts.items())
+        return f"RunResult(out={str(self.out) if self.out else None!r}, {text}, failure={self.failure!r})"
 
     @property
     def best_reconstruction(self) -> Reconstruction | None:

@@ -45,6 +45,13 @@ def test_every_method_gives_f_with_inliers_noise_and_covariance(method):
     assert 0.4 < np.median(ratios) < (40.0 if method == "eight-point" else 2.0)
 
 
+def test_without_a_threshold_all_matches_are_right():
+    rng = np.random.default_rng(0)
+    xy = spoil(make_pair(50, rng), rng, sigma=0.5, outliers=0.0)[:2]
+    every = thesisrecon.estimate_fundamental(*xy, method="gold-standard")
+    assert np.array_equal(thesisrecon.estimate_fundamental(*xy, threshold_px=None).F, every.F)
+
+
 def test_seven_matches_give_all_solutions():
     pair = make_pair(7, np.random.default_rng(4))
     fit = thesisrecon.estimate_fundamental(pair.xy1, pair.xy2, method="seven-point")

@@ -58,7 +58,7 @@ def test_a_mask_is_named_like_its_image(folders):
     np.testing.assert_array_equal(found["a.jpg"], half_white() > 0)
     np.testing.assert_array_equal(found["b.png"], half_white() == 0)
     assert found["c.png"] is None
-    assert unused == ["a.bmp"]
+    assert unused == ["a.bmp is a mask of no image"]
 
 
 def test_a_mask_changes_the_digest_of_its_image_only(folders):

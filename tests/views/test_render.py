@@ -72,6 +72,11 @@ def test_light_falls_by_the_cosine():
     assert lamp[0, 0] < 180
 
 
+def test_a_run_without_a_surface_has_nothing_to_render():
+    with pytest.raises(ValueError, match="a run until 'metric' has no mesh"):
+        render(None, Camera(np.eye(3), np.eye(3), np.zeros(3), (20, 20)))
+
+
 def test_nothing_is_seen_where_nothing_is():
     empty = TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     camera = Camera(K, np.eye(3), np.zeros(3), SIZE)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -137,7 +138,10 @@ def exit_code_of(command: Callable[[], object]) -> int:
             return _report(f"{message} (see thesisrecon --help)", USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
-        sentence = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 for a traceback"
+        # The last place is that of a user's own method, if its code failed.
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+        place = f"{Path(frame.f_code.co_filename).name} line {line}"
+        sentence = f"{type(error).__name__} in {place}: {error}; set {DEBUG_VARIABLE}=1 for a traceback"
         return _report(sentence, INTERNAL)
 
 

@@ -101,22 +101,18 @@ def reconstruct(
     """Reconstruct cameras, points and a textured model from images."""
     cap_threads(threads)
     chosen: dict[str, Any] = {"config": config, "preset": preset, "cameras": cameras, "pairs": pairs}
-    chosen |= {"max_size": max_size, "set": settings or []}
+    chosen |= {"max_size": max_size, "set": settings or [], "masks": masks}
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
     if source is None:
         if images is None or images_folder is not None:
             raise UsageError(
                 "give the folder of the images, or --from DATABASE|SPARSE with or without --images"
             )
-        _run(images, out, seed, chosen | options | {"masks": masks})
+        _run(images, out, seed, chosen | options)
         return
     if images is not None or chosen.pop("pairs") is not None:
         raise UsageError(
             "with --from the images are given by --images, and the pairs are those of the source"
-        )
-    if masks is not None:
-        raise UsageError(
-            "--masks applies to features that are detected in images; with --from the source has its own"
         )
     _run_from(source, out, seed, chosen | options | {"images": images_folder})
 

@@ -26,7 +26,7 @@ def estimate_fundamental(
     xy2: NDArray[np.float64],
     *,
     method: Method = "locally-optimised",
-    threshold_px: float = 1.0,
+    threshold_px: float | None = 1.0,
     seed: int | Generator = 0,
     check_degeneracy: bool = False,
 ) -> FundamentalFit:
@@ -41,8 +41,9 @@ def estimate_fundamental(
         (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
         the thesis) or "least-median". Of all matches: "gold-standard" (least reprojection error, HZ 11.3),
         "eight-point" (normalised) or "seven-point" (up to three solutions).
-    threshold_px : float
-        Sampson distance of an inlier during the search of the first two methods.
+    threshold_px : float or None
+        Sampson distance of an inlier during the search of the first two methods. None: all matches are right,
+        and these methods are "gold-standard".
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from; the same seed gives the same result.
     check_degeneracy : bool
@@ -78,6 +79,8 @@ def estimate_fundamental(
     (9, 9)
     """
     rng = np.random.default_rng(seed)
+    if threshold_px is None:
+        threshold_px, method = 1.0, "gold-standard" if method in ("locally-optimised", "ransac") else method
     if method == "locally-optimised":
         fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
     elif method == "seven-point":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -53,6 +54,18 @@ def checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tupl
     return P, K, checked_sizes(caller, sizes, len(P))
 
 
+def require_inside(view: I64, xy: F64, sizes: I64) -> None:
+    """``ValueError`` if pixels (K, 2) lie far outside the images (V, 2) of their views."""
+    size = sizes[view]
+    reach = (np.maximum(-xy, xy - size) / size.max(axis=1, keepdims=True)).max(axis=1)
+    if len(reach) and reach.max() > _OUTSIDE:
+        k = int(reach.argmax())
+        raise ValueError(
+            f"pixels of view {view[k]} lie outside its size {tuple(size[k].tolist())} by {reach[k]:.0%} of "
+            "the long side; sizes are (width, height)"
+        )
+
+
 def checked_points(
     P: F64, sizes: I64, X: F64 | None, xy: F64 | None, *, finite: bool
 ) -> tuple[F64, I64, I64, F64]:
@@ -62,14 +75,8 @@ def checked_points(
         xy = np.full((len(P), 0 if X is None else len(X), 2), np.nan)
     xy = np.asarray(xy, dtype=np.float64)
     require_shapes(caller, P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
-    with np.errstate(invalid="ignore"):
-        reach = np.maximum(-xy, xy - sizes[:, None]) / sizes.max(axis=1)[:, None, None]
-    if (worst := float(np.nanmax(reach, initial=-1.0))) > _OUTSIDE:
-        view = int(np.argwhere(reach == worst)[0, 0])
-        raise ValueError(
-            f"pixels of view {view} lie outside its size {tuple(sizes[view].tolist())} by {worst:.0%} of the "
-            "long side; sizes are (width, height)"
-        )
+    point, views = np.nonzero(np.isfinite(xy).all(axis=2).T)
+    require_inside(views, xy[views, point], sizes)
     X = triangulate(P, xy) if X is None and xy.shape[1] else np.zeros((0, 4)) if X is None else np.asarray(X)
     X = homogenize(X.astype(np.float64)) if X.ndim == 2 and X.shape[1] == 3 else X.astype(np.float64)
     require_shapes(caller, X=(X, ("N", 4)), xy=(xy[0], ("N", 2)))
@@ -77,7 +84,6 @@ def checked_points(
     if finite:
         near = np.abs(X[:, 3:]) > 1e-12 * np.linalg.norm(X, axis=1, keepdims=True)
         X = np.where(near, X / np.where(near, X[:, 3:], 1.0), 0.0)
-    point, views = np.nonzero(np.isfinite(xy).all(axis=2).T)
     return X, views, point, xy[views, point]
 
 
@@ -94,15 +100,18 @@ def as_cameras(
                 f"{caller} has no camera for {missing[0]}; the first of them is {next(iter(cameras), None)}"
             )
         return [cameras[name] for name in names or cameras]
-    given = list(cameras)
-    if all(isinstance(one, Camera) for one in given):
-        return given  # type: ignore[return-value]
-    if len(given) != 3 or any(isinstance(one, Camera) for one in given):
-        raise ValueError(f"{caller} needs cameras as thesisrecon.Camera, or a tuple (K, R, t) of arrays")
+    given: list[Any] = list(cameras) if isinstance(cameras, Sequence) else []
+    if given and all(isinstance(one, Camera) for one in given):
+        return given
+    if len(given) != 3 or any(isinstance(one, Camera | str) for one in given):
+        kinds = "cameras as thesisrecon.Camera (result.cameras), or a tuple (K, R, t) of arrays"
+        raise ValueError(f"{caller} needs {kinds}; got a {type(cameras).__name__}")
     if sizes is None:
         raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height, with (K, R, t)")
     K, R, t = (np.asarray(one, dtype=np.float64) for one in given)
-    return _of_reconstruction(caller, Reconstruction.from_cameras(K, R, t, sizes=sizes))
+    K = np.broadcast_to(K, (len(R), 3, 3)) if K.ndim == 2 else K
+    require_shapes(caller, K=(K, ("V", 3, 3)), R=(R, ("V", 3, 3)), t=(t, ("V", 3)))
+    return [Camera(*one) for one in zip(K, R, t, checked_sizes(caller, sizes, len(R)), strict=True)]
 
 
 def _of_reconstruction(caller: str, r: Reconstruction) -> list[Camera]:

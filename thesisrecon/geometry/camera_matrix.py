@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry._conditioning import require_shapes
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
 _CONVERGED = 1e-9
@@ -287,6 +288,7 @@ def cheirality(P: F64, X: F64) -> F64:
     >>> cheirality(np.eye(3, 4), X).round(9).tolist()
     [0.5, -0.5]
     """
+    require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
     return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
 
 

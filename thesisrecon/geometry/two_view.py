@@ -108,6 +108,7 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
     [[0.0, 1.0, 30.0]]
     """
+    require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
     return unit_normals(homogenize(xy1) @ F.T)
 
 

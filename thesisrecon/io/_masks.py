@@ -33,7 +33,7 @@ def add_masks(
     *,
     map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
 ) -> tuple[ImageSet, list[str]]:
-    """Set the masks of images named like files in a folder; return also the names of the other files."""
+    """Set the masks of images named like files in a folder; return also warnings of the other files."""
     files: dict[str, list[Path]] = {}
     for path in list_images(folder):
         files.setdefault(printable(path.stem), []).append(path)
@@ -59,7 +59,8 @@ def add_masks(
         image = replace(image, mask=_read_mask(mask_of[image.name], image))
         return with_digest(replace(decoded, image=image))
 
-    unused = [path.name for paths in files.values() for path in paths if path not in owner]
+    others = [path.name for paths in files.values() for path in paths if path not in owner]
+    unused = [f"{name} is a mask of no image" for name in others]
     return replace(inputs, decoded=tuple(map_all(masked, list(inputs.decoded)))), unused
 
 

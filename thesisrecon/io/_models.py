@@ -24,7 +24,7 @@ _ROUNDING = 1e-3
 def read_model(path: str | Path) -> SparseModel:
     """Read a model and recognise its format.
 
-    A path is the folder of a run or of a COLMAP model (itself or the parent of ``sparse/0``), a
+    A path is the folder of a run or of a COLMAP model (itself, or the parent of ``0`` or ``sparse/0``), a
     ``cameras.json`` or a trajectory, camera-to-world: TUM (time, centre and quaternion x, y, z, w per line,
     named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000). UsageError for anything
     else.
@@ -50,7 +50,7 @@ _KNOWN = (
 
 
 def _read_folder(folder: Path) -> SparseModel:
-    places = (folder, folder / "sparse" / "0", folder / "sparse")
+    places = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
     colmap = next((place for place in places if is_colmap_model(place)), None)
     if (folder / "cameras.json").is_file():
         views = _read_views(folder / "cameras.json")

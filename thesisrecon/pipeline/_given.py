@@ -15,8 +15,10 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._images import DecodedImage, ImageSet, read_image
+from thesisrecon.matching._prepared import select_matches
 from thesisrecon.matching.tracks import corners_from_matches
-from thesisrecon.pipeline._image_pair import verify_matches
+from thesisrecon.numerics._observations import Observations, sort_observations
+from thesisrecon.pipeline._image_pair import values_at, verify_matches
 from thesisrecon.pipeline._stages import finish_matches, finish_tracks, require_accepted_pair
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView
@@ -94,9 +96,12 @@ def given_matches(
     keypoints: Sequence[F64] | None, matches: Mapping[tuple[int, int], PairMatches], views: Views
 ) -> Given:
     count = len(views.names)
+    if keypoints is not None and len(keypoints) != count:
+        raise UsageError(f"there are keypoints of {len(keypoints)} images and {count} sizes")
+    if not isinstance(matches, Mapping):
+        wanted = "a table {(i, j): rows or positions}"
+        raise UsageError(f"matches must be {wanted}; got a {type(matches).__name__}")
     corners = None if keypoints is None else [_positions(xy, i, views) for i, xy in enumerate(keypoints)]
-    if corners is not None and len(corners) != count:
-        raise UsageError(f"there are keypoints of {len(corners)} images and {count} sizes")
     found: list[Matches] = []
     for key, given in sorted(matches.items()):
         i, j = _pair(key, count, matches)
@@ -145,10 +150,14 @@ def _pair(key: Any, count: int, matches: Mapping[Any, Any]) -> tuple[int, int]:
 
 def _positions(xy: Any, i: int, views: Views) -> F64:
     """Checked positions (N, 2) of one image."""
-    found = np.asarray(xy, dtype=np.float64)
+    name = views.names[i]
+    try:
+        found = np.asarray(xy, dtype=np.float64)
+    except (TypeError, ValueError):
+        advice = "of OpenCV's keypoints take [k.pt for k in keypoints]"
+        raise UsageError(f"keypoints of {name!r} must be (N, 2) numbers; {advice}") from None
     if found.size == 0:
         return np.zeros((0, 2))
-    name = views.names[i]
     if found.ndim != 2 or found.shape[1] != 2 or not np.isfinite(found).all():
         raise UsageError(f"keypoints of {name!r} must be (N, 2) finite positions; got shape {found.shape}")
     size = views.sizes[i]
@@ -202,9 +211,15 @@ def _forward(m: Matches) -> Matches:
 def given_tracks(tracks: Tracks, views: Views) -> Given:
     """The matches of all pairs of images that share enough points."""
     count = len(views.names)
+    if not isinstance(tracks, Tracks):
+        raise UsageError(f"tracks must be thesisrecon.Tracks; got a {type(tracks).__name__}")
     view, point = np.asarray(tracks.view_index), np.asarray(tracks.point_index)
-    if tracks.n_views != count or len(view) == 0 or view.max() >= count:
+    if tracks.n_views != count:
         raise UsageError(f"the tracks are of {tracks.n_views} images, the sizes of {count}")
+    try:
+        sort_observations(Observations(view, point, tracks.xy), count, tracks.n_points)
+    except ValueError as error:
+        raise UsageError(f"these are no tracks: {error}") from None
     # One observation of a point in a view, sorted by point and view.
     _, kept = np.unique(np.asarray(point, dtype=np.int64) * count + view, return_index=True)
     kept = kept[np.bincount(point[kept], minlength=tracks.n_points)[point[kept]] >= 2]
@@ -223,6 +238,27 @@ def given_tracks(tracks: Tracks, views: Views) -> Given:
         )
     _, number = np.unique(point, return_inverse=True)
     return Given(corners, found, Tracks(view, number, xy, count, int(number.max()) + 1))
+
+
+def outside_masks(given: Given, images: Sequence[Image]) -> Given:
+    """The same without matches and observations in masked pixels; all at working size."""
+    if all(image.mask is None for image in images):
+        return given
+    clear = [
+        np.ones(len(xy), bool) if image.mask is None else values_at(image.mask, xy)
+        for image, xy in zip(images, given.corners, strict=True)
+    ]
+    matches = [select_matches(m, clear[m.i][m.index1] & clear[m.j][m.index2]) for m in given.matches]
+    t = given.tracks
+    if t is None:
+        return replace(given, matches=matches)
+    kept = np.zeros(len(t.xy), bool)
+    for i, here in enumerate(clear):
+        kept[t.view_index == i] = here
+    kept &= np.bincount(t.point_index[kept], minlength=t.n_points)[t.point_index] >= 2
+    numbers, point = np.unique(t.point_index[kept], return_inverse=True)
+    tracks = Tracks(t.view_index[kept], point, t.xy[kept], t.n_views, len(numbers))
+    return replace(given, matches=matches, tracks=tracks)
 
 
 def at_working_size(given: Given, images: Sequence[Image]) -> Given:

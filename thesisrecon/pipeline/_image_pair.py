@@ -84,12 +84,12 @@ def detect_features(config: PipelineConfig, image: Image) -> Features:
 
 
 def _unmasked(found: Found, clear: Any) -> Found:
-    keep = _at(clear, found.xy) > MASK_REACH * found.scale
+    keep = values_at(clear, found.xy) > MASK_REACH * found.scale
     arrays = {field.name: getattr(found, field.name) for field in fields(found)}
     return replace(found, **{name: a[keep] for name, a in arrays.items() if isinstance(a, np.ndarray)})
 
 
-def _at(pixels: Any, xy: Any) -> Any:
+def values_at(pixels: Any, xy: Any) -> Any:
     """Values (N,) of an array (H, W) at the nearest pixels."""
     x, y = (np.clip(np.rint(xy[:, k]).astype(np.int64), 0, pixels.shape[1 - k] - 1) for k in (0, 1))
     return pixels[y, x]
@@ -115,7 +115,7 @@ def match_views(
         return _rejected_pair(pair, 0, str(failure))
     for mask, side in zip(masks, ("xy1", "xy2"), strict=True):
         if mask is not None:
-            matches = select_matches(matches, _at(mask, getattr(matches, side)))
+            matches = select_matches(matches, values_at(mask, getattr(matches, side)))
     return verify_matches(config, matches, rng)
 
 

@@ -17,6 +17,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap_reading import read_database
 from thesisrecon.io._images import images_folder
+from thesisrecon.io._masks import add_masks, check_masks_folder
 from thesisrecon.io._models import read_model
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.pipeline._given import (
@@ -26,6 +27,7 @@ from thesisrecon.pipeline._given import (
     at_working_size,
     given_matches,
     given_tracks,
+    outside_masks,
     take_corners,
     take_pairs,
     take_tracks,
@@ -45,6 +47,7 @@ from thesisrecon.runtime._run_folder import key_of
 class GivenOptions(RunOptions, total=False):
     """Options of the functions of this module: those of :func:`reconstruct` except ``pairs``."""
 
+    masks: str | Path | None
     preset: str | None
     max_size: int | None
     cameras: str | None
@@ -86,8 +89,9 @@ def reconstruct_from_matches(
         The images, for colours, depth maps and the textured model: a folder with files of these names, or the
         images in the order of the keypoints.
     config, seed, progress, **options
-        As for :func:`reconstruct`: ``preset``, ``max_size``, ``cameras``, ``set``, ``until`` ("metric"
-        without images), ``threads``, ``executor``, ``overwrite``, ``shared``.
+        As for :func:`reconstruct`: ``preset``, ``max_size``, ``cameras``, ``set``, ``masks`` (matches in
+        masked pixels are dropped), ``until`` ("metric" without images), ``threads``, ``executor``,
+        ``overwrite``, ``shared``.
 
     Returns
     -------
@@ -254,6 +258,7 @@ def _reconstruct(
     options = dict(options)
     chosen = {name: options.pop(name, None) for name in ("preset", "max_size", "cameras")}
     config = build_config(config, **chosen, settings=options.pop("set", ()))
+    masks = options.pop("masks", None)
     if isinstance(config.tracks, AlignedTracks):
         # There are no prepared images to align the observations with.
         config = replace(config, tracks=PlainTracks())
@@ -266,12 +271,16 @@ def _reconstruct(
             until = "metric" if until == "model" else until
         else:
             run.images_folder = images_folder(views.images)
+        if masks is not None:
+            check_masks_folder(Path(masks), run.images_folder)
         with claimed(run, overwrite=overwrite):
             with run.clock("images"):
                 digests = [key_of(views.names[i], views.sizes[i], xy) for i, xy in enumerate(given.corners)]
-                inputs = views.read(run, digests)
-                given = at_working_size(given, inputs.images)
-            run.finish("images", counts={"read": len(digests), "refused": 0})
+                inputs, warnings = views.read(run, digests), list[str]()
+                if masks is not None:
+                    inputs, warnings = add_masks(inputs, Path(masks), map_all=run.workers.map_all)
+                given = outside_masks(at_working_size(given, inputs.images), inputs.images)
+            run.finish("images", counts={"read": len(digests), "refused": 0}, warnings=warnings)
             result = empty_result(run, inputs)
             state = PipelineState(run, inputs, result, until)
             content = [[m.i, m.j, m.xy1, m.xy2] for m in given.matches]

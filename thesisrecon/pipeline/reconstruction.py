@@ -132,7 +132,7 @@ def _read_inputs(run: Run, images: ImageSource, masks: Path | None) -> ImageSet:
         raise UsageError("no images")
     warnings = [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
     warnings += [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
-    warnings += [f"{name} is a mask of no image" for name in unused]
+    warnings += unused
     warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
     masked = sum(image.mask is not None for image in inputs.images)
     counts = {"read": found, "refused": refused} | ({"masked": masked} if masked else {})

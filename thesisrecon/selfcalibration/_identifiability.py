@@ -418,7 +418,8 @@ def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, foca
         given = " more exactly" if focal_std < float("inf") else ""
         advice += f", or give the focal length{given}"
     if "focal_std_rel" not in evidence:
-        return [advice]
+        untested = "the cameras see too few common points to test whether they determine the focal length"
+        return [advice] if motion else [f"{untested}; {advice}"]
     std = evidence["focal_std_rel_median"]
     if evidence["rotation_significance"] < MIN_ROTATION_SIGNIFICANCE and std < MAX_FOCAL_STD:
         return [f"the rotations are within image noise and do not determine the focal length; {advice}"]

@@ -183,6 +183,10 @@ def render(
 
 
 def _check(mesh: TexturedMesh) -> None:
+    if not isinstance(mesh, TexturedMesh):
+        raise ValueError(
+            f"render needs a TexturedMesh; got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
+        )
     if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
         raise ValueError("the faces refer to vertices that do not exist")
     if mesh.uv is not None and mesh.uv.shape != (len(mesh.faces), 3, 2):

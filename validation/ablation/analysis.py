@@ -224,6 +224,10 @@ def _warnings(rows: Rows) -> list[str]:
         if here and all(r.failure for r in here):
             where = f"{scene} ({condition.name})" if condition.name else scene
             found.append(f"every row of {where} failed: {here[0].failure}")
+    for variant in plan.variants:
+        here = [r for r in rows if r.variant == variant.name]
+        if here and all(r.failure for r in here):
+            found.append(f"every row of {variant.name} failed: {here[0].failure}")
     for measure in plan.measures:
         if len(rows) and not any(measure.name in r.metrics for r in rows):
             found.append(f"no row has the metric {measure.name}")

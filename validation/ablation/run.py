@@ -72,7 +72,7 @@ def ablate(
     study: Study,
     out: str | Path,
     *,
-    executor: str = "processes",
+    executor: str = "local",
     threads: int | None = None,
     on_progress: ProgressCallback = lambda _: None,
 ) -> Rows:
@@ -83,7 +83,7 @@ def ablate(
     study : the study to run.
     out : the folder of the study. It may be used again, after a kill or for a study that has grown: rows that
         are there under the same setting, scene, seed and versions are not computed again.
-    executor : "local" (this process) or "processes".
+    executor : "local" (this process) or "processes", for which a script needs ``if __name__ == "__main__":``.
     threads : processes; as many as processors where None.
     on_progress : called with the state after each row.
 
