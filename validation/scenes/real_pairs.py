@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,9 @@ def match_images(paths: tuple[Path, Path], cache: Path, *, ratio: float, mutual:
     return found[:, :2].copy(), found[:, 2:].copy()
 
 
+@lru_cache(maxsize=4)
 def _sift(path: Path) -> SiftKeypoints:
+    """Return the keypoints of an image, which is in several pairs of its neighbourhood."""
     with Image.open(path) as image:
         return detect_sift(np.asarray(image.convert("L")))
 

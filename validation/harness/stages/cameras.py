@@ -62,7 +62,9 @@ class CamerasStage(Stage):
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         if options.gates_only:
-            return (OURS, THESIS) if scene == FIXTURE else (OURS, PER_IMAGE)
+            if scene == FIXTURE:
+                return (OURS, THESIS)
+            return (OURS, PER_IMAGE) if load_images(scene, options).has_truth else (OURS,)
         if options.quick:
             return (OURS, MATCHES, COLMAP, THESIS)
         return (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)

@@ -51,7 +51,7 @@ class SurfaceStage(Stage):
         return (OURS, TSDF) if options.quick or options.gates_only else (OURS, THESIS, TSDF, POISSON)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        return (("depth", THESIS if method == THESIS else OURS),)
+        return (("cameras", OURS), ("depth", THESIS if method == THESIS else OURS))
 
     def run(self, task: Task, options: ReportOptions) -> None:
         mesh = _surface(task.method, task.scene, options)

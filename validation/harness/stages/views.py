@@ -28,7 +28,7 @@ TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF,
 OWN_PICTURE = "Open3D TSDF, 1 px, its own image"
 VOXELS_PX = {TSDF: 1.5, FINE: 1.0, LEVELLED: 1.0}
 SCENES = (COURTYARD, "Herz-Jesus-P8")
-LEFT_OUT = 2
+LEFT_OUT, QUICK_LEFT_OUT = 2, 1
 RED_LEVELS = 64.0
 """Difference in grey levels that is red in the figures."""
 
@@ -51,7 +51,7 @@ class ViewsStage(Stage):
     name = "views"
     title = "Views of the model"
     definition = (
-        f"{LEFT_OUT} images are left out, one by one: neither "
+        f"{LEFT_OUT} images (in a quick report {QUICK_LEFT_OUT}) are left out, one by one: neither "
         "their depth map nor their colours go into a model. (Other depth maps were matched with them, for "
         "all alike.) Ours is textured; Open3D's is its grid of truncated signed distances with coloured "
         "vertices, from the same depth maps and images, once with exposures equalised by our gains. All "
@@ -69,14 +69,15 @@ class ViewsStage(Stage):
         return strictest if options.quick or options.gates_only else (OURS, TSDF, FINE, LEVELLED)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        return (("depth", OURS), *(((self.name, OURS),) if method == LEVELLED else ()))
+        surface = ((self.name, OURS),) if method == LEVELLED else ()
+        return (("cameras", OURS), ("depth", OURS), *surface)
 
     def run(self, task: Task, options: ReportOptions) -> None:
         maps = our_maps(task.scene, options)
         views = views_of(load_images(task.scene, options), options)
         place = options.place(task.stage, task.scene, task.method)
         shared = options.place(task.stage, task.scene, OURS)
-        for k in _left_out(sorted(maps)):
+        for k in _left_out(sorted(maps), options):
             others = [i for i in sorted(maps) if i != k]
             seen = [views[i] for i in others]
             mesh = _model(task.method, [maps[i] for i in others], seen, shared / f"surface-{k:04d}.npz")
@@ -92,7 +93,7 @@ class ViewsStage(Stage):
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         views = views_of(load_images(scene, options), options)
-        left_out = _left_out(sorted(read_maps(options.place("depth", scene, OURS))))
+        left_out = _left_out(sorted(read_maps(options.place("depth", scene, OURS))), options)
         place, pictures = options.place(self.name, scene), list[Picture]()
         found: dict[str, list[Likeness]] = {}
         for k in left_out:
@@ -114,9 +115,10 @@ class ViewsStage(Stage):
         return Judgement(_metrics(scene, {n: _mean(found.get(n)) for n in names}), (), pictures, notes)
 
 
-def _left_out(views: Sequence[int]) -> list[int]:
+def _left_out(views: Sequence[int], options: ReportOptions) -> list[int]:
     """Return evenly spaced views, without the first and the last if possible."""
-    places = np.linspace(0, len(views) - 1, LEFT_OUT + 2)[1:-1]
+    count = QUICK_LEFT_OUT if options.quick else LEFT_OUT
+    places = np.linspace(0, len(views) - 1, count + 2)[1:-1]
     return sorted({views[round(float(place))] for place in places})
 
 
