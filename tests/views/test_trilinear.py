@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._conditioning import unit_tensor
 from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project
-from thesisrecon.geometry.three_view import tensor_from_cameras, unit_tensor
+from thesisrecon.geometry.three_view import tensor_from_cameras
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.views import trilinear
 from thesisrecon.views.trilinear_synthesis import _transfer_rows

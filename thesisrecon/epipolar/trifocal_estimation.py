@@ -15,14 +15,14 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._frame import MAX_PX
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import normalizing_transform, require_finite, require_shapes
-from thesisrecon.geometry.homogeneous import homogenize, unit_normals
-from thesisrecon.geometry.three_view import (
-    cameras_from_tensor,
-    tensor_epipoles,
-    tensor_from_cameras,
+from thesisrecon.geometry._conditioning import (
+    normalizing_transform,
+    require_finite,
+    require_shapes,
     unit_tensor,
 )
+from thesisrecon.geometry.homogeneous import homogenize, unit_normals
+from thesisrecon.geometry.three_view import cameras_from_tensor, tensor_epipoles, tensor_from_cameras
 from thesisrecon.numerics._levenberg_marquardt import (
     DenseSystem,
     invert_information,

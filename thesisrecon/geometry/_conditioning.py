@@ -116,3 +116,9 @@ def unit_norm(F: F64) -> F64:
     """Scale matrices (..., 3, 3) to unit Frobenius norm; zeros stay zeros."""
     norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))
     return F / np.where(norm > 0.0, norm, 1.0)
+
+
+def unit_tensor(T: F64) -> F64:
+    """Scale a tensor (3, 3, 3) to unit norm; zeros stay zeros."""
+    norm = float(np.linalg.norm(T))
+    return T / norm if norm > 0.0 else T

@@ -10,25 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import checked_unit, require_finite, unit_norm
+from thesisrecon.geometry._conditioning import checked_unit, require_finite, unit_norm, unit_tensor
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
-
-
-def unit_tensor(T: F64) -> F64:
-    """Scale a tensor to unit norm; zeros stay zeros.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Tensor.
-
-    Returns
-    -------
-    ndarray (3, 3, 3)
-    """
-    norm = float(np.linalg.norm(T))
-    return T / norm if norm > 0.0 else T
 
 
 def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
