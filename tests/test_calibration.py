@@ -153,6 +153,22 @@ def test_a_reconstruction_of_arrays_has_their_cameras_and_points():
     refuses(ValueError, r"sizes \(V, 2\) or \(2,\)", build, scene.P, sizes=scene.sizes[:3])
 
 
+def test_cameras_without_points_are_identifiable_in_any_frame():
+    """Without points some of the worlds are mirrored: the optical axes then meet behind the cameras."""
+    K, target = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]]), np.array([0.0, 0, 6])
+    P, rng = [], np.random.default_rng(0)
+    for centre in rng.uniform(-2, 2, (6, 3)):
+        z = (target - centre) / np.linalg.norm(target - centre)
+        x = np.cross([0.1 * rng.normal(), 1, 0], z)
+        R = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
+        P.append(K @ np.column_stack([R, -R @ centre]))
+    for seed in range(6):
+        H = np.random.default_rng(seed).normal(size=(4, 4))
+        found = thesisrecon.absolute_dual_quadric(np.array(P) @ H, (640, 480))
+        assert found.identifiable, found.reasons
+        assert found.K[0, 0, 0] == pytest.approx(900, rel=0.01)
+
+
 def test_the_way_out_of_a_wrong_call_is_named():
     scene = make_scene(seed=4)
     metric = Reconstruction.from_cameras(scene.P, sizes=scene.sizes)

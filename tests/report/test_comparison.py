@@ -12,6 +12,20 @@ from thesisrecon.io._models import read_model
 from thesisrecon.report._comparison import comparison_page
 
 
+def test_all_points_are_in_view_although_the_reference_has_none(browser, tmp_path):
+    export(tmp_path, scene())
+    a = read_model(tmp_path)
+    path = tmp_path / "page.html"
+    b = replace(a, X=a.X[:0], view_index=a.view_index[:0], point_index=a.point_index[:0], xy=a.xy[:0])
+    a = replace(a, X=a.X - np.array([0.0, 4.0, 0.0]))
+    path.write_text(comparison_page(compare_models(a, b), "a", "b"), encoding="utf-8")
+    seen = synthetic.Witness(browser, path, 900, drawn=("scene-figure",))
+    points = np.abs(seen.pixels("#scene-figure").astype(int) - (255, 199, 138)).max(axis=2) < 30
+    assert points.sum() > 20
+    assert not points[:3].any()
+    assert not points[-3:].any()
+
+
 def test_a_browser_draws_both_models(browser, tmp_path):
     export(tmp_path, scene())
     b = read_model(tmp_path)

@@ -200,13 +200,14 @@ def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict
         state, level, reason = _state(data, i)
         (width, height), (w, h) = image.original_size, image.size
         processed = "" if (width, height) == (w, h) else f", processed at {w} × {h}"
+        masked = "" if image.mask is None else f", {1.0 - image.mask.mean():.0%} masked"
         card = {
             "number": i + 1,
             "name": image.name,
             "state": state,
             "level": level,
             "reason": reason,
-            "size": f"{width} × {height} px{processed}",
+            "size": f"{width} × {height} px{processed}{masked}",
             "picture": thumbnail(image, len(data.images)),
             "residuals": summarize_distances(distances[i]),
             "bars": bars[i],

@@ -37,8 +37,12 @@
   // The nearest eye in a direction that shows every camera and 99 % of the points.
   function camera(element, figure, direction) {
     const back = unit(direction), right = unit(cross([0, 0, 1], back)), up = cross(back, right);
-    const points = vertices(figure, figure.data[0], [right, up, back]);
-    const pyramids = vertices(figure, figure.data[1], [right, up, back]);
+    // Each model has three traces: points, pyramids, centres.
+    const all = function (kind) {
+      return figure.data.filter(function (_, n) { return n % 3 === kind; })
+        .flatMap(function (trace) { return vertices(figure, trace, [right, up, back]); });
+    };
+    const points = all(0), pyramids = all(1);
     const fields = [FIELD * element.clientWidth / Math.max(element.clientHeight, 1), FIELD];
     // Positions of the eye along axis d from which everything lies within the field of view.
     function bounds(distance, d) {

@@ -122,9 +122,15 @@ def check_identifiability(
     lengths under the prior; a second covariance, with free aspect ratio and principal point, shows what
     depends on these. ``evidence`` holds the measures of critical motions and those of :func:`_report`.
     """
-    if not reconstruction.inlier.any():
-        reconstruction = _with_virtual_points(reconstruction, upgrade)
-    problem = _bundle_problem(reconstruction, upgrade, prior)
+    problem = None
+    if reconstruction.inlier.any():
+        problem = _bundle_problem(reconstruction, upgrade, prior)
+    else:
+        # Without points the world may be mirrored: the optical axes then meet behind the cameras.
+        for side in (1.0, -1.0):
+            metric = np.diag([1.0, 1.0, 1.0, side]) @ upgrade.metric_from_projective
+            one = replace(upgrade, metric_from_projective=metric)
+            problem = problem or _bundle_problem(_with_virtual_points(reconstruction, one), one, prior)
     if problem is None:
         return identifiability_without_calibration(reconstruction, prior)
     fit = problem.adjust(iterations=_MAX_ITERATIONS)
