@@ -50,9 +50,9 @@ class PerViewChecks:
 
     ``inlier_ratio`` of the triangulable observations; ``confirmed`` the same for points that two or more
     other views determine (two-view points fit any two cameras along their epipolar lines); ``behind`` the
-    share of observations whose point lies behind the camera; ``noise_px`` of one coordinate, corrected for
-    the redundancy of the points; ``focal_off`` the log ratio of the view's own focal length, from its points
-    alone, to the model's.
+    share of their observations whose point lies behind the camera; ``noise_px`` of one coordinate,
+    corrected for the redundancy of the points; ``focal_off`` the log ratio of the view's own focal length,
+    from its points alone, to the model's.
     """
 
     inlier_ratio: F64
@@ -83,7 +83,8 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     # Points that are inliers in two or more other views.
     count = np.bincount(t.point_index[agree], minlength=t.n_points)
     fixed = count[t.point_index] - agree >= 2
-    known = near & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
+    # Wrong matches of two views meet behind them as often as before them.
+    known = near & fixed & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
     _, depth = reproject_observations(model, t.view_index, t.point_index)
     own = [_own_camera(model, view, np.flatnonzero(agree & (t.view_index == view))) for view in range(n)]
     return PerViewChecks(

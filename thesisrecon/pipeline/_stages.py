@@ -15,6 +15,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._image_pair import detect_features, match_views
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
 from thesisrecon.records import (
@@ -211,7 +212,7 @@ def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
     pixels = images if all(image.has_pixels for image in images) else ()
     calibration: SelfCalibration = _cached(
         state, "selfcalibration", attempt, [upstream, prior.shared, prior.mean, prior.std, prior.kind],
-        lambda rng: with_images(method, pixels).calibrate(projective, prior=prior, rng=rng),
+        lambda rng: calibrate_with_core(with_images(method, pixels), projective, prior=prior, rng=rng),
     )  # fmt: skip
     state.result = replace(state.result, calibration=calibration)
     counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
@@ -228,8 +229,9 @@ def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
 
 
 def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) -> MetricResult:
-    run, prior, projective = state.run, state.prior, state.result.projective
-    assert projective is not None
+    run, prior = state.run, state.prior
+    assert state.result.projective is not None
+    projective = calibrated_part(state.result.projective, calibration)
     metric: MetricResult = _cached(
         state, "metric", attempt, run.logs["selfcalibration"].keys[f"attempt-{attempt}"],
         lambda rng: state.config.metric.refine(projective, calibration, prior=prior, rng=rng),
