@@ -166,7 +166,10 @@ class FakeMetric:
             "principal_y_px": records.IntrinsicInterval(40.0, 0.5, "fake"),
             "k1": records.IntrinsicInterval(0.0, 0.0, "fake"),
         }
-        metric = replace(reconstruction, stratum="metric", K=calibration.K, distortion=np.zeros((views, 3)))
+        P = calibration.K @ np.linalg.inv(K) @ reconstruction.P
+        metric = replace(
+            reconstruction, stratum="metric", P=P, K=calibration.K, distortion=np.zeros((views, 3))
+        )
         trusted = attempt >= self.trusted_from
         return records.MetricResult(
             metric, (intervals,) * views, {"x": 1.0}, trusted, () if trusted else self.failed_checks
