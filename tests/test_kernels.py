@@ -1,6 +1,7 @@
 """The cache of compiled kernels: keyed by all code of a kernel, safe against kills and concurrent runs."""
 
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -50,18 +51,34 @@ def package(tmp_path):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def compiled_once(tmp_path_factory):
+    """The cache of a process that has compiled the caller."""
+    folder = tmp_path_factory.mktemp("compiled")
+    (folder / "callee.py").write_text(CALLEE, encoding="utf-8")
+    (folder / "caller.py").write_text(CALLER, encoding="utf-8")
+    assert run_in(folder) == ["8.0", "0"]
+    return folder / "cache"
+
+
+@pytest.fixture
+def compiled(package, compiled_once):
+    """The package after a first process."""
+    shutil.copytree(compiled_once, package / "cache")
+    return package
+
+
 def edit(file, old, new):
     text = file.read_text(encoding="utf-8")
     assert text.count(old) == 1
     file.write_text(text.replace(old, new), encoding="utf-8")
 
 
-def test_a_second_process_compiles_nothing(package):
-    assert run_in(package) == ["8.0", "0"]
-    assert run_in(package, PYTHONHASHSEED="7") == ["8.0", "1"]
+def test_a_second_process_compiles_nothing(compiled):
+    assert run_in(compiled, PYTHONHASHSEED="7") == ["8.0", "1"]
 
 
-def test_a_changed_variable_of_numba_leaves_the_level(package):
+def test_a_changed_variable_of_numba_leaves_the_level(compiled):
     changed = """
 import os, numba, caller, callee
 values = [callee.inner(3.0)]
@@ -70,32 +87,28 @@ numba.njit(lambda x: x)(1.0)
 values.append(caller.outer(3.0))
 print(*values, sum(caller.outer.stats.cache_hits.values()))
 """
-    assert run_in(package) == ["8.0", "0"]
-    assert run_in(package, changed) == ["4.0", "8.0", "1"]
+    assert run_in(compiled, changed) == ["4.0", "8.0", "1"]
 
 
 @pytest.mark.parametrize(
     ("old", "new", "value"), [("x + OFFSET", "x - OFFSET", "4.0"), ("= 1.0", "= 2.0", "10.0")]
 )
-def test_an_edit_of_a_called_function_or_its_constant_recompiles_the_caller(package, old, new, value):
-    run_in(package)
-    edit(package / "callee.py", old, new)
-    assert run_in(package) == [value, "0"]
+def test_an_edit_of_a_called_function_or_its_constant_recompiles_the_caller(compiled, old, new, value):
+    edit(compiled / "callee.py", old, new)
+    assert run_in(compiled) == [value, "0"]
 
 
-def test_an_edit_of_a_comment_or_a_moved_function_recompiles_nothing(package):
-    run_in(package)
-    edit(package / "callee.py", "Add an offset.", "Add a constant.")
-    edit(package / "caller.py", "\n@kernel", "\n# further down\n\n@kernel")
-    assert run_in(package) == ["8.0", "1"]
+def test_an_edit_of_a_comment_or_a_moved_function_recompiles_nothing(compiled):
+    edit(compiled / "callee.py", "Add an offset.", "Add a constant.")
+    edit(compiled / "caller.py", "\n@kernel", "\n# further down\n\n@kernel")
+    assert run_in(compiled) == ["8.0", "1"]
 
 
-def test_a_damaged_entry_is_compiled_again(package):
-    run_in(package)
-    for entry in (package / "cache" / "thesisrecon").iterdir():
+def test_a_damaged_entry_is_compiled_again(compiled):
+    for entry in (compiled / "cache" / "thesisrecon").iterdir():
         entry.write_bytes(entry.read_bytes()[:-7])
-    assert run_in(package) == ["8.0", "0"]
-    assert run_in(package) == ["8.0", "1"]
+    assert run_in(compiled) == ["8.0", "0"]
+    assert run_in(compiled) == ["8.0", "1"]
 
 
 def test_a_folder_that_cannot_be_written_costs_only_the_cache(package):
@@ -106,8 +119,7 @@ def test_a_folder_that_cannot_be_written_costs_only_the_cache(package):
     assert " ".join(words).count("set the variable NUMBA_CACHE_DIR to a writable folder") == 1
 
 
-def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(package):
-    run_in(package)
+def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(compiled):
     killed = """
         import os, caller
         from thesisrecon import kernels
@@ -115,8 +127,8 @@ def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(packag
         caller.outer(3)
         """
     with pytest.raises(AssertionError):
-        run_in(package, textwrap.dedent(killed))
-    assert run_in(package, RUN.replace("3.0", "3")) == ["8.0", "0"]
+        run_in(compiled, textwrap.dedent(killed))
+    assert run_in(compiled, RUN.replace("3.0", "3")) == ["8.0", "0"]
 
 
 def test_two_processes_at_once_compile_once(package):

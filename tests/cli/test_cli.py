@@ -21,7 +21,7 @@ from thesisrecon.io import _images
 ROOT = Path(__file__).parents[2]
 COURTYARD = ROOT / "fixtures" / "courtyard"
 VIEWS = 6
-SMALL = ["--max-size", "640", "--threads", "2", "--until", "metric"]
+SMALL = ["--max-size", "480", "--threads", "2", "--until", "metric"]
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_a_finished_run_is_not_touched_by_another_config(killed_and_resumed, pho
     out, _ = killed_and_resumed
     before = (out / "summary.json").read_bytes()
     arguments = ["reconstruct", str(photographs), "-o", str(out), "--max-size", "700"]
-    assert "images.max_size_px was 640 and is now 700" in refused(arguments)
+    assert "images.max_size_px was 480 and is now 700" in refused(arguments)
     assert (out / "summary.json").read_bytes() == before
 
 

@@ -169,7 +169,7 @@ def test_the_covariance_reflects_points_near_a_plane():
     assert weaknesses[0] < 0.01 < weaknesses[1] < 0.4
 
 
-@pytest.mark.parametrize("sigma", [0.2, 1.0, 2.0])
+@pytest.mark.parametrize("sigma", [0.2, 2.0])
 @pytest.mark.parametrize("kind", ["plane", "rotation", "line", "chance"])
 def test_noisy_matches_that_cannot_work_are_named(kind, sigma):
     for seed in range(5):
