@@ -233,7 +233,7 @@ def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkey
     monkeypatch.delenv(common.DEBUG_VARIABLE, raising=False)
     monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", fail)
     arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out")]
-    assert "IndexError: index 3" in refused(arguments, 1)
+    assert re.search(r"IndexError in test_cli\.py line \d+: index 3 is out", refused(arguments, 1))
     monkeypatch.setenv(common.DEBUG_VARIABLE, "1")
     with pytest.raises(IndexError):
         run_command(arguments)
