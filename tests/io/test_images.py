@@ -93,6 +93,20 @@ def test_exif_rotation_is_applied(tmp_path, orientation):
     assert image.original_size == (96, 80)
 
 
+def test_heic_images_are_read_with_their_reader(tmp_path):
+    pillow_heif = pytest.importorskip("pillow_heif", reason="the extra heif is not installed")
+    pillow_heif.register_heif_opener()
+    image = read_one(save(tmp_path / "a.heic", picture(), quality=-1, chroma=444))
+    assert image.size == (96, 80)
+    assert np.abs(image.rgb.astype(int) - picture()).mean() < 2.0
+
+
+def test_heic_images_without_their_reader_name_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("thesisrecon.io._images._formats", lambda: ("JPEG", "PNG"))
+    (tmp_path / "IMG_0001.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    assert "the extra heif" in reason(tmp_path / "IMG_0001.HEIC")
+
+
 def test_the_focal_length_of_exif_is_read_but_only_offered(tmp_path):
     exif = PIL.Image.Exif()
     exif[0x8769] = {0xA405: 36}

@@ -10,9 +10,10 @@ import hashlib
 import math
 import stat
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from importlib import import_module
 from importlib.resources import files
 from itertools import chain, count
 from pathlib import Path
@@ -55,11 +56,12 @@ def demo_images() -> list[Path]:
 T = TypeVar("T")
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
 
-# Raw and HEIC files are listed so that they are refused by name, not overlooked.
+# Raw files, and HEIC files without their reader, are listed so that they are refused by name, not overlooked.
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".jp2", ".avif"),
     *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
 )
+_HEIF_SUFFIXES = (".heic", ".heif")
 _GENERIC_FOLDERS = ("images", "photographs", "photos", "pictures", "dcim")
 MAX_FILE_BYTES = 2**31
 """Uncompressed images of the largest sensors take less than half of it."""
@@ -280,6 +282,8 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
         limit = 2 * (PIL.Image.MAX_IMAGE_PIXELS or 0) // 10**6
         raise UnusableImage(f"claims more than {limit} megapixels") from None
     except PIL.UnidentifiedImageError:
+        if path.suffix.lower() in _HEIF_SUFFIXES and "HEIF" not in _formats():
+            raise UnusableImage("is a HEIC image: install pillow-heif, the extra heif, to read it") from None
         raise UnusableImage("is not an image of a known format") from None
     except MemoryError:
         raise UnusableImage("does not fit in memory") from None
@@ -313,8 +317,10 @@ def _too_large(file: PIL.Image.Image, needed: int) -> str:
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Formats of ``FORMATS`` that this Pillow supports."""
+    """Formats of ``FORMATS`` that this Pillow supports, HEIC if pillow-heif is installed."""
     PIL.Image.init()
+    with suppress(ImportError):
+        import_module("pillow_heif").register_heif_opener()
     return tuple(name for name in FORMATS if name in PIL.Image.OPEN)
 
 
