@@ -142,5 +142,7 @@ def test_wrong_input_gets_one_sentence(walled, tmp_path):
         depth_maps(images[:2], away)
     with pytest.raises(StageFailure, match="no depths"):
         fuse_depth_maps([np.full((180, 240), np.nan)], cameras[:1])
+    with pytest.raises(UsageError, match="needs a TexturedMesh; got a NoneType"):
+        write_mesh(tmp_path / "model.glb", None)
     with pytest.raises(UsageError, match=r"ending \.glb"):
         write_mesh(tmp_path / "model.ply", fuse_depth_maps([np.ones((180, 240))], cameras[:1]))

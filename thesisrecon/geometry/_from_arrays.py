@@ -104,7 +104,7 @@ def as_cameras(
     if given and all(isinstance(one, Camera) for one in given):
         return given
     if len(given) != 3 or any(isinstance(one, Camera | str) for one in given):
-        kinds = "cameras as thesisrecon.Camera (result.cameras), or a tuple (K, R, t) of arrays"
+        kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
         raise ValueError(f"{caller} needs {kinds}; got a {type(cameras).__name__}")
     if sizes is None:
         raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height, with (K, R, t)")

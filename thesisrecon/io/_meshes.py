@@ -136,6 +136,8 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     path = Path(path)
     if path.suffix.lower() != ".glb":
         raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
+    if not isinstance(mesh, TexturedMesh):
+        raise UsageError(f"write_mesh needs a TexturedMesh; got a {type(mesh).__name__}")
     import trimesh
     from trimesh.visual import material as materials
     from trimesh.visual import texture as textures

@@ -35,8 +35,9 @@ def sort_observations(observations: Observations, n_views: int, n_points: int) -
     view = np.ascontiguousarray(observations.view_index, dtype=np.int64)
     point = np.ascontiguousarray(observations.point_index, dtype=np.int64)
     xy = np.ascontiguousarray(observations.xy, dtype=np.float64)
-    require_shapes("observations", view_index=(view, ("K",)), point_index=(point, ("K",)), xy=(xy, ("K", 2)))
-    require_finite("observations", xy)
+    what = "a list of observations"
+    require_shapes(what, view_index=(view, ("K",)), point_index=(point, ("K",)), xy=(xy, ("K", 2)))
+    require_finite(what, xy)
     if len(view) and (view.min() < 0 or view.max() >= n_views or point.min() < 0 or point.max() >= n_points):
         raise ValueError(f"observation indices are beyond the {n_views} views or {n_points} points")
     key = point * max(n_views, 1) + view

@@ -214,7 +214,9 @@ def start_run(
     """Check the options of a call; return the last stage, the run and whether to overwrite another."""
     unknown = sorted(set(options) - set(RunOptions.__annotations__))
     if unknown:
-        raise TypeError(unknown_word("option of reconstruct", unknown[0], RunOptions.__annotations__))
+        others = ("config", "preset", "max_size", "cameras", "pairs", "set", "masks", "seed")
+        known = (*RunOptions.__annotations__, *others)
+        raise TypeError(unknown_word("option of reconstruct", unknown[0], known))
     until: Until = options.get("until") or "model"
     if until not in get_args(Until):
         raise UsageError(unknown_word("stage", str(until), get_args(Until)))

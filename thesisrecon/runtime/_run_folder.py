@@ -253,7 +253,8 @@ class RunDirectory:
             there = {name: value for name, value in there.items() if name in identity}
         difference = next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
-            advice = "choose another folder, or use --overwrite to replace it (unaffected stages are reused)"
+            replaced = "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
+            advice = f"choose another folder, or {replaced}"
             raise UsageError(f"the output folder {self.path} holds another run ({difference}); {advice}")
         return bool(difference)
 
