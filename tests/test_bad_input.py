@@ -66,13 +66,13 @@ def test_too_few_images(copies, words, found, folder, reconstruct):
 
 def test_damaged_files_among_good_ones(folder, reconstruct):
     """A text named .jpg and a truncated JPEG are refused with their reasons; the others go on to cameras."""
-    for path in courtyard(5):
+    for path in courtyard(4):
         shutil.copy(path, folder / f"good {path.name}")
     (folder / "letter.jpg").write_text("dear reader")
     whole = courtyard(6)[5].read_bytes()
     (folder / "cut off.jpg").write_bytes(whole[: len(whole) // 2])
     _, summary = reconstruct()
-    assert summary["registered"] == 5
+    assert summary["registered"] == 4
     reasons = {entry["name"]: entry["reason"] for entry in summary["refused"]}
     assert "not an image" in reasons["letter.jpg"]
     assert "truncated" in reasons["cut off.jpg"]
@@ -101,14 +101,14 @@ def test_every_kind_of_pixel_in_one_scene(folder, reconstruct):
 
 
 def test_mixed_sizes_are_different_cameras(folder, reconstruct):
-    for k in range(6):
+    for k in range(4):
         scale = 0.75 if k % 2 else 1.0
         image = picture(k)
         image.resize((int(image.size[0] * scale), int(image.size[1] * scale))).save(folder / f"{k}.png")
     _, summary = reconstruct()
-    assert summary["registered"] == 6
+    assert summary["registered"] == 4
     focals = [c["focal_px"]["value"] / c["width_px"] for c in summary["cameras"]]
-    assert [c["camera"] for c in summary["cameras"]] == [0, 1, 0, 1, 0, 1]
+    assert [c["camera"] for c in summary["cameras"]] == [0, 1, 0, 1]
     assert np.ptp(focals) < 0.1 * np.mean(focals)
 
 
