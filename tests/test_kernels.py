@@ -78,6 +78,15 @@ def test_a_second_process_compiles_nothing(compiled):
     assert run_in(compiled, PYTHONHASHSEED="7") == ["8.0", "1"]
 
 
+def test_python_can_call_what_was_compiled_for_a_kernel(compiled):
+    code = """
+import caller, callee
+print(caller.outer(3.0), callee.inner(3.0), caller.outer(4.0), sum(callee.inner.stats.cache_hits.values()))
+"""
+    assert run_in(compiled, code) == ["8.0", "4.0", "10.0", "0"]
+    assert run_in(compiled, code) == ["8.0", "4.0", "10.0", "1"]
+
+
 def test_a_changed_variable_of_numba_leaves_the_level(compiled):
     changed = """
 import os, numba, caller, callee

@@ -20,6 +20,7 @@ import os
 import pickle
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -28,12 +29,14 @@ from typing import IO, TYPE_CHECKING, Any, TypeVar, overload
 
 import numba
 import numpy as np
-from numba.core import cgutils, types
+from numba.core import cgutils, codegen, types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
+from numba.core.sigutils import normalize_signature
 from numba.core.typing.arraydecl import GetItemBuffer, SetItemBuffer
 from numba.core.typing.templates import AbstractTemplate, infer, infer_global, signature
 from numba.cpython.builtins import do_minmax
@@ -56,6 +59,8 @@ COMPILER_SETTINGS = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE"
 """Settings of numba that change the machine code."""
 
 PACKAGE = Path(__file__).parent
+LIST = PACKAGE / "kernels.txt"
+"""Kernels that a run calls from Python, with the types of their arguments; see `runtime._precompilation`."""
 
 _pickled: Callable[[Any], bytes] = dumps
 
@@ -103,22 +108,46 @@ def kernel(function: Any = None, **options: Any) -> Any:
         }
         dispatcher: Any = numba.njit(**settings)(function)
         if isinstance(dispatcher, Dispatcher):  # a plain function where NUMBA_DISABLE_JIT is set
-            stored = vars(dispatcher)["_cache"] = KernelCache(dispatcher)
-            vars(dispatcher)["compile"] = stored.releasing(dispatcher.compile)
-            vars(dispatcher)["get_call_template"] = _without_literals(dispatcher.get_call_template)
+            stored = KernelCache(dispatcher)
+            vars(dispatcher).update(
+                _cache=stored,
+                compile=stored.releasing(dispatcher.compile),
+                add_overload=stored.registering(dispatcher.add_overload),
+                get_call_template=_for_a_kernel(dispatcher.get_call_template),
+            )
+            compiler: Any = vars(dispatcher)["_compiler"]
+            compiler._customize_flags = stored.with_or_without_wrapper
         return dispatcher
 
     return compiled if function is None else compiled(function)
 
 
-def _without_literals(template: Callable[..., Any]) -> Callable[..., Any]:
+# numba times each call of LLVM for its statistics, which takes longer than most of these calls.
+with contextlib.suppress(AttributeError):
+    vars(codegen)["ll"].ffi.lib._lock._cblist.clear()
+
+_caller = threading.local()
+"""`is_kernel` is set while this thread compiles a kernel for another one."""
+
+
+def _for_a_kernel(template: Callable[..., Any]) -> Callable[..., Any]:
     """Let kernels call kernels with plain types; numba would compile a version for each literal argument."""
 
     def get_call_template(args: Any, kws: Any) -> Any:
         plain = tuple(types.unliteral(a) for a in args)
-        return template(plain, {name: types.unliteral(a) for name, a in kws.items()})
+        before, _caller.is_kernel = getattr(_caller, "is_kernel", False), True
+        try:
+            return template(plain, {name: types.unliteral(a) for name, a in kws.items()})
+        finally:
+            _caller.is_kernel = before
 
     return get_call_template
+
+
+@cache
+def _called_by_python() -> set[str]:
+    """Names of the kernels that a run calls from Python."""
+    return {line.partition("(")[0] for line in LIST.read_text(encoding="utf-8").splitlines()}
 
 
 @contextlib.contextmanager
@@ -164,8 +193,11 @@ class KernelCache(NullCache):
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
+        function = dispatcher.py_func
+        self._name = f"{function.__module__.removeprefix('thesisrecon.')}.{function.__name__}"
         self._digest = ""
         self._locks: dict[Path, IO[bytes]] = {}
+        self._only_for_kernels: set[tuple[Any, ...]] = set()
 
     @property
     def cache_path(self) -> str:
@@ -189,7 +221,6 @@ class KernelCache(NullCache):
             _warn_once(path.parent, error.strerror or type(error).__name__)
 
     def _path(self, sig: Any, codegen: Any) -> Path:
-        function = self._dispatcher.py_func
         self._digest = self._digest or code_digest(self._dispatcher)
         what = (
             self._digest,
@@ -198,10 +229,19 @@ class KernelCache(NullCache):
             sys.implementation.cache_tag,
             (numba.__version__, np.__version__),
             [getattr(numba.config, name) for name in COMPILER_SETTINGS],
+            self.is_for_kernels(),
         )
         key = hashlib.sha256(repr(what).encode()).hexdigest()[:32]
-        name = f"{function.__module__.removeprefix('thesisrecon.')}.{function.__name__}"
-        return cache_folder() / f"{name}-{key}"
+        return cache_folder() / f"{self._name}-{key}"
+
+    def is_for_kernels(self) -> bool:
+        """Whether what is compiled now needs no function for Python, a tenth of the compile time."""
+        return getattr(_caller, "is_kernel", False) and self._name not in _called_by_python()
+
+    def with_or_without_wrapper(self, flags: Any) -> Any:
+        """Change numba's flags of a compilation."""
+        flags.no_cpython_wrapper = self.is_for_kernels()
+        return flags
 
     def releasing(self, compile_signature: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """Release the lock of a compilation however it ends; loading and saving happen inside it."""
@@ -210,13 +250,30 @@ class KernelCache(NullCache):
             before = set(self._locks)
             _set_level()
             try:
-                with _without_garbage_collection():
+                with global_compiler_lock, _without_garbage_collection():
+                    arguments = tuple(normalize_signature(signature)[0])
+                    if arguments in self._only_for_kernels and not self.is_for_kernels():
+                        self._only_for_kernels.remove(arguments)
+                        del self._dispatcher.overloads[arguments]
                     return compile_signature(signature)
             finally:
                 for path in set(self._locks) - before:
                     self._unlock(path)
 
         return compile_and_release
+
+    def registering(self, add_overload: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Hide from Python what is compiled for kernels."""
+
+        def add(compiled: Any) -> None:
+            arguments = tuple(compiled.signature.args)
+            if self.is_for_kernels():
+                self._only_for_kernels.add(arguments)
+                self._dispatcher.overloads[arguments] = compiled
+            else:
+                add_overload(compiled)
+
+        return add
 
     def _lock(self, path: Path) -> None:
         """Lock an entry; wait at most MAX_WAIT_S for another process that compiles it."""

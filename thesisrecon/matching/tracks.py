@@ -26,18 +26,15 @@ Pair = TypeVar("Pair", Matches, TwoView)
 def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
     """First corner (N,) of the set of each corner after uniting along ``edges`` (E, 2) in their order.
 
-    An edge between two sets that share a view is rejected. ``view_of`` (N,) is the view of each corner. Only
-    the views of the smaller set are compared, so that the cost of an edge does not grow with the number of
-    images.
+    An edge between two sets that share a view is rejected. ``view_of`` (N,) is the view of each corner. A set
+    has one corner per view at most, so that an edge costs no more than the length of a track.
     """
     count = len(view_of)
-    parent = np.arange(count)
     # Sets are lists linked through ``following``; the smaller one joins the larger.
-    following, last, size = full(count, -1, np.int64), np.arange(count), full(count, 1, np.int64)
-    # Views of the set of a root: root times views plus view.
-    has = {np.int64(-1)}
+    parent, last, size = empty(count, np.int64), empty(count, np.int64), full(count, 1, np.int64)
+    following, edge_of_view = full(count, -1, np.int64), full(n_views, -1, np.int64)
     for n in range(count):
-        has.add(n * n_views + view_of[n])
+        parent[n] = last[n] = n
     for e in range(len(edges)):
         a, b = edges[e, 0], edges[e, 1]
         while parent[a] != a:
@@ -51,15 +48,14 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
         if size[b] > size[a]:
             a, b = b, a
         n = b
-        while n >= 0 and a * n_views + view_of[n] not in has:
+        while n >= 0:
+            edge_of_view[view_of[n]] = e
+            n = following[n]
+        n = a
+        while n >= 0 and edge_of_view[view_of[n]] != e:
             n = following[n]
         if n >= 0:
             continue
-        n = b
-        while n >= 0:
-            has.discard(b * n_views + view_of[n])
-            has.add(a * n_views + view_of[n])
-            n = following[n]
         parent[b] = a
         following[last[a]] = b
         last[a] = last[b]
@@ -84,9 +80,10 @@ def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle:
     view of every observation and the map (K, 2, 2) to it; an unreachable observation keeps its own corner.
     """
     count = len(xy)
-    position, maps = xy.copy(), zeros((count, 2, 2))
-    maps[:, 0, 0] = 1.0
-    maps[:, 1, 1] = 1.0
+    position, maps = empty((count, 2)), zeros((count, 2, 2))
+    for k in range(count):
+        position[k, 0], position[k, 1] = xy[k, 0], xy[k, 1]
+        maps[k, 0, 0] = maps[k, 1, 1] = 1.0
     start = zeros(count + 1, np.int64)
     for e in range(len(edges)):
         start[edges[e, 0] + 1] += 1

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import empty, full, kernel
+from thesisrecon.kernels import copy_to, empty, full, kernel
 from thesisrecon.numerics._observations import Jacobians
 from thesisrecon.numerics._small_solvers import invert_cholesky_3x3, multiply_transposed_3x3
 
@@ -341,5 +341,5 @@ def revert_crossing_points(
                 before += row_before[v, c] * X_before[j, c]
                 after += row_after[v, c] * X_after[j, c]
             if before * after < 0.0:
-                X_after[j] = X_before[j]
+                copy_to(X_after[j], X_before[j])
                 break

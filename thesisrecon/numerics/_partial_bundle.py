@@ -9,7 +9,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_transform
-from thesisrecon.kernels import empty, kernel
+from thesisrecon.kernels import copy_to, empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
 from thesisrecon.numerics._metric_kernels import (
     MetricModel,
@@ -141,7 +141,7 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
                 candidate, flipped = _point_cost(P, moved[0], view, seen, options)
                 accepted = candidate < cost and (flipped == behind or not options.keep_cheirality)
             if accepted:
-                x[0] = moved[0]
+                copy_to(x[0], moved[0])
                 gain = cost - candidate
                 cost, behind = candidate, flipped
                 damping = max(damping * 0.2, 1e-9)

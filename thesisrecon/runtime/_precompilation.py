@@ -19,13 +19,12 @@ from typing import Any
 import numba
 from numba.core import types
 
-from thesisrecon.kernels import cache_folder
+from thesisrecon.kernels import LIST, cache_folder
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of
 from thesisrecon.runtime._signals import kill_on_exit, starting_processes
 
 PACKAGE = Path(__file__).parent.parent
-LIST = PACKAGE / "kernels.txt"
 WORKER = f"""import sys
 sys.path.insert(0, {str(PACKAGE.parent)!r})
 from {__name__} import compile_requested

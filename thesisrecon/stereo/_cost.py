@@ -201,32 +201,37 @@ def _both(a: U8, b: U8, out: U8) -> None:
 
 @kernel
 def _row_costs(
-    y: int, left: CostFeatures, right: CostFeatures, first: int, weights: I16, outside: np.uint8, out: U8
+    y: int, left: CostFeatures, right: CostFeatures, first: int, weights: I16, outside: np.uint8, padded: U8
 ) -> None:
     """Costs (D, W) of row y of the left image at the disparities first, first + 1, ...
 
     ``weights``: of a census bit, of a quarter level, and the truncation of the levels (sum over channels).
-    ``outside`` is the cost of a pair with a missing pixel.
+    ``outside`` is the cost of a pair with a missing pixel. The costs are in the middle of ``padded``.
     """
     bits_l, a, valid_l = left
     bits_r, b, valid_r = right
     width = bits_l.shape[1]
     total, differing = empty(width, np.int16), empty(width, np.int16)
     known = empty(width, np.uint8)
-    for q in range(len(out)):
+    margin = (padded.shape[1] - width) // 2
+    for q in range(len(padded)):
         d = first + q
         lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
-        out[q, : min(lo, width)] = outside
-        out[q, max(hi, 0) :] = outside
+        out = padded[q, margin : margin + width]
+        for x in range(lo):
+            out[x] = outside
+        for x in range(hi, width):
+            out[x] = outside
         if hi <= lo:
             continue
         n = hi - lo
-        total[:n] = 0
+        for x in range(n):
+            total[x] = 0
         for k in range(len(a) if weights[1] != 0 else 0):
             _add_difference(a[k, y, lo:hi], b[k, y, lo - d : hi - d], total[:n])
         _hamming(bits_l[y, lo:hi], bits_r[y, lo - d : hi - d], differing[:n])
         _both(valid_l[y, lo:hi], valid_r[y, lo - d : hi - d], known[:n])
-        _join(differing[:n], total[:n], known[:n], weights, outside, out[q, lo:hi])
+        _join(differing[:n], total[:n], known[:n], weights, outside, out[lo:hi])
 
 
 @kernel
@@ -357,7 +362,7 @@ def cost_volume(
     summed = 0
     for y in range(height):
         while summed < min(y + ARM + 1, height):
-            _row_costs(summed, left, right, first, weights, outside, costs[:, ARM : ARM + width])
+            _row_costs(summed, left, right, first, weights, outside, costs)
             _sum_along_row(ones, masks, summed, counts[summed % span])
             for q in range(n):
                 _sum_along_row(costs[q], masks, summed, ring[q, summed % span])

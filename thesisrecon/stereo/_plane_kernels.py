@@ -51,7 +51,7 @@ class PatchWindow(NamedTuple):
     weights: F32
 
 
-@kernel(error_model="numpy")
+@kernel
 def pack_squares(gray: F32, squares: U32) -> None:
     """Pack the grey levels of 2 x 2 pixels into one word, so that an interpolation needs one load.
 
@@ -72,7 +72,7 @@ def pack_squares(gray: F32, squares: U32) -> None:
                 squares[v, u] = word
 
 
-@kernel(error_model="numpy")
+@kernel
 def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
     """Fit the gradient of the inverse depth (H, W) around every known pixel.
 
@@ -104,7 +104,7 @@ def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
                     gy[v, u] = (sxx * syd - sxy * sxd) / det
 
 
-@kernel(error_model="numpy", inline="always")
+@kernel(fastmath=SUMS, forceinline=True)
 def _window_samples(gray: F32, u: int, v: int, window: PatchWindow, samples: F32) -> float:
     """Fill ``samples`` (2, S) with normalised weights and weighted, centred grey levels of the window.
 
@@ -131,7 +131,7 @@ def _window_samples(gray: F32, u: int, v: int, window: PatchWindow, samples: F32
     return square / total - mean * mean
 
 
-@kernel(error_model="numpy", inline="always")
+@kernel(fastmath=SUMS, forceinline=True)
 def _plane_homography(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, warp: F64) -> bool:
     """Fill ``warp`` (8,) with the homography of the plane from offsets (dx, dy) of pixel ``at`` to view k.
 
@@ -151,7 +151,7 @@ def _plane_homography(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, w
     return True
 
 
-@kernel(error_model="numpy", fastmath=SUMS, inline="always", forceinline=True)
+@kernel(fastmath=SUMS, inline="always", forceinline=True)
 def _cost_inside(
     squares: U32, start: int, width: int, warp: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
@@ -188,13 +188,13 @@ def _cost_inside(
     return cost
 
 
-@kernel(error_model="numpy", inline="always")
+@kernel(inline="always")
 def _cost_of(variance: float, other_variance: float, covariance: float) -> float:
     spread = (max(variance, 0.0) + TEXTURE) * (max(other_variance, 0.0) + TEXTURE)
     return float(max(1.0 - covariance / np.sqrt(spread), 0.0))
 
 
-@kernel(error_model="numpy")
+@kernel
 def _cost_at_border(
     squares: U32, start: int, size: tuple[int, int], warp: F64, offsets: F32, samples: F32
 ) -> float:
@@ -226,7 +226,7 @@ def _cost_at_border(
     return _cost_of(saa / held - sa * sa, sbb / held - sb * sb, sab / held - sa * sb)
 
 
-@kernel(error_model="numpy", inline="always", forceinline=True)
+@kernel(fastmath=SUMS, forceinline=True)
 def _view_cost(
     squares: U32, layout: I64, k: int, warp: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
@@ -244,7 +244,7 @@ def _view_cost(
     return _cost_at_border(squares, start, (width, height), warp, offsets, samples)
 
 
-@kernel(error_model="numpy", inline="always", forceinline=True)
+@kernel(fastmath=SUMS, forceinline=True)
 def _plane_cost(
     views: PatchViews, at: tuple[int, int], plane: F64, offsets: F32, samples: F32, variance: float, warp: F64
 ) -> float:
@@ -269,7 +269,7 @@ def _plane_cost(
     return least + 0.5 * min(second - least, MAX_EXCESS_COST) if least < UNKNOWN else UNKNOWN
 
 
-@kernel(error_model="numpy", inline="always")
+@kernel(fastmath=SUMS, forceinline=True)
 def _motion_px(H: F64, e: F64, k: int, at: tuple[int, int], rho: float) -> float:
     """Motion of the projection in view ``k`` in pixels per unit of inverse depth."""
     u, v = at
@@ -280,7 +280,7 @@ def _motion_px(H: F64, e: F64, k: int, at: tuple[int, int], rho: float) -> float
     return float(np.sqrt(dx * dx + dy * dy))
 
 
-@kernel(error_model="numpy", inline="always")
+@kernel(fastmath=SUMS, forceinline=True)
 def _step(H: F64, e: F64, at: tuple[int, int], rho: float, px: float) -> float:
     """Step of inverse depth that moves the projection by at most ``px`` in any view."""
     most = 0.0
@@ -289,7 +289,7 @@ def _step(H: F64, e: F64, at: tuple[int, int], rho: float, px: float) -> float:
     return px / most
 
 
-@kernel(error_model="numpy", inline="always")
+@kernel(fastmath=SUMS, forceinline=True)
 def _continued(planes: F32, a: int, b: int, u: int, v: int, trial: F64) -> bool:
     """Fill ``trial`` with the plane of pixel (a, b) evaluated at (u, v); False if there is none."""
     if not (0 <= a < planes.shape[1] and 0 <= b < planes.shape[0]) or not np.isfinite(planes[b, a, 0]):
@@ -299,7 +299,7 @@ def _continued(planes: F32, a: int, b: int, u: int, v: int, trial: F64) -> bool:
     return True
 
 
-@kernel(error_model="numpy", fastmath=SUMS)
+@kernel(fastmath=SUMS)
 def sweep_planes(
     views: PatchViews,
     window: PatchWindow,
@@ -366,7 +366,7 @@ def sweep_planes(
             cost[v, u] = least
 
 
-@kernel(error_model="numpy", fastmath=SUMS)
+@kernel(fastmath=SUMS)
 def rate_planes(
     views: PatchViews, window: PatchWindow, planes: F32, max_cost: float, least: F32, support: U8, slope: F32
 ) -> None:
@@ -400,7 +400,7 @@ def rate_planes(
             slope[v, u] = np.sqrt(total)
 
 
-@kernel(error_model="numpy", fastmath=SUMS)
+@kernel(fastmath=SUMS)
 def begin_planes(views: PatchViews, window: PatchWindow, planes: F32, cost: F32) -> None:
     """Compute the cost (H, W) of planes (H, W, 3), ``UNKNOWN`` without one."""
     gray, offsets = views.gray, window.offsets

@@ -190,7 +190,8 @@ def prepare_views(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: 
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         prepared = list(pool.map(lambda view: _prepared(mesh, view), views))
     stride = max(1, len(mesh.vertices) // GAIN_POINTS)
-    weight, color = _observe(prepared, mesh.vertices[::stride], vertex_normals(mesh)[::stride])
+    points, normals = (np.ascontiguousarray(a[::stride]) for a in (mesh.vertices, vertex_normals(mesh)))
+    weight, color = _observe(prepared, points, normals)
     gains = _equalizing_gains(weight, color)
     return [view._replace(gain=gain) for view, gain in zip(prepared, gains, strict=True)]
 
