@@ -123,7 +123,7 @@ def kernel(function: Any = None, **options: Any) -> Any:
 
 
 # numba times each call of LLVM for its statistics, which takes longer than most of these calls.
-with contextlib.suppress(AttributeError):
+with contextlib.suppress(AttributeError, KeyError):
     vars(codegen)["ll"].ffi.lib._lock._cblist.clear()
 
 _caller = threading.local()
