@@ -56,6 +56,9 @@ def test_what_no_intrinsic_explains_is_named_and_widens_the_interval():
     assert "camera model" in focal.source
     assert abs(focal.value - 1500.0) < 2.0 * focal.std
     assert focal.std < 0.05 * focal.value
+    x = result.intrinsics[0]["principal_x_px"]
+    assert "camera model" in x.source
+    assert abs(x.value - scene.K[0, 0, 2]) < 2.0 * x.std
     assert centre_error(result, scene) < 0.02
 
 

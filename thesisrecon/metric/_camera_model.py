@@ -117,12 +117,13 @@ def differences_of_images(model: MetricEstimate, columns: tuple[int, ...]) -> st
 class CameraDifferences:
     """How much two camera models change the cameras.
 
-    The largest one of the ``centre``, relative to the RMS radius of the camera path, and of the ``focal``,
-    relative.
+    The largest one of the ``centre``, relative to the RMS radius of the camera path, of the ``focal``,
+    relative, and of the ``principal_point`` over the focal length.
     """
 
     centre: float
     focal: float
+    principal_point: float
 
     @property
     def harmless(self) -> bool:
@@ -138,4 +139,6 @@ def camera_differences(a: MetricEstimate, b: MetricEstimate) -> CameraDifference
     off = np.linalg.norm(A - move.apply(B), axis=1)
     radius = np.sqrt(np.mean(np.sum((A - A.mean(axis=0)) ** 2, axis=1)))
     f, g = (m.cameras.intrinsics[m.cameras.group[v], FOCAL] for m in (a, b))
-    return CameraDifferences(float(off.max() / radius), float(np.abs(np.log(g / f)).max()))
+    c, d = (m.cameras.intrinsics[m.cameras.group[v]][:, CENTRE] for m in (a, b))
+    moved = float((np.abs(d - c) / f[:, None]).max())
+    return CameraDifferences(float(off.max() / radius), float(np.abs(np.log(g / f)).max()), moved)

@@ -255,16 +255,23 @@ def widen_unverified_focals(
 
 
 def widen_by_camera_model(
-    intervals: Sequence[Mapping[str, IntrinsicInterval]], difference: float
+    intervals: Sequence[Mapping[str, IntrinsicInterval]], difference: tuple[float, float]
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
-    """Add the relative ``difference`` to a richer camera model to the std of the focal lengths."""
+    """Add the differences to a richer camera model to the standard deviations.
+
+    ``difference`` of the focal lengths and of the principal points, over the focal length.
+    """
+    moved = {"focal_px": difference[0], "principal_x_px": difference[1], "principal_y_px": difference[1]}
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own in intervals:
-        focal = own.get("focal_px")
-        if focal is not None and focal.std > 0.0:
-            std = float(np.hypot(focal.std, difference * focal.value))
-            own = {**own, "focal_px": IntrinsicInterval(focal.value, std, CAMERA_MODEL)}
-        answer.append(own)
+        wider = {
+            name: IntrinsicInterval(
+                own[name].value, float(np.hypot(own[name].std, off * own["focal_px"].value)), CAMERA_MODEL
+            )
+            for name, off in moved.items()
+            if name in own and own[name].std > 0.0 and off > 0.0
+        }
+        answer.append({**own, **wider})
     return tuple(answer)
 
 

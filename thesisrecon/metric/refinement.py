@@ -72,8 +72,8 @@ UNDETERMINED_REL = 0.1
 LAST_ITERATIONS = 25
 """Zoomed images lie in a long valley of the cost: the last adjustment must reach its bottom."""
 NOT_EXPLAINED = (
-    "Values of each image do not predict other observations better, so the shared ones stay; the interval of "
-    "the focal length contains the difference"
+    "Values of each image do not predict other observations better, so the shared ones stay; their "
+    "intervals contain the difference"
 )
 NO_COMMON_POINTS = "shares no points with the model"
 
@@ -108,7 +108,7 @@ class MetricRefinement:
         shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
-        if difference > 0.0:
+        if any(difference):
             intervals = widen_by_camera_model(intervals, difference)
         check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
@@ -144,25 +144,25 @@ _Finished = tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockSca
 
 def settle_camera_model(
     simple: _Finished,
-) -> tuple[_Finished, SharedCameraTest, tuple[str, ...], float]:
+) -> tuple[_Finished, SharedCameraTest, tuple[str, ...], tuple[float, float]]:
     """Settle intrinsics that the images contradict.
 
     They become values of each image if that predicts held-out observations far better. Contradictions that
-    no richer model explains are limitations if such a model hardly changes the cameras: the relative
-    difference of the focal lengths then widens their intervals.
+    no richer model explains are limitations if such a model hardly changes the cameras: the differences of
+    the focal lengths and principal points, over the focal length, then widen their intervals.
     """
     chosen, sharing = simple, check_shared_cameras(*simple[:2])
-    limitations, difference = tuple[str, ...](), 0.0
+    limitations, difference = tuple[str, ...](), (0.0, 0.0)
     for columns in richer_models(sharing.contradicted, simple[1].prior):
         if not sharing.failed_checks:
             break
         rich = finish_metric(*with_own_values(*simple[:2], columns))
         if remaining_cost(chosen[:2], rich[:2]) < MAX_REMAINING:
             chosen, sharing = rich, check_shared_cameras(*rich[:2])
-            limitations, difference = (differences_of_images(rich[0], columns),), 0.0
+            limitations, difference = (differences_of_images(rich[0], columns),), (0.0, 0.0)
         elif (change := camera_differences(chosen[0], rich[0])).harmless:
-            difference = max(difference, change.focal)
-    if sharing.failed_checks and difference > 0.0:
+            difference = max(difference[0], change.focal), max(difference[1], change.principal_point)
+    if sharing.failed_checks and any(difference):
         limitations += tuple(f"{fact}. {NOT_EXPLAINED}" for fact, _ in sharing.found)
         sharing = replace(sharing, found=())
     return chosen, sharing, limitations, difference
