@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, I64, Stratum
@@ -257,6 +258,14 @@ class Reconstruction:
     reasons: tuple[str, ...]
     K: F64 | None = None
     distortion: F64 | None = None
+
+    @property
+    def common_points(self) -> F64:
+        """(V, V) number of points with an inlier in both views."""
+        t, keep = self.tracks, self.inlier
+        where = (t.view_index[keep], t.point_index[keep])
+        seen = scipy.sparse.csr_array((np.ones(len(where[0])), where), (t.n_views, t.n_points))
+        return np.asarray((seen @ seen.T).toarray())
 
     @classmethod
     def from_cameras(

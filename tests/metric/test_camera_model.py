@@ -13,6 +13,7 @@ from thesisrecon.metric._camera_model import (
     camera_differences,
     held_out_observations,
     remaining_cost,
+    richer_models,
     with_own_values,
 )
 from thesisrecon.metric._model import CENTRE, FOCAL
@@ -102,3 +103,12 @@ def test_differences_are_relative_to_the_path_and_free_of_the_frame():
     zoomed = replace(model, cameras=replace(cameras, intrinsics=longer))
     assert camera_differences(model, zoomed).focal == pytest.approx(np.log(1.02))
     assert camera_differences(model, zoomed).harmless
+
+
+def test_each_model_is_tried_once_and_known_intrinsics_stay_known():
+    free = setting()[1]
+    known = setting(principal_point="known")[1]
+    focal = np.arange(8) == FOCAL
+    assert list(richer_models(focal, free)) == [(FOCAL,), (FOCAL, *CENTRE)]
+    assert list(richer_models(focal, known)) == [(FOCAL,)]
+    assert list(richer_models(np.zeros(8, bool), free)) == []

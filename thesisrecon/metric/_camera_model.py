@@ -37,9 +37,9 @@ def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[in
     if not contradicted.any():
         return
     unknown = np.flatnonzero((prior.std > 0.0).all(axis=0))
-    for columns in RICHER:
-        if np.isin(np.flatnonzero(contradicted), columns).all():
-            yield tuple(column for column in columns if column in unknown)
+    enough = (columns for columns in RICHER if np.isin(np.flatnonzero(contradicted), columns).all())
+    # Without known columns two models may be the same.
+    yield from dict.fromkeys(tuple(c for c in columns if c in unknown) for columns in enough)
 
 
 def with_own_values(
@@ -134,7 +134,7 @@ class CameraDifferences:
 def camera_differences(a: MetricEstimate, b: MetricEstimate) -> CameraDifferences:
     """Differences between the cameras of two estimates after a similarity alignment of their centres."""
     v = np.flatnonzero(a.registered & b.registered)
-    A, B = (-np.einsum("vba,vb->va", m.cameras.R[v], m.cameras.t[v]) for m in (a, b))
+    A, B = (m.cameras.centres[v] for m in (a, b))
     move = estimate_similarity(B, A)
     off = np.linalg.norm(A - move.apply(B), axis=1)
     radius = np.sqrt(np.mean(np.sum((A - A.mean(axis=0)) ** 2, axis=1)))

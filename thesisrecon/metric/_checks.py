@@ -107,7 +107,7 @@ def triangulable_observations(model: MetricEstimate) -> B8:
 def _from_two_places(model: MetricEstimate, near: B8) -> B8:
     """(N,) whether the views of a point have a baseline above ``MIN_BASELINE_RATIO`` of the distance."""
     t = model.tracks
-    centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
+    centres = model.cameras.centres
     view, point = t.view_index[near], t.point_index[near]
     known = model.inlier[near]
     if not known.any():

@@ -119,7 +119,7 @@ def select_inliers(model: MetricEstimate, *, sigmas: float, min_angle: float) ->
     """Update inliers and valid points (two inliers and a triangulation angle above ``min_angle`` rad)."""
     t = model.tracks
     inlier = inlier_mask(model, sigmas=sigmas)
-    centres = -np.einsum("vba,vb->va", model.cameras.R, model.cameras.t)
+    centres = model.cameras.centres
     view, point = t.view_index[inlier], t.point_index[inlier]
     angle = triangulation_angles(centres, view, point, model.X, t.n_points)
     valid = (np.bincount(point, minlength=t.n_points) >= 2) & (angle > min_angle)

@@ -119,7 +119,7 @@ class _SharedGroup:
 
 
 def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) -> SharedCameraTest:
-    """Test shared focals and principal points of three views or more by the decrease in cost (chi-square)."""
+    """Test shared focals and principal points of two views or more by the decrease in cost (chi-square)."""
     views = np.flatnonzero(model.registered)
     focal_std = np.full(len(model.registered), np.nan)
     contradicted = np.zeros(WIDTH, dtype=bool)

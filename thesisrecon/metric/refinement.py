@@ -72,7 +72,7 @@ UNDETERMINED_REL = 0.1
 LAST_ITERATIONS = 25
 """Zoomed images lie in a long valley of the cost: the last adjustment must reach its bottom."""
 NOT_EXPLAINED = (
-    "Values of each image do not predict other observations better, so the shared ones stay; their "
+    "Values of each image hardly predict other observations better, so the shared ones stay; their "
     "intervals contain the difference"
 )
 NO_COMMON_POINTS = "shares no points with the model"

@@ -52,6 +52,11 @@ class MetricCameras:
         """Cameras before distortion, K [R t]; (V, 3, 4)."""
         return np.asarray(self.K @ np.concatenate([self.R, self.t[:, :, None]], axis=2))
 
+    @property
+    def centres(self) -> F64:
+        """Camera centres (V, 3)."""
+        return np.asarray(-np.einsum("vba,vb->va", self.R, self.t))
+
 
 POSE_DOF = 6
 FOCAL = 0

@@ -52,17 +52,15 @@ def calibrated_part(projective: Reconstruction, calibration: SelfCalibration) ->
 
 def _cores(projective: Reconstruction) -> Iterator[B8]:
     """Masks (V,) of views: each view, best observed first, with those that share most points with it."""
-    t, registered = projective.tracks, np.flatnonzero(projective.registered)
+    registered = np.flatnonzero(projective.registered)
     if len(registered) <= CORE_VIEWS:
         return
-    seen = np.zeros((t.n_views, t.n_points), dtype=np.float32)
-    seen[t.view_index[projective.inlier], t.point_index[projective.inlier]] = 1.0
-    shared = seen[registered] @ seen[registered].T
+    shared = projective.common_points[np.ix_(registered, registered)]
     tried = set[bytes]()
     for first in np.argsort(-shared.diagonal(), kind="stable"):
         # A view shares most points with itself.
         nearest = np.argsort(-shared[first], kind="stable")[:CORE_VIEWS]
-        views = np.isin(np.arange(t.n_views), registered[nearest])
+        views = np.isin(np.arange(len(projective.registered)), registered[nearest])
         if views.tobytes() not in tried:
             tried.add(views.tobytes())
             yield views

@@ -312,9 +312,7 @@ def _report(
     """Return the report; focal lengths in long sides, ``focal_std_rel`` of the worst view, others medians."""
     cameras, views = fit.cameras, problem.views
     focal = cameras.intrinsics[cameras.group, 0]
-    metric = UpgradedCameras(
-        focal / problem.longest, cameras.R, -np.einsum("vba,vb->va", cameras.R, cameras.t), fit.X
-    )
+    metric = UpgradedCameras(focal / problem.longest, cameras.R, cameras.centres, fit.X)
     evidence = measure_motion(metric)
     motion, distance = nearest_critical_motion(evidence)
     evidence["critical_motion_distance"] = distance

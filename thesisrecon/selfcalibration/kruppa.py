@@ -64,11 +64,8 @@ class _Pairs:
 
 def _overlapping_pairs(frame: ReferenceFrame, reconstruction: Reconstruction, min_common: int) -> _Pairs:
     """Return F of the cameras for all pairs with at least ``min_common`` common observations."""
-    tracks, keep = reconstruction.tracks, reconstruction.inlier
-    seen = np.zeros((tracks.n_views, tracks.n_points))
-    seen[tracks.view_index[keep], tracks.point_index[keep]] = 1.0
-    common = seen[frame.views] @ seen[frame.views].T
-    if not keep.any():
+    common = reconstruction.common_points[np.ix_(frame.views, frame.views)]
+    if not reconstruction.inlier.any():
         common[:] = np.inf  # cameras without points: all pairs
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
     places, found = [], []

@@ -37,13 +37,8 @@ def model_from_reconstruction(found: Reconstruction, prior: IntrinsicsPrior) -> 
     )  # fmt: skip
 
 
-def centres(model: MetricEstimate) -> F64:
-    """(V, 3)."""
-    return np.asarray(-np.einsum("vba,vb->va", model.cameras.R, model.cameras.t))
-
-
 def _spread(model: MetricEstimate) -> float:
-    C = centres(model)[model.registered]
+    C = model.cameras.centres[model.registered]
     return float(np.sqrt(np.mean(np.sum((C - C.mean(axis=0)) ** 2, axis=1))))
 
 
@@ -61,7 +56,7 @@ def move_cameras(
     model: MetricEstimate, rng: np.random.Generator, views: I64, degrees: float
 ) -> MetricEstimate:
     """Views turned by up to ``degrees`` (at least a quarter) and moved by a fifth to a half of the path."""
-    R, C = model.cameras.R.copy(), centres(model)
+    R, C = model.cameras.R.copy(), model.cameras.centres
     for v in views:
         turn = np.radians(rng.uniform(degrees / 4.0, degrees)) * _direction(rng)
         R[v] = Rotation.from_rotvec(turn).as_matrix() @ R[v]
@@ -82,7 +77,7 @@ def all_moved(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate
 def two_swapped(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """Swap two cameras."""
     i, j = rng.choice(np.flatnonzero(model.registered), 2, replace=False)
-    R, C = model.cameras.R.copy(), centres(model)
+    R, C = model.cameras.R.copy(), model.cameras.centres
     R[[i, j]], C[[i, j]] = R[[j, i]], C[[j, i]]
     return _placed(model, R, C)
 
@@ -95,7 +90,7 @@ def mirrored(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     M = np.eye(3) - 2.0 * np.outer(z, z)
     R = np.diag([1.0, 1.0, -1.0]) @ model.cameras.R @ M
     # Mirrored cameras look away from the scene; move them back to their side.
-    C = o + (centres(model) - o) @ M
+    C = o + (model.cameras.centres - o) @ M
     return _placed(model, R, C - 2.0 * ((C - o) @ z)[:, None] * z)
 
 

@@ -26,7 +26,7 @@ from thesisrecon.metric._shared_camera import contradicted_focal_priors
 from thesisrecon.metric.refinement import finish_metric, settle_camera_model
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 from thesisrecon.results import RunResult
-from validation.scenes.spoiled import SPOILINGS, centres, model_from_reconstruction
+from validation.scenes.spoiled import SPOILINGS, model_from_reconstruction
 from validation.studies.runner import Part, Rows, report_progress, scenes_here, text_table
 
 OURS = "ours"
@@ -58,7 +58,7 @@ def settle(model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimat
 def is_wrong(model: MetricEstimate, right: MetricEstimate) -> bool:
     """Return whether a focal errs by 3 %, or an aligned camera by 3 % of the path or by 1 degree."""
     v = model.registered & right.registered
-    A, B = centres(right)[v], centres(model)[v]
+    A, B = right.cameras.centres[v], model.cameras.centres[v]
     move = estimate_similarity(B, A)
     off, path = np.linalg.norm(A - move.apply(B), axis=1), np.linalg.norm(A - A.mean(axis=0), axis=1)
     turned = Rotation.from_matrix(
