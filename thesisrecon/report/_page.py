@@ -12,6 +12,7 @@ import gzip
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -74,6 +75,15 @@ def render_page(
     **content: Any,
 ) -> str:
     """Render a page: text is escaped, names are defined, JSON has no NaN, and only these scripts run."""
+    digests = (hashlib.sha256(script.encode("utf-8")).digest() for script in scripts)
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+    given = {"style": page_resource("style.css"), "scripts": scripts, "hashes": hashes or "'none'"}
+    return str(_compiled(template, tuple((filters or {}).items())).render(**given, **content))
+
+
+@cache
+def _compiled(template: str, filters: tuple[tuple[str, Callable[..., str]], ...]) -> Any:
+    """The template in executable form, made once in a process."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -81,11 +91,8 @@ def render_page(
     )
     # NaN is not JSON: the script of the page could not parse it.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    environment.filters.update(filters or {})
-    digests = (hashlib.sha256(script.encode("utf-8")).digest() for script in scripts)
-    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
-    given = {"style": page_resource("style.css"), "scripts": scripts, "hashes": hashes or "'none'"}
-    return environment.from_string(template).render(**given, **content)
+    environment.filters.update(filters)
+    return environment.from_string(template)
 
 
 def page_resource(name: str) -> str:
@@ -93,6 +100,7 @@ def page_resource(name: str) -> str:
     return files("thesisrecon.report").joinpath(name).read_text(encoding="utf-8")
 
 
+@cache
 def plotly_script() -> str:
     """Return plotly.js as text that can be embedded in a page."""
     from plotly.offline import get_plotlyjs
@@ -100,14 +108,19 @@ def plotly_script() -> str:
     return str(get_plotlyjs()).replace("</script", "<\\/script")
 
 
+@cache
+def _packed(script: str) -> str:
+    """A script, compressed, as text; a fifth of a second for plotly.js."""
+    return base64.b64encode(gzip.compress(script.encode("utf-8"), mtime=0)).decode("ascii")
+
+
 def figure_content(figures: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
     """Return the scripts that draw plotly.js figures by element id, and what the template needs for them."""
     library = plotly_script() if figures else ""
     scripts = [page_resource("unpack.js"), page_resource("page.js")] if figures else []
-    packed = base64.b64encode(gzip.compress(library.encode("utf-8"), mtime=0)).decode("ascii")
     # page.js adds the unpacked library as a script, which the policy of the page must list too.
     allowed = [*scripts, library] if figures else []
-    return allowed, {"figures": figures, "figure_scripts": scripts, "plotly": packed}
+    return allowed, {"figures": figures, "figure_scripts": scripts, "plotly": _packed(library)}
 
 
 def strip_page(
