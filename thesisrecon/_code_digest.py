@@ -13,7 +13,6 @@ import pickle
 import sys
 import sysconfig
 import uuid
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, MappingProxyType, MethodType, ModuleType
@@ -27,6 +26,7 @@ _LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "p
 
 # Libraries that count by name, even as the value itself.
 _BY_NAME = {*sys.stdlib_module_names, "numpy", "scipy", "numba"}
+_PLAIN = {int, float, str, bytes, bool, type(None)}
 _NOTED = {"_abc_impl", "_is_protocol", "_is_runtime_protocol"}
 
 
@@ -39,11 +39,8 @@ def code_digest(*values: Any) -> str:
     object of a C++ library, gives another digest each time, so that nothing stored is used for it.
     """
     walk = _Walk({OWN, *(_package_of(value) for value in values)} - _BY_NAME)
-    digest = hashlib.sha256()
-    for part in walk.parts(values):
-        digest.update(part.encode())
-        digest.update(b"\0")
-    return digest.hexdigest()
+    walk.follow(values)
+    return hashlib.sha256("".join(f"{text}\0" for text in walk.found).encode()).hexdigest()
 
 
 def _package_of(value: Any) -> str:
@@ -85,118 +82,128 @@ class _Walk:
     def __init__(self, packages: set[str]) -> None:
         self._packages = packages
         self._seen: dict[int, Any] = {}  # keeps the objects, so that no identity is used twice
+        self.found: list[str] = []
 
     def _followed(self, module: str) -> bool:
         package = str(module).partition(".")[0]
         return package in self._packages or not _is_library(package)
 
-    def parts(self, value: Any) -> Iterator[str]:
+    def follow(self, value: Any) -> None:
+        """Note what the meaning of a value depends on."""
+        if type(value) in _PLAIN:
+            self.found.append(repr(value))
+            return
         if hasattr(value, "targetoptions") and hasattr(value, "py_func"):  # a kernel
-            yield from self.parts(sorted(value.targetoptions.items()))
+            self.follow(sorted(value.targetoptions.items()))
             value = value.py_func
         if isinstance(value, (staticmethod, classmethod, MethodType)):
             value = value.__func__
         if isinstance(value, FunctionType):
-            yield from self._function(value)
+            self._function(value)
         elif isinstance(value, type):
-            yield from self._class(value)
+            self._class(value)
         elif isinstance(value, property):
-            yield from self.parts((value.fget, value.fset))
+            self.follow((value.fget, value.fset))
         elif isinstance(value, functools.cached_property):
-            yield from self.parts(value.func)
+            self.follow(value.func)
         elif isinstance(value, functools.partial):
-            yield from self.parts((value.func, value.args, value.keywords))
+            self.follow((value.func, value.args, value.keywords))
         elif hasattr(value, "__wrapped__"):
-            yield from self.parts(value.__wrapped__)
+            self.follow(value.__wrapped__)
         else:
-            yield from self._plain(value)
+            self._plain(value)
 
-    def _plain(self, value: Any) -> Iterator[str]:
+    def _plain(self, value: Any) -> None:
         library = not self._followed(type(value).__module__)
         if type(value) in (list, set, frozenset) or isinstance(value, tuple):
-            yield f"{type(value).__name__} {len(value)}"
+            self.found.append(f"{type(value).__name__} {len(value)}")
             # The order of a set changes from process to process.
             for item in sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value:
-                yield from self.parts(item)
+                self.follow(item)
         elif type(value) is MappingProxyType or (isinstance(value, dict) and library):
-            yield f"mapping {len(value)}"
+            self.found.append(f"mapping {len(value)}")
             for key, item in value.items():
-                yield from self.parts((key, item))
+                self.follow((key, item))
         elif isinstance(value, np.ndarray):
-            yield f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+            self.found.append(f"{value.dtype} {value.shape} {value.tobytes().hex()}")
         elif isinstance(value, ModuleType):
-            yield value.__name__
+            self.found.append(value.__name__)
         elif isinstance(value, (int, float, complex, str, bytes, np.generic, np.dtype, Path, type(None))):
-            yield repr(value)
+            self.found.append(repr(value))
         else:
-            yield from self._class(type(value))
+            self._class(type(value))
             if id(value) in self._seen:
                 return
             self._seen[id(value)] = value
             if dataclasses.is_dataclass(value):
                 for field in dataclasses.fields(value):
-                    yield from self.parts((field.name, getattr(value, field.name, None)))
+                    self.follow((field.name, getattr(value, field.name, None)))
             elif library and isinstance(name := getattr(value, "__qualname__", None), str):
                 owner = getattr(value, "__self__", None)
-                yield from (name, *self.parts(None if isinstance(owner, type) else owner))
+                self.found.append(name)
+                self.follow(None if isinstance(owner, type) else owner)
             else:
-                yield from self._state(value)
+                self._state(value)
 
-    def _state(self, value: Any) -> Iterator[str]:
+    def _state(self, value: Any) -> None:
         """The pickled state of an object, and the functions and classes in it."""
         stream = io.BytesIO()
         pickler = _Pickler(stream)
         try:
             pickler.dump(value)
-            yield hashlib.sha256(stream.getvalue()).hexdigest()
+            self.found.append(hashlib.sha256(stream.getvalue()).hexdigest())
         except Exception:
             # Any class may raise anything here.
-            yield uuid.uuid4().hex
-        yield from self.parts(pickler.code)
+            self.found.append(uuid.uuid4().hex)
+        self.follow(pickler.code)
 
-    def _function(self, function: FunctionType) -> Iterator[str]:
-        yield f"{function.__module__}.{function.__qualname__}"
+    def _function(self, function: FunctionType) -> None:
+        self.found.append(f"{function.__module__}.{function.__qualname__}")
         if id(function) in self._seen or not self._followed(function.__module__):
             return
         self._seen[id(function)] = function
-        yield from self.parts((function.__defaults__, function.__kwdefaults__))
+        self.follow((function.__defaults__, function.__kwdefaults__))
         for cell in function.__closure__ or ():
             try:
-                yield from self.parts(cell.cell_contents)
+                self.follow(cell.cell_contents)
             except ValueError:  # not yet filled
-                yield "empty"
-        yield from self._code(function.__code__, function)
+                self.found.append("empty")
+        self._code(function.__code__, function)
 
-    def _class(self, kind: type) -> Iterator[str]:
-        yield f"{kind.__module__}.{kind.__qualname__}"
+    def _class(self, kind: type) -> None:
+        self.found.append(f"{kind.__module__}.{kind.__qualname__}")
         if id(kind) in self._seen or not self._followed(kind.__module__):
             return
         self._seen[id(kind)] = kind
-        yield str(vars(kind).get("__annotations__", ""))
-        yield from self.parts(kind.__bases__)
+        self.found.append(str(vars(kind).get("__annotations__", "")))
+        self.follow(kind.__bases__)
         for name, member in list(vars(kind).items()):
             # Python and its libraries note other things there, some of them when an instance is pickled.
             noted = name.startswith("__") and not hasattr(member, "__get__")
             if not noted and name not in _NOTED:
-                yield name
-                yield from self.parts(member)
+                self.found.append(name)
+                self.follow(member)
 
-    def _code(self, code: CodeType, function: FunctionType) -> Iterator[str]:
-        yield code.co_code.hex()
-        yield f"{code.co_names} {code.co_varnames} {code.co_freevars} {code.co_exceptiontable.hex()}"
+    def _code(self, code: CodeType, function: FunctionType) -> None:
+        self.found.append(code.co_code.hex())
+        names = f"{code.co_names} {code.co_varnames} {code.co_freevars}"
+        self.found.append(f"{names} {code.co_exceptiontable.hex()}")
         for constant in code.co_consts:
             if isinstance(constant, CodeType):
-                yield from self._code(constant, function)
+                self._code(constant, function)
             elif constant != function.__doc__:
-                yield from self.parts(constant)
+                self.follow(constant)
         modules = []
         for name in code.co_names:
             if name in function.__globals__:
                 value = function.__globals__[name]
                 modules += [value] if isinstance(value, ModuleType) else []
-                yield name
-                yield from self.parts(value)
-        for operation, argument in zip(code.co_code[::2], code.co_code[1::2], strict=True):
+                self.found.append(name)
+                self.follow(value)
+        operations = code.co_code[::2]
+        # Few functions import.
+        imports = zip(operations, code.co_code[1::2], strict=True) if _IMPORT in operations else ()
+        for operation, argument in imports:
             if operation == _IMPORT and argument < len(code.co_names):
                 name = code.co_names[argument]
                 with contextlib.suppress(ImportError):
@@ -207,4 +214,4 @@ class _Walk:
                     value = getattr(module, name, None)
                     if isinstance(value, ModuleType) and value not in modules:
                         modules.append(value)
-                    yield from self.parts(value)
+                    self.follow(value)
