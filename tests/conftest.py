@@ -1,6 +1,7 @@
 """Shared fixtures; files with slow tests start first, so that workers finish together."""
 
 import logging
+import os
 
 import pytest
 
@@ -11,6 +12,14 @@ LOCAL = {
     "silence_logs": logging.ERROR,
 }  # fmt: skip
 """Options of a Dask cluster on loopback."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _not_flushed():
+    """Leave the flushing of files to the system: no test loses its power, and thousands of waits add up."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
 
 
 @pytest.fixture(scope="module")

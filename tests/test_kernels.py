@@ -1,5 +1,6 @@
 """The cache of compiled kernels: keyed by all code of a kernel, safe against kills and concurrent runs."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -35,7 +36,49 @@ print(value, sum(caller.outer.stats.cache_hits.values()))
 """
 
 
+FORKS = """
+import json, os, sys, traceback
+import thesisrecon.kernels
+sys.dont_write_bytecode = True  # Python misses an edit of the same second and size
+for line in sys.stdin:
+    folder, code = json.loads(line)
+    child = os.fork()
+    if child == 0:
+        log = os.open(os.path.join(folder, "log"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(log, 1), os.dup2(log, 2)
+        os.environ["NUMBA_CACHE_DIR"] = os.path.join(folder, "cache")
+        sys.path.insert(0, folder)
+        try:
+            exec(code, {"__name__": "__main__"})
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        sys.stdout.flush()
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def forks():
+    """Runs code in a process of its own, a fork of one that has imported numba and compiled nothing."""
+    pipe = subprocess.PIPE
+    path = {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    with subprocess.Popen(
+        [sys.executable, "-c", FORKS], stdin=pipe, stdout=pipe, text=True, env=os.environ | path
+    ) as template:
+
+        def run(folder, code=RUN):
+            print(json.dumps([str(folder), code]), file=template.stdin, flush=True)
+            ended, said = template.stdout.readline().strip(), (folder / "log").read_text(encoding="utf-8")
+            assert ended == "0", said
+            return said.split()
+
+        yield run
+
+
 def run_in(folder, code=RUN, **variables):
+    """The same in a new interpreter."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), **variables}
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # Python misses an edit of the same second and size
     environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(Path(__file__).parent.parent)])
@@ -52,12 +95,12 @@ def package(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def compiled_once(tmp_path_factory):
+def compiled_once(tmp_path_factory, forks):
     """The cache of a process that has compiled the caller."""
     folder = tmp_path_factory.mktemp("compiled")
     (folder / "callee.py").write_text(CALLEE, encoding="utf-8")
     (folder / "caller.py").write_text(CALLER, encoding="utf-8")
-    assert run_in(folder) == ["8.0", "0"]
+    assert forks(folder) == ["8.0", "0"]
     return folder / "cache"
 
 
@@ -78,16 +121,16 @@ def test_a_second_process_compiles_nothing(compiled):
     assert run_in(compiled, PYTHONHASHSEED="7") == ["8.0", "1"]
 
 
-def test_python_can_call_what_was_compiled_for_a_kernel(compiled):
+def test_python_can_call_what_was_compiled_for_a_kernel(compiled, forks):
     code = """
 import caller, callee
 print(caller.outer(3.0), callee.inner(3.0), caller.outer(4.0), sum(callee.inner.stats.cache_hits.values()))
 """
-    assert run_in(compiled, code) == ["8.0", "4.0", "10.0", "0"]
-    assert run_in(compiled, code) == ["8.0", "4.0", "10.0", "1"]
+    assert forks(compiled, code) == ["8.0", "4.0", "10.0", "0"]
+    assert forks(compiled, code) == ["8.0", "4.0", "10.0", "1"]
 
 
-def test_a_changed_variable_of_numba_leaves_the_level(compiled):
+def test_a_changed_variable_of_numba_leaves_the_level(compiled, forks):
     changed = """
 import os, numba, caller, callee
 values = [callee.inner(3.0)]
@@ -96,39 +139,39 @@ numba.njit(lambda x: x)(1.0)
 values.append(caller.outer(3.0))
 print(*values, sum(caller.outer.stats.cache_hits.values()))
 """
-    assert run_in(compiled, changed) == ["4.0", "8.0", "1"]
+    assert forks(compiled, changed) == ["4.0", "8.0", "1"]
 
 
 @pytest.mark.parametrize(
     ("old", "new", "value"), [("x + OFFSET", "x - OFFSET", "4.0"), ("= 1.0", "= 2.0", "10.0")]
 )
-def test_an_edit_of_a_called_function_or_its_constant_recompiles_the_caller(compiled, old, new, value):
+def test_an_edit_of_a_called_function_or_its_constant_recompiles_the_caller(compiled, old, new, value, forks):
     edit(compiled / "callee.py", old, new)
-    assert run_in(compiled) == [value, "0"]
+    assert forks(compiled) == [value, "0"]
 
 
-def test_an_edit_of_a_comment_or_a_moved_function_recompiles_nothing(compiled):
+def test_an_edit_of_a_comment_or_a_moved_function_recompiles_nothing(compiled, forks):
     edit(compiled / "callee.py", "Add an offset.", "Add a constant.")
     edit(compiled / "caller.py", "\n@kernel", "\n# further down\n\n@kernel")
-    assert run_in(compiled) == ["8.0", "1"]
+    assert forks(compiled) == ["8.0", "1"]
 
 
-def test_a_damaged_entry_is_compiled_again(compiled):
+def test_a_damaged_entry_is_compiled_again(compiled, forks):
     for entry in (compiled / "cache" / "thesisrecon").iterdir():
         entry.write_bytes(entry.read_bytes()[:-7])
-    assert run_in(compiled) == ["8.0", "0"]
-    assert run_in(compiled) == ["8.0", "1"]
+    assert forks(compiled) == ["8.0", "0"]
+    assert forks(compiled) == ["8.0", "1"]
 
 
-def test_a_folder_that_cannot_be_written_costs_only_the_cache(package):
+def test_a_folder_that_cannot_be_written_costs_only_the_cache(package, forks):
     (package / "cache").write_text("a file in the place of the folder", encoding="utf-8")
     warned = "import logging, sys; logging.basicConfig(format='%(message)s', stream=sys.stdout)" + RUN
-    words = run_in(package, warned)
+    words = forks(package, warned)
     assert words[-2:] == ["8.0", "0"]
     assert " ".join(words).count("set the variable NUMBA_CACHE_DIR to a writable folder") == 1
 
 
-def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(compiled):
+def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(compiled, forks):
     killed = """
         import os, caller
         from thesisrecon import kernels
@@ -136,8 +179,8 @@ def test_a_process_that_is_killed_while_it_compiles_leaves_no_lock_behind(compil
         caller.outer(3)
         """
     with pytest.raises(AssertionError):
-        run_in(compiled, textwrap.dedent(killed))
-    assert run_in(compiled, RUN.replace("3.0", "3")) == ["8.0", "0"]
+        forks(compiled, textwrap.dedent(killed))
+    assert forks(compiled, RUN.replace("3.0", "3")) == ["8.0", "0"]
 
 
 def test_two_processes_at_once_compile_once(package):
@@ -147,17 +190,17 @@ def test_two_processes_at_once_compile_once(package):
     assert sorted(hits for _, hits in done) == ["0", "1", "1"]
 
 
-def test_an_entry_of_a_record_that_has_moved_is_compiled_again(package):
+def test_an_entry_of_a_record_that_has_moved_is_compiled_again(package, forks):
     record = "from typing import NamedTuple\n\n\nclass Pair(NamedTuple):\n    x: float\n    y: float\n"
     (package / "records_here.py").write_text(record, encoding="utf-8")
     edit(package / "caller.py", "return 2.0 * inner(x)", "return inner(x.x)")
     code = RUN.replace("caller.outer(3.0)", "caller.outer(records.Pair(3.0, 1.0))")
-    assert run_in(package, code.replace("sys,", "sys, records_here as records,")) == ["4.0", "0"]
+    assert forks(package, code.replace("sys,", "sys, records_here as records,")) == ["4.0", "0"]
     (package / "records_here.py").rename(package / "records_there.py")
-    assert run_in(package, code.replace("sys,", "sys, records_there as records,")) == ["4.0", "0"]
+    assert forks(package, code.replace("sys,", "sys, records_there as records,")) == ["4.0", "0"]
 
 
-def test_a_compilation_that_fails_or_is_done_holds_no_lock(package):
+def test_a_compilation_that_fails_or_is_done_holds_no_lock(package, forks):
     code = """
         import caller
         try:
@@ -167,7 +210,7 @@ def test_a_compilation_that_fails_or_is_done_holds_no_lock(package):
         caller.outer(3.0)
         print(len(caller.outer._cache._locks), len(caller.inner._cache._locks))
         """
-    assert run_in(package, textwrap.dedent(code)) == ["TypingError", "0", "0", "0", "0"]
+    assert forks(package, textwrap.dedent(code)) == ["TypingError", "0", "0", "0", "0"]
     assert not list((package / "cache" / "thesisrecon").glob("*.lock"))
 
 

@@ -132,7 +132,7 @@ def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Im
         # Beside the dot, inside the image.
         at = (x + 15 if x < picture.width - 64 else x - 50, min(max(y - 34, 2), picture.height - 38))
         draw.text(at, str(n + 1), font=font, fill="white", stroke_width=3, stroke_fill="#101418")
-    return picture.resize((picture.width // 2, picture.height // 2), PillowImage.Resampling.LANCZOS)
+    return picture.reduce(2)
 
 
 def _faded(image: Image) -> tuple[PillowImage.Image, float]:
@@ -140,9 +140,10 @@ def _faded(image: Image) -> tuple[PillowImage.Image, float]:
     width, height = image.size
     s = 2.0 * _PANEL_LONG_SIDE / max(width, height)
     even = (max(2, 2 * round(s * width / 2)), max(2, 2 * round(s * height / 2)))
-    colour = _sampled(image).resize(even, PillowImage.Resampling.BILINEAR)
+    colour = _sampled(image)
     grey = colour.convert("L").convert("RGB")
-    return PillowImage.blend(grey, colour, 0.45).point(lambda v: 0.78 * v), s
+    faded = PillowImage.blend(grey, colour, 0.45).point(lambda v: 0.78 * v)
+    return faded.resize(even, PillowImage.Resampling.BILINEAR), s
 
 
 def _to_drawing(xy: F64, s: float) -> list[Point]:
