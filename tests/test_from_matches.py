@@ -1,5 +1,6 @@
 """Matches and tracks of other programs: the same cameras from each form, and one sentence for wrong input."""
 
+import shutil
 import sqlite3
 from dataclasses import replace
 
@@ -84,8 +85,23 @@ def test_a_run_in_a_folder_is_resumed_and_other_matches_are_another_run(tmp_path
     assert "projective" in again.summary["resumed"]
     assert (out / "report.html").is_file()
     fewer = {pair: rows[20:] for pair, rows in SCENE.matches.items()}
-    with pytest.raises(UsageError, match=r"holds another run \(matches was"):
+    digests = r"the given matches \(digest \w{12}\), this run starts from the given matches \(digest \w{12}\)"
+    with pytest.raises(UsageError, match=rf"it was made from {digests}\); choose another folder"):
         reconstruct_from_matches(SCENE.keypoints, fewer, SCENE.sizes, out)
+    model = (tmp_path / "sparse").absolute()
+    shutil.copytree(out / "sparse" / "0", model)
+    with pytest.raises(UsageError, match=rf"given matches \(.*\), this run starts from {model} \("):
+        reconstruct_from_colmap(model, out)
+    with pytest.raises(UsageError, match=r"given matches \(.*\), this run starts from images\)"):
+        thesisrecon.reconstruct([np.zeros((480, 640, 3), np.uint8)] * 5, out)
+
+
+def test_a_source_that_was_moved_is_the_same_run(tmp_path, from_rows):
+    from_rows.save(tmp_path / "first")
+    reconstruct_from_colmap(tmp_path / "first" / "sparse" / "0", tmp_path / "out")
+    shutil.move(tmp_path / "first", tmp_path / "second")
+    again = reconstruct_from_colmap(tmp_path / "second" / "sparse" / "0", tmp_path / "out")
+    assert "projective" in again.summary["resumed"]
 
 
 def moved(index, value):

@@ -237,6 +237,72 @@ def test_undistorted_exports_project_known_points(tmp_path, images, to):
         assert np.abs(error.mean(axis=0)).max() < 0.2
 
 
+MASKED = np.s_[30:70, 40:90]
+"""Rows and columns that the mask of one image leaves out."""
+
+
+@pytest.mark.parametrize(
+    ("to", "mask_names"),
+    [
+        ("colmap-undistorted", {name: f"masks/{name}.png" for name in WRITTEN.values()}),
+        ("nerfstudio", {name: f"masks/{name}.png" for name in WRITTEN.values()}),
+        (
+            "openmvs",
+            {name: f"masks/{name.split('/')[-1].rpartition('.')[0]}.mask.png" for name in WRITTEN.values()},
+        ),
+    ],
+)
+def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path, images, to, mask_names):
+    """One image of four has a mask; programs want one for every image."""
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[MASKED] = 0
+    (tmp_path / "given").mkdir()
+    PIL.Image.fromarray(mask).save(tmp_path / "given" / "c.png.png")
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path / "out", to=to, images=images, masks=tmp_path / "given")
+    for name, file in mask_names.items():
+        written = pixels_of(tmp_path / "out" / file)
+        rgb = pixels_of(tmp_path / "out" / "images" / name)
+        assert written.shape == rgb.shape[:2]
+        assert set(np.unique(written)) <= {0.0, 255.0}
+        if name != "sub/c.png":
+            assert (written == 255).all()
+            continue
+        # The colours of a pixel tell its place in the original.
+        x, y = rgb[..., 0] / SLOPE[0], rgb[..., 1] / SLOPE[1]
+        inside = (x > 41) & (x < 88) & (y > 31) & (y < 68)
+        outside = (x < 38) | (x > 91) | (y < 28) | (y > 71)
+        assert inside.sum() > 1000
+        assert (written[inside] == 0).all()
+        assert (written[outside] == 255).all()
+    if to == "nerfstudio":
+        table = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
+        found = {frame["file_path"].removeprefix("images/"): frame["mask_path"] for frame in table["frames"]}
+        assert found == mask_names
+
+
+def test_the_masks_of_a_run_are_exported_with_it(tmp_path):
+    names = [image.name for image in fakes.photographs(4)]
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    for image in fakes.photographs(4):
+        PIL.Image.fromarray(image.rgb).save(tmp_path / "images" / image.name)
+        mask = np.full(image.rgb.shape[:2], 255, np.uint8)
+        mask[:, :9] = 0
+        PIL.Image.fromarray(mask).save(tmp_path / "masks" / f"{image.name}.png")
+    out, config = tmp_path / "out", fakes.fake_config()
+    reconstruct(tmp_path / "images", out, config=config, until="metric", masks=tmp_path / "masks")
+    report = export(out, tmp_path / "a", to="colmap-undistorted")
+    assert report.notes == ()
+    assert all((pixels_of(tmp_path / "a" / "masks" / f"{name}.png")[:, 0] == 0).all() for name in names)
+    assert "Bundler has none" in export(out, tmp_path / "b", to="bundler").notes[0]
+    (tmp_path / "masks").rename(tmp_path / "moved")
+    assert "is gone; give --masks" in export(out, tmp_path / "c", to="nerfstudio").notes[0]
+    assert not (tmp_path / "c" / "masks").exists()
+    export(out, tmp_path / "d", to="openmvs", masks=tmp_path / "moved")
+    assert len(list((tmp_path / "d" / "masks").iterdir())) == len(names)
+
+
 @pytest.mark.parametrize(("to", "read"), [("colmap", read_colmap), ("opencv", read_opencv)])
 def test_exports_with_distortion_project_known_points(tmp_path, to, read):
     model = make_model(BARREL, PINCUSHION)

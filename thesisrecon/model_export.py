@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -20,6 +20,7 @@ from thesisrecon.io._export_formats import coefficients
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import find_images, read_image
+from thesisrecon.io._masks import find_masks, read_mask
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._executors import available_threads
 from thesisrecon.sparse_model import SparseModel, SparseView
@@ -54,13 +55,13 @@ _DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] 
     "kalibr": formats.write_kalibr,
 }
 """Formats of cameras with distortion, which need no images."""
-_PINHOLE: Mapping[str, Callable[[Path, SparseModel], Path]] = {
-    "colmap-undistorted": lambda folder, model: _colmap(folder, model, pinhole=True),
-    "nerfstudio": formats.write_nerfstudio,
-    "openmvs": formats.write_openmvs,
-    "bundler": formats.write_bundler,
+_PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
+    "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),
+    "nerfstudio": lambda folder, model, masked: formats.write_nerfstudio(folder, model, masked=masked),
+    "openmvs": lambda folder, model, _: formats.write_openmvs(folder, model),
+    "bundler": lambda folder, model, _: formats.write_bundler(folder, model),
 }
-"""Formats with undistorted images."""
+"""Formats with undistorted images, perhaps with masks."""
 FORMATS = (*_PINHOLE, *_DISTORTED)
 
 
@@ -70,6 +71,7 @@ def export(
     *,
     to: str,
     images: str | Path | None = None,
+    masks: str | Path | None = None,
     threads: int = 0,
 ) -> ExportReport:
     """Write a model for another program.
@@ -85,6 +87,8 @@ def export(
         of pinhole cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
     images : path, optional
         Folder of the original images; None: the folder that the run was made from.
+    masks : path, optional
+        Folder of the masks of the original images; None: that of the run, if it had masks.
     threads : int
         Images that are undistorted at one time; 0: one per processor.
 
@@ -114,18 +118,23 @@ def export(
     if to not in FORMATS:
         raise UsageError(unknown_word("export format", to, FORMATS))
     folder = Path(out)
-    images = images or recorded_images(model)
+    images, lost = images or recorded_images(model), list[str]()
+    if masks is None:
+        masks, lost = recorded_masks(model, to)
     model = as_sparse_model(model)
     _require_cameras(model, to)
     if (folder / "run.json").exists():
         raise UsageError(f"the folder {folder} holds a run; export to another folder")
-    notes = _rounding_notes(model) if to in ("nerfstudio", "openmvs") else []
+    notes = lost + (_rounding_notes(model) if to in ("nerfstudio", "openmvs") else [])
     if to in _DISTORTED:
         file, more = _DISTORTED[to](folder, model)
         return ExportReport(file, (*notes, *more))
     undistorted = _undistorted(model, bundler=to == "bundler")
-    _write_images(folder / "images", model, undistorted, images, threads)
-    return ExportReport(_PINHOLE[to](folder, undistorted), tuple(notes))
+    if masks is not None and to == "bundler":
+        notes, masks = [*notes, "no masks are written: Bundler has none"], None
+    files = None if masks is None else _mask_files(Path(masks), model, undistorted, to)
+    _write_images(folder, model, undistorted, images, files, threads)
+    return ExportReport(_PINHOLE[to](folder, undistorted, files is not None), tuple(notes))
 
 
 def _require_cameras(model: SparseModel, to: str) -> None:
@@ -167,10 +176,22 @@ def recorded_images(model: SparseModel | RunResult | str | Path) -> Path | None:
     -------
     Path or None
     """
+    return _recorded(model, "images_folder")
+
+
+def recorded_masks(model: SparseModel | RunResult | str | Path, to: str) -> tuple[Path | None, list[str]]:
+    """Return the folder of the masks of a run for formats with images, or a note that it is gone."""
+    folder = _recorded(model, "masks_folder") if to in _PINHOLE else None
+    if folder is None or folder.is_dir():
+        return folder, []
+    return None, [f"no masks are written: the folder {folder} of the run is gone; give --masks (masks=)"]
+
+
+def _recorded(model: SparseModel | RunResult | str | Path, name: str) -> Path | None:
     if isinstance(model, SparseModel):
         return None
     summary = model.summary if isinstance(model, RunResult) else read_json(Path(model) / "summary.json")
-    folder = summary.get("images_folder") if isinstance(summary, Mapping) else None
+    folder = summary.get(name) if isinstance(summary, Mapping) else None
     return Path(folder) if isinstance(folder, str) else None
 
 
@@ -255,34 +276,60 @@ def _growing_radius(distortion: F64) -> float:
     return float(np.sqrt(squares.min())) if len(squares) else np.inf
 
 
+def _mask_files(
+    masks: Path, model: SparseModel, pinholes: SparseModel, to: str
+) -> list[tuple[Path | None, str]]:
+    """The mask of each view, if any, and the file to write: programs want a mask for every image."""
+    names = [formats.mask_name(to, name) for name in pinholes.names]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(f"two images of the model would have the mask {twice} in {to}; rename one of them")
+    found, _ = find_masks(masks, model.names)
+    return [(found.get(view), name) for view, name in zip(model.names, names, strict=True)]
+
+
 def _write_images(
-    folder: Path, model: SparseModel, pinholes: SparseModel, images: str | Path | None, threads: int
+    folder: Path,
+    model: SparseModel,
+    pinholes: SparseModel,
+    images: str | Path | None,
+    masks: Sequence[tuple[Path | None, str]] | None,
+    threads: int,
 ) -> None:
-    """Undistort the images of a model into a folder."""
+    """Undistort the images of a model, and their masks, into a folder."""
     if images is None:
         raise UsageError(
             "the model does not record the folder of its images; give it with --images (images=)"
         )
     originals = Path(images)
     paths = find_images(originals, model.names)
-    if folder.resolve() == originals.resolve():
+    if (folder / "images").resolve() == originals.resolve():
         raise UsageError(
             f"the undistorted images would replace the originals in {originals}; export elsewhere"
         )
 
-    def write(view: SparseView, pinhole: SparseView, path: Path) -> None:
+    def write(i: int) -> None:
+        view, pinhole = model.views[i], pinholes.views[i]
         assert view.K is not None
         assert view.distortion is not None
         assert pinhole.K is not None
         assert pinhole.size is not None
-        image = read_image(path, max_size_px=np.iinfo(np.int32).max).images[0]
+        image = read_image(paths[i], max_size_px=np.iinfo(np.int32).max).images[0]
         if image.size != view.size:
             sizes = f"{image.size} pixels, but {view.size} (width, height) in the model"
-            raise UsageError(f"{path} has {sizes}; give the images of the model")
-        rgb = image.rgb
+            raise UsageError(f"{paths[i]} has {sizes}; give the images of the model")
+        file, name = (None, "") if masks is None else masks[i]
+        mask = None if file is None else read_mask(file, image)
+        rgb, used = image.rgb, mask
         if view.distortion.any() or view.size != pinhole.size or not np.array_equal(view.K, pinhole.K):
-            rgb, _ = undistort_image(rgb, view.K, view.distortion, pinhole.K, pinhole.size)
-        write_image(folder / pinhole.name, rgb)
+            frames = view.K, view.distortion, pinhole.K, pinhole.size
+            rgb, _ = undistort_image(rgb, *frames)
+            if mask is not None:
+                _, used = undistort_image(mask[:, :, None].astype(np.uint8), *frames, mask=mask)
+        write_image(folder / "images" / pinhole.name, rgb)
+        if name:
+            used = np.ones(rgb.shape[:2], bool) if used is None else used
+            write_image(folder / name, np.where(used, 255, 0).astype(np.uint8))
 
     with ThreadPoolExecutor(threads or available_threads()) as pool:
-        list(pool.map(write, model.views, pinholes.views, paths))
+        list(pool.map(write, range(len(paths))))

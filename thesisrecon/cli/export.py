@@ -29,6 +29,15 @@ def export(
         Path | None,
         typer.Option("--images", help="Folder of the original images (default: that of the run)."),
     ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            "--masks",
+            parser=parse_folder,
+            metavar="DIR",
+            help="Folder of the masks of the images (default: that of the run).",
+        ),
+    ] = None,
     scale: Annotated[
         tuple[str, str, float] | None,
         typer.Option(
@@ -49,7 +58,7 @@ def export(
     from thesisrecon.alignment import align_to_positions, scaled
     from thesisrecon.io._models import read_model
     from thesisrecon.model_export import export as write_export
-    from thesisrecon.model_export import recorded_images
+    from thesisrecon.model_export import recorded_images, recorded_masks
 
     if folder.resolve() == model.resolve():
         raise UsageError(f"the folder {folder} holds the model; export to another folder")
@@ -60,8 +69,10 @@ def export(
         found, report = align_to_positions(found, positions)
         typer.echo("\n".join(map(printable, str(report).splitlines())))
     with interruptible("repeat the command to write all files"):
-        images = images or recorded_images(model)
-        written = write_export(found, folder, to=to, images=images, threads=threads)
-    for note in written.notes:
+        images, lost = images or recorded_images(model), list[str]()
+        if masks is None:
+            masks, lost = recorded_masks(model, to)
+        written = write_export(found, folder, to=to, images=images, masks=masks, threads=threads)
+    for note in (*lost, *written.notes):
         typer.echo(f"note: {note}")
     typer.echo(f"{len(found.views)} images and {len(found.X)} points: {printable(str(written.file))}")

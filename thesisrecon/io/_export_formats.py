@@ -2,14 +2,15 @@
 
 Here the centre of the top-left pixel is (0, 0). It is (0.5, 0.5) in nerfstudio, and (0, 0) in OpenMVS, OpenCV
 and Kalibr; Bundler counts from the centre of the image with y up. nerfstudio and Bundler cameras look along
--z with y up. Each writer returns its main file; images lie in ``images/`` beside it.
+-z with y up. Each writer returns its main file; images lie in ``images/`` beside it, masks in ``masks/``.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from pathlib import Path
+from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,12 @@ _MVS_VERSION = 2
 """OpenMVS reads all versions up to its own; later ones add only optional fields."""
 
 
-def write_nerfstudio(folder: Path, model: SparseModel) -> Path:
+def mask_name(to: str, image: str) -> str:
+    """File of the mask of an image where the program looks for it: OpenMVS drops its folders and suffix."""
+    return f"masks/{PurePath(image).stem}.mask.png" if to == "openmvs" else f"masks/{image}.png"
+
+
+def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
     """Write ``transforms.json`` (camera-to-world with OpenGL axes) and ``points.ply`` of pinhole views."""
     cameras = [_nerfstudio_camera(view) for view in model.views]
     shared = all(camera == cameras[0] for camera in cameras)
@@ -34,7 +40,9 @@ def write_nerfstudio(folder: Path, model: SparseModel) -> Path:
     for view, camera in zip(model.views, cameras, strict=True):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = view.R.T @ _LOOKS_BACK, view.centre
-        own = {} if shared else camera
+        own: dict[str, Any] = {} if shared else camera
+        if masked:
+            own = {**own, "mask_path": mask_name("nerfstudio", view.name)}
         frames.append({"file_path": f"images/{view.name}", **own, "transform_matrix": pose})
     head = {"camera_model": "OPENCV", **(cameras[0] if shared else {}), "ply_file_path": "points.ply"}
     write_point_cloud(folder / "points.ply", model.X, colors_of(model))

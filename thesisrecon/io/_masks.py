@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,27 +19,23 @@ from thesisrecon.records import Image
 _NAMES = "the mask of IMG.jpg is IMG.jpg.png, or IMG with any suffix"
 
 
-def check_masks_folder(masks: Path, images: Path | None) -> None:
-    """UsageError if the folder holds no masks or is the folder of the images."""
+def check_masks_folder(masks: Path, images: Path | None) -> Path:
+    """Absolute path; UsageError if the folder holds no masks or is the folder of the images."""
     if not list_images(masks):
         raise UsageError(f"there are no masks in {masks}; {_NAMES}")
     if images is not None and images.is_dir() and masks.samefile(images):
         raise UsageError(f"{masks} is the folder of the images; the masks need a folder of their own")
+    return masks.absolute()
 
 
-def add_masks(
-    inputs: ImageSet,
-    folder: Path,
-    *,
-    map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
-) -> tuple[ImageSet, list[str]]:
-    """Set the masks of images named like files in a folder; return also warnings of the other files."""
+def find_masks(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
+    """The masks of images by name, and warnings of the other files."""
     files: dict[str, list[Path]] = {}
     for path in list_images(folder):
         files.setdefault(printable(path.stem), []).append(path)
     owner: dict[Path, str] = {}
     mask_of: dict[str, Path] = {}
-    for name in [*(decoded.image.name for decoded in inputs.decoded), *inputs.refused]:
+    for name in names:
         # The names of files from several folders are paths.
         found = files.get(Path(name).name) or files.get(Path(name).stem, [])
         if len(found) > 1:
@@ -51,20 +47,31 @@ def add_masks(
             mask_of[name] = found[0]
     if not mask_of:
         raise UsageError(f"no file in {folder} is named like an image; {_NAMES}")
+    others = [path.name for paths in files.values() for path in paths if path not in owner]
+    return mask_of, [f"{name} is a mask of no image" for name in others]
+
+
+def add_masks(
+    inputs: ImageSet,
+    folder: Path,
+    *,
+    map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
+) -> tuple[ImageSet, list[str]]:
+    """Set the masks of images named like files in a folder; return also warnings of the other files."""
+    names = [*(decoded.image.name for decoded in inputs.decoded), *inputs.refused]
+    mask_of, unused = find_masks(folder, names)
 
     def masked(decoded: DecodedImage) -> DecodedImage:
         image = decoded.image
         if image.name not in mask_of:
             return decoded
-        image = replace(image, mask=_read_mask(mask_of[image.name], image))
+        image = replace(image, mask=read_mask(mask_of[image.name], image))
         return with_digest(replace(decoded, image=image))
 
-    others = [path.name for paths in files.values() for path in paths if path not in owner]
-    unused = [f"{name} is a mask of no image" for name in others]
     return replace(inputs, decoded=tuple(map_all(masked, list(inputs.decoded)))), unused
 
 
-def _read_mask(path: Path, image: Image) -> B8 | None:
+def read_mask(path: Path, image: Image) -> B8 | None:
     """Pixels to use of an image at working size, by nearest neighbour; None: all."""
     try:
         full = decode_file(path, lambda file: StoredImage(file, read_exif(file)[1]).nonblack())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -37,11 +37,14 @@ SURFACE_STEPS = (estimate_depth_maps, build_model)
 STEPS["dense"] = (*STEPS["metric"], *SURFACE_STEPS[:1])
 STEPS["model"] = (*STEPS["metric"], *SURFACE_STEPS)
 
+Source = Mapping[str, str]
+"""Name and digest of the matches or tracks that a run starts from."""
+
 
 @contextmanager
-def claimed(run: Run, *, overwrite: bool) -> Iterator[None]:
+def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Iterator[None]:
     """Hold the workers and the output folder of a run."""
-    claim = run.directory.claim(_settings_identity(run), overwrite=overwrite)
+    claim = run.directory.claim(_settings_identity(run, source), overwrite=overwrite)
     with run.workers, claim, run.resumable():
         yield
 
@@ -77,16 +80,17 @@ def _run_all(
             return
 
 
-def _settings_identity(run: Run) -> dict[str, Any]:
+def _settings_identity(run: Run, source: Source | None) -> dict[str, Any]:
     """The part of a run's identity that is known before its images are read."""
-    return {"version": 1, "seed": run.seed, "settings": tables_from_config(run.config)}
+    given = {} if source is None else {"source": source}
+    return {"version": 1, **given, "seed": run.seed, "settings": tables_from_config(run.config)}
 
 
-def identity_of(run: Run, inputs: ImageSet) -> dict[str, Any]:
+def identity_of(run: Run, inputs: ImageSet, source: Source | None = None) -> dict[str, Any]:
     """Settings, seed and content of the images: runs with equal identity are the same."""
     digests = {p.image.name: p.digest for p in inputs.decoded}
     refused = {name: f"refused: {reason}" for name, reason in inputs.refused.items()}
-    return _settings_identity(run) | {"images": digests | refused}
+    return _settings_identity(run, source) | {"images": digests | refused}
 
 
 def empty_result(run: Run, inputs: ImageSet) -> RunResult:

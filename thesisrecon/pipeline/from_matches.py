@@ -123,7 +123,7 @@ def reconstruct_from_matches(
     """
     views = views_of(sizes, names, images)
     given = given_matches(keypoints, matches, views)
-    return _reconstruct(given, views, out, config, seed, progress, options)
+    return _reconstruct("the given matches", given, views, out, config, seed, progress, options)
 
 
 def reconstruct_from_tracks(
@@ -171,7 +171,8 @@ def reconstruct_from_tracks(
     True
     """
     views = views_of(sizes, names, images)
-    return _reconstruct(given_tracks(tracks, views), views, out, config, seed, progress, options)
+    given = given_tracks(tracks, views)
+    return _reconstruct("the given tracks", given, views, out, config, seed, progress, options)
 
 
 def reconstruct_from_colmap(
@@ -234,7 +235,7 @@ def reconstruct_from_colmap(
         database = read_database(path)
         views = views_of(database.sizes, database.names, images)
         given = given_matches(database.keypoints, database.matches, views)
-    return _reconstruct(given, views, out, config, seed, progress, options)
+    return _reconstruct(str(path), given, views, out, config, seed, progress, options)
 
 
 @contextmanager
@@ -247,6 +248,7 @@ def _folder(out: str | Path | None) -> Iterator[str | Path]:
 
 
 def _reconstruct(
+    name: str,
     given: Given,
     views: Views,
     out: str | Path | None,
@@ -272,8 +274,11 @@ def _reconstruct(
         else:
             run.images_folder = images_folder(views.images)
         if masks is not None:
-            check_masks_folder(Path(masks), run.images_folder)
-        with claimed(run, overwrite=overwrite):
+            run.masks_folder = check_masks_folder(Path(masks), run.images_folder)
+        matches = [[m.i, m.j, m.xy1, m.xy2] for m in given.matches]
+        content = [views.names, views.sizes, given.corners, matches]
+        source = {"name": name, "digest": key_of(content)}
+        with claimed(run, overwrite=overwrite, source=source):
             with run.clock("images"):
                 digests = [key_of(views.names[i], views.sizes[i], xy) for i, xy in enumerate(given.corners)]
                 inputs, warnings = views.read(run, digests), list[str]()
@@ -283,8 +288,7 @@ def _reconstruct(
             run.finish("images", counts={"read": len(digests), "refused": 0}, warnings=warnings)
             result = empty_result(run, inputs)
             state = PipelineState(run, inputs, result, until)
-            content = [[m.i, m.j, m.xy1, m.xy2] for m in given.matches]
-            identity = identity_of(run, inputs) | {"matches": key_of(content)}
+            identity = identity_of(run, inputs, source)
             run.directory.adopt(identity, overwrite=overwrite, results=RESULT_FILES)
             found = run_steps(state, _steps(given, until), surface_required=requested)
         return found if out is not None else replace(found, out=None)

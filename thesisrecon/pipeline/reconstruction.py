@@ -106,7 +106,7 @@ def reconstruct(
         run.title = scene_name(Path(images)) or run.title
     run.images_folder = images_folder(images)
     if masks is not None:
-        check_masks_folder(Path(masks), run.images_folder)
+        run.masks_folder = check_masks_folder(Path(masks), run.images_folder)
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
     with claimed(run, overwrite=overwrite):

@@ -82,6 +82,7 @@ class Run:
     progress: Progress
     title: str  #: of the report
     images_folder: Path | None = None  #: of all images, None if they are from several or from memory
+    masks_folder: Path | None = None
     logs: dict[str, _StageLog] = field(default_factory=dict)
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)  #: stages read from the cache

@@ -250,7 +250,7 @@ class RunDirectory:
             # A damaged run file identifies no run: other files count as another run.
             return bool(strange)
         if isinstance(there, dict):
-            there = {name: value for name, value in there.items() if name in identity}
+            there = {name: value for name, value in there.items() if name in (*identity, "source")}
         difference = next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
             replaced = "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
@@ -261,11 +261,14 @@ class RunDirectory:
 
 def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
     """Differences of two JSON values in words."""
-    if isinstance(there, dict) and isinstance(here, dict):
+    if place == "source":
+        yield from _source_differences(there, here)
+    elif isinstance(there, dict) and isinstance(here, dict):
         if place == "images":
             yield from _image_differences(there, here)
             return
-        for name in [*here, *(k for k in there if k not in here)]:
+        # Another source mostly comes with other settings.
+        for name in sorted(here | there, key=lambda name: name != "source"):
             yield from _differences(there.get(name), here.get(name), f"{place}.{name}" if place else name)
     elif there != here:
         yield f"{place.removeprefix('settings.')} was {_short(there)} and is now {_short(here)}"
@@ -278,6 +281,18 @@ def _image_differences(there: dict[str, str], here: dict[str, str]) -> Iterator[
         if names:
             more = f" and {len(names) - 1} more" if len(names) > 1 else ""
             yield f"other images: this run is {what} {names[0]!r}{more}"
+
+
+def _source_differences(there: Any, here: Any) -> Iterator[str]:
+    """A source that was only moved is the same."""
+    sources = [source if isinstance(source, dict) else {} for source in (there, here)]
+    digests = [str(source.get("digest", "")) for source in sources]
+    if digests[0] != digests[1]:
+        was, now = (
+            f"{source.get('name')} (digest {digest[:12]})" if digest else "images"
+            for source, digest in zip(sources, digests, strict=True)
+        )
+        yield f"it was made from {was}, this run starts from {now}"
 
 
 def _short(value: Any) -> str:

@@ -14,14 +14,18 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from thesisrecon.errors import UsageError, counted
+from thesisrecon.io._files import printable
 from thesisrecon.runtime._signals import CODES, with_resume_advice
 from validation.ablation.analysis import analyse
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import Plan, plan_study
 from validation.ablation.run import ProgressCallback, Rows, State, ablate, parts_of, read_rows
+from validation.ablation.tables import failures_of
 from validation.ablation.toml import read_study
 
 KEPT = "run the same command to continue from the finished rows in {}"
+SHOWN = 20
+"""Most failures that are printed."""
 STUDIES = Path(__file__).parent / "studies"
 
 
@@ -95,9 +99,12 @@ def plan_words(plan: Plan) -> str:
 
 
 def _last_words(rows: Rows, page: Path) -> str:
+    """Failures, a line for each variant and scene, and the path of the page."""
     failed = sum(bool(r.failure) for r in rows)
+    found = [f"{f.variant} failed on {f.scene}: {f.why}" for f in failures_of(rows)]
+    more = [f"... and {len(found) - SHOWN} more on the page"] if len(found) > SHOWN else []
     text = counted(len(rows), "row") + f", {failed} of them failed" * bool(failed)
-    return f"{text}; the page is {page}"
+    return "\n".join([*map(printable, found[:SHOWN]), *more, f"{text}; the page is {page}"])
 
 
 @contextmanager

@@ -12,9 +12,8 @@ import numpy as np
 
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan
-from validation.ablation.run import Row
 from validation.ablation.study import Measure
-from validation.ablation.tables import comparison_text, mean_text, number, write_tables
+from validation.ablation.tables import comparison_text, failures_of, mean_text, number, write_tables
 from validation.harness.page import plot_at, write_page
 from validation.harness.records import Plot, slug
 from validation.harness.rows import plot, scatter
@@ -44,7 +43,7 @@ def write_analysis(analysis: Analysis, out: str | Path) -> Path:
         facts=_facts(analysis),
         findings=_findings(analysis),
         warnings=analysis.warnings,
-        failures=_failures([r for r in analysis.rows if r.failure]),
+        failures=failures_of(analysis.rows),
         versions=list(plan.versions.items()),
         tables=[t.name for t in tables],
     )
@@ -86,17 +85,6 @@ def _findings(analysis: Analysis) -> list[str]:
 
 def _who(found: Any) -> str:
     return f"{found.variant} ({found.condition})" if found.condition else found.variant
-
-
-def _failures(failed: Sequence[Row]) -> list[dict[str, Any]]:
-    """Failed rows, those of one reason together."""
-    groups: dict[tuple[str, str], list[str]] = {}
-    for row in failed:
-        groups.setdefault((_who(row), row.failure), []).append(f"{row.scene}, seed {row.seed}")
-    return [
-        {"who": who, "why": why, "where": "; ".join(where) if len(where) <= 4 else f"{len(where)} rows"}
-        for (who, why), where in groups.items()
-    ]
 
 
 # ---------------------------------------------------------------- a measure

@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from thesisrecon.io._files import write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
+from validation.ablation.run import Row
 from validation.ablation.study import Measure
 from validation.studies.runner import text_table
 
@@ -90,9 +93,33 @@ def _is_nan(value: Any) -> bool:
 
 
 def text_of(analysis: Analysis) -> str:
-    """Markdown: a table for each measure."""
+    """Markdown: a table for each measure, and one of the rows that failed."""
     blocks = [f"warning: {w}" for w in analysis.warnings]
-    return "\n\n".join([*blocks, *(_measure_text(analysis, measure) for measure in analysis.plan.measures)])
+    blocks += [_measure_text(analysis, measure) for measure in analysis.plan.measures]
+    failed = [list(vars(f).values()) for f in failures_of(analysis.rows)]
+    return "\n\n".join([*blocks, *([text_table(["failed", "scene", "why"], failed)] if failed else [])])
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A variant that failed on a scene, for one reason."""
+
+    variant: str
+    scene: str
+    why: str
+
+
+def failures_of(rows: Iterable[Row]) -> list[Failure]:
+    """Failed rows; those of one variant, scene and reason together, with their number."""
+    found = Counter(
+        (f"{r.variant} ({r.condition})" if r.condition else r.variant, r.scene, " ".join(r.failure.split()))
+        for r in rows
+        if r.failure
+    )
+    return [
+        Failure(who, f"{scene} ({count} seeds)" if count > 1 else scene, why)
+        for (who, scene, why), count in found.items()
+    ]
 
 
 def _measure_text(analysis: Analysis, measure: Measure) -> str:

@@ -6,6 +6,8 @@ n of a longer set are the set of n, spread over the same arc.
 
 from __future__ import annotations
 
+import io
+import re
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -14,10 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.io._files import write_json
+from thesisrecon.arrays import F32
+from thesisrecon.io._files import write_atomically, write_json
 from validation.scenes.courtyard import build_courtyard, build_yard
 from validation.scenes.image_files import write_png
 from validation.scenes.pose import Pose, look_at
+from validation.scenes.raycast import trace
 from validation.scenes.sensor import take_image
 
 FOCAL_REL = 0.9
@@ -73,6 +77,7 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
         list(pool.map(write, missing))
 
 
+YARD = re.compile(r"yard-\d{1,4}")
 YARD_IMAGES, YARD_SIZE = 10, (960, 720)
 
 
@@ -101,3 +106,30 @@ def write_yard(folder: Path, seed: int) -> None:
         size = {"width": YARD_SIZE[0], "height": YARD_SIZE[1]}
         entries.append({"name": name, **size, "K": K, "distortion": [0.0, 0.0, 0.0], "R": seen.R, "t": t})
     write_json(folder / "cameras.json", {"cameras": entries})
+
+
+STEREO_SIZE, STEREO_BASELINE_M = (480, 360), 0.3
+
+
+def stereo_yard_folder(seed: int) -> Path:
+    """The folder of a rectified pair of a yard and its true disparities, rendered on first use."""
+    folder = Path(tempfile.gettempdir()) / "thesisrecon-yards" / f"stereo-{seed}"
+    if not (folder / "disparity.npy").is_file():
+        write_stereo_yard(folder, seed)
+    return folder
+
+
+def write_stereo_yard(folder: Path, seed: int) -> None:
+    """``left.png``, ``right.png`` and ``disparity.npy`` (2, H, W) of both images, NaN for the sky."""
+    world, pose = build_yard(seed), replace(walk(1, STEREO_SIZE, seed=1000 + seed)[0], exposure=1.0)
+    poses = (pose, replace(pose, C=pose.C + STEREO_BASELINE_M * pose.R[0]))
+    disparities = list[F32]()
+    for k, (name, seen) in enumerate(zip(("left", "right"), poses, strict=True)):
+        rng = np.random.default_rng([2004, seed, k])
+        write_png(folder / f"{name}.png", take_image(world, seen, STEREO_SIZE, gains=(0.82,) * 3, rng=rng))
+        depth = trace(world, seen, STEREO_SIZE, shade=False)[1]
+        shift = seen.K[0, 0] * STEREO_BASELINE_M / np.where(depth > 0.0, depth, np.nan)
+        disparities.append(shift.astype(np.float32))
+    whole = io.BytesIO()
+    np.save(whole, np.stack(disparities))
+    write_atomically(folder / "disparity.npy", whole.getvalue())

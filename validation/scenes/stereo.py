@@ -11,6 +11,7 @@ from PIL import Image
 
 from thesisrecon.arrays import B8, F32, U8
 from validation.scenes.image_files import read_rgb
+from validation.scenes.many_views import YARD, stereo_yard_folder
 from validation.scenes.real import data_root
 
 STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
@@ -45,7 +46,9 @@ def stereo_folder(name: str) -> Path | None:
 
 
 def load_stereo_pair(name: str) -> StereoPair | None:
-    """One of ``STEREO_PAIRS``, None if its files are not on this machine."""
+    """One of ``STEREO_PAIRS``, None if its files are not on this machine; or a rendered yard, "yard-N"."""
+    if YARD.fullmatch(name):
+        return _yard(stereo_yard_folder(int(name.rpartition("-")[2])), name)
     folder = stereo_folder(name)
     if folder is None:
         return None
@@ -85,6 +88,14 @@ def _motorcycle(folder: Path) -> StereoPair:
     truth = np.where(np.isfinite(stored), stored, np.float32(np.nan)).astype(np.float32)
     left, right = (read_rgb(folder / f"motorcycle_{side}.png") for side in ("left", "right"))
     return StereoPair("Motorcycle", left, right, truth, seen_by_both(truth, None), 64)
+
+
+def _yard(folder: Path, name: str) -> StereoPair:
+    left, right = (read_rgb(folder / f"{side}.png") for side in ("left", "right"))
+    truth, other = np.load(folder / "disparity.npy")
+    return StereoPair(
+        name, left, right, truth, seen_by_both(truth, other), int(np.ceil(np.nanmax(truth))) + 2
+    )
 
 
 def read_disparity(path: Path, scale: float) -> F32:

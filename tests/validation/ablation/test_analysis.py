@@ -142,6 +142,7 @@ def test_only_pairs_count_and_failures_are_reported():
     ranks = {c.variant: c.rank for c in analysis.cells if c.measure.name == "miss"}
     assert ranks["aim = 1"] == pytest.approx((15 * 3.0 + 5 * 2.0) / 20)
     assert "17 (15 of 20 failed)" in str(analysis)
+    assert "| aim = 1 | a (15 seeds) | no luck |" in str(analysis)
 
 
 def test_each_step_of_a_ladder_is_also_compared_with_the_one_before():

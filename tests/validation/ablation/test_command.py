@@ -79,7 +79,14 @@ def test_failed_rows_and_wrong_options_have_their_exit_codes(tmp_path, capsys):
     out = ["-o", str(tmp_path / "out"), "--executor", "local", "--threads", "1"]
     some = write_study(tmp_path, "refuses")
     assert main(["ablate", str(some), *out]) == 0
-    assert "18 rows, 9 of them failed" in capsys.readouterr().out
+    said = capsys.readouterr().out.splitlines()
+    assert said[:3] == [
+        f"{name} failed on refuses (3 seeds): no board; nothing hangs there; hang one up."
+        for name in ("unchanged", "aim = 1", "aim = 4")
+    ]
+    assert said[3].startswith("18 rows, 9 of them failed; the page is ")
+    table = (tmp_path / "out" / "tables.md").read_text(encoding="utf-8")
+    assert "| aim = 4 | refuses (3 seeds) | no board" in table
     some.write_text(some.read_text().replace('["a", ', "["), encoding="utf-8")
     assert main(["ablate", str(some), "-o", str(tmp_path / "two"), *out[2:]]) == 3
     assert main(["ablate", str(tmp_path / "none.toml"), *out]) == 2

@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 
 import thesisrecon
+from tests.conftest import refuses
 from thesisrecon.config import PipelineConfig, preset
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.selfcalibration.stratified import Stratified
 from validation.ablation import Place, Study, ablate
 from validation.ablation.plan import plan_study
 from validation.ablation.tasks import TASKS, Reconstruction
 from validation.ablation.tasks.calibration import CalibrationOverNoise
 from validation.ablation.tasks.fundamental import FundamentalOfCube
-from validation.ablation.tasks.pairs import ImagePairs
-from validation.ablation.tasks.stereo import RectifiedPairs
+from validation.ablation.tasks.pairs import ImagePairs, numbers_of_pair, read_pair
+from validation.ablation.tasks.stereo import RectifiedPairs, matched_pair
 from validation.ablation.tasks.triangulation import TriangulationOverNoise
+from validation.scenes import stereo as stereo_scenes
+from validation.scenes.image_files import write_png
 from validation.scenes.real import ROOT, data_root
 
 CONFIG = PipelineConfig()
@@ -69,7 +72,9 @@ def test_exact_views_are_calibrated_exactly():
         (TriangulationOverNoise(), "six views", "did you mean five views"),
         (CalibrationOverNoise(), "clod", "did you mean cloud"),
         (ImagePairs(), "fountain-P11", "unknown pair"),
+        (ImagePairs(), "courtyard/13", "there is no pair courtyard/13"),
         (RectifiedPairs(), "Tedy", "did you mean Teddy"),
+        (RectifiedPairs(), "Teddy#3/2", "with k from 1 to n"),
         (Reconstruction(), "courtyrd", "a folder of images is one too"),
         (Reconstruction(), str(ROOT / "scripts"), "there are no images in"),
     ],
@@ -101,6 +106,38 @@ def test_a_rectified_pair_has_few_bad_pixels():
     found = RectifiedPairs().run(CONFIG, "Tsukuba", 0, NOWHERE)
     assert found["bad1_pct"] < 5.0
     assert found["bad2_pct"] < found["bad1_pct"]
+
+
+def test_a_yard_is_matched_whole_and_in_windows_of_its_rows(tmp_path, monkeypatch):
+    texture = np.random.default_rng(0).integers(0, 256, (30, 80, 3), dtype=np.uint8)
+    # The lower half of the scene is nearer; the left image sees the right one's column x at x + d.
+    disparity = np.repeat([[8.0], [12.0]], 30, axis=0) * np.ones(160)
+    right = texture.repeat(2, axis=0).repeat(2, axis=1)
+    left = np.stack([np.roll(row, int(d), axis=0) for row, d in zip(right, disparity[:, 0], strict=True)])
+    for name, image in (("left", left), ("right", right)):
+        write_png(tmp_path / f"{name}.png", image)
+    np.save(tmp_path / "disparity.npy", np.stack([disparity, disparity]).astype(np.float32))
+    monkeypatch.setattr(stereo_scenes, "stereo_yard_folder", {9: tmp_path}.get)
+    task = RectifiedPairs()
+    assert task.subsets("yard-9", 2) == ["yard-9#1/2", "yard-9#2/2"]
+    for scene, rows in (("yard-9", 60), ("yard-9#1/2", 40), ("yard-9#2/2", 40)):
+        assert task.scene_of(scene) == "yard-9"
+        pair = matched_pair(scene)
+        assert pair.left.shape == pair.right.shape == (rows, 160, 3)
+        assert pair.disparities >= 13
+        assert task.run(CONFIG, scene, 0, NOWHERE)["bad1_pct"] < 5.0
+    np.testing.assert_array_equal(matched_pair("yard-9#2/2").left, left[20:])
+
+
+def test_pairs_of_a_scene_are_one_value_and_a_wrong_F_is_a_failure():
+    task = ImagePairs(gap=2)
+    assert {task.scene_of(f"courtyard/{i}") for i in (0, 4)} == {"courtyard"}
+    images, truth = read_pair("courtyard", 4, 2)
+    views = [CONFIG.matching.prepare(image, CONFIG.features.detect(image)) for image in images]
+    found = numbers_of_pair(CONFIG, views, (4, 6), 0, truth)
+    assert found["verified"] > 500
+    assert found["error_px"] < 0.1
+    refuses(StageFailure, "F is wrong", numbers_of_pair, CONFIG, views, (4, 6), 0, truth[:, [0, 1, 2, 0]])
 
 
 @pytest.fixture(scope="module")

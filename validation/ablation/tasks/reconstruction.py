@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +19,11 @@ from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task
+from validation.ablation.tasks.windows import window_names, window_parts, window_slice
 from validation.harness.records import ReportOptions
 from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
-from validation.scenes.many_views import yard_folder
+from validation.scenes.many_views import YARD, yard_folder
 from validation.scenes.real import Scene, read_scene
 
 SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
@@ -36,10 +35,7 @@ SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
     "model": ("model",),
 }
 """The settings that each step adds to those before it."""
-YARD = re.compile(r"yard-\d{1,4}")
 NEED_TRUTH = ("focal_error_pct", "centre_error_mm", "rotation_error_deg")
-SUBSET_SHARE = 2 / 3
-"""Enough images for self-calibration where the scene has eight; neighbours by name mostly overlap."""
 AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
     "matches": ("verified", "sigma_px"),
     "projective": ("registered_pct", "points"),
@@ -54,7 +50,7 @@ class Reconstruction(Task):
 
     A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth
     if there is one; without truth the errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n
-    windows of ``SUBSET_SHARE`` of the images, in the order of their names, spread over the scene. "yard-N" is
+    windows of two thirds of the images, in the order of their names, spread over the scene. "yard-N" is
     a rendered yard with true cameras, another one for each number.
     """
 
@@ -77,10 +73,10 @@ class Reconstruction(Task):
             raise ValueError(unknown_word("stage", self.until, get_args(Until)))
 
     def scene_of(self, scene: str) -> str:
-        return _parts(scene)[0]
+        return window_parts(scene)[0]
 
     def subsets(self, scene: str, count: int) -> list[str]:
-        return [f"{scene}#{k}/{count}" for k in range(1, count + 1)]
+        return window_names(scene, count)
 
     def check(self, scene: str) -> None:
         _load(scene)
@@ -135,30 +131,15 @@ class Reconstruction(Task):
         )
 
 
-def _parts(scene: str) -> tuple[str, int, int]:
-    """Name of the scene, and number k of n subsets; 0 of 0 for the whole scene."""
-    name, mark, place = scene.rpartition("#")
-    k, _, n = place.partition("/")
-    if not mark or not (k.isdecimal() and n.isdecimal()):
-        return scene, 0, 0
-    if not 1 <= int(k) <= int(n):
-        raise UsageError(f"a subset is NAME#k/n with k from 1 to n; got {scene!r}")
-    return name, int(k), int(n)
-
-
 def _images(scene: str) -> tuple[Path, ...]:
     """The images of a scene or of one of its subsets."""
-    paths, (_, k, n) = _load(scene).image_paths, _parts(scene)
-    if not n:
-        return paths
-    size = math.ceil(SUBSET_SHARE * len(paths))
-    first = round((k - 1) * (len(paths) - size) / max(n - 1, 1))
-    return paths[first : first + size]
+    paths = _load(scene).image_paths
+    return paths[window_slice(scene, len(paths))]
 
 
 def _load(scene: str) -> Scene:
     """The images of a whole scene by its name or its folder; :class:`UsageError` if there are none."""
-    scene = _parts(scene)[0]
+    scene = window_parts(scene)[0]
     if YARD.fullmatch(scene):
         return read_scene(yard_folder(int(scene.rpartition("-")[2])), scene)
     folder = Path(scene)
