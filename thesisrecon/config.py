@@ -147,18 +147,8 @@ class Matcher(Protocol):
         estimate_fundamental: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match the corners of two images one-to-one.
-
-        Parameters
-        ----------
-        view1, view2 : Any
-            The prepared images.
-        pair : tuple of int
-            Numbers of the views.
-        estimate_fundamental : callable
-            Robust estimator of F, for guided matching.
-        rng : numpy.random.Generator
-            Source of randomness.
+        """Match the corners of two prepared images one-to-one; ``pair`` are the numbers of the views, and
+        ``estimate_fundamental`` is the robust estimator of F for guided matching.
 
         Returns
         -------

@@ -29,25 +29,9 @@ class Image:
     original_size: tuple[int, int]
     mask: B8 | None = None
 
-    @classmethod
-    def without_pixels(cls, name: str, size: tuple[int, int]) -> Image:
-        """Return a grey image in the place of one that is not available.
-
-        Parameters
-        ----------
-        name, size : str, tuple of int
-            File name, and (width, height).
-
-        Returns
-        -------
-        Image
-            It takes no memory; ``has_pixels`` is False.
-        """
-        return cls(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), size)
-
     @property
     def has_pixels(self) -> bool:
-        """Whether the image was read, and is not one of :meth:`without_pixels`."""
+        """Whether the image was read, and is not a grey one in its place, which takes no memory."""
         return any(self.rgb.strides)
 
     @property

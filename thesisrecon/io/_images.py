@@ -106,6 +106,11 @@ class ImageSet:
         return np.array([d.exif_focal_px for d in self.decoded])
 
 
+def image_without_pixels(name: str, size: tuple[int, int]) -> Image:
+    """A grey image of (width, height) in the place of one that is not available."""
+    return Image(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), size)
+
+
 def list_images(folder: Path) -> list[Path]:
     """List the image files of a folder by suffix, sorted, without hidden files and sub-folders."""
     if not folder.exists():

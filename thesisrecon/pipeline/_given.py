@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
-from thesisrecon.io._images import DecodedImage, ImageSet, read_image
+from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image
 from thesisrecon.matching._prepared import select_matches
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.numerics._observations import Observations, sort_observations
@@ -57,7 +57,7 @@ class Views:
     def _read(self, run: Run, i: int, digest: str) -> DecodedImage:
         width, height = (int(side) for side in self.sizes[i])
         if self.images is None:
-            return DecodedImage(Image.without_pixels(self.names[i], (width, height)), digest)
+            return DecodedImage(image_without_pixels(self.names[i], (width, height)), digest)
         source = self.images / self.names[i] if isinstance(self.images, Path) else self.images[i]
         (found,) = read_image(source, max_size_px=run.config.images.max_size_px).decoded
         if found.image.original_size != (width, height):

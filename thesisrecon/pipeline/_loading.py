@@ -12,6 +12,7 @@ import numpy as np
 from thesisrecon.arrays import I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_json
+from thesisrecon.io._images import image_without_pixels
 from thesisrecon.pipeline._outputs import SUMMARY, with_image_names
 from thesisrecon.pipeline._stages import best_result
 from thesisrecon.records import Image
@@ -116,5 +117,5 @@ def _working_size(view: Mapping[str, Any]) -> I64:
 
 
 def _image(view: Mapping[str, Any], size: I64) -> Image:
-    grey = Image.without_pixels(view["name"], (int(size[0]), int(size[1])))
+    grey = image_without_pixels(view["name"], (int(size[0]), int(size[1])))
     return Image(grey.name, grey.rgb, (view["width_px"], view["height_px"]))

@@ -83,18 +83,7 @@ class FixedPlaneQuadric:
     starts: int = 9
 
     def calibrations(self, scene: ProjectiveScene, plane: F64) -> F64:
-        """Compute the calibrations for a plane at infinity.
-
-        Parameters
-        ----------
-        scene, plane : ProjectiveScene, ndarray (3,)
-            Cameras and prior, and the plane p.
-
-        Returns
-        -------
-        ndarray (R, 3, 3)
-            Unit-free calibrations. ``StageFailure`` if they are not determined.
-        """
+        """See `thesisrecon.selfcalibration.absolute_conic.LinearAbsoluteConic.calibrations`."""
         unknown, frame = scene.unknown, scene.frame
         H = _homographies(frame, plane)
         focals = np.log(np.geomspace(*self.focal_range, self.starts))

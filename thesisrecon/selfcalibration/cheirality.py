@@ -51,12 +51,12 @@ class CheiralitySearch:
         Parameters
         ----------
         scene, rng : ProjectiveScene, numpy.random.Generator
-            Cameras, points and prior; selects the points.
+            Cameras, points and prior; source of the random choices.
 
         Returns
         -------
         PlaneCandidates
-            The planes. ``StageFailure`` if none within the bounds gives a real image of the absolute conic.
+            The planes; ``StageFailure`` if there is none.
         """
         planes, _ = self.search(scene.frame, scene.reconstruction, scene.constraints, rng)
         if not len(planes):

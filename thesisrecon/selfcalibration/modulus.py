@@ -73,18 +73,7 @@ class ModulusConstraint:
     max_points: int = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Find candidate planes at infinity, best first.
-
-        Parameters
-        ----------
-        scene, rng : ProjectiveScene, numpy.random.Generator
-            Cameras, points and prior; draws the starts.
-
-        Returns
-        -------
-        PlaneCandidates
-            The planes. ``StageFailure`` below three views of one K, or if none keeps the scene on one side.
-        """
+        """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; ``rng`` draws the starts."""
         frame = scene.frame
         pairs = _pairs_of_constant_cameras(scene.constraints.first)
         if len(pairs) < 3:

@@ -271,18 +271,7 @@ class ParallelLines:
     max_candidates: int = 5
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Find candidate planes at infinity, best supported first: one from given points, or several.
-
-        Parameters
-        ----------
-        scene, rng : ProjectiveScene, numpy.random.Generator
-            Cameras, points and prior; draws pairs of segments.
-
-        Returns
-        -------
-        PlaneCandidates
-            The planes. ``StageFailure`` without three directions, or if no plane keeps the scene on one side.
-        """
+        """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; one plane of given points."""
         if self.points is not None:
             X = _points_at_infinity(scene.frame, self.points)
             v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)

@@ -303,23 +303,11 @@ class MaximumLikelihoodScanline:
             raise ValueError(f"cohesion must be none, along, or along and across; got {self.cohesion}")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
-        """Compute integer disparities of the left image.
+        """See `thesisrecon.stereo.semi_global.SemiGlobalMatching.match`; the disparities are whole numbers.
 
         The confidence is the probability of the disparity (or an adjacent one) among the range given the two
         measurements alone, 3 / D if they are indistinguishable. It is reduced where texture is missing,
         because errors of neighbouring pixels are then not independent.
-
-        Parameters
-        ----------
-        left, right : array_like (H, W) or (H, W, K <= 4)
-            Grey levels 0 .. 255 of a rectified pair, NaN = no pixel.
-        disparity_range : tuple of int
-            First and last disparity in pixels, both included; x_right = x_left - d.
-
-        Returns
-        -------
-        DisparityMap
-            NaN where the pixel is occluded.
         """
         first, last = checked_range(disparity_range)
         sides = prepare_stereo_images(left, right)

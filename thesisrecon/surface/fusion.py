@@ -356,18 +356,7 @@ class DepthSheets:
             raise ValueError(f"step must be >= 1; got {self.step}")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:  # noqa: ARG002
-        """Combine the depth maps to one mesh.
-
-        Parameters
-        ----------
-        depth_maps, threads
-            As in :meth:`VolumetricFusion.fuse`; one thread is used.
-
-        Returns
-        -------
-        TexturedMesh
-            Mesh without colours.
-        """
+        """See `thesisrecon.surface.fusion.VolumetricFusion.fuse`; one thread is used."""
         order = sorted(depth_maps, key=lambda m: (-int(np.isfinite(m.depth).sum()), m.view))
         sheets: list[TexturedMesh] = []
         shows: list[Callable[[F64], B8]] = []

@@ -64,15 +64,5 @@ class LinearSurface:
     """Piecewise linear surface through all depths: :func:`surface_from_depth` of the map itself."""
 
     def smooth(self, depth_map: DepthMap) -> DepthMap:
-        """Return the map unchanged.
-
-        Parameters
-        ----------
-        depth_map : DepthMap
-            Depths of one view.
-
-        Returns
-        -------
-        DepthMap
-        """
+        """See `thesisrecon.surface.bspline.BSplineSurface.smooth`; the map is unchanged."""
         return depth_map
