@@ -16,7 +16,7 @@ from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.io import _export_formats as formats
 from thesisrecon.io._colmap_writing import has_skew, write_sparse_model
-from thesisrecon.io._export_formats import coefficients
+from thesisrecon.io._export_formats import calibration, coefficients
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import find_images, read_image
@@ -200,10 +200,8 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
     frames: dict[tuple[bytes, bytes, object], tuple[F64, tuple[int, int]]] = {}
     views, xy = list[SparseView](), model.xy.copy()
     for i, view in enumerate(model.views):
-        assert view.K is not None
-        assert view.size is not None
-        k = coefficients(view)
-        key = (view.K.tobytes(), k.tobytes(), view.size)
+        K, size = calibration(view)
+        key = (K.tobytes(), coefficients(view).tobytes(), size)
         if key not in frames:
             frames[key] = _pinhole_frame(view, centred=bundler)
         K, size = frames[key]
@@ -228,39 +226,36 @@ def _file_name(name: str, *, plain: bool) -> str:
 
 def _normalized(view: SparseView, xy: F64) -> F64:
     """Undistorted normalised points (N, 2) of pixels."""
-    assert view.K is not None
-    return undistort(dehomogenize(homogenize(xy) @ np.linalg.inv(view.K).T), coefficients(view))
+    return undistort(dehomogenize(homogenize(xy) @ np.linalg.inv(calibration(view)[0]).T), coefficients(view))
 
 
 def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, int]]:
     """K of the same focal lengths, without skew, and size of the largest pinhole image in the original."""
-    assert view.K is not None
-    assert view.size is not None
-    width, height = view.size
+    original, (width, height) = calibration(view)
     x, y = np.arange(float(width)), np.arange(float(height))
     sides = [(np.zeros(height), y), (np.full(height, width - 1.0), y), (x, np.zeros(width))]
     borders = [
         _normalized(view, np.column_stack(side)) for side in (*sides, (x, np.full(width, height - 1.0)))
     ]
-    focal = np.array([view.K[0, 0], view.K[0, 0] if centred else view.K[1, 1]])
+    focal = np.array([original[0, 0], original[0, 0] if centred else original[1, 1]])
     low = focal * [borders[0][:, 0].max(), borders[2][:, 1].max()]
     high = focal * [borders[1][:, 0].min(), borders[3][:, 1].min()]
     corner = float(np.hypot(*(np.maximum(-low, high) / focal)))
     inner = min(1.0, _INNER * _growing_radius(coefficients(view)) / corner)
     low, high, K = low * inner, high * inner, np.diag([*focal, 1.0])
     if centred:
-        reach = np.minimum(np.minimum(-low, high), np.array(view.size) * (0.5 + _MAX_GROWTH))
+        reach = np.minimum(np.minimum(-low, high), np.array([width, height]) * (0.5 + _MAX_GROWTH))
         size = np.floor(2.0 * reach + _ROUNDING_PX).astype(np.int64) + 1
         K[:2, 2] = (size - 1) / 2
     else:
-        centre, growth = view.K[:2, 2], _MAX_GROWTH * np.array(view.size)
+        centre, growth = original[:2, 2], _MAX_GROWTH * np.array([width, height])
         first = np.ceil(np.maximum(low + centre, -growth) - _ROUNDING_PX)
-        last = np.floor(np.minimum(high + centre, np.array(view.size) - 1 + growth) + _ROUNDING_PX)
+        last = np.floor(np.minimum(high + centre, np.array([width, height]) - 1 + growth) + _ROUNDING_PX)
         size = (last - first).astype(np.int64) + 1
         K[:2, 2] = centre - first
     if not (np.isfinite(K).all() and size.min() >= _MIN_SIDE_PX):
         k = ", ".join(f"{value:.3g}" for value in coefficients(view))
-        place = f"distortion {k}, principal point {view.K[0, 2]:.0f}, {view.K[1, 2]:.0f}"
+        place = f"distortion {k}, principal point {original[0, 2]:.0f}, {original[1, 2]:.0f}"
         raise UsageError(
             f"the undistorted image of {view.name} would be {size[0]} x {size[1]} px ({place}); "
             "the camera is not plausible, so export the model as colmap"
@@ -309,24 +304,21 @@ def _write_images(
         )
 
     def write(i: int) -> None:
-        view, pinhole = model.views[i], pinholes.views[i]
-        assert view.K is not None
-        assert view.distortion is not None
-        assert pinhole.K is not None
-        assert pinhole.size is not None
+        (K, size), distortion = calibration(model.views[i]), coefficients(model.views[i])
+        pinhole_K, pinhole_size = calibration(pinholes.views[i])
         image = read_image(paths[i], max_size_px=np.iinfo(np.int32).max).images[0]
-        if image.size != view.size:
-            sizes = f"{image.size} pixels, but {view.size} (width, height) in the model"
+        if image.size != size:
+            sizes = f"{image.size} pixels, but {size} (width, height) in the model"
             raise UsageError(f"{paths[i]} has {sizes}; give the images of the model")
         file, name = (None, "") if masks is None else masks[i]
         mask = None if file is None else read_mask(file, image)
         rgb, used = image.rgb, mask
-        if view.distortion.any() or view.size != pinhole.size or not np.array_equal(view.K, pinhole.K):
-            frames = view.K, view.distortion, pinhole.K, pinhole.size
+        if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
+            frames = K, distortion, pinhole_K, pinhole_size
             rgb, _ = undistort_image(rgb, *frames)
             if mask is not None:
                 _, used = undistort_image(mask[:, :, None].astype(np.uint8), *frames, mask=mask)
-        write_image(folder / "images" / pinhole.name, rgb)
+        write_image(folder / "images" / pinholes.views[i].name, rgb)
         if name:
             used = np.ones(rgb.shape[:2], bool) if used is None else used
             write_image(folder / name, np.where(used, 255, 0).astype(np.uint8))

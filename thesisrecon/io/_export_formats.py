@@ -51,7 +51,7 @@ def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
 
 
 def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
-    K, (width, height) = _calibration(view)
+    K, (width, height) = calibration(view)
     cx, cy = K[0, 2] + PIXEL_CENTRE, K[1, 2] + PIXEL_CENTRE
     values = {
         "fl_x": K[0, 0],
@@ -72,7 +72,7 @@ def write_openmvs(folder: Path, model: SparseModel) -> Path:
     still = _matrices(np.eye(3), np.zeros(3))
     parts = [b"MVSI", struct.pack("<II", _MVS_VERSION, 0), _count(1), _text("platform"), _count(len(cameras))]
     for i, view in enumerate(cameras):
-        K, size = _calibration(view)
+        K, size = calibration(view)
         parts += [_text(f"camera{i}"), struct.pack("<II", *size), _matrices(K), still]
     parts += [_count(len(model.views)), *(_matrices(view.R, view.centre) for view in model.views)]
     parts.append(_count(len(model.views)))
@@ -107,7 +107,7 @@ def write_bundler(folder: Path, model: SparseModel) -> Path:
     lines = ["# Bundle file v0.3", f"{len(model.views)} {len(model.X)}"]
     centre = np.zeros((len(model.views), 2))
     for i, view in enumerate(model.views):
-        K, _ = _calibration(view)
+        K, _ = calibration(view)
         centre[i] = K[:2, 2]
         rows = [[K[0, 0], 0.0, 0.0], *(_LOOKS_BACK @ view.R), _LOOKS_BACK @ view.t]
         lines += [_numbers(row) for row in rows]
@@ -136,7 +136,7 @@ def write_opencv(folder: Path, model: SparseModel) -> Path:
     cameras, number = _distinct_cameras(model)
     head = "%YAML:1.0\n---\n"
     for i, view in enumerate(cameras):
-        K, (width, height) = _calibration(view)
+        K, (width, height) = calibration(view)
         k1, k2, k3 = coefficients(view)
         entries = [f"image_width: {width}\nimage_height: {height}\n", _matrix("camera_matrix", K)]
         entries.append(_matrix("distortion_coefficients", np.array([[k1, k2, 0.0, 0.0, k3]])))
@@ -160,7 +160,7 @@ def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
     """Write ``camchain.yaml`` of pinhole-radtan cameras without k3, and note the largest difference."""
     lines, notes = list[str](), list[str]()
     for i, view in enumerate(_distinct_cameras(model)[0]):
-        K, (width, height) = _calibration(view)
+        K, (width, height) = calibration(view)
         (k1, k2), error_px = _two_coefficients(view)
         if error_px > 0.0:
             notes.append(f"cam{i}: k1 and k2 replace k1, k2 and k3, within {error_px:.2g} px in the image")
@@ -182,7 +182,7 @@ def _two_coefficients(view: SparseView) -> tuple[F64, float]:
     k = coefficients(view)
     if k[2] == 0.0:
         return k[:2], 0.0
-    K, (width, height) = _calibration(view)
+    K, (width, height) = calibration(view)
     corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)]) @ np.linalg.inv(K).T
     r = np.linspace(0.0, float(np.linalg.norm(undistort(corners[:, :2], k), axis=1).max()), 500)[1:]
     powers = r[:, None] ** [3, 5, 7]
@@ -198,7 +198,7 @@ def _distinct_cameras(model: SparseModel) -> tuple[list[SparseView], list[int]]:
     """Return one view per set of intrinsics and size, and the number of each view's set."""
     first, number, cameras = dict[tuple[object, ...], int](), list[int](), list[SparseView]()
     for view in model.views:
-        K, size = _calibration(view)
+        K, size = calibration(view)
         key = (size, K.tobytes(), coefficients(view).tobytes())
         if key not in first:
             first[key] = len(cameras)
@@ -213,7 +213,8 @@ def coefficients(view: SparseView) -> F64:
     return view.distortion
 
 
-def _calibration(view: SparseView) -> tuple[F64, tuple[int, int]]:
+def calibration(view: SparseView) -> tuple[F64, tuple[int, int]]:
+    """K and (width, height) of a view in which they are known."""
     assert view.K is not None
     assert view.size is not None
     return view.K, view.size

@@ -135,6 +135,7 @@ def test_pairs_of_a_scene_are_one_value_and_a_wrong_F_is_a_failure():
     images, truth = read_pair("courtyard", 4, 2)
     views = [CONFIG.matching.prepare(image, CONFIG.features.detect(image)) for image in images]
     found = numbers_of_pair(CONFIG, views, (4, 6), 0, truth)
+    assert [image.name for image in images] == ["0004.jpg", "0006.jpg"]
     assert found["verified"] > 500
     assert found["error_px"] < 0.1
     refuses(StageFailure, "F is wrong", numbers_of_pair, CONFIG, views, (4, 6), 0, truth[:, [0, 1, 2, 0]])

@@ -101,8 +101,10 @@ def read_pair(name: str, i: int, gap: int) -> tuple[tuple[Image, ...], F64]:
     """Both images and correspondences (M, 4) px of the true cameras."""
     scene = _load(name)
     assert scene is not None
-    images = read_images([scene.image_paths[i], scene.image_paths[i + gap]], max_size_px=MAX_SIZE_PX)
+    # One by one: several are sorted by name.
+    paths = scene.image_paths[i], scene.image_paths[i + gap]
+    images = tuple(read_images([path], max_size_px=MAX_SIZE_PX).images[0] for path in paths)
     truths = [pair.truth for pair in camera_pairs(scene, CACHE, (gap,))]
     truth = truths[i]
     assert truth is not None
-    return images.images, np.asarray(truth)
+    return images, np.asarray(truth)
