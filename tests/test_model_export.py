@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests import fake_stages as fakes
 from thesisrecon import Camera, UsageError, export, reconstruct
+from thesisrecon.cli.main import run_command
 from thesisrecon.sparse_model import SparseModel, SparseView
 
 SIZE = (160, 120)
@@ -279,9 +280,15 @@ def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path,
         table = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
         found = {frame["file_path"].removeprefix("images/"): frame["mask_path"] for frame in table["frames"]}
         assert found == mask_names
+    if to == "openmvs":
+        alike = replace(model, views=[replace(model.views[0], name="c.jpg"), *model.views[1:]])
+        with pytest.raises(
+            UsageError, match=r"two images of the model would have the mask masks/c\.mask\.png"
+        ):
+            export(alike, tmp_path / "alike", to=to, images=images, masks=tmp_path / "given")
 
 
-def test_the_masks_of_a_run_are_exported_with_it(tmp_path):
+def test_the_masks_of_a_run_are_exported_with_it(tmp_path, capsys):
     names = [image.name for image in fakes.photographs(4)]
     for folder in ("images", "masks"):
         (tmp_path / folder).mkdir()
@@ -296,8 +303,13 @@ def test_the_masks_of_a_run_are_exported_with_it(tmp_path):
     assert report.notes == ()
     assert all((pixels_of(tmp_path / "a" / "masks" / f"{name}.png")[:, 0] == 0).all() for name in names)
     assert "Bundler has none" in export(out, tmp_path / "b", to="bundler").notes[0]
+    command = ["export", str(out), "--to", "nerfstudio", "-o"]
+    assert run_command([*command, str(tmp_path / "e")]) == 0
+    assert "note" not in capsys.readouterr().out
+    assert len(list((tmp_path / "e" / "masks").iterdir())) == len(names)
     (tmp_path / "masks").rename(tmp_path / "moved")
-    assert "is gone; give --masks" in export(out, tmp_path / "c", to="nerfstudio").notes[0]
+    assert run_command([*command, str(tmp_path / "c")]) == 0
+    assert "is gone; give --masks" in capsys.readouterr().out
     assert not (tmp_path / "c" / "masks").exists()
     export(out, tmp_path / "d", to="openmvs", masks=tmp_path / "moved")
     assert len(list((tmp_path / "d" / "masks").iterdir())) == len(names)

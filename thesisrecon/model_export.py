@@ -210,11 +210,14 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
         views.append(
             replace(view, name=_file_name(view.name, plain=bundler), K=K, size=size, distortion=np.zeros(3))
         )
-    names = [view.name for view in views]
+    _require_distinct([view.name for view in views], "be written as")
+    return replace(model, views=views, xy=xy)
+
+
+def _require_distinct(names: Sequence[str], what: str) -> None:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise UsageError(f"two images of the model would be written as {twice}; rename one of them")
-    return replace(model, views=views, xy=xy)
+        raise UsageError(f"two images of the model would {what} {twice}; rename one of them")
 
 
 def _file_name(name: str, *, plain: bool) -> str:
@@ -276,9 +279,7 @@ def _mask_files(
 ) -> list[tuple[Path | None, str]]:
     """The mask of each view, if any, and the file to write: programs want a mask for every image."""
     names = [formats.mask_name(to, name) for name in pinholes.names]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise UsageError(f"two images of the model would have the mask {twice} in {to}; rename one of them")
+    _require_distinct(names, "have the mask")
     found, _ = find_masks(masks, model.names)
     return [(found.get(view), name) for view, name in zip(model.names, names, strict=True)]
 

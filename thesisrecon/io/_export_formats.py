@@ -52,18 +52,9 @@ def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
 
 def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
     K, (width, height) = calibration(view)
-    cx, cy = K[0, 2] + PIXEL_CENTRE, K[1, 2] + PIXEL_CENTRE
-    values = {
-        "fl_x": K[0, 0],
-        "fl_y": K[1, 1],
-        "cx": cx,
-        "cy": cy,
-        "k1": 0.0,
-        "k2": 0.0,
-        "p1": 0.0,
-        "p2": 0.0,
-    }
-    return {"w": width, "h": height, **{name: float(value) for name, value in values.items()}}
+    cx, cy = (K[:2, 2] + PIXEL_CENTRE).tolist()
+    known = {"w": width, "h": height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": cx, "cy": cy}
+    return known | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
 
 
 def write_openmvs(folder: Path, model: SparseModel) -> Path:
