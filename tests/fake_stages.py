@@ -196,7 +196,7 @@ class FakeDense:
     def required_views(self, scene, view):
         return frozenset({view, *list(scene.views)[:2]})
 
-    def depth_map(self, scene, view):
+    def depth_map(self, scene, view, *, pool=None):
         CALLS.append(f"depth {view}")
         shape, P = scene.views[view].rgb.shape[:2], scene.views[view].P
         y, x = np.indices(shape)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Protocol
@@ -330,8 +331,8 @@ class DepthEstimator(StereoMatcher, Protocol):
             Numbers of the views, the view among them.
         """
 
-    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
-        """Compute the depth map of one view from its neighbours.
+    def depth_map(self, scene: MultiViewScene, view: int, *, pool: Executor | None = None) -> DepthMap:
+        """Compute the depth map of one view from its neighbours; idle threads of ``pool`` may take part.
 
         Returns
         -------

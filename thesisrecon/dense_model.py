@@ -97,7 +97,8 @@ def depth_maps(
         advice = "give R world to camera and t = -R centre, images with more overlap, or a depth_range"
         raise StageFailure("no depth was found", rule, advice)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        found = dict(zip(order, pool.map(lambda i: dense.depth_map(scene, i), order), strict=True))
+        each = pool.map(lambda i: dense.depth_map(scene, i, pool=pool), order)
+        found = dict(zip(order, each, strict=True))
         maps = list(pool.map(lambda i: dense.confirm(scene, found, i), order))
     if limits is not None:
         maps = [_within(one, limits[one.view]) for one in maps]

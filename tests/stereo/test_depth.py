@@ -1,5 +1,6 @@
 """Depth maps of whole scenes against truth, and what hopeless ones give."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,10 @@ from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.records import Image
+from thesisrecon.stereo import correspondence
+from thesisrecon.stereo.correspondence import PairMatching
 from thesisrecon.stereo.depth import MultiViewStereo
+from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
 
 STEREO = MultiViewStereo()
@@ -54,6 +58,36 @@ def test_the_same_bytes_with_any_number_of_threads(walled):
         one = stereo.confirm(scene, raw, i)
         for field in ("depth", "std", "views", "P"):
             assert getattr(one, field).tobytes() == getattr(together[i], field).tobytes()
+
+
+def test_idle_threads_take_part_in_a_depth_map(walled):
+    stereo = replace(STEREO, max_side=120, match_side=90)
+    scene = stereo.prepare(walled.images, walled.reconstruction)
+    with ThreadPoolExecutor(3) as pool:
+        shared = stereo.depth_map(scene, 1, pool=pool)
+    assert shared.depth.tobytes() == stereo.depth_map(scene, 1).depth.tobytes()
+
+
+def test_frames_with_many_disparities_are_reduced_and_still_match_the_scene(walled, monkeypatch):
+    costs = []
+
+    class Counting(SemiGlobalMatching):
+        def match(self, left, right, *, disparity_range):
+            first, last = disparity_range
+            costs.append(left.shape[0] * left.shape[1] * (last - first + 1) / (240 * 180))
+            return super().match(left, right, disparity_range=disparity_range)
+
+    stereo = MultiViewStereo(pairs=PairMatching(matcher=Counting()))
+    stereo.depth_map(stereo.prepare(walled.images, walled.reconstruction), 1)
+    whole, limit = max(costs), 0.4 * max(costs)
+    costs.clear()
+    monkeypatch.setattr(correspondence, "MAX_COSTS", limit)
+    error, known = errors(walled, stereo.map_all(walled.images, walled.reconstruction))
+    # Margins of whole pixels add to the limit of so small an image.
+    assert max(costs) < 1.2 * limit < whole
+    assert np.median(error) < 0.002
+    assert np.mean(error < 0.01) > 0.95
+    assert known > 0.75
 
 
 @pytest.mark.parametrize("links", [0, 1])

@@ -36,6 +36,14 @@ def difference(mesh):
     return seen.color[where] - paint(points)[where]
 
 
+def quality_of(mesh, views):
+    return blending.face_quality(mesh, views, blending.depth_buffers(mesh, views))
+
+
+def prepared_views(mesh, views):
+    return blending.prepare_views(mesh, views, blending.depth_buffers(mesh, views))
+
+
 def test_a_new_view_shows_the_painted_sphere(sphere):
     mesh = TextureAtlas().texture(sphere, [photograph(m) for m in ring_of()])
     assert mesh.untextured.mean() < 0.05
@@ -54,7 +62,7 @@ def test_a_model_of_noisy_depths_is_a_small_file(tmp_path):
 
 def test_hidden_and_cut_off_points_are_not_visible(sphere):
     view = photograph(ring_of()[0])
-    quality = blending.face_quality(sphere, [view])[:, 0]
+    quality = quality_of(sphere, [view])[:, 0]
     middle = sphere.vertices[sphere.faces].mean(axis=1)
     centre = -np.linalg.solve(view.P[:, :3], view.P[:, 3])
     towards = (middle * (centre - middle)).sum(1) / np.linalg.norm(centre - middle, axis=1)
@@ -63,12 +71,12 @@ def test_hidden_and_cut_off_points_are_not_visible(sphere):
     half = replace(view, seen=np.arange(160)[None, :].repeat(120, axis=0) < 80)
     xy = middle @ view.P[:, :3].T + view.P[:, 3]
     right = xy[:, 0] / xy[:, 2] > 82
-    assert blending.face_quality(sphere, [half])[right, 0].max() == 0.0
+    assert quality_of(sphere, [half])[right, 0].max() == 0.0
 
 
 def test_charts_are_large_and_use_views_that_see_them(sphere):
     views = [photograph(m) for m in ring_of()]
-    quality = blending.face_quality(sphere, views)
+    quality = quality_of(sphere, views)
     neighbours = face_neighbours(sphere.faces)
     label = blending.choose_views(quality, neighbours)
     seen = quality.max(axis=1) > 0.0
@@ -128,7 +136,7 @@ def test_a_surface_outside_all_views_is_rejected(sphere):
 
 def test_gains_are_found(sphere):
     views = [photograph(m, gain) for m, gain in zip(ring_of(), GAINS, strict=True)]
-    found = [view.gain for view in blending.prepare_views(sphere, views)]
+    found = [view.gain for view in prepared_views(sphere, views)]
     wanted = np.exp(np.log(GAINS).mean()) / np.array(GAINS)
     np.testing.assert_allclose(found, np.repeat(wanted[:, None], 3, axis=1), atol=0.025)
 
@@ -151,7 +159,7 @@ def test_depths_that_one_image_contradicts_are_removed(sphere, monkeypatch):
     x, y = (towards[:, :2] / towards[:, 2:]).T
     facing = (sphere.vertices @ np.linalg.solve(views[0].P[:, :3], views[0].P[:, 3])) < 0
     hit = facing & (np.abs(x - 80) < 15) & (np.abs(y - 60) < 15)
-    prepared, error = blending.prepare_views(sphere, views), []
+    prepared, error = prepared_views(sphere, views), []
     for scatter in (1e6, 20.0):
         monkeypatch.setattr(blending, "SCATTER", scatter)
         color = blending.blend_colors(prepared, sphere.vertices, vertex_normals(sphere))[0]
@@ -205,7 +213,7 @@ def observed(points, normals, P, depth, trust, tolerance):
 
 
 def test_observe_points_matches_its_twin(sphere):
-    view = blending.prepare_views(sphere, [photograph(ring_of()[2])])[0]
+    view = prepared_views(sphere, [photograph(ring_of()[2])])[0]
     rng = np.random.default_rng(1)
     points = rng.normal(size=(400, 3))
     points *= 1.01 / np.linalg.norm(points, axis=1, keepdims=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -106,7 +107,11 @@ def _described(run: Run, result: RunResult, until: str, failure: StageFailure | 
 
 def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
     out = run.directory.path
-    with run.clock("outputs"):
+    with run.clock("outputs"), ThreadPoolExecutor(1) as beside:
+        # The file of the model is written while that of the page is made.
+        for_page = beside.submit(_model_for_page, result, max(run.workers.threads - 1, 1))
+        if run.workers.threads == 1:
+            for_page.exception()  # waits
         colors, affine, warnings = _write_results(run.directory, result)
         run.warnings.extend(warnings)
         result = _described(run, result, until, failure)
@@ -126,7 +131,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             metric=result.metric,
             colors=colors,
             affine=affine,
-            model=_model_for_page(run, result),
+            model=for_page.result(),
             held_out=result.held_out,
             depth_maps={m.view: _thinned(m.depth) for m in result.depth_maps},
             until=None if until == "model" else until,
@@ -229,10 +234,9 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
     }
 
 
-def _model_for_page(run: Run, result: RunResult) -> TexturedMesh | None:
+def _model_for_page(result: RunResult, threads: int) -> TexturedMesh | None:
     if result.mesh is None:
         return None
-    threads = run.workers.threads
     coarse = reduce_faces(result.mesh, PAGE_FACES, threads=threads)
     return TextureAtlas(max_texels=PAGE_TEXELS).texture(coarse, result.views, threads=threads)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -306,8 +307,10 @@ def _compare_held_out(state: PipelineState, mesh: TexturedMesh) -> HeldOut | Non
     return HeldOut(view.view, view.rgb, matched, compared, *similarity)
 
 
-def _depths(config: PipelineConfig, scene: MultiViewScene, view: int) -> list[DepthMap]:
-    return [config.dense.depth_map(scene, view)]
+def _depths(
+    config: PipelineConfig, scene: MultiViewScene, view: int, pool: Executor | None
+) -> list[DepthMap]:
+    return [config.dense.depth_map(scene, view, pool=pool)]
 
 
 def estimate_depth_maps(state: PipelineState) -> None:
@@ -328,7 +331,8 @@ def estimate_depth_maps(state: PipelineState) -> None:
         return (scene if run.workers.in_process else scene.subset(near)), near
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
-        return (([n], (state.config, seen_from(order[n])[0], order[n])) for n in missing)
+        for n in missing:
+            yield [n], (state.config, seen_from(order[n])[0], order[n], run.workers.pool)
 
     found = run.map_cached("dense", keys, _depths, batches)
     maps, confirmed = dict(zip(order, found, strict=True)), dict[int, DepthMap]()

@@ -196,6 +196,11 @@ class Workers:
         """Whether tasks share the memory of this process, so that nothing is copied."""
         return self.executor == "local" or isinstance(self.executor, futures.ThreadPoolExecutor)
 
+    @property
+    def pool(self) -> futures.Executor | None:
+        """The pool of threads that processes the tasks, for parts of a task; None without one."""
+        return self._remote.executor if self.in_process and self._remote is not None else None
+
     def __enter__(self) -> Workers:
         """Connect to the cluster; processes start when needed."""
         self._open_stack = ExitStack()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,6 +20,9 @@ from thesisrecon.stereo.correspondence import Correspondence
 
 Correspond = Callable[[int, int], Correspondence | None]
 """Returns the correspondence of view i in view j, None if the pair fails."""
+
+A = TypeVar("A")
+B = TypeVar("B")
 
 GATE = 3.0
 """Standard deviations within which estimates agree; limit of the innovation of the filter."""
@@ -35,16 +41,29 @@ class InverseDepth:
 
 
 def fuse_neighbours(
-    view: int, views: Mapping[int, PinholeView], neighbours: Sequence[int], correspond: Correspond
+    view: int,
+    views: Mapping[int, PinholeView],
+    neighbours: Sequence[int],
+    correspond: Correspond,
+    pool: Executor | None = None,
 ) -> InverseDepth:
     """Robust weighted mean of the inverse depths measured with all neighbours.
 
     The largest group of estimates that agree is averaged, the more certain one among equals. A measurement
     with a single neighbour is kept; the depth map of another view must confirm it.
     """
-    pairs = [(other, correspond(view, other)) for other in neighbours]
+    pairs = zip(neighbours, _with_idle_threads(pool, partial(correspond, view), neighbours), strict=True)
     found = [_measured(views[view].P, views[other].P, pair) for other, pair in pairs if pair is not None]
     return _fused(views[view].seen.shape, found)
+
+
+def _with_idle_threads(pool: Executor | None, function: Callable[[A], B], items: Sequence[A]) -> list[B]:
+    """Map a function in this thread; threads of ``pool`` without other work take items that are not begun."""
+    if pool is None:
+        return [function(item) for item in items]
+    offers = [pool.submit(function, item) for item in items]
+    own = {n: function(items[n]) for n, offer in enumerate(offers) if offer.cancel()}
+    return [own[n] if n in own else offer.result() for n, offer in enumerate(offers)]
 
 
 def link_sequence(

@@ -34,6 +34,8 @@ from thesisrecon.stereo._resampling import Rectification
 
 SEARCH = 96
 """Lines at infinity that are tried before the best is refined."""
+PRECISION = 1e-4
+"""Relative change of the distortion and of its parameters at which the descent ends."""
 MAX_LOG_SCALE, MAX_SHEAR = 0.05, 0.06
 """Limits of the least-squares adjustment of the first rows."""
 
@@ -44,6 +46,11 @@ class PlanarRectification(Rectification):
 
     H: F64
     size: tuple[int, int]
+
+    def reduced(self, scale: float) -> PlanarRectification:
+        width, height = (max(2, int(np.ceil(scale * side))) for side in self.size)
+        move = np.full((2, 2), 0.5 * scale - 0.5)
+        return PlanarRectification(scale_and_shift(scale, move) @ self.H, (width, height))
 
     def _original(self, side: int, xy: F64) -> F64:
         return _moved(np.asarray(np.linalg.inv(self.H[side])), xy)
@@ -154,6 +161,8 @@ def minimum_distortion(pair: EpipolarPair) -> PlanarRectification:
         start,
         bounds=(np.append(low + inset, -bound), np.append(high - inset, bound)),
         max_nfev=40,
+        ftol=PRECISION,
+        xtol=PRECISION,
     )
     return _crop_and_scale(pair, _homographies_of_rows(pair, *_adjusted(pair, found.x)))
 
@@ -185,15 +194,16 @@ def _loop_zhang_line(pair: EpipolarPair) -> float:
     """phi of Loop and Zhang's line at infinity phi + pi/2: least variation of the third coordinate."""
     z = [homogenize(pair.pencil.normalized(s, pair.regions[s])) for s in (0, 1)]
 
-    def variation(phi: float) -> float:
-        third = [z[s] @ w for s, w in enumerate(_pencil_rows(pair, phi)[:, 1])]
-        return float(sum(np.var(t) / np.mean(t) ** 2 for t in third))
+    def variation(phi: F64) -> F64:
+        w = plane_from_angle(phi + 0.5 * np.pi)
+        third = [z[s] @ (pair.pencil.lines[s] @ w.T) for s in (0, 1)]
+        return np.asarray(sum(np.var(t, axis=0) / np.mean(t, axis=0) ** 2 for t in third))
 
     low, high = _admissible_lines(pair)
     # At the ends the line at infinity touches the field of view.
     tried = low + (high - low) * (np.arange(SEARCH) + 0.5) / SEARCH
     with np.errstate(all="ignore"):
-        costs = np.array([variation(phi) for phi in tried])
+        costs = variation(tried)
     if not np.isfinite(costs).any():
         raise StageFailure("no line can be sent to infinity", advice="rectify in polar coordinates")
     k, step = int(np.nanargmin(costs)), (high - low) / SEARCH

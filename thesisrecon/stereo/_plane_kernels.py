@@ -19,7 +19,7 @@ MIN_WINDOW_COVERAGE = 0.7
 """Share of the window's weight that must lie in a neighbour's image."""
 SAME_PLANE = 0.1
 """Planes closer than this, in search steps over the window, are not tried again."""
-MIN_GAIN = 0.002
+MIN_GAIN = 0.006
 """Fall of the cost in one pass below which a plane has converged."""
 SUMS = {"reassoc", "contract", "arcp", "nsz"}
 """Floating-point rules for sums over a window that allow vectorisation; NaN is preserved."""
@@ -244,29 +244,59 @@ def _view_cost(
     return _cost_at_border(squares, start, (width, height), warp, offsets, samples)
 
 
+@kernel
+def _work_space(n_views: int) -> tuple[F64, F64, I64]:
+    order = empty(n_views, np.int64)
+    for k in range(n_views):
+        order[k] = k
+    return empty(8), empty(n_views), order
+
+
+@kernel(inline="always")
+def _mean_cost(first: float, second: float) -> float:
+    """Mean of two costs, the larger at most ``MAX_EXCESS_COST`` above the smaller."""
+    return float(min(first, second) + 0.5 * min(abs(second - first), MAX_EXCESS_COST))
+
+
 @kernel(fastmath=SUMS, forceinline=True)
 def _plane_cost(
-    views: PatchViews, at: tuple[int, int], plane: F64, offsets: F32, samples: F32, variance: float, warp: F64
+    views: PatchViews,
+    at: tuple[int, int],
+    plane: F64,
+    offsets: F32,
+    samples: F32,
+    variance: float,
+    limit: float,
+    work: tuple[F64, F64, I64],
 ) -> float:
     """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first.
 
-    A neighbour in which the pixel is occluded has limited influence. ``warp`` (8,) is work space.
+    A neighbour in which the pixel is occluded has limited influence. ``work`` is work space (8,) and (K,),
+    and the order (K,) in which neighbours are tried. If the first two of it cost ``limit`` or more, the
+    others are not tried; else the two of smallest cost become the first two.
     """
     _, squares, layout, H, e = views
+    warp, costs, order = work
+    n_views = layout.shape[0]
     if not plane[0] > 0.0:
         return UNKNOWN
-    least, second = UNKNOWN, UNKNOWN
-    for k in range(layout.shape[0]):
-        if not _plane_homography(H, e, k, at, plane, warp):
-            continue
-        cost = _view_cost(squares, layout, k, warp, offsets, samples, variance)
-        if cost >= 0.0:
-            if cost < least:
-                least, second = cost, least
-            elif cost < second:
-                second = cost
-    # The cap limits the influence of neighbours in which the pixel is occluded.
-    return least + 0.5 * min(second - least, MAX_EXCESS_COST) if least < UNKNOWN else UNKNOWN
+    for n in range(n_views):
+        if n == 2 and _mean_cost(costs[0], costs[1]) >= limit:
+            return UNKNOWN
+        k = order[n]
+        costs[n] = UNKNOWN
+        if _plane_homography(H, e, k, at, plane, warp):
+            cost = _view_cost(squares, layout, k, warp, offsets, samples, variance)
+            if cost >= 0.0:
+                costs[n] = cost
+    for n in range(min(n_views, 2)):
+        least = n
+        for m in range(n + 1, n_views):
+            if costs[m] < costs[least]:
+                least = m
+        costs[n], costs[least] = costs[least], costs[n]
+        order[n], order[least] = order[least], order[n]
+    return _mean_cost(costs[0], costs[1] if n_views > 1 else UNKNOWN) if costs[0] < UNKNOWN else UNKNOWN
 
 
 @kernel(fastmath=SUMS, forceinline=True)
@@ -320,8 +350,8 @@ def sweep_planes(
     """
     gray, H, e, offsets = views.gray, views.H, views.e, window.offsets
     height, width = gray.shape
-    samples, warp = empty((2, offsets.shape[1]), np.float32), empty(8)
-    plane, trial = empty(3), empty(3)
+    samples, plane, trial = empty((2, offsets.shape[1]), np.float32), empty(3), empty(3)
+    work = _work_space(len(H))
     reach = -float(offsets[0, 0])
     back = -1 if backward else 1
     for row in range(height):
@@ -339,6 +369,7 @@ def sweep_planes(
                 plane[d] = planes[v, u, d]
             least = float(cost[v, u])
             move = _step(H, e, (u, v), plane[0], step_px) if least < UNKNOWN else 0.0
+            shifted = False
             for k in range(8):
                 if k < 2:
                     if not _continued(planes, u - back * (1 - k), v - back * k, u, v, trial):
@@ -351,12 +382,18 @@ def sweep_planes(
                         break
                     if k == 2:
                         move = _step(H, e, (u, v), plane[0], step_px)
+                    # Back from an accepted step is the plane before it.
+                    if k % 2 == 1 and shifted:
+                        continue
                     by = move if k % 2 == 0 else -move
                     for d in range(3):
                         trial[d] = plane[d]
                     trial[k // 2 - 1] += by if k < 4 else by / reach
-                tried = _plane_cost(views, (u, v), trial, offsets, samples, variance, warp)
-                if tried < least:
+                # The first step ranks the neighbours for the others.
+                limit = np.inf if k <= 2 else least
+                tried = _plane_cost(views, (u, v), trial, offsets, samples, variance, limit, work)
+                shifted = tried < least
+                if shifted:
                     least = tried
                     for d in range(3):
                         plane[d] = trial[d]
@@ -405,7 +442,8 @@ def begin_planes(views: PatchViews, window: PatchWindow, planes: F32, cost: F32)
     """Compute the cost (H, W) of planes (H, W, 3), ``UNKNOWN`` without one."""
     gray, offsets = views.gray, window.offsets
     height, width = gray.shape
-    samples, warp, plane = empty((2, offsets.shape[1]), np.float32), empty(8), empty(3)
+    samples, plane = empty((2, offsets.shape[1]), np.float32), empty(3)
+    work = _work_space(len(views.H))
     for v in range(height):
         for u in range(width):
             cost[v, u] = UNKNOWN
@@ -413,4 +451,4 @@ def begin_planes(views: PatchViews, window: PatchWindow, planes: F32, cost: F32)
                 variance = _window_samples(gray, u, v, window, samples)
                 for d in range(3):
                     plane[d] = planes[v, u, d]
-                cost[v, u] = _plane_cost(views, (u, v), plane, offsets, samples, variance, warp)
+                cost[v, u] = _plane_cost(views, (u, v), plane, offsets, samples, variance, np.inf, work)

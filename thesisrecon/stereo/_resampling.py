@@ -200,6 +200,10 @@ class Rectification(ABC):
         inside = np.all((xy >= -0.5) & (xy <= np.array(self.size) - 0.5), axis=1)
         return np.where(inside[:, None], xy, np.nan)
 
+    def reduced(self, scale: float) -> Rectification:  # noqa: ARG002
+        """The frame with ``scale`` times as many pixels per side, or itself where its size is bounded."""
+        return self
+
     def warp(self, image: F32, side: int) -> F32:
         """Resample an image (H, W) or (H, W, C) into the frame, NaN outside."""
         return warp_image(image, partial(self._lookup, side), self.size)

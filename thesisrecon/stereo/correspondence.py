@@ -24,6 +24,8 @@ STRIP_ROWS = 128
 """Rows of the reference view that are mapped at a time."""
 ONE_SURFACE_PX = 1.0
 """Disparity range of four neighbours up to which they are interpolated."""
+MAX_COSTS = 400.0
+"""Matching costs per pixel of the reference view; the frames of wide baselines are reduced to that."""
 GAIN_PATCH = 2
 """Radius of the patches whose brightness is compared."""
 RANGE_MARGIN = 0.25
@@ -68,6 +70,10 @@ class PairMatching:
         own = reference.seen.shape, other.seen.shape
         frame = rectify_cameras(reference.P, other.P, own[0][::-1], own[1][::-1], xy1=xy1, xy2=xy2)
         wanted = _searched_range(frame, xy1, xy2)
+        costs = frame.size[0] * frame.size[1] * (wanted[1] - wanted[0] + 1) / reference.seen.size
+        if costs > MAX_COSTS:
+            frame = frame.reduced((MAX_COSTS / costs) ** (1.0 / 3.0))
+            wanted = _searched_range(frame, xy1, xy2)
         left = frame.warp(_levels(reference), 0)
         right = frame.warp(_levels(other) * _brightness_gain(reference.rgb, other.rgb, xy1, xy2), 1)
         found = self.matcher.match(left, right, disparity_range=wanted)
@@ -98,11 +104,11 @@ class PairMatching:
             d, sure = _sample_disparity(found, places)
             inside: B8 = np.asarray(np.isfinite(d) & (sure >= self.min_confidence))
             d, sure, places = d[inside], sure[inside], places[inside]
-            right, a, b = (
+            right, beside = (
                 frame.original_from_rectified(1, places - np.outer(d + step, (1.0, 0.0)), within=False)
-                for step in (0.0, -0.5, 0.5)
+                for step in (0.0, 1.0)
             )
-            scale = np.linalg.norm(b - a, axis=1)
+            scale = np.linalg.norm(beside - right, axis=1)
             xy[rows].reshape(-1, 2)[inside] = _resized(right, own[1], wanted[1])
             # Confidence 1/2: the second best disparity costs P1 more on every path.
             sigma[rows].reshape(-1)[inside] = std * scale * np.sqrt(0.5 / np.clip(sure, 0.05, 0.5))

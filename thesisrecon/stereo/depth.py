@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -305,7 +305,7 @@ class MultiViewStereo:
         chosen = {i: _select_neighbours(points, views, i, self.max_neighbours) for i in views}
         return MultiViewScene(views, points, chosen, matched)
 
-    def depth_map(self, scene: MultiViewScene, view: int) -> DepthMap:
+    def depth_map(self, scene: MultiViewScene, view: int, *, pool: Executor | None = None) -> DepthMap:
         """See `thesisrecon.config.DepthEstimator.depth_map`."""
         if view not in scene.views:
             raise ValueError(f"view {view} has no camera; those with one are {sorted(scene.views)}")
@@ -321,7 +321,7 @@ class MultiViewStereo:
         if self.sequence_links:
             found = link_sequence(view, scene.views, self.sequence_links, correspond)
         else:
-            found = fuse_neighbours(view, scene.views, scene.neighbours[view], correspond)
+            found = fuse_neighbours(view, scene.views, scene.neighbours[view], correspond, pool)
         keep = scene.views[view].seen
         if self.refinement:
             found = refine_depths(scene.views[view], [scene.views[j] for j in scene.neighbours[view]], found)
@@ -375,7 +375,8 @@ class MultiViewStereo:
         scene = self.prepare(images, reconstruction, threads=threads)
         order = sorted(scene.views)
         with ThreadPoolExecutor(threads) as pool:
-            found = dict(zip(order, pool.map(lambda i: self.depth_map(scene, i), order), strict=True))
+            maps = pool.map(lambda i: self.depth_map(scene, i, pool=pool), order)
+            found = dict(zip(order, maps, strict=True))
             return dict(zip(order, pool.map(lambda i: self.confirm(scene, found, i), order), strict=True))
 
 

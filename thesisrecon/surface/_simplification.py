@@ -35,7 +35,7 @@ MAX_TURN = 0.5
 """Cosine of the largest change of a face's normal in one collapse."""
 MIN_ROUNDNESS = 0.05
 """Smallest height of a face over its longest side, unless it was flatter before."""
-SHARES, LONGEST = (0.04, 0.08, 0.16, 0.32), 8.0
+SHARES, LONGEST = (0.08, 0.32), 8.0
 """Limits tried for a number of faces, and longest new side; unit: side of a square of a face's mean area."""
 MAX_FAN = 24
 """Largest number of faces around a vertex."""

@@ -47,10 +47,17 @@ def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
     return xy, depth
 
 
-def _visible_vertices(mesh: TexturedMesh, view: PinholeView, xy: F64, depth: F64, *, threads: int = 1) -> B8:
+def depth_buffers(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> list[F32]:
+    """Depth of the surface in each view (H, W), infinite where there is none."""
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        return list(
+            pool.map(lambda view: rasterize(mesh.vertices, mesh.faces, view_camera(view)).depth, views)
+        )
+
+
+def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8:
     """Vertices (N,) with pixels ``xy`` and ``depth`` that lie inside the image and are not occluded."""
     camera = view_camera(view)
-    buffer = rasterize(mesh.vertices, mesh.faces, camera, threads=threads).depth
     width, height = camera.size
     with np.errstate(invalid="ignore"):
         inside = (xy >= 0.0).all(axis=1) & (xy[:, 0] <= width - 1.0) & (xy[:, 1] <= height - 1.0)
@@ -63,12 +70,12 @@ def _visible_vertices(mesh: TexturedMesh, view: PinholeView, xy: F64, depth: F64
     return np.asarray(inside & seen & (depth <= farthest + tolerance))
 
 
-def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> F32:
+def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32]) -> F32:
     """Count the pixels (M, V) of each face in each view, 0 if its outside is not completely visible."""
     quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
-    for v, view in enumerate(views):
+    for v, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
         xy, depth = project_to_view(view_camera(view), mesh.vertices)
-        seen = _visible_vertices(mesh, view, xy, depth, threads=threads)
+        seen = _visible_vertices(view, buffer, xy, depth)
         a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
         # y points down: faces that are anticlockwise from outside have a negative area.
         area = 0.5 * ((c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]) - (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]))
@@ -153,7 +160,7 @@ FEATHER_PX = 8.0
 
 
 def paint_texture(
-    mesh: TexturedMesh, views: Sequence[PinholeView], uv: F64, cut_out: U8, *, threads: int = 1
+    mesh: TexturedMesh, prepared: Sequence[ViewSurface], uv: F64, cut_out: U8, *, threads: int = 1
 ) -> U8:
     """Compute the colours of a texture (H, W, 3) as a robust blend of all images that show a point.
 
@@ -162,7 +169,6 @@ def paint_texture(
     reflections, people). Weights vary smoothly, so no seams occur. ``uv`` (M, 3, 2): corners of the faces in
     texels, NaN for faces that no view shows; other texels keep the colours of ``cut_out``.
     """
-    prepared = prepare_views(mesh, views, threads=threads)
     normals = vertex_normals(mesh)
     texture = cut_out.copy()
     drawn = np.zeros(texture.shape[:2], dtype=bool)
@@ -185,10 +191,12 @@ def paint_texture(
     return texture
 
 
-def prepare_views(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> list[ViewSurface]:
+def prepare_views(
+    mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32], *, threads: int = 1
+) -> list[ViewSurface]:
     """The surface as each view sees it, with gains that equalise the brightness of the views."""
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        prepared = list(pool.map(lambda view: _prepared(mesh, view), views))
+        prepared = list(pool.map(_prepared, views, buffers))
     stride = max(1, len(mesh.vertices) // GAIN_POINTS)
     points, normals = (np.ascontiguousarray(a[::stride]) for a in (mesh.vertices, vertex_normals(mesh)))
     weight, color = _observe(prepared, points, normals)
@@ -238,9 +246,8 @@ def _points_of_rows(
     return np.column_stack([y + rows.start, x]), points, towards
 
 
-def _prepared(mesh: TexturedMesh, view: PinholeView) -> ViewSurface:
+def _prepared(view: PinholeView, depth: F32) -> ViewSurface:
     camera = view_camera(view)
-    depth = rasterize(mesh.vertices, mesh.faces, camera).depth
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     # Pixels without a surface are no outline: they may be holes.
     far = scipy.ndimage.maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)

@@ -18,9 +18,11 @@ from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface._mesh import face_neighbours
 from thesisrecon.surface._texture_blending import (
     choose_views,
+    depth_buffers,
     face_quality,
     label_charts,
     paint_texture,
+    prepare_views,
     project_to_view,
     view_camera,
 )
@@ -72,7 +74,8 @@ class TextureAtlas:
             If no face is visible, or the atlas is too large even with images reduced to ``MIN_SCALE``.
         """
         neighbours = face_neighbours(mesh.faces)
-        quality = face_quality(mesh, views, threads=threads)
+        buffers = depth_buffers(mesh, views, threads=threads)
+        quality = face_quality(mesh, views, buffers)
         label = choose_views(quality, neighbours)
         if not (label >= 0).any():
             raise StageFailure("the surface has no texture", "no image shows any part of it")
@@ -96,7 +99,10 @@ class TextureAtlas:
         uv = xy + (offsets - rectangles[:, :2])[chart][:, None, :]
         cut_out = _fill(smaller, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
         seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
-        texture = paint_texture(mesh, smaller, seen_uv, cut_out, threads=threads)
+        if scale < 1.0:
+            buffers = depth_buffers(mesh, smaller, threads=threads)
+        prepared = prepare_views(mesh, smaller, buffers, threads=threads)
+        texture = paint_texture(mesh, prepared, seen_uv, cut_out, threads=threads)
         uv, texture = _swatches(neighbours, label, uv, texture)
         return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 

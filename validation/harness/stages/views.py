@@ -12,7 +12,7 @@ import PIL.Image
 from thesisrecon.arrays import B8, U8
 from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
-from thesisrecon.surface._texture_blending import prepare_views
+from thesisrecon.surface._texture_blending import depth_buffers, prepare_views
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
@@ -142,9 +142,10 @@ def _read_surface(path: Path) -> TexturedMesh:
 
 def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list[PinholeView]:
     """Return the images with equalised exposures, by our texture gains."""
+    prepared = prepare_views(surface, views, depth_buffers(surface, views))
     return [
         replace(view, rgb=np.clip(np.rint(view.rgb * seen.gain), 0, 255).astype(np.uint8))
-        for view, seen in zip(views, prepare_views(surface, views), strict=True)
+        for view, seen in zip(views, prepared, strict=True)
     ]
 
 
