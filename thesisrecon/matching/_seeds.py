@@ -12,10 +12,20 @@ from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.matching._prepared import empty_matches
 from thesisrecon.records import Matches, Seeds
 
-BLOCK = 256
+BLOCK, CHUNK = 256, 64
+"""Rows multiplied at a time, and columns compared at once."""
 NEIGHBOURS, TOLERANCE = 10, 0.3
 # Maximum distance of a corner from its seed or prediction.
 REACH_PX = 4.0
+
+
+@kernel(fastmath={"nnan", "nsz"}, forceinline=True)
+def _largest(values: F32, first: int, last: int) -> float:
+    """Largest of some values; without branches, several are compared at once."""
+    most = np.float32(-2.0)
+    for n in range(first, last):
+        most = values[n] if values[n] > most else most
+    return float(most)
 
 
 @kernel
@@ -29,19 +39,27 @@ def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F3
     index = zeros(rows, np.int64)
     value = full(rows, -1.0, np.float32)
     second_best = full(rows, -1.0, np.float32)
+    largest = full((columns + CHUNK - 1) // CHUNK, -2.0, np.float32)
     for b in range(rows):
         row = correlation[b]
         best, top = 0, np.float32(-2.0)
-        for n in range(columns):
-            if row[n] > top:
-                best, top = n, row[n]
+        for c in range(len(largest)):
+            largest[c] = _largest(row, c * CHUNK, min((c + 1) * CHUNK, columns))
+            if largest[c] > top:
+                top = largest[c]
+                best = c * CHUNK
+        while row[best] != top and best + 1 < columns:
+            best += 1
         second = np.float32(-1.0)
         x, y, limit = xy2[best, 0], xy2[best, 1], apart2[best]
-        for n in range(columns):
-            if row[n] > second:
-                dx, dy = xy2[n, 0] - x, xy2[n, 1] - y
-                if dx * dx + dy * dy > limit:
-                    second = row[n]
+        for c in range(len(largest)):
+            if not largest[c] > second:
+                continue
+            for n in range(c * CHUNK, min((c + 1) * CHUNK, columns)):
+                if row[n] > second:
+                    dx, dy = xy2[n, 0] - x, xy2[n, 1] - y
+                    if dx * dx + dy * dy > limit:
+                        second = row[n]
         index[b], value[b], second_best[b] = best, top, second
     return index, value, second_best
 
