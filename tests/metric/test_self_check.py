@@ -20,7 +20,7 @@ from thesisrecon.metric._shared_camera import (
     contradicted_focal_priors,
     inconsistent_principal_point,
 )
-from thesisrecon.metric._uncertainty import widen_unverified_focals
+from thesisrecon.metric._uncertainty import widen_by_camera_model, widen_unverified_focals
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
@@ -196,7 +196,9 @@ def changed(scene, factors, shift_px):
 def test_one_camera_and_own_cameras_are_not_doubted():
     for views in (3, 8):
         scene = make_scene(views=views, sigma_px=0.5, seed=5)
-        assert check_shared_cameras(*settled(scene)).failed_checks == ()
+        test = check_shared_cameras(*settled(scene))
+        assert test.failed_checks == ()
+        assert test.misfit == 1.0
     scene = make_scene(sigma_px=0.3, zoom=0.2, seed=8)
     assert check_shared_cameras(*settled(scene, cameras="per-image")).failed_checks == ()
 
@@ -210,6 +212,20 @@ def test_two_similar_zooms_in_turn_are_detected(zoom):
     assert "shared focal length" in failed_checks[0]
     # The sentence holds at any size of the images.
     assert "px" not in failed_checks[0]
+
+
+def test_harmless_differences_beyond_chance_widen_the_intervals():
+    scene = make_scene(sigma_px=0.1, seed=6)
+    factors = np.where(np.arange(8) % 2 == 0, 1.0, 1.008)
+    test = check_shared_cameras(*settled(changed(scene, factors, np.zeros((8, 2)))))
+    assert test.failed_checks == ()
+    assert test.misfit > 4.0
+    narrow = {"focal_px": IntrinsicInterval(1000.0, 1.0, ""), "aspect": IntrinsicInterval(1.0, 0.0, "")}
+    (wide,) = widen_by_camera_model([narrow], (0.0, 0.0), test.misfit)
+    assert wide["focal_px"].std == pytest.approx(np.sqrt(test.misfit))
+    assert wide["aspect"] == narrow["aspect"]
+    (moved,) = widen_by_camera_model([narrow], (0.01, 0.0), test.misfit)
+    assert moved["focal_px"].std == pytest.approx(np.hypot(1.0, 10.0))
 
 
 @pytest.mark.parametrize("zoom", [1.03, 1.06])

@@ -92,13 +92,16 @@ class SharedCameraTest:
     """Contradictions of shared values, with advice, and sentences on sets of views that cannot be tested.
 
     ``focal_std`` (V,) is the relative standard deviation of focal lengths whose sharing cannot be tested, NaN
-    elsewhere; ``contradicted`` (8,) are the intrinsics that differ from view to view.
+    elsewhere; ``contradicted`` (8,) are the intrinsics that differ from view to view. ``misfit`` is the
+    decrease in cost by own focal lengths per degree of freedom, 1 for noise alone, if they differ by harmless
+    amounts but more than by chance; else 1.
     """
 
     found: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
     focal_std: F64
     contradicted: B8
+    misfit: float = 1.0
 
     @property
     def failed_checks(self) -> tuple[str, ...]:
@@ -127,11 +130,13 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
     if not focals and not centres:
         return SharedCameraTest((), (), focal_std, contradicted)
     freed: tuple[int, ...] = (FOCAL,) if focals else ()
-    found, warnings = list[tuple[str, str]](), list[str]()
+    found, warnings, misfit = list[tuple[str, str]](), list[str](), 1.0
     before = _adjust_per_view(model, adjustment, ())
     if focals:
         alone = _adjust_per_view(model, adjustment, freed)
-        apart = [s for s in _contradicted(before, alone, focals, 1) if _focals_apart(alone, s)]
+        decrease = _decrease_beyond_chance(before, alone, focals, 1)
+        apart = [s for s in focals if decrease and _focals_apart(alone, s)]
+        misfit = max(decrease, 1.0) if not apart else 1.0
         found += [_focals_differ(views, alone, s) for s in apart]
         contradicted[FOCAL] = bool(apart)
         for s in [s for s in focals if s not in apart and _focal_std(alone, s).max() > MAX_OWN_FOCAL_STD]:
@@ -142,12 +147,12 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
         centres = [s for s in centres if not any(b & set(s.places.tolist()) for b in bent)]
     if centres:
         both = _adjust_per_view(model, adjustment, (*freed, *CENTRE))
-        for s in _contradicted(before, both, centres, 2):
+        for s in centres if _decrease_beyond_chance(before, both, centres, 2) else ():
             off = _centres_off(model, adjustment, views, both, s)
             if np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
                 found.append(_centres_differ(s, off))
                 contradicted[list(CENTRE)] |= not s.known
-    return SharedCameraTest(tuple(found), tuple(warnings), focal_std, contradicted)
+    return SharedCameraTest(tuple(found), tuple(warnings), focal_std, contradicted, misfit)
 
 
 def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, column: int) -> list[_SharedGroup]:
@@ -162,13 +167,13 @@ def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, colum
     return [s for s in sets if len(s.places) >= 2]
 
 
-def _contradicted(
+def _decrease_beyond_chance(
     before: MetricBundleResult, after: MetricBundleResult, sets: list[_SharedGroup], values: int
-) -> list[_SharedGroup]:
-    """All sets if own values reduce the cost by more than chance, else none."""
+) -> float:
+    """Decrease in cost by own values, chi-square per degree of freedom; 0 if it may be chance."""
     saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
     freedom = values * sum(s.degrees_of_freedom for s in sets)
-    return sets if saved > scipy.special.chdtri(freedom, FALSE_ALARM_RATE) else []
+    return saved / freedom if saved > scipy.special.chdtri(freedom, FALSE_ALARM_RATE) else 0.0
 
 
 def _focal_std(alone: MetricBundleResult, s: _SharedGroup) -> F64:

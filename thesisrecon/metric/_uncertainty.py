@@ -255,21 +255,25 @@ def widen_unverified_focals(
 
 
 def widen_by_camera_model(
-    intervals: Sequence[Mapping[str, IntrinsicInterval]], difference: tuple[float, float]
+    intervals: Sequence[Mapping[str, IntrinsicInterval]], difference: tuple[float, float], misfit: float
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
-    """Add the differences to a richer camera model to the standard deviations.
+    """Add the differences to a richer camera model to the standard deviations, or multiply by its misfit.
 
-    ``difference`` of the focal lengths and of the principal points, over the focal length.
+    ``difference`` of the focal lengths and of the principal points, over the focal length. Without one, a
+    chi-square ``misfit`` above 1 per degree of freedom is a variance ratio (Birge ratio).
     """
     moved = {"focal_px": difference[0], "principal_x_px": difference[1], "principal_y_px": difference[1]}
+    factor = 1.0 if any(difference) else np.sqrt(misfit)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own in intervals:
         wider = {
             name: IntrinsicInterval(
-                own[name].value, float(np.hypot(own[name].std, off * own["focal_px"].value)), CAMERA_MODEL
+                own[name].value,
+                float(np.hypot(factor * own[name].std, off * own["focal_px"].value)),
+                CAMERA_MODEL,
             )
             for name, off in moved.items()
-            if name in own and own[name].std > 0.0 and off > 0.0
+            if name in own and own[name].std > 0.0 and (off > 0.0 or factor > 1.0)
         }
         answer.append({**own, **wider})
     return tuple(answer)

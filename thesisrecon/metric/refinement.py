@@ -108,8 +108,7 @@ class MetricRefinement:
         shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
-        if any(difference):
-            intervals = widen_by_camera_model(intervals, difference)
+        intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
         check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
