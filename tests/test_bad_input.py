@@ -11,7 +11,7 @@ import pytest
 from thesisrecon.cli.main import run_command
 
 COURTYARD = Path(__file__).parent.parent / "fixtures" / "courtyard" / "images"
-SMALL = ["--max-size", "480", "--threads", "2", "--until", "metric"]
+SMALL = ["--max-size", "320", "--threads", "2", "--until", "metric"]
 
 
 @pytest.fixture

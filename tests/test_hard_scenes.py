@@ -136,7 +136,7 @@ def folder(tmp_path):
 
 def test_the_others_become_a_model(folder, tmp_path, capsys):
     out = tmp_path / "out"
-    command = ["reconstruct", str(folder), "-o", str(out), "--max-size", "240", "--threads", "2"]
+    command = ["reconstruct", str(folder), "-o", str(out), "--max-size", "200", "--threads", "2"]
     assert run_command(command) == 0
     printed = capsys.readouterr()
     assert printed.err == ""

@@ -20,8 +20,8 @@ from thesisrecon.io import _images
 
 ROOT = Path(__file__).parents[2]
 COURTYARD = ROOT / "fixtures" / "courtyard"
-VIEWS = 6
-SMALL = ["--max-size", "480", "--threads", "2", "--until", "metric"]
+VIEWS = 5
+SMALL = ["--max-size", "320", "--threads", "2", "--until", "metric"]
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_an_early_end_prints_the_results_of_its_stage(photographs, tmp_path, cap
         "matches": r"^1 of 1 image pair accepted, \d\d+ verified",
     }
     for until, words in wanted.items():
-        arguments = ["reconstruct", str(few), "-o", str(out), "--until", until, "--max-size", "480"]
+        arguments = ["reconstruct", str(few), "-o", str(out), "--until", until, "--max-size", "320"]
         assert run_command(arguments) == 0
         assert re.match(words, capsys.readouterr().out)
         assert run_command(["inspect", str(out)]) == 0
@@ -135,7 +135,7 @@ def test_a_finished_run_is_not_touched_by_another_config(killed_and_resumed, pho
     out, _ = killed_and_resumed
     before = (out / "summary.json").read_bytes()
     arguments = ["reconstruct", str(photographs), "-o", str(out), "--max-size", "700"]
-    assert "images.max_size_px was 480 and is now 700" in refused(arguments)
+    assert "images.max_size_px was 320 and is now 700" in refused(arguments)
     assert (out / "summary.json").read_bytes() == before
 
 
@@ -260,10 +260,10 @@ def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, cap
     knowledge.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
     given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
     assert run_command([*given, "--pairs", str(knowledge)]) == 0
-    assert "of 2 image pairs accepted (15 are possible)" in capsys.readouterr().out
+    assert "of 2 image pairs accepted (10 are possible)" in capsys.readouterr().out
     pairs = read(out / "summary.json")["pairs"]
-    assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 15, "the listed pairs")
-    assert "2 of 15 pairs were matched: the listed pairs." in (out / "report.html").read_text(
+    assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 10, "the listed pairs")
+    assert "2 of 10 pairs were matched: the listed pairs." in (out / "report.html").read_text(
         encoding="utf-8"
     )
     for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is not among"), ("", "leaves no pair")):

@@ -52,7 +52,7 @@ def serial(tmp_path_factory):
 
 
 def small_job(images, out, **options):
-    config = replace(PipelineConfig(), images=ImageOptions(max_size_px=320))
+    config = replace(PipelineConfig(), images=ImageOptions(max_size_px=200))
     reconstruct(images, out, config=config, until="metric", **options)
 
 
