@@ -16,11 +16,11 @@ class ReportOptions:
     """Options of a report.
 
     ``out``: output folder. ``scenes``, ``stages``: names in order. ``folders``: folder of each user scene.
-    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references that no gate needs.
-    ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s). ``side_px``:
-    long side of depth maps, 0 for the default. ``resume``: folder of an earlier run whose references are
-    reused, or empty. ``methods``: own methods that run again with ``resume``, empty for all. ``stages_from``:
-    module of ``STAGES``.
+    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references and pictures that no gate
+    needs. ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s).
+    ``side_px``: long side of depth maps, 0 for the default. ``resume``: folder of an earlier run whose
+    references are reused, or empty. ``methods``: own methods that run again with ``resume``, empty for all.
+    ``stages_from``: module of ``STAGES``.
     """
 
     out: Path

@@ -104,7 +104,9 @@ class DepthStage(Stage):
         seconds = each(known, lambda place: (place / "seconds.txt").read_text())
         words = "processor time, compiling included"
         metrics = [*_metrics(scene, judged), row(scene, "time a view", "s", seconds, words)]
-        return Judgement(metrics, pictures=_pictures(images, found, model, options))
+        return Judgement(
+            metrics, pictures=[] if options.gates_only else _pictures(images, found, model, options)
+        )
 
 
 def side_of(options: ReportOptions) -> int:

@@ -68,7 +68,7 @@ class SurfaceStage(Stage):
         notes = [f"The scene is {truth.depth_m:.2f} m deep, the median over all true depth maps."]
         place, pictures = options.place(self.name, scene), list[Picture]()
         camera = _camera(scene, options)
-        for name in SHOWN:
+        for name in () if options.gates_only else SHOWN:
             mesh = meshes.get(name)
             if mesh is None:
                 continue
