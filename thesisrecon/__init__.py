@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [  # noqa: F405
-    "BundleAdjustment", "Camera", "DepthMap", "DisparityMap", "FundamentalFit", "Image",
-    "ModelComparison", "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure",
-    "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__", "absolute_dual_quadric",
+    "BundleAdjustment", "Camera", "DepthMap", "DisparityMap", "FundamentalEstimate", "FundamentalFit",
+    "Image", "ModelComparison", "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration",
+    "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__", "absolute_dual_quadric",
     "align_to_positions", "bundle_adjust", "cheirality", "compare_models", "depth_maps",
     "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental", "estimate_homography",
     "estimate_trifocal", "export", "fuse_depth_maps", "interpolate_view", "kruppa", "load", "match_pair",
@@ -28,6 +28,7 @@ _HOMES = {
     "BundleAdjustment": "bundle_adjustment",
     "Camera": "camera",
     "DepthMap": "records",
+    "FundamentalEstimate": "epipolar.estimation",
     "ModelComparison": "comparison",
     "Reconstruction": "records",
     "RunResult": "results",

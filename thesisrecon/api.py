@@ -14,7 +14,7 @@ from thesisrecon.comparison import ModelComparison, compare_models
 from thesisrecon.config import PipelineConfig
 from thesisrecon.dense_model import depth_maps, fuse_depth_maps, texture
 from thesisrecon.epipolar._drawing import draw_lines
-from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.epipolar.estimation import FundamentalEstimate, estimate_fundamental
 from thesisrecon.epipolar.homography import estimate_homography
 from thesisrecon.epipolar.trifocal_estimation import estimate_trifocal
 from thesisrecon.errors import StageFailure, UsageError
@@ -53,10 +53,11 @@ from thesisrecon.view_synthesis import synthesize_view
 from thesisrecon.views.render import render
 
 __all__ = [
-    "BundleAdjustment", "Camera", "DepthMap", "DisparityMap", "FundamentalFit", "Image",
-    "ModelComparison", "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration", "StageFailure",
-    "TexturedMesh", "Tracks", "TwoView", "UsageError", "absolute_dual_quadric", "align_to_positions",
-    "bundle_adjust", "cheirality", "compare_models", "depth_maps", "draw_epipolar_lines",
+    "BundleAdjustment", "Camera", "DepthMap", "DisparityMap", "FundamentalEstimate", "FundamentalFit",
+    "Image", "ModelComparison", "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration",
+    "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError", "absolute_dual_quadric",
+    "align_to_positions", "bundle_adjust", "cheirality", "compare_models", "depth_maps",
+    "draw_epipolar_lines",
     "epipolar_lines", "estimate_fundamental", "estimate_homography", "estimate_trifocal", "export",
     "fuse_depth_maps", "interpolate_view", "kruppa", "load", "match_pair", "match_rectified",
     "plane_at_infinity", "read_cameras", "reconstruct", "reconstruct_from_colmap",

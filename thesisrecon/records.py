@@ -128,8 +128,6 @@ class FundamentalFit:
         Number of samples.
     competing_models : ndarray (K, 3, 3)
         Other results of the search, best first; F is ambiguous if they explain as many matches.
-    degeneracy : DegeneracyReport, optional
-        Whether the matches determine F; None if not tested.
     """
 
     F: F64
@@ -138,7 +136,6 @@ class FundamentalFit:
     covariance: F64
     iterations: int = 0
     competing_models: F64 = field(default_factory=lambda: np.empty((0, 3, 3)))
-    degeneracy: DegeneracyReport | None = None
 
 
 @dataclass(frozen=True)
@@ -149,7 +146,7 @@ class TwoView:
 
     Parameters
     ----------
-    i, j, F, sigma_px, degeneracy
+    i, j, F, sigma_px
         View numbers, and the estimate as in :class:`FundamentalFit`.
     index1, index2, xy1, xy2, affine : ndarray
         Verified matches, as in :class:`Matches`.
@@ -161,6 +158,8 @@ class TwoView:
         Whether the pair enters the tracks, else why not.
     configuration : str
         "general", "plane", "pure rotation" or "pure translation"; empty for too few matches.
+    degeneracy : DegeneracyReport, optional
+        Whether the matches determine F; None for too few matches.
     """
 
     i: int

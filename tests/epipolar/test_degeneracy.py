@@ -1,7 +1,10 @@
 """Degeneracy of F is assessed from the matches off the plane, not from the number of inliers."""
 
+import pickle
+
 import numpy as np
 import pytest
+import scipy
 
 from tests.conftest import refuses
 from tests.epipolar.facade import FacadeMaker
@@ -28,7 +31,7 @@ WINDOWS = FacadeMaker(matches=500, relief=0.0, off_plane=0.0, wrong=0.4, repeate
 
 def judged(xy1, xy2, seed=0):
     fit = estimate_fundamental(xy1, xy2, seed=seed)
-    return fit, assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(seed))
+    return fit, fit.degeneracy
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
@@ -118,14 +121,45 @@ def test_a_wide_covariance_is_a_reason():
     assert "covariance" in degeneracy.reasons[0]
 
 
-def test_the_public_function_assesses_degeneracy_on_request():
+def test_an_estimate_is_tested_when_this_is_read():
     pair = make_pair(200, np.random.default_rng(1))
     xy1, xy2, _ = spoil(pair, np.random.default_rng(1), sigma=0.3, outliers=0.2)
-    plain, reported = estimate_fundamental(xy1, xy2), estimate_fundamental(xy1, xy2, check_degeneracy=True)
-    assert plain.degeneracy is None
-    assert reported.degeneracy is not None
-    assert reported.degeneracy.determined
-    np.testing.assert_array_equal(plain.F, reported.F)
+    fit = estimate_fundamental(xy1, xy2)
+    expected = assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(0))
+    sent = pickle.loads(pickle.dumps(fit))
+    xy1[:], xy2[:] = xy2.copy(), 0.0
+    assert "degeneracy" not in vars(fit)
+    for one in (fit, sent, pickle.loads(pickle.dumps(fit))):
+        assert (one.determined, one.reasons) == (True, ())
+        assert repr(one.degeneracy) == repr(expected)
+        np.testing.assert_array_equal(one.F, fit.F)
+
+
+@pytest.mark.parametrize("outliers", [0, 60])
+def test_a_pure_rotation_does_not_determine_f(outliers):
+    K = np.array([[800.0, 0.0, 500.0], [0.0, 800.0, 400.0], [0.0, 0.0, 1.0]])
+    R = scipy.spatial.transform.Rotation.from_rotvec([0.05, 0.2, 0.03]).as_matrix()
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        xy1 = rng.uniform(0.0, (1000.0, 800.0), (300, 2))
+        x2 = np.c_[xy1, np.ones(300)] @ (K @ R @ np.linalg.inv(K)).T
+        xy2 = x2[:, :2] / x2[:, 2:] + rng.normal(0.0, 0.4, (300, 2))
+        xy2[:outliers] = rng.uniform(0.0, (1000.0, 800.0), (outliers, 2))
+        fit = estimate_fundamental(xy1, xy2)
+        assert fit.inliers.sum() > 220
+        assert not fit.determined
+        assert any("dominant plane" in reason or "covariance" in reason for reason in fit.reasons)
+
+
+def test_few_matches_do_not_determine_f():
+    pair = make_pair(8, np.random.default_rng(0))
+    xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.5, outliers=0.0)
+    for fit, words in (
+        (estimate_fundamental(xy1, xy2), "matches off the dominant plane"),
+        (estimate_fundamental(xy1[:7], xy2[:7], method="seven-point"), "7 matches leave none"),
+    ):
+        assert not fit.determined
+        assert words in fit.reasons[0]
 
 
 def test_the_same_generator_gives_the_same_report():

@@ -71,9 +71,16 @@ def rng():
 
 
 def default_with_all_it_says(xy1, xy2):
-    fit = estimate_fundamental(xy1, xy2, check_degeneracy=True)
+    fit = estimate_fundamental(xy1, xy2)
     e1, e2 = epipoles_of(fit)
-    return fit, epipolar_distance_interval(fit, xy1, xy2), e1.direction, e2.direction, e1.covariance
+    return (
+        fit,
+        fit.degeneracy,
+        epipolar_distance_interval(fit, xy1, xy2),
+        e1.direction,
+        e2.direction,
+        e1.covariance,
+    )
 
 
 FUNCTIONS = {

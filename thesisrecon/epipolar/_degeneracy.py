@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
@@ -45,6 +46,8 @@ MIN_MARGIN = 3.0
 MIN_GAIN = 0.05
 # Distance from epipolar lines that is relevant, px, or 2 sigma if that is larger.
 MAX_ERROR_PX = 1.0
+# Two-sided 95 % quantile of a normal variable.
+NORMAL_95 = 1.96
 # Fraction of neighbours that contradict a match, maximum fraction of contradicted matches, and sample size.
 CONTRADICTED, MAX_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
 
@@ -245,8 +248,10 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
             f"another F explains {other.gained:.0f} matches that this F does not explain, and "
             f"misses {other.lost:.0f} of its inliers"
         )
-    if error_px > relevant_px:
-        reasons.append(f"the covariance of F allows epipolar line errors of {error_px:.2g} px")
+    # Few matches estimate their own noise: Student's quantile instead of the normal one.
+    allowed_px = error_px * float(scipy.special.stdtrit(max(fit.inliers.sum() - 7, 1), 0.975)) / NORMAL_95
+    if not allowed_px <= relevant_px:
+        reasons.append(f"the covariance of F allows epipolar line errors of {allowed_px:.2g} px")
     return DegeneracyReport(
         determined=not reasons,
         reasons=tuple(reasons),

@@ -1,8 +1,9 @@
-"""The fundamental matrix by any method of chapter 5, with its inliers, noise and covariance."""
+"""The fundamental matrix by any method of chapter 5, with its noise, covariance and degeneracy test."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -14,11 +15,44 @@ from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure, unknown_word
-from thesisrecon.records import FundamentalFit
+from thesisrecon.records import DegeneracyReport, FundamentalFit
 
 Method = Literal[
     "locally-optimised", "ransac", "least-median", "gold-standard", "eight-point", "seven-point"
 ]  # fmt: skip
+# Seven matches agree with every F that they give.
+MIN_TESTED = 8
+
+
+@dataclass(frozen=True)
+class FundamentalEstimate(FundamentalFit):
+    """An estimate of F with its matches, and whether they determine it, tested when it is first read.
+
+    Parameters
+    ----------
+    xy1, xy2 : ndarray (M, 2)
+        The matches, px.
+    """
+
+    xy1: NDArray[np.float64] = field(kw_only=True, repr=False)
+    xy2: NDArray[np.float64] = field(kw_only=True, repr=False)
+
+    @cached_property
+    def degeneracy(self) -> DegeneracyReport:
+        """The test of section 5.5 with its evidence; the same for the same matches and F."""
+        if len(self.xy1) < MIN_TESTED:
+            return DegeneracyReport(False, (f"{len(self.xy1)} matches leave none to test F with",))
+        return assess_degeneracy(self, self.xy1, self.xy2, rng=np.random.default_rng(0))
+
+    @property
+    def determined(self) -> bool:
+        """Whether the matches determine F; many inliers alone do not show it."""
+        return self.degeneracy.determined
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the matches do not determine F, in sentences; empty if they do."""
+        return self.degeneracy.reasons
 
 
 def estimate_fundamental(
@@ -28,8 +62,7 @@ def estimate_fundamental(
     method: Method = "locally-optimised",
     threshold_px: float | None = 1.0,
     seed: int | Generator = 0,
-    check_degeneracy: bool = False,
-) -> FundamentalFit:
+) -> FundamentalEstimate:
     """Estimate the fundamental matrix of matches by one of the methods of chapter 5.
 
     Parameters
@@ -46,16 +79,14 @@ def estimate_fundamental(
         and these methods are "gold-standard".
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from; the same seed gives the same result.
-    check_degeneracy : bool
-        Also test whether the matches determine F
-        (:func:`~thesisrecon.epipolar._degeneracy.assess_degeneracy`); many inliers alone do not show it.
 
     Returns
     -------
-    FundamentalFit
-        F with x2' F x1 = 0, inliers, noise, covariance and, on request, the degeneracy report. The covariance
-        is that of the least Sampson distance at F; that of the linear methods is not smaller. Seven matches
-        leave no residuals: their noise and covariance are NaN, the other solutions are ``competing_models``.
+    FundamentalEstimate
+        F with x2' F x1 = 0, inliers, noise, covariance, and ``determined`` with its ``reasons``: whether no
+        other F explains the matches as well. The covariance is that of the least Sampson distance at F; that
+        of the linear methods is not smaller. Seven matches leave no residuals: their noise and covariance are
+        NaN, the other solutions are ``competing_models``.
 
     Raises
     ------
@@ -72,9 +103,12 @@ def estimate_fundamental(
     >>> xy1 = rng.uniform(0, 500, (60, 2))
     >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
     >>> xy2[:20] = rng.uniform(0, 500, (20, 2))
-    >>> fit = thesisrecon.estimate_fundamental(xy1, xy2, check_degeneracy=True)
-    >>> bool(fit.inliers[20:].all()), fit.degeneracy.determined
+    >>> fit = thesisrecon.estimate_fundamental(xy1, xy2)
+    >>> bool(fit.inliers[20:].all()), fit.determined
     (True, True)
+    >>> plane = xy1 + rng.normal([40.0, 10.0], 0.3, (60, 2))
+    >>> thesisrecon.estimate_fundamental(xy1, plane).determined
+    False
     >>> thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point").covariance.shape
     (9, 9)
     """
@@ -97,7 +131,9 @@ def estimate_fundamental(
             fit = LeastMedianOfSquares().estimate(xy1, xy2, rng)
         else:
             fit = _fit_all(xy1, xy2, refined=method == "gold-standard")
-    return replace(fit, degeneracy=assess_degeneracy(fit, xy1, xy2, rng=rng)) if check_degeneracy else fit
+    # Copies: the test is made later.
+    xy1, xy2 = np.array(xy1, dtype=np.float64), np.array(xy2, dtype=np.float64)
+    return FundamentalEstimate(**vars(fit), xy1=xy1, xy2=xy2)
 
 
 def _fit_all(xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, refined: bool) -> FundamentalFit:
