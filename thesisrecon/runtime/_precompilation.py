@@ -125,6 +125,8 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
                 while thread.is_alive():
                     thread.join(POLL_S)
                     progress("kernels", len(finished), len(lines))
+            # All may have ended before the first look.
+            progress("kernels", len(finished), len(lines))
         finally:
             for worker in workers:
                 worker.kill()
