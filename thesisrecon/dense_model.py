@@ -12,12 +12,14 @@ import numpy as np
 from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.camera import Camera
+from thesisrecon.config import DepthEstimator
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients
 from thesisrecon.io._images import list_images, read_image
 from thesisrecon.pipeline._image_pair import ImageInput
 from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks
 from thesisrecon.stereo._resampling import pinhole_view
+from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.surface.model import SurfaceModel
 
 ImagesInput = str | Path | Sequence[ImageInput]
@@ -91,21 +93,28 @@ def depth_maps(
     limits = None if depth_range is None else _limits(depth_range, len(read))
     dense = method.dense
     scene = dense.prepare(read, model, depth_range=limits, threads=threads)
-    order = sorted(scene.views)
-    if not any(scene.neighbours[view] for view in order):
+    if not any(scene.neighbours[view] for view in scene.views):
         rule = "no two images contain common points whose rays meet at an angle that gives depth"
         advice = "give R world to camera and t = -R centre, images with more overlap, or a depth_range"
         raise StageFailure("no depth was found", rule, advice)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        each = pool.map(lambda i: dense.depth_map(scene, i, pool=pool), order)
-        found = dict(zip(order, each, strict=True))
-        maps = list(pool.map(lambda i: dense.confirm(scene, found, i), order))
+    maps = list(confirmed_depth_maps(dense, scene, threads=threads).values())
     if limits is not None:
         maps = [_within(one, limits[one.view]) for one in maps]
     if not any(np.isfinite(one.depth).any() for one in maps):
         evidence = f"none of {counted(len(maps), 'view')} agrees with another on any surface"
         raise StageFailure("no depth was found", evidence, "check the cameras, or give a wider depth_range")
     return tuple(maps)
+
+
+def confirmed_depth_maps(
+    dense: DepthEstimator, scene: MultiViewScene, *, threads: int = 1
+) -> dict[int, DepthMap]:
+    """Depth maps of all views by number, confirmed by each other; the result does not depend on threads."""
+    order = sorted(scene.views)
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        each = pool.map(lambda i: dense.depth_map(scene, i, pool=pool), order)
+        found = dict(zip(order, each, strict=True))
+        return dict(zip(order, pool.map(lambda i: dense.confirm(scene, found, i), order), strict=True))
 
 
 def fuse_depth_maps(

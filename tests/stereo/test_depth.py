@@ -8,6 +8,7 @@ import PIL.Image
 import pytest
 
 from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
+from thesisrecon.dense_model import confirmed_depth_maps
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.records import Image
@@ -35,7 +36,7 @@ def errors(walled, maps):
 @pytest.mark.parametrize("links", [0, 4])
 def test_depth_matches_the_scene_and_its_std_predicts_the_error(walled, links):
     stereo = MultiViewStereo(sequence_links=links)
-    maps = stereo.map_all(walled.images, walled.reconstruction)
+    maps = confirmed_depth_maps(stereo, stereo.prepare(walled.images, walled.reconstruction))
     error, known = errors(walled, maps)
     assert np.median(error) < 0.002
     assert np.mean(error < 0.01) > 0.95
@@ -51,8 +52,8 @@ def test_depth_matches_the_scene_and_its_std_predicts_the_error(walled, links):
 def test_the_same_bytes_with_any_number_of_threads(walled):
     reconstruction = replace(walled.reconstruction, registered=np.array([True, True, True, False]))
     stereo = replace(STEREO, max_side=120, match_side=90)
-    together = stereo.map_all(walled.images, reconstruction, threads=2)
     scene = stereo.prepare(walled.images, reconstruction)
+    together = confirmed_depth_maps(stereo, scene, threads=2)
     raw = {i: stereo.depth_map(scene, i) for i in sorted(scene.views, reverse=True)}
     for i in scene.views:
         one = stereo.confirm(scene, raw, i)
@@ -82,7 +83,8 @@ def test_frames_with_many_disparities_are_reduced_and_still_match_the_scene(wall
     whole, limit = max(costs), 0.4 * max(costs)
     costs.clear()
     monkeypatch.setattr(correspondence, "MAX_COSTS", limit)
-    error, known = errors(walled, stereo.map_all(walled.images, walled.reconstruction))
+    scene = stereo.prepare(walled.images, walled.reconstruction)
+    error, known = errors(walled, confirmed_depth_maps(stereo, scene))
     # Margins of whole pixels add to the limit of so small an image.
     assert max(costs) < 1.2 * limit < whole
     assert np.median(error) < 0.002
@@ -117,7 +119,8 @@ def test_the_surroundings_of_a_view_are_enough_for_its_map(links):
 
 def test_one_baseline_gives_depth_though_nothing_is_seen_by_a_third_view():
     walled = make_walled(on_arc((-5.0, 5.0)))
-    error, known = errors(walled, STEREO.map_all(walled.images, walled.reconstruction))
+    scene = STEREO.prepare(walled.images, walled.reconstruction)
+    error, known = errors(walled, confirmed_depth_maps(STEREO, scene))
     assert known > 0.5
     assert np.median(error) < 0.003
 

@@ -8,6 +8,7 @@ import pytest
 from tests.stereo import hard_scenes as scenes
 from tests.stereo.depth_scenes import photograph_scene
 from thesisrecon.config import preset
+from thesisrecon.dense_model import confirmed_depth_maps
 
 DEFAULT, THESIS = (preset(name).dense for name in ("default", "thesis"))
 BOTH = pytest.mark.parametrize("stereo", [DEFAULT, THESIS], ids=["default", "thesis"])
@@ -26,7 +27,7 @@ def shares(scene, maps):
 
 
 def solve(stereo, scene):
-    return shares(scene, stereo.map_all(scene.images, scene.reconstruction))
+    return shares(scene, confirmed_depth_maps(stereo, stereo.prepare(scene.images, scene.reconstruction)))
 
 
 @BOTH
@@ -94,7 +95,7 @@ def test_an_unrelated_view_stays_unregistered_and_does_no_harm(stereo):
     scene = scenes.of_elsewhere()
     prepared = stereo.prepare(scene.images, scene.reconstruction)
     assert prepared.neighbours[3] == ()
-    maps = stereo.map_all(scene.images, scene.reconstruction)
+    maps = confirmed_depth_maps(stereo, prepared)
     assert np.isnan(maps[3].depth).all()
     assert not maps[3].views.any()
     r = scene.reconstruction
@@ -105,7 +106,7 @@ def test_an_unrelated_view_stays_unregistered_and_does_no_harm(stereo):
 @BOTH
 def test_a_photograph_far_smaller_than_the_others(stereo):
     scene = scenes.far_smaller(0.15)
-    maps = stereo.map_all(scene.images, scene.reconstruction)
+    maps = confirmed_depth_maps(stereo, stereo.prepare(scene.images, scene.reconstruction))
     known, wrong, _ = shares(scene, {i: maps[i] for i in range(3)})
     assert known > 0.6
     assert wrong < 0.01

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
@@ -19,6 +18,7 @@ from thesisrecon.epipolar._planes import OFF_PLANE, find_dominant_plane, fundame
 from thesisrecon.epipolar._refinement import SAMPSON, epipolar_distance_std, refine
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.kernels import empty, kernel, zeros
+from thesisrecon.numerics._noise import student_factor
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
 NEIGHBOURS = 5
@@ -47,7 +47,6 @@ MIN_GAIN = 0.05
 # Distance from epipolar lines that is relevant, px, or 2 sigma if that is larger.
 MAX_ERROR_PX = 1.0
 # Two-sided 95 % quantile of a normal variable.
-NORMAL_95 = 1.96
 # Fraction of neighbours that contradict a match, maximum fraction of contradicted matches, and sample size.
 CONTRADICTED, MAX_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
 
@@ -249,7 +248,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
             f"misses {other.lost:.0f} of its inliers"
         )
     # Few matches estimate their own noise: Student's quantile instead of the normal one.
-    allowed_px = error_px * float(scipy.special.stdtrit(max(fit.inliers.sum() - 7, 1), 0.975)) / NORMAL_95
+    allowed_px = error_px * student_factor(max(int(fit.inliers.sum()) - 7, 1))
     if not allowed_px <= relevant_px:
         reasons.append(f"the covariance of F allows epipolar line errors of {allowed_px:.2g} px")
     return DegeneracyReport(

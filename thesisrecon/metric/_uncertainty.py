@@ -16,12 +16,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.metric._adjustment import BundleAdjustment, HierarchicalPrior
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.numerics._block_scatter import BlockScatter
+from thesisrecon.numerics._noise import student_factor
 from thesisrecon.records import IntrinsicInterval
 
 USUAL_INFLATION = 4.0
@@ -46,7 +46,6 @@ MIN_SPREAD_SIGMAS = 0.3
 """Lower bound of tau in units of the noise: a few values can agree by chance."""
 UNVERIFIED_SHARING = "shared focal length that the images cannot verify: small zoom differences allowed for"
 CAMERA_MODEL = "bundle adjustment; the interval contains the difference to a richer camera model"
-NORMAL_95 = 1.959964
 _COLUMNS = {
     "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
     "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1],
@@ -283,4 +282,4 @@ def _inflation(scatter: BlockScatter, g: int, column: int) -> float:
     ratio = float(scatter.ratio[g, column])
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(ratio):
         return USUAL_INFLATION
-    return float(np.sqrt(ratio) * scipy.special.stdtrit(scatter.blocks - 1, 0.975) / NORMAL_95)
+    return float(np.sqrt(ratio) * student_factor(scatter.blocks - 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F64
 
@@ -20,6 +21,8 @@ def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
     return 2.0 * delta**2 * (root - 1.0), 1.0 / root
 
 
+NORMAL_95 = 1.959963984540054
+"""97.5 % quantile of the normal distribution."""
 # 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75), which is not consistent.
 MAD_FACTOR = 1.4826022185056018
 _RAYLEIGH_MEDIAN = 1.1774
@@ -31,6 +34,11 @@ _HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
 def noise_from_distances(distances: F64) -> float:
     """Standard deviation of a coordinate from lengths (N,) of residuals: their median by Rayleigh's."""
     return float(np.median(distances)) / _RAYLEIGH_MEDIAN
+
+
+def student_factor(dof: int) -> float:
+    """Student's 95 % quantile over the normal one; ``dof`` degrees of freedom estimate the noise."""
+    return float(scipy.special.stdtrit(dof, 0.975) / NORMAL_95)
 
 
 def next_inlier_limit(distance: F64, inliers: B8, limit: float, *, unknowns: int) -> float:

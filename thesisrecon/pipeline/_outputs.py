@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -111,7 +111,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         # The file of the model is written while that of the page is made.
         for_page = beside.submit(_model_for_page, result, max(run.workers.threads - 1, 1))
         if run.workers.threads == 1:
-            for_page.exception()  # waits
+            wait([for_page])
         colors, affine, warnings = _write_results(run.directory, result)
         run.warnings.extend(warnings)
         result = _described(run, result, until, failure)

@@ -354,31 +354,6 @@ class MultiViewStereo:
         order = sorted((j for j in common if common[j]), key=lambda j: (-common[j], j))
         return sorted(near | set(order[: max(self.min_comparison_views - len(near), 0)]))
 
-    def map_all(
-        self, images: Sequence[Image], reconstruction: Reconstruction, *, threads: int = 1
-    ) -> dict[int, DepthMap]:
-        """Compute the confirmed depth maps of all registered views.
-
-        Parameters
-        ----------
-        images : sequence of Image
-            The V images.
-        reconstruction : Reconstruction
-            Their metric reconstruction.
-        threads : int
-            Number of threads; the result does not depend on it.
-
-        Returns
-        -------
-        dict of int to DepthMap
-        """
-        scene = self.prepare(images, reconstruction, threads=threads)
-        order = sorted(scene.views)
-        with ThreadPoolExecutor(threads) as pool:
-            maps = pool.map(lambda i: self.depth_map(scene, i, pool=pool), order)
-            found = dict(zip(order, maps, strict=True))
-            return dict(zip(order, pool.map(lambda i: self.confirm(scene, found, i), order), strict=True))
-
 
 def _depth_map(view: PinholeView, found: InverseDepth, keep: B8) -> DepthMap:
     """Convert inverse depths to depths; those not kept or not significantly above 0 are unknown."""

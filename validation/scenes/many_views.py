@@ -22,6 +22,7 @@ from validation.scenes.courtyard import build_courtyard, build_yard
 from validation.scenes.image_files import write_png
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.raycast import trace
+from validation.scenes.real import Scene, read_scene
 from validation.scenes.sensor import take_image
 
 FOCAL_REL = 0.9
@@ -77,16 +78,23 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
         list(pool.map(write, missing))
 
 
-YARD = re.compile(r"yard-\d{1,4}")
+_YARD = re.compile(r"yard-(\d{1,4})")
+YARDS = Path(tempfile.gettempdir()) / "thesisrecon-yards"
 YARD_IMAGES, YARD_SIZE = 10, (960, 720)
 
 
-def yard_folder(seed: int) -> Path:
-    """The folder of images and true cameras of a yard, rendered on first use (a minute)."""
-    folder = Path(tempfile.gettempdir()) / "thesisrecon-yards" / f"yard-{seed}-{YARD_IMAGES}"
+def yard_number(name: str) -> int | None:
+    """N of "yard-N"; None if ``name`` is not of a yard."""
+    found = _YARD.fullmatch(name)
+    return None if found is None else int(found[1])
+
+
+def load_yard(number: int) -> Scene:
+    """Images and true cameras of a yard, rendered on first use (a minute)."""
+    folder = YARDS / f"yard-{number}-{YARD_IMAGES}"
     if not (folder / "cameras.json").is_file():
-        write_yard(folder, seed)
-    return folder
+        write_yard(folder, number)
+    return read_scene(folder, f"yard-{number}")
 
 
 def write_yard(folder: Path, seed: int) -> None:
@@ -113,7 +121,7 @@ STEREO_SIZE, STEREO_BASELINE_M = (480, 360), 0.3
 
 def stereo_yard_folder(seed: int) -> Path:
     """The folder of a rectified pair of a yard and its true disparities, rendered on first use."""
-    folder = Path(tempfile.gettempdir()) / "thesisrecon-yards" / f"stereo-{seed}"
+    folder = YARDS / f"stereo-{seed}"
     if not (folder / "disparity.npy").is_file():
         write_stereo_yard(folder, seed)
     return folder

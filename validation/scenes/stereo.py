@@ -11,7 +11,7 @@ from PIL import Image
 
 from thesisrecon.arrays import B8, F32, U8
 from validation.scenes.image_files import read_rgb
-from validation.scenes.many_views import YARD, stereo_yard_folder
+from validation.scenes.many_views import stereo_yard_folder, yard_number
 from validation.scenes.real import data_root
 
 STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
@@ -47,8 +47,9 @@ def stereo_folder(name: str) -> Path | None:
 
 def load_stereo_pair(name: str) -> StereoPair | None:
     """One of ``STEREO_PAIRS``, None if its files are not on this machine; or a rendered yard, "yard-N"."""
-    if YARD.fullmatch(name):
-        return _yard(stereo_yard_folder(int(name.rpartition("-")[2])), name)
+    yard = yard_number(name)
+    if yard is not None:
+        return _yard(stereo_yard_folder(yard), name)
     folder = stereo_folder(name)
     if folder is None:
         return None

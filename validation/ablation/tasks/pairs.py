@@ -19,8 +19,8 @@ from thesisrecon.pipeline._image_pair import match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place, Task
 from validation.metrics.epipolar import rms_epipolar_distance
-from validation.scenes.many_views import YARD, yard_folder
-from validation.scenes.real import Scene, load_fixture_scene, load_real_scene, read_scene
+from validation.scenes.many_views import load_yard, yard_number
+from validation.scenes.real import Scene, load_fixture_scene, load_real_scene
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs
 from validation.studies.front_end_pairs import MAX_SIZE_PX, Related
 
@@ -51,7 +51,7 @@ class ImagePairs(Task):
 
     def check(self, scene: str) -> None:
         name, _, first = scene.rpartition("/")
-        if not (name in _SCENES or YARD.fullmatch(name)) or not first.isdecimal():
+        if not (name in _SCENES or yard_number(name) is not None) or not first.isdecimal():
             raise UsageError(unknown_word("pair", scene, [f"{s}/0" for s in _SCENES]))
         found = _load(name)
         if found is None:
@@ -88,9 +88,10 @@ def numbers_of_pair(
 def _load(name: str) -> Scene | None:
     if name == _COURTYARD:
         return load_fixture_scene(name)
-    if not YARD.fullmatch(name):
+    yard = yard_number(name)
+    if yard is None:
         return load_real_scene(name)
-    scene = read_scene(yard_folder(int(name.rpartition("-")[2])), name)
+    scene = load_yard(yard)
     K, R, C = scene.cameras
     order = np.argsort(C[:, 0])
     return Scene(name, tuple(scene.image_paths[k] for k in order), K[order], R[order], C[order])

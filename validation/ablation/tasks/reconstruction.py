@@ -23,8 +23,8 @@ from validation.ablation.tasks.windows import window_names, window_parts, window
 from validation.harness.records import ReportOptions
 from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
-from validation.scenes.many_views import YARD, yard_folder
-from validation.scenes.real import Scene, read_scene
+from validation.scenes.many_views import load_yard, yard_number
+from validation.scenes.real import Scene
 
 SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
     "features": ("images", "features"),
@@ -140,8 +140,9 @@ def _images(scene: str) -> tuple[Path, ...]:
 def _load(scene: str) -> Scene:
     """The images of a whole scene by its name or its folder; :class:`UsageError` if there are none."""
     scene = window_parts(scene)[0]
-    if YARD.fullmatch(scene):
-        return read_scene(yard_folder(int(scene.rpartition("-")[2])), scene)
+    yard = yard_number(scene)
+    if yard is not None:
+        return load_yard(yard)
     folder = Path(scene)
     named = {} if scene in IMAGE_SCENES or not folder.is_dir() else {scene: str(folder)}
     if scene not in IMAGE_SCENES and not named:

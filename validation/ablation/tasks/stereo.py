@@ -15,7 +15,7 @@ from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place, Task
 from validation.ablation.tasks.windows import window_names, window_parts, window_slice
 from validation.metrics.depth import bad_pixels
-from validation.scenes.many_views import YARD
+from validation.scenes.many_views import yard_number
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 
@@ -40,7 +40,7 @@ class RectifiedPairs(Task):
 
     def check(self, scene: str) -> None:
         name = self.scene_of(scene)
-        if name not in STEREO_PAIRS and not YARD.fullmatch(name):
+        if name not in STEREO_PAIRS and yard_number(name) is None:
             raise UsageError(unknown_word("scene", name, STEREO_PAIRS))
         if load_stereo_pair(name) is None:
             raise UsageError(f"the pair {name} is not on this machine (THESISRECON_DATA; scikit-image)")

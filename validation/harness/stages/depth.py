@@ -12,6 +12,7 @@ import PIL.Image
 
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import preset
+from thesisrecon.dense_model import confirmed_depth_maps
 from thesisrecon.io._files import write_text
 from thesisrecon.io._images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
@@ -83,7 +84,8 @@ class DepthStage(Stage):
         dense = preset(PRESETS[task.method]).dense
         assert isinstance(dense, MultiViewStereo)
         start = time.process_time()
-        maps = replace(dense, max_side=side_of(options)).map_all(images, model, threads=1)
+        dense = replace(dense, max_side=side_of(options))
+        maps = confirmed_depth_maps(dense, dense.prepare(images, model))
         seconds = time.process_time() - start
         place = options.place(task.stage, task.scene, task.method)
         for view, m in maps.items():
