@@ -46,7 +46,6 @@ MIN_MARGIN = 3.0
 MIN_GAIN = 0.05
 # Distance from epipolar lines that is relevant, px, or 2 sigma if that is larger.
 MAX_ERROR_PX = 1.0
-# Two-sided 95 % quantile of a normal variable.
 # Fraction of neighbours that contradict a match, maximum fraction of contradicted matches, and sample size.
 CONTRADICTED, MAX_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
 

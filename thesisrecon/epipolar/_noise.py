@@ -159,8 +159,10 @@ def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
     numbers = np.zeros(len(xy1), dtype=np.int64)
     for xy in (xy1, xy2):
         x, y = np.floor(xy / _SAME_PX).astype(np.int64).T
-        _, cell, count = np.unique(x * 1_000_003 + y, return_inverse=True, return_counts=True)
-        numbers = np.maximum(numbers, count[cell])
+        cell = x * 1_000_003 + y
+        ordered = np.sort(cell)
+        count = np.searchsorted(ordered, cell, "right") - np.searchsorted(ordered, cell, "left")
+        numbers = np.maximum(numbers, count)
     return np.asarray(1.0 / numbers)
 
 

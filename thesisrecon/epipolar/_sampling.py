@@ -329,10 +329,10 @@ def search_fundamental(
 ) -> int:
     """Score a seven-point sample per row of ``uniforms`` (B, 7); returns the number of samples drawn.
 
-    The search ends with the batch that finds a better ``F`` or when enough samples are drawn. ``columns``
-    (4, N) are ``points`` too. ``stop``: samples drawn before, minimum number, probability of a sample without
-    outliers. ``state`` (4,): best score, its inlier ratio, points seen and points inside the gate of rejected
-    models.
+    The search ends with the batch that finds a better ``F`` or when enough samples are drawn. Samples are of
+    ``points``, scores are on ``columns`` (4, N). ``stop``: samples drawn before, minimum number, probability
+    of a sample without outliers. ``state`` (4,): best score, its inlier ratio, points seen and points inside
+    the gate of rejected models.
     """
     done, least, confidence = stop
     X, Y = full((28, LANES), 1.0), empty((ROWS, LANES))
@@ -352,7 +352,7 @@ def search_fundamental(
             for k in range(seven_point_batch_solutions(Y, lane, work, solutions)):
                 score, inliers, seen = truncated_score(solutions[k], columns, gate, state[0], evidence)
                 if score < state[0]:
-                    state[0], state[1] = score, inliers / len(points)
+                    state[0], state[1] = score, inliers / columns.shape[1]
                     copy_to(F, solutions[k])
                 else:
                     state[2] += seen

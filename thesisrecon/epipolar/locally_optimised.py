@@ -41,6 +41,13 @@ FEW_MATCHES = 28.0
 # Standard deviations that contain nearly all noise.
 COVERED = 3.0
 COMPETING = 3
+# Distances in gates at which noise decides whether a match is inside. Two searches that end in one minimum
+# differ by about the square root of the number of such matches.
+NEAR_GATE = 0.7, 1.3
+# Distances are truncated at this many gates when two F are compared.
+FAR = 20.0
+# Samples of a round among the matches near an F, what is near in gates, and the most rounds.
+NEAR_SAMPLES, NEAR_INLIERS, MOST_ROUNDS = 256, 3.0, 10
 # Gate of the second search, and width of the ring beyond the noise that is examined, in gates.
 WIDER, RING = 4.0, 15.0
 # Fraction of the inliers by which the ring must exceed the expected count to repeat the search.
@@ -54,7 +61,8 @@ class LocallyOptimisedRansac:
 
     A search draws samples until one without outliers is likely; its best F is refined by Levenberg-Marquardt
     on the Sampson distances (5.4) with Huber's loss. Searches are repeated until ``starts`` of them end at
-    the best score: they disagree if a plane or a repeated pattern has many inliers.
+    the best score: they disagree if a plane or a repeated pattern has many inliers, or if few matches are
+    right. Then each search continues with samples of the matches near its F, an inner RANSAC [2]_.
 
     The best F is refined once more with a loss fitted to its residuals: a mixture of noise, its heavier tail
     and wrong matches gives the inlier limit and the best width of Huber's loss. If more matches than expected
@@ -90,9 +98,9 @@ class LocallyOptimisedRansac:
     threshold_px: float = 1.0
     confidence: float = 0.9999
     starts: int = 3
-    max_starts: int = 16
+    max_starts: int = 10
     min_samples: int = 4000
-    max_samples: int = 100000
+    max_samples: int = 60000
     gates: tuple[float, ...] = (2.0, 1.5, 1.0)
     inlier_sigmas: float = np.inf
     inlier_floor_px: float = 0.3
@@ -124,34 +132,53 @@ class LocallyOptimisedRansac:
 
     def _best_of_searches(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         ends, samples = self._repeat_search(points, gate, rng)
-        f, others = _best_and_competing(ends, SAME_SCORE * len(points) ** 0.5)
+        f, others = _best_and_competing(ends, points, gate)
         noise, loss = _refine_to_noise(f, points, gate) if f.any() else (None, (0.0, 0.0))
         return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, others)
 
     def _repeat_search(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
-        """Score and F (9,) of each search until enough agree, and the number of samples."""
+        """Score and F (9,) of each search until enough agree, and the number of samples.
+
+        If the first searches disagree, these and all later ones continue among the matches near their F.
+        """
         found: list[tuple[float, F64]] = []
         samples = 0
-        for _ in range(self.max_starts):
+        for k in range(self.max_starts):
             shuffled = points[rng.permutation(len(points))]
             columns = np.ascontiguousarray(shuffled.T)
             f, drawn = self._search(shuffled, columns, gate, rng)
             samples += drawn
             if f.any():
-                self._refine_start(f, shuffled, gate)
-                score, _, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
-                found.append((score * len(points), f))
-            best = min((score for score, _ in found), default=np.inf)
-            agreeing = sum(score - best < SAME_SCORE * len(points) ** 0.5 for score, _ in found)
-            if agreeing >= self.starts + (len(found) - agreeing) // 2 or samples >= self.max_samples:
+                if k >= self.starts:
+                    _search_among_inliers(f, shuffled, columns, gate, rng)
+                found.append(self._refine_start(f, shuffled, columns, gate))
+            if k + 1 == self.starts and not self._agree(found, points, gate):
+                for _, f in found:
+                    _search_among_inliers(f, shuffled, columns, gate, rng)
+                found = [self._refine_start(f, shuffled, columns, gate) for _, f in found]
+            if samples >= self.max_samples or self._agree(found, points, gate):
                 break
         return found, samples
 
-    def _refine_start(self, f: F64, points: F64, gate: float) -> None:
+    def _agree(self, found: list[tuple[float, F64]], points: F64, gate: float) -> bool:
+        """Whether enough searches end at the best score, up to what the matches near the gate decide."""
+        if len(found) < self.starts:
+            return False
+        best, f = min(found, key=lambda end: end[0])
+        ratio = np.asarray(sampson_distances(f, points)) / gate
+        near = np.count_nonzero((ratio > NEAR_GATE[0]) & (ratio < NEAR_GATE[1]))
+        same = max(SAME_SCORE * len(points) ** 0.5, near**0.5)
+        agreeing = sum(score - best < same and _coincide(f, other, points, gate) for score, other in found)
+        return agreeing >= self.starts + (len(found) - agreeing) // 2
+
+    def _refine_start(self, f: F64, points: F64, columns: F64, gate: float) -> tuple[float, F64]:
+        """Refine ``f`` in place; return its sum of truncated squares and itself."""
         for width in self.gates[:-1]:
             refine(f, points[:START_POINTS], SAMPSON, width * gate, KNEE * width * gate, START_STEPS)
         width = self.gates[-1]
         refine(f, points, SAMPSON, width * gate, KNEE * width * gate, LAST_STEPS)
+        score, _, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
+        return score * len(points), f
 
     def _search(self, points: F64, columns: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
@@ -227,17 +254,41 @@ def _refine_best(points: F64, columns: F64, gate: float, state: F64, f: F64) -> 
         f[:] = trial
 
 
-def _best_and_competing(ends: list[tuple[float, F64]], same: float) -> tuple[F64, list[F64]]:
-    """The F with the lowest score (0 without any) and the next ones, each at least ``same`` worse."""
-    best, last = np.zeros(9), -np.inf
-    competing_models: list[F64] = []
-    for score, f in sorted(ends, key=lambda end: end[0]):
-        if last == -np.inf:
-            best = f
-        elif score - last >= same and len(competing_models) < COMPETING:
-            competing_models.append(f)
-        last = score
-    return best, competing_models
+def _search_among_inliers(f: F64, points: F64, columns: F64, gate: float, rng: Generator) -> None:
+    """Improve ``f`` in place by samples of the matches near it until a round finds no better one."""
+    score, inliers, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
+    state = np.array([score, inliers / len(points), *PRIOR])
+    for _ in range(MOST_ROUNDS):
+        near = points[np.asarray(sampson_distances(f, points)) < NEAR_INLIERS * gate]
+        if len(near) < MINIMUM:
+            return
+        before, done, uniforms = state[0], 0, rng.random((NEAR_SAMPLES, 7))
+        while done < NEAR_SAMPLES:
+            score, stop = state[0], (done, NEAR_SAMPLES, 1.0)
+            done = search_fundamental(near, columns, uniforms[done:], gate, stop, state, f)
+            if state[0] < score:
+                _refine_best(points, columns, gate, state, f)
+        if not state[0] < before:
+            return
+
+
+def _coincide(f: F64, other: F64, points: F64, gate: float) -> bool:
+    """Whether the inliers of either F are near the other: their RMS distance is below the gate."""
+    distances = np.asarray(sampson_distances(f, points)), np.asarray(sampson_distances(other, points))
+    for mine, theirs in (distances, distances[::-1]):
+        far = np.minimum(theirs[mine < gate], FAR * gate)
+        if len(far) and np.mean(far**2) > gate**2:
+            return False
+    return True
+
+
+def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float) -> tuple[F64, list[F64]]:
+    """The F with the lowest score (0 without any), and the next ones that coincide with none before."""
+    chosen: list[F64] = []
+    for _, f in sorted(ends, key=lambda end: end[0]):
+        if len(chosen) <= COMPETING and not any(_coincide(g, f, points, gate) for g in chosen):
+            chosen.append(f)
+    return (chosen[0], chosen[1:]) if chosen else (np.zeros(9), [])
 
 
 def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
