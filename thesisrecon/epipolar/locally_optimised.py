@@ -169,7 +169,7 @@ class LocallyOptimisedRansac:
         near = np.count_nonzero((ratio > NEAR_GATE[0]) & (ratio < NEAR_GATE[1]))
         same = max(SAME_SCORE * len(points) ** 0.5, near**0.5)
         agreeing = sum(score - best < same and _coincide(f, other, points, gate) for score, other in found)
-        return agreeing >= self.starts + (len(found) - agreeing) // 2
+        return bool(agreeing >= self.starts + (len(found) - agreeing) // 2)
 
     def _refine_start(self, f: F64, points: F64, columns: F64, gate: float) -> tuple[float, F64]:
         """Refine ``f`` in place; return its sum of truncated squares and itself."""
