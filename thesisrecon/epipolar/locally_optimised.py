@@ -152,11 +152,13 @@ class LocallyOptimisedRansac:
                 if k >= self.starts:
                     _search_among_inliers(f, shuffled, columns, gate, rng)
                 found.append(self._refine_start(f, shuffled, columns, gate))
-            if k + 1 == self.starts and not self._agree(found, points, gate):
+            agreed = self._agree(found, points, gate)
+            if k + 1 == self.starts and not agreed:
                 for _, f in found:
                     _search_among_inliers(f, shuffled, columns, gate, rng)
                 found = [self._refine_start(f, shuffled, columns, gate) for _, f in found]
-            if samples >= self.max_samples or self._agree(found, points, gate):
+                agreed = self._agree(found, points, gate)
+            if agreed or samples >= self.max_samples:
                 break
         return found, samples
 
