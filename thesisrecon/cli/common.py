@@ -25,6 +25,7 @@ from thesisrecon.runtime._signals import CODES, REASONS, with_resume_advice
 DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
 _STAGE_LABELS = {
+    "frames": "frames of the video",
     "kernels": "compiling (first run)",
     "features": "corners",
     "pairs": "pair selection",

@@ -32,7 +32,16 @@ _DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
 def reconstruct(
     out: OutputFolder,
     images: Annotated[
-        Path | None, typer.Argument(parser=parse_folder, metavar="IMAGES", help="Folder of images.")
+        Path | None,
+        typer.Argument(
+            parser=parse_folder, metavar="IMAGES", help="Folder of images; with --every also a video."
+        ),
+    ] = None,
+    every: Annotated[
+        int | None,
+        typer.Option(
+            "--every", min=1, metavar="N", help="Take the sharpest of each N frames of a video or folder."
+        ),
     ] = None,
     source: Annotated[
         Path | None,
@@ -108,11 +117,11 @@ def reconstruct(
             raise UsageError(
                 "give the folder of the images, or --from DATABASE|SPARSE with or without --images"
             )
-        _run(images, out, seed, chosen | options)
+        _run(images, out, seed, chosen | options | {"every": every})
         return
-    if images is not None or chosen.pop("pairs") is not None:
+    if images is not None or chosen.pop("pairs") is not None or every is not None:
         raise UsageError(
-            "with --from the images are given by --images, and the pairs are those of the source"
+            "with --from the images are given by --images, and images and pairs are those of the source"
         )
     _run_from(source, out, seed, chosen | options | {"images": images_folder})
 

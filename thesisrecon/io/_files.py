@@ -24,6 +24,8 @@ MAX_TEXT_BYTES = 2**26
 """Far above any list of pairs, far below the memory of a computer."""
 _MAX_LINE = 2**14
 """Characters of a line of a pair list; two file names with folders are shorter on every system."""
+FRAMES_FOLDER = "00-frames"
+"""The frames of a video in a run folder, written before the run is identified by their pixels."""
 SPECIAL_FILE = "a pipe, a device or a socket"
 
 _CONTROL_CATEGORIES = ("Cc", "Zl", "Zp")

@@ -11,6 +11,7 @@ from thesisrecon._settings import Config, Pairs, Settings, build_config
 from thesisrecon.arrays import F64
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.intrinsics import IntrinsicsOptions
+from thesisrecon.io._frames import FrameSource
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
 from thesisrecon.io._masks import add_masks, check_masks_folder
 from thesisrecon.matching.pair_selection import ListedPairs
@@ -32,6 +33,7 @@ def reconstruct(
     pairs: Pairs | None = None,
     set: Settings = (),
     masks: str | Path | None = None,
+    every: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Unpack[RunOptions],
@@ -41,7 +43,7 @@ def reconstruct(
     Parameters
     ----------
     images : path, or sequence of path, ndarray (H, W) or (H, W, 3) uint8, or Image
-        A folder, or the images.
+        A folder, or the images; with ``every`` a video (extra ``video``) or a folder of frames.
     out : path
         Output folder: created if missing, resumed if it holds the same run.
     config : PipelineConfig, str or path, optional
@@ -59,6 +61,8 @@ def reconstruct(
     masks : path, optional
         Folder of masks: the black pixels of ``NAME.png``, or of a file like the image with any suffix, give
         no features, no depth and no texture. Images without one are used as a whole.
+    every : int, optional
+        Take the sharpest of each ``every`` frames; those of a video are written to ``out/00-frames``.
     seed : int
         Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
         workers.
@@ -100,28 +104,53 @@ def reconstruct(
         config, preset=preset, max_size=max_size, cameras=cameras, pairs=pairs, settings=set
     )
     until, run, overwrite = start_run(out, chosen, seed, progress, options)
+    frames = None if every is None else _frame_source(images, every, run)
     if isinstance(images, str | Path):
-        if not list_images(Path(images)):
+        if Path(images).is_file() and frames is None:
+            raise UsageError(
+                f"{images} is a file; give a folder of images, or a video and --every N (every=N)"
+            )
+        if frames is None and not list_images(Path(images)):
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
         run.title = scene_name(Path(images)) or run.title
-    run.images_folder = images_folder(images)
+    run.images_folder = images_folder(images) if frames is None else frames.home(run.directory.path)
     if masks is not None:
         run.masks_folder = check_masks_folder(Path(masks), run.images_folder)
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
-    with claimed(run, overwrite=overwrite):
-        inputs = _read_inputs(run, images, None if masks is None else Path(masks))
+    source = None if frames is None else frames.identity
+    with claimed(run, overwrite=overwrite, source=source):
+        inputs = _read_inputs(
+            run, images if frames is None else frames, None if masks is None else Path(masks)
+        )
         listed = run.config.pairs
         if isinstance(listed, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
             listed.check([image.name for image in inputs.images], inputs.refused)
         state = PipelineState(run, inputs, empty_result(run, inputs), until)
-        run.directory.adopt(identity_of(run, inputs), overwrite=overwrite, results=RESULT_FILES)
+        run.directory.adopt(identity_of(run, inputs, source), overwrite=overwrite, results=RESULT_FILES)
         return run_steps(state, STEPS[until], surface_required=surface_required)
 
 
-def _read_inputs(run: Run, images: ImageSource, masks: Path | None) -> ImageSet:
+def _frame_source(images: ImageSource, every: int, run: Run) -> FrameSource:
+    if not isinstance(images, str | Path):
+        raise UsageError("every needs a video or a folder of frames, not a list of images")
+    if isinstance(run.config.pairs, ListedPairs):
+        raise UsageError(
+            "pairs by name cannot be combined with every, which chooses the images; use window:N"
+        )
+    return FrameSource(Path(images), every)
+
+
+def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None) -> ImageSet:
+    warnings: list[str] = []
+    counts: dict[str, int] = {}
     with run.clock("images"):
+        if isinstance(images, FrameSource):
+            out, workers = run.directory.path, run.workers
+            images, counts["frames"], warnings = images.choose(
+                out, threads=workers.threads, map_all=workers.map_all, progress=run.progress
+            )
         size = run.config.images.max_size_px
         inputs = read_images(images, max_size_px=size, map_all=run.workers.map_all)
         unused: list[str] = []
@@ -130,12 +159,13 @@ def _read_inputs(run: Run, images: ImageSource, masks: Path | None) -> ImageSet:
     found, refused = len(inputs.decoded), len(inputs.refused)
     if found + refused == 0:
         raise UsageError("no images")
-    warnings = [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
+    warnings += [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
     warnings += [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
-    warnings += unused
+    # The masks of frames that were not chosen are no mistake.
+    warnings += unused if not counts else []
     warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
     masked = sum(image.mask is not None for image in inputs.images)
-    counts = {"read": found, "refused": refused} | ({"masked": masked} if masked else {})
+    counts |= {"read": found, "refused": refused} | ({"masked": masked} if masked else {})
     run.finish("images", counts=counts, warnings=warnings)
     return inputs
 

@@ -215,7 +215,7 @@ def start_run(
     """Check the options of a call; return the last stage, the run and whether to overwrite another."""
     unknown = sorted(set(options) - set(RunOptions.__annotations__))
     if unknown:
-        others = ("config", "preset", "max_size", "cameras", "pairs", "set", "masks", "seed")
+        others = ("config", "preset", "max_size", "cameras", "pairs", "set", "masks", "every", "seed")
         known = (*RunOptions.__annotations__, *others)
         raise TypeError(unknown_word("option of reconstruct", unknown[0], known))
     until: Until = options.get("until") or "model"

@@ -23,7 +23,15 @@ import numpy as np
 
 from thesisrecon import records
 from thesisrecon.errors import OutputError, UsageError
-from thesisrecon.io._files import as_read, is_partial, link, read_json, write_atomically, write_json
+from thesisrecon.io._files import (
+    FRAMES_FOLDER,
+    as_read,
+    is_partial,
+    link,
+    read_json,
+    write_atomically,
+    write_json,
+)
 from thesisrecon.records import StageReport
 
 FORMAT = 2
@@ -243,7 +251,7 @@ class RunDirectory:
         """Whether the folder holds another run."""
         there = read_json(self.path / RUN_FILE)
         if there is None:
-            strange = sorted(p.name for p in self.path.iterdir() if p.name != LOCK_FILE)
+            strange = sorted(p.name for p in self.path.iterdir() if p.name not in (LOCK_FILE, FRAMES_FOLDER))
             if strange and RUN_FILE not in strange and not all(map(is_partial, strange)):
                 foreign = f"{strange[0]!r}, which thesisrecon did not create; choose an empty or a new folder"
                 raise UsageError(f"the output folder {self.path} holds {foreign}")

@@ -1,0 +1,165 @@
+"""The sharpest frame of each window of N frames, of a video or of a folder of frames.
+
+The focus measure is the variance of the Laplacian (Pech-Pacheco et al., "Diatom autofocusing in brightfield
+microscopy", ICPR 2000) of the smoothed image, relative to the variance of its grey levels: brightness and
+contrast do not change it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+from scipy.ndimage import gaussian_laplace
+
+from thesisrecon.errors import UsageError, counted
+from thesisrecon.io._exports import write_image
+from thesisrecon.io._files import FRAMES_FOLDER, printable, read_json, write_json
+from thesisrecon.io._images import decode_file, list_images
+from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
+
+_CHOICE = "frames.json"
+_MEASURED_SIDE = 1024
+_CONTRAST_FLOOR = 64.0
+"""Squared grey levels: the noise of a dark frame is not sharpness."""
+_UPRIGHT = {turn: EXIF_TRANSFORMS[k] for turn, k in ((90, 8), (-90, 6), (180, 3), (-180, 3))}
+"""Transform to the upright image by the rotation (degrees, counter-clockwise) that a video states."""
+_INSTALL = 'install the extra video (pip install "thesisrecon[video]"), or give a folder of its frames'
+MapAll = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """A video or a folder of frames, from which the sharpest of each ``every`` frames is taken."""
+
+    path: Path
+    every: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.every, int) or isinstance(self.every, bool) or self.every < 1:
+            raise UsageError(f"every must be a whole number of frames of at least 1; got {self.every!r}")
+        if not self.video and not list_images(self.path):
+            raise UsageError(f"there are no frames in {self.path} (subfolders are not searched)")
+
+    @cached_property
+    def video(self) -> bool:
+        """Whether the source is a file."""
+        return self.path.is_file()
+
+    @cached_property
+    def identity(self) -> dict[str, str]:
+        """Name and digest; equal digests give the same frames under the same names."""
+        content = hashlib.sha256(f"{self.every}".encode())
+        for path in [self.path] if self.video else list_images(self.path):
+            content.update(f"{path.name} ".encode(errors="replace"))
+            # Unreadable files are refused when they are decoded; a pipe would block here.
+            with suppress(OSError):
+                if path.is_file():
+                    with path.open("rb") as stream:
+                        content.update(hashlib.file_digest(stream, "sha256").digest())
+        name = printable(self.path.absolute().name)
+        return {"name": f"every {self.every} of {name}", "digest": content.hexdigest()}
+
+    def home(self, out: Path) -> Path:
+        """The folder of the chosen frames; those of a video are written to the run folder ``out``."""
+        return (out / FRAMES_FOLDER if self.video else self.path).absolute()
+
+    def choose(
+        self,
+        out: Path,
+        *,
+        threads: int = 1,
+        map_all: MapAll = map,
+        progress: Progress = lambda *_: None,
+    ) -> tuple[list[Path], int, list[str]]:
+        """Return the chosen frames, the number of all frames, and warnings, as ``out`` records them."""
+        record, home = out / FRAMES_FOLDER / _CHOICE, self.home(out)
+        digest, known = self.identity["digest"], read_json(record)
+        unchanged = isinstance(known, dict) and known.get("digest") == digest
+        if not unchanged or not all((home / name).is_file() for name in known["names"]):
+            names, total, warnings = (
+                self._write_frames(home, threads, progress) if self.video else self._listed_frames(map_all)
+            )
+            known = {"digest": digest, "names": names, "total": total, "warnings": warnings}
+            write_json(record, known)
+        return [home / name for name in known["names"]], known["total"], known["warnings"]
+
+    def _listed_frames(self, map_all: MapAll) -> tuple[list[str], int, list[str]]:
+        paths = list_images(self.path)
+        sharpness = list(map_all(_file_sharpness, paths))
+        starts = range(0, len(paths), self.every)
+        best = [max(range(n, min(n + self.every, len(paths))), key=sharpness.__getitem__) for n in starts]
+        return [paths[n].name for n in best], len(paths), []
+
+    def _write_frames(self, home: Path, threads: int, progress: Progress) -> tuple[list[str], int, list[str]]:
+        """Decode the video and write the best frame of each window; two frames are in memory at a time."""
+        for old in list_images(home) if home.is_dir() else ():
+            old.unlink()
+        names: list[str] = []
+        warnings: list[str] = []
+        total = 0
+
+        def measured(numbered: tuple[int, tuple[Any, int]]) -> float:
+            nonlocal total
+            total = numbered[0] + 1
+            return _sharpness(numbered[1][0].to_image())
+
+        frames = enumerate(_decoded(self.path, threads, warnings))
+        for _, window in groupby(frames, key=lambda numbered: numbered[0] // self.every):
+            number, (frame, stated) = max(window, key=measured)
+            turn = _UPRIGHT.get(frame.rotation)
+            image = frame.to_image()
+            names.append(f"{self.path.stem}-{number:06d}.png")
+            write_image(home / names[-1], np.array(image if turn is None else image.transpose(turn)))
+            progress("frames", total, max(total, stated))
+        if not names:
+            raise UsageError(f"{self.path} contains no video frame that can be decoded")
+        return names, total, warnings
+
+
+def _sharpness(image: PIL.Image.Image) -> float:
+    grey = StoredImage(image).rows(0, image.height).convert("L")
+    levels = np.asarray(grey.reduce(-(-max(grey.size) // _MEASURED_SIDE)), dtype=np.float32)
+    return float(gaussian_laplace(levels, 1.0).var() / (levels.var() + _CONTRAST_FLOOR))
+
+
+def _file_sharpness(path: Path) -> float:
+    try:
+        return decode_file(path, _sharpness)
+    except UnusableImage:
+        return -1.0  # If all of a window are unreadable, one is taken and its reason reported.
+
+
+def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[Any, int]]:
+    """Frames of a video as PyAV gives them, with their stated number (0 = not stated); adds a warning."""
+    try:
+        av = import_module("av")
+    except ImportError:
+        raise UsageError(f"{path} is read as a video by PyAV: {_INSTALL}") from None
+    damaged = 0
+    try:
+        # A stream, since FFmpeg reads some names as addresses, and playlists name other files.
+        with path.open("rb") as stream, av.open(stream) as container:
+            if not container.streams.video:
+                raise UsageError(f"{path} contains no video frame that can be decoded")
+            video = container.streams.video[0]
+            video.thread_type, video.codec_context.thread_count = "AUTO", threads
+            for packet in container.demux(video):
+                try:
+                    yield from ((frame, video.frames) for frame in packet.decode())
+                except av.FFmpegError:
+                    damaged += 1
+    except (av.FFmpegError, OSError) as error:
+        raise UsageError(f"{path} cannot be read as a video: {error.strerror}") from None
+    if damaged:
+        warnings.append(f"{path.name}: {counted(damaged, 'packet')} of the video cannot be decoded")
