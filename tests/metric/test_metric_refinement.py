@@ -109,6 +109,17 @@ def test_a_fixed_principal_point_is_reported_as_assumed():
     assert interval.source == "assumed"
 
 
+def test_a_known_calibration_stays_and_gives_cameras_and_points():
+    scene = make_scene(sigma_px=0.3, seed=7)
+    known = {name: "known" for name in ("focal", "principal_point", "k1")}
+    options = IntrinsicsOptions(**known, focal_px=1500.0, principal_point_px=tuple(scene.K[0, :2, 2]))
+    result = run(scene, options=options)
+    assert result.trusted, result.failed_checks
+    np.testing.assert_array_equal(result.reconstruction.K[:, 0, 0], 1500.0)
+    assert result.intrinsics[0]["focal_px"].std == 0.0
+    assert centre_error(result, scene) < 2e-3
+
+
 def test_calibrated_resection_survives_half_wrong_points():
     scene = make_scene()
     rng = np.random.default_rng(0)

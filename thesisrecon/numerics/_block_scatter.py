@@ -108,11 +108,11 @@ def block_scatter(
     ratio = curvature * _block_ratio(system, C[tested], C, block)
     alone = curvature * _point_ratio(system, C[tested])
     valid = np.isfinite(ratio) & (alone > 0.0)
-    number, own = values.number, np.maximum(values.number, 0)
+    estimated, number = values.number >= 0, values.number
     return BlockScatter(
-        np.where(number >= 0, np.diag(C)[first + own], 0.0),
+        np.where(estimated, np.diag(C)[np.where(estimated, first + number, 0)], 0.0),
         _shared_variances(S, values, frame, views),
-        np.where(number >= 0, ratio[len(poses) + own], np.nan),
+        np.where(estimated, ratio[np.where(estimated, len(poses) + number, 0)], np.nan),
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )
@@ -132,9 +132,8 @@ def _linearise(
     linearize_metric(model, o, weighting, np.arange(width), none, weighted)
     first = POSE_DOF * (int(place.max()) + 1)
     number = values.number[cameras.group[o.view_index]]
-    column = np.concatenate(
-        [POSE_DOF * place[o.view_index][:, None] + np.arange(POSE_DOF), first + np.maximum(number, 0)], axis=1
-    )
+    poses = POSE_DOF * place[o.view_index][:, None] + np.arange(POSE_DOF)
+    column = np.concatenate([poses, np.where(number >= 0, first + number, 0)], axis=1)
     weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
     J = _sparse(weighted.A, column, first + values.size)
     B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
