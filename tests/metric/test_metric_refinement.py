@@ -111,7 +111,7 @@ def test_a_fixed_principal_point_is_reported_as_assumed():
 
 def test_a_known_calibration_stays_and_gives_cameras_and_points():
     scene = make_scene(sigma_px=0.3, seed=7)
-    known = {name: "known" for name in ("focal", "principal_point", "k1")}
+    known = dict.fromkeys(("focal", "principal_point", "k1"), "known")
     options = IntrinsicsOptions(**known, focal_px=1500.0, principal_point_px=tuple(scene.K[0, :2, 2]))
     result = run(scene, options=options)
     assert result.trusted, result.failed_checks
