@@ -44,12 +44,10 @@ need_packages() {
     </dev/null >/dev/null || echo "apt-get could not install ${missing[*]}; going on without them" >&2
 }
 
-# need_package EXTRAS: the virtual environment with the package (editable) and these extras.
+# need_package EXTRAS: the virtual environment with the package (editable) and these extras. pip works on one core: beside
+# the extras, which only developers need, the kernels are compiled.
 need_package() {
-  local extras="$1" python stamp wanted
-  stamp="$VENV/.thesisrecon-$(echo "${extras:-core}" | tr -c 'a-z\n' '-')"
-  wanted="$(sha256sum "$ROOT/pyproject.toml" | cut -d' ' -f1)"
-  [ -x "$VENV/bin/python" ] && [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$wanted" ] && return 0
+  local python compiling
   if [ ! -x "$VENV/bin/python" ]; then
     python="$(find_python)"
     if [ -z "$python" ]; then
@@ -62,9 +60,29 @@ need_package() {
     fi
     "$python" -m venv "$VENV" || fail "no virtual environment could be made in $VENV (Debian: python3-venv)"
   fi
-  echo "installing thesisrecon${extras:+ [$extras]} into $VENV"
-  "$VENV/bin/python" -m pip install -qq --no-compile --disable-pip-version-check \
-    -e "$ROOT${extras:+[$extras]}" </dev/null ||
+  is_installed "core" || pip_install "core" -e "$ROOT"
+  if [ -n "$1" ] && ! is_installed "$1"; then
+    "$VENV/bin/python" -P -c "import os
+from thesisrecon.runtime._precompilation import precompile
+precompile('model', os.cpu_count(), lambda *_: None)" &
+    compiling=$!
+    trap 'kill "$compiling" 2>/dev/null || true' EXIT
+    # By name: pip takes the installed package, and builds it no second time.
+    pip_install "$1" "thesisrecon[$1]"
+    wait "$compiling" || true
+    trap - EXIT
+  fi
+}
+
+# The file that states for which pyproject.toml a set of extras was installed.
+stamp() { echo "$VENV/.thesisrecon-${1//,/-}"; }
+wanted() { sha256sum "$ROOT/pyproject.toml" | cut -d' ' -f1; }
+is_installed() { [ -f "$(stamp "$1")" ] && [ "$(cat "$(stamp "$1")")" = "$(wanted)" ]; }
+
+# pip_install EXTRAS REQUIREMENT...
+pip_install() {
+  echo "installing thesisrecon [$1] into $VENV"
+  "$VENV/bin/python" -m pip install -qq --no-compile --disable-pip-version-check "${@:2}" </dev/null ||
     fail "pip could not install the package; its message stands above"
-  echo "$wanted" >"$stamp"
+  wanted >"$(stamp "$1")"
 }

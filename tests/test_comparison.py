@@ -87,8 +87,10 @@ def test_validation_measures_the_same(tmp_path):
     assert min(summary["focal_error_rel"]["median"], summary["centre_error"]["mean"]) > 1e-3
 
 
+@pytest.mark.references
 def test_pycolmap_aligns_in_the_same_way(truth):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     model = changed(truth, noisy)
     found = compare_models(model, truth)
     source, target = (np.array([view.centre for view in m.views]) for m in (model, truth))

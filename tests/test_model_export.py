@@ -64,7 +64,8 @@ def pixels_of(path):
 
 
 def read_colmap(folder):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     model = pycolmap.Reconstruction(folder / "sparse" / "0")
 
     def reader(image):
@@ -180,7 +181,8 @@ def read_bundler(folder):
 
 
 def read_opencv(folder):
-    cv2 = pytest.importorskip("cv2")
+    import cv2
+
     file, found = cv2.FileStorage(str(folder / "poses.yml"), cv2.FILE_STORAGE_READ), {}
     poses = file.getNode("images")
     for i in range(poses.size()):
@@ -197,19 +199,19 @@ def read_opencv(folder):
     return found
 
 
-UNDISTORTED = {
-    "colmap-undistorted": read_colmap,
-    "nerfstudio": read_nerfstudio,
-    "openmvs": read_openmvs,
-    "bundler": read_bundler,
-}
-
-
-@pytest.mark.parametrize("to", UNDISTORTED)
-def test_undistorted_exports_project_known_points(tmp_path, images, to):
+@pytest.mark.parametrize(
+    ("to", "read"),
+    [
+        pytest.param("colmap-undistorted", read_colmap, marks=pytest.mark.references),
+        ("nerfstudio", read_nerfstudio),
+        ("openmvs", read_openmvs),
+        ("bundler", read_bundler),
+    ],
+)
+def test_undistorted_exports_project_known_points(tmp_path, images, to, read):
     model = make_model(BARREL, PINCUSHION)
     export(model, tmp_path / "out", to=to, images=images)
-    found = UNDISTORTED[to](tmp_path / "out")
+    found = read(tmp_path / "out")
     for view in model.views:
         name = WRITTEN[view.name].replace(" ", "_") if to == "bundler" else WRITTEN[view.name]
         project, (width, height) = found[name]
@@ -315,6 +317,7 @@ def test_the_masks_of_a_run_are_exported_with_it(tmp_path, capsys):
     assert len(list((tmp_path / "d" / "masks").iterdir())) == len(names)
 
 
+@pytest.mark.references
 @pytest.mark.parametrize(("to", "read"), [("colmap", read_colmap), ("opencv", read_opencv)])
 def test_exports_with_distortion_project_known_points(tmp_path, to, read):
     model = make_model(BARREL, PINCUSHION)
@@ -376,6 +379,7 @@ def test_a_colmap_model_is_an_input_and_equal_cameras_are_shared(tmp_path, image
     np.testing.assert_array_equal(body["rgb"], model.colors)
 
 
+@pytest.mark.references
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_result_is_exported_with_or_without_its_folder(tmp_path, kept):
     run = reconstruct(fakes.photographs(4), tmp_path / "run", config=fakes.fake_config(), until="metric")
@@ -390,6 +394,7 @@ def test_a_result_is_exported_with_or_without_its_folder(tmp_path, kept):
         export(result, tmp_path / "out", to="nerfstudio")
 
 
+@pytest.mark.references
 def test_skew_is_resampled_away_or_refused(tmp_path, images):
     model = make_model(PINCUSHION, PINCUSHION, skew=3.0)
     export(model, tmp_path / "out", to="colmap-undistorted", images=images)

@@ -17,8 +17,8 @@ BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re
 GIVEN = {"until": "matches", "max_size": 400}
 
 
+@pytest.mark.references
 def test_opencv_sift_is_a_matching_function(tmp_path):
-    pytest.importorskip("cv2", reason="OpenCV comes with the extra validation")
     definition, call = BLOCKS[0].split("result = ")
     scope = {"__name__": "__main__"}
     exec(definition, scope)

@@ -61,16 +61,18 @@ def test_images_give_cameras_and_a_projected_point(finished):
     assert np.median(np.linalg.norm(finished["distance"], axis=1)) < 0.2
 
 
+@pytest.mark.references
 def test_own_matches_give_the_focal_length(place, monkeypatch):
-    pytest.importorskip("cv2", reason="OpenCV is in the extra validation")
     camera = run("Own matches to a metric model", place, monkeypatch)["result"].cameras[0]
     assert camera.K[0, 0] == pytest.approx(FOCAL_PX, rel=2e-3)
     assert abs(camera.K[0, 0] - FOCAL_PX) < 2 * camera.std["focal_px"]
 
 
+@pytest.mark.references
 @pytest.mark.usefixtures("finished")
 def test_colmap_s_database_and_model_are_calibrated_again(place, monkeypatch, capsys):
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is in the extra validation")
+    import pycolmap
+
     database, mode = place / "database.db", pycolmap.CameraMode.SINGLE
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.sift.max_num_features = 640, 2000

@@ -50,6 +50,7 @@ def export(folder, reconstruction, *, scale=1.0, names=NAMES):
     )  # fmt: skip
 
 
+@pytest.mark.references
 @pytest.mark.parametrize(
     ("k", "aspect", "kind"),
     [
@@ -62,7 +63,8 @@ def export(folder, reconstruction, *, scale=1.0, names=NAMES):
 )
 @pytest.mark.parametrize("scale", [1.0, 2.0])
 def test_pycolmap_projects_as_we_do(tmp_path, k, aspect, kind, scale):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     ours = scene(k=k, aspect=aspect)
     assert export(tmp_path, ours, scale=scale) == 0
     theirs = pycolmap.Reconstruction(tmp_path)
@@ -109,8 +111,10 @@ def test_reading_restores_the_export(tmp_path):
     assert (np.diff(back.tracks.point_index * V + back.tracks.view_index) > 0).all()
 
 
+@pytest.mark.references
 def test_views_of_a_group_share_a_camera_only_where_their_intrinsics_agree(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     ours = scene()
     K, P = ours.K.copy(), ours.P.copy()
     K[1, 0, 0] = K[1, 1, 1] = 650.0
@@ -128,8 +132,10 @@ def test_a_model_with_skew_is_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.references
 def test_a_model_without_points_is_written(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     export(tmp_path, replace(scene(), valid=np.zeros(N, bool)))
     theirs = pycolmap.Reconstruction(tmp_path)
     assert (theirs.num_reg_images(), theirs.num_points3D()) == (4, 0)

@@ -66,9 +66,11 @@ def rig_model(pycolmap):
     return model, X
 
 
+@pytest.mark.references
 @pytest.mark.parametrize("text", [True, False])
 def test_a_rig_with_cameras_of_all_kinds_is_read_as_pycolmap_reads_it(tmp_path, text):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     theirs, X = rig_model(pycolmap)
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     (theirs.write_text if text else theirs.write_binary)(tmp_path / "sparse" / "0")
@@ -100,8 +102,10 @@ def test_a_rig_with_cameras_of_all_kinds_is_read_as_pycolmap_reads_it(tmp_path, 
         np.testing.assert_allclose(ours.xy[here, 0], 10.0 * np.arange(3) + view.camera - 0.5)
 
 
+@pytest.mark.references
 def test_tangential_distortion_is_of_another_kind(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     export(tmp_path, scene(k=(-0.1, 0.05, -0.02)))
     model = pycolmap.Reconstruction(tmp_path)
     model.cameras[1].params = [*model.cameras[1].params[:6], 1e-4, *model.cameras[1].params[7:]]
@@ -179,6 +183,7 @@ def test_other_paths_are_refused(tmp_path):
     refuses(UsageError, "is not a UTF-8 text", read_model, tmp_path / "images.bin")
 
 
+@pytest.mark.references
 @pytest.mark.parametrize(
     ("file", "old", "new", "words"),
     [
@@ -191,7 +196,8 @@ def test_other_paths_are_refused(tmp_path):
     ],
 )
 def test_a_damaged_text_model_is_refused(tmp_path, file, old, new, words):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     export(tmp_path / "binary", scene())
     pycolmap.Reconstruction(tmp_path / "binary").write_text(tmp_path)
     path = tmp_path / f"{file}.txt"
