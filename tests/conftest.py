@@ -1,5 +1,6 @@
 """Shared fixtures; files with slow tests start first, so that workers finish together."""
 
+import gc
 import logging
 import os
 
@@ -55,6 +56,12 @@ def refused(capsys):
         return said
 
     return run
+
+
+def pytest_collection_finish():
+    """Keep the objects that all tests have in common out of each search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items):

@@ -14,6 +14,8 @@ from typing import NamedTuple
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "thesisrecon"
 MODULES = sorted(PACKAGE.rglob("*.py"))
+PAGE = runpy.run_path(str(ROOT / "scripts" / "make_architecture"))
+tree_of = PAGE["tree_of"]
 STAGES = {
     "features", "matching", "epipolar", "projective", "selfcalibration", "metric", "stereo", "surface",
     "views",
@@ -43,11 +45,6 @@ GLOBAL_RANDOMNESS = {
     "seed", "rand", "randn", "random", "randint", "choice", "shuffle", "permutation", "normal",
 }  # fmt: skip
 MAX_KERNEL_ARGUMENTS = 8
-
-
-@cache
-def tree_of(path):
-    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 @cache
@@ -135,8 +132,7 @@ def test_chapters_export_nothing():
 
 def test_the_page_on_the_architecture_is_up_to_date():
     """``scripts/make_architecture`` writes it."""
-    script = runpy.run_path(str(ROOT / "scripts" / "make_architecture"))
-    assert script["PAGE"].read_text(encoding="utf-8") == script["page"]()
+    assert PAGE["PAGE"].read_text(encoding="utf-8") == PAGE["page"]()
 
 
 def test_array_types_are_defined_once():
