@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tests.io.test_colmap import export, scene
 from tests.report import synthetic
@@ -10,6 +11,8 @@ from thesisrecon import compare_models
 from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.io._models import read_model
 from thesisrecon.report._comparison import comparison_page
+
+pytestmark = pytest.mark.browser
 
 
 def test_all_points_are_in_view_although_the_reference_has_none(browser, tmp_path):
