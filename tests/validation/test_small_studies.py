@@ -14,15 +14,18 @@ import pytest
 
 from tests.fake_stages import CALLS, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import UsageError
 from thesisrecon.pipeline.reconstruction import reconstruct
 from validation.metrics.record import Metric
 from validation.scenes.many_views import walk
 from validation.studies import growth, timing
+from validation.studies.facades import KINDS, centre_error_mm, lens_error
 from validation.studies.growth import Cost, Meter
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
 from validation.studies.runner import MODULES, load_study, run_studies, run_study, study_parser, text_table
-from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, table_row, take_views
+from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, solve, table_row, take_views
 from validation.studies.timing import ratio_table, ratios_to_ours
 
 
@@ -214,3 +217,25 @@ def test_a_call_in_a_process_of_its_own_returns_its_answer():
     assert call_apart(exponent, [1.0, 10.0], [1.0, 100.0])[0] == pytest.approx(2.0)
     with pytest.raises(RuntimeError, match=r"ZeroDivisionError|ValueError"):
         call_apart(exponent, [], [])
+
+
+def test_lens_errors_of_facades_are_a_tenth_of_a_pixel_and_vanish_at_the_principal_point():
+    K = np.array([[900.0, 0.0, 404.0], [0.0, 900.0, 296.0], [0.0, 0.0, 1.0]])
+    xy = np.random.default_rng(0).uniform(0.0, (800.0, 600.0), (2000, 2))
+    for kind in KINDS:
+        moved = lens_error(kind, xy, K, np.random.default_rng(1))
+        rms = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+        assert 0.05 < rms < 0.5 if kind != "none" else rms == 0.0
+        if kind in ("decentring", "aspect"):
+            assert not lens_error(kind, K[None, :2, 2], K, np.random.default_rng(1)).any()
+    with pytest.raises(UsageError, match="lens error"):
+        lens_error("fisheye", xy, K, np.random.default_rng(1))
+
+
+def test_the_error_of_centres_is_after_a_similarity():
+    scene = make_scene(views=6, points=200)
+    subset = replace(matched_scene(), tracks=scene.tracks, pairs=true_pairs(scene), sizes=scene.sizes)
+    found, *_ = solve(subset, PipelineConfig(), seed=0, first=0)
+    assert centre_error_mm(found, 5.0 * scene.centres) < 0.05
+    spoiled = 5.0 * scene.centres + [[1e-3, 0.0, 0.0]] * np.array([1, 0, 0, 0, 0, -1])[:, None]
+    assert 0.2 < centre_error_mm(found, spoiled) < 0.5

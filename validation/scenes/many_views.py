@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import re
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from math import cos, pi, sin, tan
@@ -16,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.arrays import F32
+from thesisrecon.arrays import F32, F64
 from thesisrecon.io._files import write_atomically, write_json
-from validation.scenes.courtyard import build_courtyard, build_yard
+from validation.scenes.courtyard import build_courtyard, build_facade, build_yard
 from validation.scenes.image_files import write_png
 from validation.scenes.pose import Pose, look_at
-from validation.scenes.raycast import trace
+from validation.scenes.raycast import World, trace
 from validation.scenes.real import Scene, read_scene
 from validation.scenes.sensor import take_image
 
@@ -80,7 +81,7 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
 
 _YARD = re.compile(r"yard-(\d{1,4})")
 YARDS = Path(tempfile.gettempdir()) / "thesisrecon-yards"
-YARD_IMAGES, YARD_SIZE = 10, (960, 720)
+YARD_IMAGES, YARD_SIZE, FACADE_SIZE = 10, (960, 720), (800, 600)
 
 
 def yard_number(name: str) -> int | None:
@@ -99,21 +100,53 @@ def load_yard(number: int) -> Scene:
 
 def write_yard(folder: Path, seed: int) -> None:
     """Images and ``cameras.json`` of a yard of its own (:func:`build_yard`), seen by cameras of its own."""
-    world, poses = build_yard(seed), walk(YARD_IMAGES, YARD_SIZE, seed=1000 + seed)
+    poses = walk(YARD_IMAGES, YARD_SIZE, seed=1000 + seed)
     zoom = float(np.random.default_rng([72, seed]).uniform(0.85, 1.25))
+    zoomed = [replace(pose, K=_zoomed(pose.K, zoom)) for pose in poses]
+    _write_scene(folder, build_yard(seed), zoomed, YARD_SIZE, (2003, seed))
+
+
+def _zoomed(K: F64, zoom: float) -> F64:
+    zoomed: F64 = K * np.array([[zoom], [zoom], [1.0]])
+    zoomed[:2, 2] = K[:2, 2]
+    return zoomed
+
+
+def _write_scene(
+    folder: Path, world: World, poses: Sequence[Pose], size: tuple[int, int], seed: tuple[int, int]
+) -> None:
     entries = []
     for k, pose in enumerate(poses):
-        K = pose.K * np.array([[zoom], [zoom], [1.0]])
-        K[:2, 2] = pose.K[:2, 2]
-        seen = replace(pose, K=K)
-        gain, rng = 0.82 * pose.exposure, np.random.default_rng([2003, seed, k])
-        rgb = take_image(world, seen, YARD_SIZE, gains=(gain, gain, gain), rng=rng)
+        gain, rng = 0.82 * pose.exposure, np.random.default_rng([*seed, k])
+        rgb = take_image(world, pose, size, gains=(gain, gain, gain), rng=rng)
         name = f"{k:04d}.png"
         write_png(folder / "images" / name, rgb)
-        t = -seen.R @ seen.C
-        size = {"width": YARD_SIZE[0], "height": YARD_SIZE[1]}
-        entries.append({"name": name, **size, "K": K, "distortion": [0.0, 0.0, 0.0], "R": seen.R, "t": t})
+        t = -pose.R @ pose.C
+        given = {"name": name, "width": size[0], "height": size[1], "K": pose.K, "R": pose.R, "t": t}
+        entries.append({**given, "distortion": [0.0, 0.0, 0.0]})
     write_json(folder / "cameras.json", {"cameras": entries})
+
+
+def load_facade(number: int) -> Scene:
+    """Ten images of a facade (:func:`build_facade`) by one camera, rendered on first use (a minute).
+
+    The principal point is off the middle by 0.5 % of the long side.
+    """
+    folder = YARDS / f"facade-{number}-{YARD_IMAGES}"
+    if not (folder / "cameras.json").is_file():
+        rng, (width, height) = np.random.default_rng([74, number]), FACADE_SIZE
+        focal = float(rng.uniform(0.9, 1.3)) * width
+        K = np.array([[focal, 0.0, 0.505 * width], [0.0, focal, 0.4933 * height], [0.0, 0.0, 1.0]])
+        poses = []
+        for k in range(YARD_IMAGES):
+            angle = (2.0 * _van_der_corput(k + 1) - 1.0) * 40.0 * pi / 180.0
+            distance, eye = rng.uniform(5.6, 7.2), rng.uniform(1.0, 3.4)
+            C = np.array([distance * sin(angle), -distance * cos(angle), eye])
+            target = rng.uniform([-0.8, 0.0, 2.0], [0.8, 0.0, 2.8])
+            roll = tan(0.5 * rng.uniform(-8.0, 8.0) * pi / 180.0)
+            poses.append(Pose(K, look_at(C, target, roll), C, float(rng.uniform(0.9, 1.1))))
+        _write_scene(folder, build_facade(number), poses, FACADE_SIZE, (2005, number))
+    return read_scene(folder, f"facade-{number}")
 
 
 STEREO_SIZE, STEREO_BASELINE_M = (480, 360), 0.3

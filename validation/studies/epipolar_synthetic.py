@@ -60,10 +60,10 @@ def check_precision(sigma_px: float, n: int, trials: int) -> list[Metric]:
             held[PIXELS][name].append(float(np.mean([e.contains_xy(t[:2] / t[2]) for e, t in truths])))
     scene_name = f"sigma {sigma_px:g} px, n = {n}"
     rms = {name: float(np.sqrt(np.mean(values))) for name, values in ratios.items()}
-    rows = [Metric(scene_name, "RMS distance over bound", "", rms, name, 1.05) for name in rms]
+    rows = [Metric(scene_name, "RMS distance over bound", "", {name: rms[name]}, name, 1.05) for name in rms]
     for kind, values in held.items():
-        mean = {name: float(np.mean(v)) for name, v in values.items()}
-        for name in mean:
+        for name, shares in values.items():
+            mean = {name: float(np.mean(shares))}
             rows.append(Metric(scene_name, f"coverage of {kind}", "", mean, name, 0.93, at_most=False))
             rows.append(Metric(scene_name, f"coverage of {kind}", "", mean, name, 0.97))
     return rows

@@ -38,6 +38,7 @@ MODULES = {
     "dinosaur": "projective",
     "epipolar": "epipolar_synthetic",
     "epipolar-methods": "epipolar_methods",
+    "facades": "facades",
     "factorization": "projective",
     "front-end": "front_end",
     "full-disk": "robustness",
