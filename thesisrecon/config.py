@@ -390,9 +390,12 @@ class ImageOptions:
     ----------
     max_size_px : int
         Larger images are reduced to this long side.
+    groups : bool
+        Reconstruct each group of 3 or more images without overlap with the others.
     """
 
     max_size_px: int = 1600
+    groups: bool = True
 
     def __post_init__(self) -> None:
         if self.max_size_px < 64:
@@ -408,10 +411,9 @@ class PipelineConfig:
     images, intrinsics : ImageOptions, IntrinsicsOptions
         How images are read, and prior knowledge of the cameras.
     features, pairs, matching, ... : Detector, PairSelector, Matcher, ...
-        The method of each stage: any object with the methods of its ``Protocol``. The stages ``features``,
-        ``pairs``, ``matching`` and ``epipolar`` also take a plain function (:mod:`thesisrecon._plug_ins`).
-
-        A method that does not fit is a ``UsageError``.
+        The method of each stage: any object with the methods of its ``Protocol``; a ``UsageError`` if it does
+        not fit. ``features``, ``pairs``, ``matching`` and ``epipolar`` also take a plain function
+        (:mod:`thesisrecon._plug_ins`).
 
     Examples
     --------

@@ -181,7 +181,15 @@ def summary_text(summary: Mapping[str, Any], out: Path) -> str:
     lines += _intrinsic_lines(summary["cameras"])
     if summary.get("model"):
         lines.append(f"model with {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
-    lines += [f"not registered: {refused['name']}: {refused['reason']}" for refused in summary["refused"]]
+    groups = summary.get("groups", ())
+    elsewhere = {name for group in groups for name in group["names"]}
+    refused = [one for one in summary["refused"] if one["name"] not in elsewhere]
+    lines += [f"not registered: {one['name']}: {one['reason']}" for one in refused]
+    for group in groups:
+        count = f"{group['registered']} of {counted(group['images'], 'image')} registered"
+        found = group["failure"] or count + (", not trusted" if group["trusted"] is False else "")
+        page = out / group["folder"] / "report.html"
+        lines.append(f"{group['folder']}: {found.removesuffix('.')}; report: {page}")
     lines += [f"camera model: {text}" for text in summary.get("limitations", ())]
     lines += [f"warning: {warning}" for warning in summary["warnings"]]
     if summary["failure"]:

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from thesisrecon._code_digest import code_digest
 from thesisrecon.camera import Camera
@@ -43,6 +44,8 @@ from thesisrecon.views.render import render
 MIN_CORNERS = 16
 ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""
+MIN_GROUP = 3
+"""Images of a group that is reconstructed for itself."""
 MIN_VIEWS = 3
 """With fewer views, others may not see the surface of the held-out one."""
 
@@ -57,13 +60,18 @@ def find_features(state: PipelineState) -> None:
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         return (([i], (state.config, images[i])) for i in missing)
 
-    features = run.map_cached("features", keys, _detect, batches)
+    finish_features(state, run.map_cached("features", keys, _detect, batches))
+
+
+def finish_features(state: PipelineState, features: Sequence[Features]) -> None:
+    """Report the features; sets ``result.features``."""
+    images = state.result.images
     state.result = replace(state.result, features=tuple(features))
     found = [len(f.xy) for f in features]
     few = [(image, n) for image, n in zip(images, found, strict=True) if n < MIN_CORNERS]
     poor = [f"{image.name} has only {counted(n, 'corner')}" for image, n in few]
     counts = {"images": len(images), "corners": sum(found), "fewest_in_one_image": min(found)}
-    run.finish("features", counts=counts, warnings=poor)
+    state.run.finish("features", counts=counts, warnings=poor)
 
 
 def _detect(config: PipelineConfig, image: Image) -> list[Features]:
@@ -145,15 +153,45 @@ def _match_all(
     return [match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j)) for i, j in pairs]
 
 
+def split_groups(state: PipelineState) -> None:
+    """Find the groups of images that accepted pairs connect; sets ``groups`` if there are several."""
+    views, links = len(state.result.images), [(p.i, p.j) for p in state.result.pairs if p.accepted]
+    if not links or not state.config.images.groups:
+        return
+    graph = scipy.sparse.coo_array((np.ones(len(links)), np.transpose(links)), shape=(views, views))
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    groups = [np.flatnonzero(label == k).tolist() for k in range(label.max() + 1)]
+    large = sorted((group for group in groups if len(group) >= MIN_GROUP), key=lambda group: -len(group))
+    state.groups = large if len(large) > 1 else ()
+
+
+def take_group(whole: PipelineState, views: Sequence[int], state: PipelineState) -> None:
+    """Features and pairs of some views of a run, in the place of the first three steps."""
+    run, number = state.run, {view: k for k, view in enumerate(views)}
+    keys = list(whole.run.logs["features"].keys.values())
+    features = [
+        run.cached("features", f"{k:05d}", keys[i], partial(whole.result.features.__getitem__, i))
+        for k, i in enumerate(views)
+    ]
+    finish_features(state, features)
+    inside = [n for n, pair in enumerate(whole.result.pairs) if {pair.i, pair.j} <= number.keys()]
+    keys, pairs = list(whole.run.logs["matches"].keys.values()), list[TwoView]()
+    for n in inside:
+        pair = whole.result.pairs[n]
+        pair = replace(pair, i=number[pair.i], j=number[pair.j])
+        key = run.key("matches", keys[n], pair.i, pair.j)
+        pairs.append(run.cached("matches", f"{pair.i:05d}-{pair.j:05d}", key, partial(replace, pair)))
+    finish_matches(state, pairs)
+
+
 def build_tracks(state: PipelineState) -> None:
     """Build tracks from the accepted pairs; sets ``result.tracks``."""
-    run, result = state.run, state.result
+    run, pairs = state.run, state.used_pairs
     require_accepted_pair(state)
-    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed)
+    group = [list(state.groups[0])] if state.groups else []
+    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed, *group)
     build, rng = state.config.tracks.build, stream(run.seed, "tracks")
-    finish_tracks(
-        state, run.cached("tracks", "tracks", key, lambda: build(_prepared(state), result.pairs, rng))
-    )
+    finish_tracks(state, run.cached("tracks", "tracks", key, lambda: build(_prepared(state), pairs, rng)))
 
 
 def require_accepted_pair(state: PipelineState) -> None:
@@ -195,11 +233,15 @@ def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
     """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
     run, result = state.run, state.result
     assert result.tracks is not None
-    tracks, sizes = result.tracks, np.array([image.size for image in result.images], dtype=np.int64)
+    tracks, pairs, sizes = (
+        result.tracks,
+        state.used_pairs,
+        np.array([image.size for image in result.images], dtype=np.int64),
+    )
     method = state.config.projective
     projective: Reconstruction = _cached(
         state, "projective", attempt, run.logs["tracks"].keys,
-        lambda rng: method.reconstruct(tracks, result.pairs, sizes, rng=rng, attempt=attempt),
+        lambda rng: method.reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt),
     )  # fmt: skip
     state.result = replace(result, projective=projective)
     run.finish("projective", counts=_sizes_of(projective), metrics={"sigma_px": projective.sigma_px})

@@ -17,7 +17,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
 from thesisrecon.numerics._observations import morton_pair_order
-from thesisrecon.records import Features, Image
+from thesisrecon.records import Features, Image, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run
 
@@ -97,6 +97,8 @@ class PipelineState:
     result: RunResult
     until: str
     prepared: Sequence[Any] | None = None
+    groups: Sequence[Sequence[int]] = ()
+    """Views of the groups of images that do not overlap, the largest first; empty if there is one."""
 
     @property
     def config(self) -> PipelineConfig:
@@ -107,6 +109,12 @@ class PipelineState:
     def names(self) -> list[str]:
         """File names of the images."""
         return [image.name for image in self.result.images]
+
+    @property
+    def used_pairs(self) -> tuple[TwoView, ...]:
+        """The matched pairs, those of the largest group if there are several."""
+        pairs = self.result.pairs
+        return tuple(p for p in pairs if {p.i, p.j} <= set(self.groups[0])) if self.groups else pairs
 
     @property
     def prior(self) -> IntrinsicsPrior:

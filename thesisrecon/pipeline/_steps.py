@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
 from typing import Any
 
 from thesisrecon._settings import tables_from_config
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import camera_numbers
 from thesisrecon.io._images import ImageSet
-from thesisrecon.pipeline._outputs import write_outputs
+from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
 from thesisrecon.pipeline._stages import (
     build_model,
     build_tracks,
@@ -20,18 +22,23 @@ from thesisrecon.pipeline._stages import (
     reconstruct_metric,
     reconstruct_projective,
     select_pairs,
+    split_groups,
+    take_group,
 )
 from thesisrecon.pipeline._state import PipelineState, name_images
+from thesisrecon.records import Reconstruction
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run import Run
+from thesisrecon.runtime._run_folder import RunDirectory
 
-STEPS = {
+Step = Callable[[PipelineState], None]
+STEPS: dict[str, tuple[Step, ...]] = {
     "features": (find_features,),
     "matches": (find_features, select_pairs, match_pairs),
-    "projective": (find_features, select_pairs, match_pairs, build_tracks, reconstruct_projective),
-    "metric": (find_features, select_pairs, match_pairs, build_tracks, reconstruct_metric),
 }
+STEPS["projective"] = (*STEPS["matches"], split_groups, build_tracks, reconstruct_projective)
+STEPS["metric"] = (*STEPS["matches"], split_groups, build_tracks, reconstruct_metric)
 """Algorithm 1: the steps up to each last stage."""
 SURFACE_STEPS = (estimate_depth_maps, build_model)
 STEPS["dense"] = (*STEPS["metric"], *SURFACE_STEPS[:1])
@@ -49,26 +56,93 @@ def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Itera
         yield
 
 
-def run_steps(
-    state: PipelineState, steps: Sequence[Callable[[PipelineState], None]], *, surface_required: bool
-) -> RunResult:
-    """Run the steps and write the outputs, of a failed run too."""
-    run = state.run
+def run_steps(state: PipelineState, steps: Sequence[Step], *, surface_required: bool) -> RunResult:
+    """Run the steps for the largest group of images, then for the others; write outputs, of failures too."""
+    failure = _failure_of(state, (_begin, *steps), surface_required=surface_required)
+    state.prepared = None
+    if split_groups in steps:
+        _run_groups(state, steps[steps.index(split_groups) + 1 :], surface_required=surface_required)
+    result = write_outputs(state.run, state.result, until=state.until, failure=failure)
+    if failure is not None:
+        raise failure
+    return result
+
+
+def _begin(state: PipelineState) -> None:
+    state.require_images()
+    precompile(state.until, state.run.workers.threads, state.run.progress)
+
+
+def _failure_of(
+    state: PipelineState, steps: Sequence[Step], *, surface_required: bool
+) -> StageFailure | None:
+    """Run the steps; return the failure that ended them."""
     try:
-        state.require_images()
-        precompile(state.until, run.workers.threads, run.progress)
         _run_all(state, steps, surface_required=surface_required)
     except StageFailure as error:
         parts = (error.reason, error.evidence, error.advice)
-        failure = StageFailure(*(name_images(part, state.names) for part in parts))
-        write_outputs(run, state.result, until=state.until, failure=failure)
-        raise failure from None
-    return write_outputs(run, state.result, until=state.until, failure=None)
+        return StageFailure(*(name_images(part, state.names) for part in parts))
+    return None
 
 
-def _run_all(
-    state: PipelineState, steps: Sequence[Callable[[PipelineState], None]], *, surface_required: bool
-) -> None:
+def _run_groups(state: PipelineState, steps: Sequence[Step], *, surface_required: bool) -> None:
+    """Reconstruct the other groups in folders of their own; remove the results of groups that are gone."""
+    run, folder = state.run, state.run.directory.path
+    for number, views in enumerate(state.groups[1:], 2):
+        run.groups.append(_run_group(state, f"group-{number}", views, steps, surface_required))
+    for number in count(max(len(state.groups), 1) + 1):
+        if not (folder / f"group-{number}" / RESULT_FILES[0]).exists():
+            break
+        RunDirectory(folder / f"group-{number}").remove(RESULT_FILES)
+    if run.groups:
+        others = ", ".join(f"{group['images']} in {group['folder']}" for group in run.groups)
+        here = counted(len(state.groups[0]), "image")
+        groups = f"The images form {len(state.groups)} groups that do not overlap"
+        run.warnings.append(f"{groups}: {here} of this model, {others}")
+        state.result = _with_group_reasons(state)
+
+
+def _run_group(
+    whole: PipelineState, name: str, views: Sequence[int], steps: Sequence[Step], surface_required: bool
+) -> dict[str, Any]:
+    """Reconstruct a group as a run of its own; return its entry in the summary of the whole."""
+    directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared)
+    run = whole.run.inside(directory)
+    inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
+    state = PipelineState(run, inputs, empty_result(run, inputs), whole.until)
+    identity = identity_of(run, inputs)
+    with directory.claim(identity, overwrite=True):
+        directory.adopt(identity, overwrite=True, results=RESULT_FILES)
+        take_group(whole, views, state)
+        failure = _failure_of(state, steps, surface_required=surface_required)
+        result = write_outputs(run, state.result, until=state.until, failure=failure)
+    facts = {fact: result.summary[fact] for fact in ("images", "registered", "trusted", "failure")}
+    return {"folder": name, "names": state.names, **facts}
+
+
+def _with_group_reasons(state: PipelineState) -> RunResult:
+    """The result in which the images of other groups are refused for that reason."""
+    folder_of = {i: f"group-{n}" for n, group in enumerate(state.groups[1:], 2) for i in group}
+
+    def named(found: Reconstruction) -> Reconstruction:
+        reasons = [
+            f"is reconstructed in {folder_of[i]}: it overlaps with none of these images"
+            if i in folder_of
+            else reason
+            for i, reason in enumerate(found.reasons)
+        ]
+        return replace(found, reasons=tuple(reasons))
+
+    result = state.result
+    if result.projective is not None:
+        result = replace(result, projective=named(result.projective))
+    if result.metric is not None:
+        metric = replace(result.metric, reconstruction=named(result.metric.reconstruction))
+        result = replace(result, metric=metric)
+    return result
+
+
+def _run_all(state: PipelineState, steps: Sequence[Step], *, surface_required: bool) -> None:
     """Run the steps; a surface that fails is only a warning unless it was asked for."""
     for step in steps:
         try:

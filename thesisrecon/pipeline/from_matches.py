@@ -35,7 +35,7 @@ from thesisrecon.pipeline._given import (
     views_of,
 )
 from thesisrecon.pipeline._outputs import RESULT_FILES
-from thesisrecon.pipeline._stages import build_tracks
+from thesisrecon.pipeline._stages import build_tracks, split_groups
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
 from thesisrecon.records import Tracks
@@ -298,5 +298,6 @@ def _steps(given: Given, until: str) -> list[Any]:
     """The steps of Algorithm 1, the first ones replaced."""
     tracks = build_tracks if given.tracks is None else partial(take_tracks, given)
     front = [partial(take_corners, given), partial(take_pairs, given), partial(verify_pairs, given)]
-    rest = STEPS[until][3:]
+    # Given tracks are not divided into groups.
+    rest = [step for step in STEPS[until][3:] if step is not split_groups or given.tracks is None]
     return [*front[: len(STEPS[until])], *(tracks if step is build_tracks else step for step in rest)]

@@ -87,8 +87,15 @@ class Run:
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)  #: stages read from the cache
     warnings: list[str] = field(default_factory=list)
+    groups: list[dict[str, Any]] = field(default_factory=list)  #: what the runs inside this one found
     started: float = field(default_factory=time.perf_counter)
     _stage: str = ""  # the one being computed
+
+    def inside(self, directory: RunDirectory) -> Run:
+        """A run of a part of the images in a folder of its own, by the same workers."""
+        options = (self.config, self.seed, self.workers, directory, self.progress)
+        title = f"{self.title}, {directory.path.name}"
+        return Run(*options, title, self.images_folder, self.masks_folder)
 
     @contextmanager
     def clock(self, stage: str) -> Iterator[_StageLog]:

@@ -1,0 +1,117 @@
+"""Folders with several groups of images that do not overlap, with fake stages: one model for each."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+
+from tests import fake_stages as fakes
+from tests.conftest import refuses
+from tests.fake_stages import CALLS, fake_config, kept_bytes, photographs, read
+from thesisrecon import load
+from thesisrecon.cli.runs import summary_text
+from thesisrecon.config import ImageOptions
+from thesisrecon.errors import StageFailure
+from thesisrecon.pipeline import reconstruction
+
+GROUPS = [range(3), range(3, 7), range(7, 9)]
+
+
+@dataclass(frozen=True)
+class GroupVerifier(fakes.FakeVerifier):
+    def verify(self, matches, fit, rng):
+        together = any(matches.i in group and matches.j in group for group in GROUPS)
+        return replace(super().verify(matches, fit, rng), accepted=together)
+
+
+@dataclass(frozen=True)
+class ProjectiveOfSize(fakes.FakeProjective):
+    """Registers the views of its pairs; fails for so many of them."""
+
+    impossible: int = 0
+
+    def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
+        found = super().reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt)
+        seen = [
+            any(view in (pair.i, pair.j) for pair in pairs if pair.accepted) for view in range(len(sizes))
+        ]
+        if sum(seen) == self.impossible:
+            raise StageFailure("no initial pair")
+        reasons = tuple("" if there else "sees 0 points" for there in seen)
+        return replace(found, registered=found.registered & seen, reasons=reasons)
+
+
+@pytest.fixture(autouse=True)
+def _forget_calls():
+    CALLS.clear()
+
+
+def run(out, impossible=0, **given):
+    config = fake_config(verification=GroupVerifier(), projective=ProjectiveOfSize(impossible=impossible))
+    config = replace(config, images=ImageOptions(groups=given.pop("groups", True)))
+    return reconstruction.reconstruct(photographs(9), out, config=config, until="metric", **given)
+
+
+def files_of(out):
+    return kept_bytes(out), kept_bytes(out / "group-2")
+
+
+def test_each_group_has_a_model_and_the_largest_is_first(tmp_path):
+    result = run(tmp_path, threads=1)
+    assert list(result.cameras) == ["03.png", "04.png", "05.png", "06.png"]
+    assert "is reconstructed in group-2" in result.refused["00.png"]
+    assert result.refused["08.png"] == "sees 0 points"
+    summary = read(tmp_path / "summary.json")
+    entry = {"folder": "group-2", "images": 3, "registered": 3, "trusted": True, "failure": None}
+    assert summary["groups"] == [entry | {"names": ["00.png", "01.png", "02.png"]}]
+    sentence = "The images form 2 groups that do not overlap: 4 images of this model, 3 in group-2"
+    assert sentence in summary["warnings"]
+    said = summary_text(summary, tmp_path)
+    assert f"group-2: 3 of 3 images registered; report: {tmp_path}" in said
+    assert "not registered: 00.png" not in said
+    assert '<a href="group-2/report.html">group-2</a>' in (tmp_path / "report.html").read_text("utf-8")
+    assert not (tmp_path / "group-3").exists()
+    other = load(tmp_path / "group-2")
+    assert list(other.cameras) == ["00.png", "01.png", "02.png"]
+    assert [(pair.i, pair.j) for pair in other.pairs] == [(0, 1), (0, 2), (1, 2)]
+    assert (tmp_path / "group-2" / "report.html").is_file()
+    calls = [call for call in CALLS if call.startswith(("detect", "match"))]
+    assert len(calls) == len(set(calls)) == 9 + 36
+
+
+def test_groups_are_resumed_to_the_same_bytes(tmp_path):
+    run(tmp_path / "whole", threads=1)
+    stopped = []
+
+    def interrupt(stage, done, _total):
+        stopped.append((stage, done))
+        if stopped.count(("projective", 0)) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cut", threads=1, progress=interrupt)
+    CALLS.clear()
+    run(tmp_path / "cut", threads=3)
+    assert files_of(tmp_path / "cut") == files_of(tmp_path / "whole")
+    assert not [call for call in CALLS if call.startswith(("detect", "match"))]
+    CALLS.clear()
+    run(tmp_path / "cut")
+    assert CALLS == []
+
+
+def test_groups_can_be_turned_off(tmp_path):
+    run(tmp_path)
+    result = run(tmp_path, groups=False, overwrite=True)
+    assert len(result.cameras) == 9
+    assert "groups" not in result.summary
+    assert not (tmp_path / "group-2" / "summary.json").exists()
+
+
+def test_a_group_that_fails_leaves_the_others_whole(tmp_path):
+    result = run(tmp_path / "second", impossible=3)
+    assert len(result.cameras) == 4
+    assert result.summary["groups"][0]["failure"] == "no initial pair."
+    assert "group-2: no initial pair; report" in summary_text(result.summary, tmp_path)
+    assert read(tmp_path / "second" / "group-2" / "summary.json")["failure"] == "no initial pair."
+    refuses(StageFailure, "no initial pair", run, tmp_path / "first", impossible=4)
+    assert read(tmp_path / "first" / "summary.json")["groups"][0]["registered"] == 3
+    assert len(load(tmp_path / "first" / "group-2").cameras) == 3
