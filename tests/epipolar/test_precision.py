@@ -28,7 +28,7 @@ def bound_of(seed, n=40, sigma=0.5):
 
 @pytest.mark.parametrize(("sigma", "n"), [(1.0, 60), (2.0, 30)])
 def test_gold_standard_reaches_the_bound_and_its_intervals_hold_the_truth(sigma, n):
-    values = {row.name: row.values[GOLD] for row in check_precision(sigma, n, 150)}
+    values = {row.name: row.values[GOLD] for row in check_precision(sigma, n, 150) if GOLD in row.values}
     assert values["RMS distance over bound"] == pytest.approx(1.0, abs=0.05)
     assert values["coverage of distances"] == pytest.approx(0.95, abs=0.02)
     assert values["coverage of epipoles"] == pytest.approx(0.95, abs=0.03)
@@ -67,7 +67,7 @@ def test_little_noise_gives_the_first_order_interval():
 
 @pytest.mark.parametrize(("sigma", "n"), [(0.25, 100), (0.5, 300), (2.0, 1000)])
 def test_the_default_comes_near_the_bound_at_its_default_threshold(sigma, n):
-    values = {row.name: row.values[DEFAULT] for row in check_precision(sigma, n, 30)}
+    values = {row.name: row.values[DEFAULT] for row in check_precision(sigma, n, 30) if DEFAULT in row.values}
     assert values["RMS distance over bound"] < 1.1
     assert values["coverage of distances"] > 0.92
 
