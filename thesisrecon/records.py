@@ -65,6 +65,7 @@ class Seeds:
     scale: F32  #: (S,) pixels per sample of the pyramid level
     angle: F32  #: (S,) rotation of the patch, rad; 0 = upright
     patches: F32  #: (S, D) patches of zero mean and unit norm
+    frame: F64 | None = None  #: (S, 2, 2) px per sample along the patch's axes; None: by scale and angle
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class Features:
     scale: F32  #: (N,) scale of each corner
     response: F32  #: (N,) corner response
     seeds: Seeds | None = None
+    oblique: Seeds | None = None  #: seeds of simulated oblique views, for pairs that need them
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from scipy.special import erf
 from tests.synthetic import photograph, texture
 from thesisrecon.features.harris import CornerMeasure, HarrisCorners, select_spread
 from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.features.oblique import simulate_view
 from thesisrecon.records import Image
 
 HARRIS = CornerMeasure(formula="harris", integration_sigma_px=1.0, integration_taps=9, colour=True)
@@ -197,3 +198,14 @@ def test_each_selection_keeps_the_number_and_the_strongest(selection):
 def test_a_detector_or_measure_that_cannot_be_is_refused(kind, field, value):
     with pytest.raises(ValueError, match=field):
         kind(**{field: value})
+
+
+@pytest.mark.parametrize("enlargement", [1.0, 2.0])
+def test_a_simulated_view_shows_each_pixel_where_it_says(enlargement):
+    y, x = np.mgrid[:90, :140]
+    blob = 200.0 * np.exp(-((x - 85.3) ** 2 + (y - 40.6) ** 2) / 18.0)
+    view = simulate_view(blob.astype(np.float32), 2.0, 0.7, enlargement)
+    row, column = np.mgrid[: view.gray.shape[0], : view.gray.shape[1]]
+    middle = np.array([(column * view.gray).sum(), (row * view.gray).sum()]) / view.gray.sum()
+    assert np.abs(middle - (view.to_view @ [85.3, 40.6] + view.offset)).max() < 0.05
+    assert np.linalg.det(view.to_view) == pytest.approx(0.5 * enlargement**2)

@@ -78,6 +78,16 @@ def test_patches_equal_their_numpy_twin():
         assert np.abs(patch.reshape(8, 8) - twin).max() < 1e-2
 
 
+def test_affine_samples_equal_their_numpy_twin():
+    image = texture(60, 80, 8).astype(np.float32)
+    A, offset = np.array([[0.8, -0.4], [0.5, 0.9]]), np.array([10.0, -3.0])
+    row, column = np.mgrid[:50, :70]
+    u = np.clip(A[0, 0] * column + A[0, 1] * row + offset[0], 0, 78.999)
+    v = np.clip(A[1, 0] * column + A[1, 1] * row + offset[1], 0, 58.999)
+    found = kernels.sample_affinely(image, A, offset, (50, 70))
+    assert np.abs(found - map_coordinates(image, [v, u], order=1)).max() < 1e-2
+
+
 def test_selected_corners_are_apart_and_none_is_dropped_without_reason():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
     kept = kernels.enforce_spacing(xy, np.arange(400), 6.0)

@@ -1,14 +1,18 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.ndimage import affine_transform, gaussian_filter
 
 from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_scene, texture
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.matching._seeds import corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.matching._seeds import corners_of_seeds, match_seeds, neighbour_support, seed_matches
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.strength import StrengthOfMatch
-from thesisrecon.records import Image, Matches
+from thesisrecon.records import FundamentalFit, Image, Matches
 
 VARIANTS = [(MultiScaleCorners(), SeedsAndGrowth()), (HarrisCorners(), StrengthOfMatch())]
 SWITCHED = [
@@ -68,6 +72,14 @@ def test_blank_tiny_and_noisy_images_give_an_empty_result(detector, variant, siz
     noise = np.random.default_rng(1).uniform(0, 255, size)
     images = [photograph(np.full(size, 9.0)), photograph(noise), photograph(noise[::-1])]
     prepared = views(detector, variant, *images)
+    if isinstance(detector, MultiScaleCorners):
+        oblique = [
+            replace(view.features, oblique=detector.oblique_seeds(image))
+            for view, image in zip(prepared, images, strict=True)
+        ]
+        prepared += [
+            variant.prepare(image, features) for image, features in zip(images, oblique, strict=True)
+        ]
     for one in prepared:
         matches = run(variant, one, prepared[0])
         assert len(matches.xy1) == 0
@@ -103,6 +115,43 @@ def test_seeds_find_a_photograph_that_was_turned(quarter_turns):
     assert right.sum() > 200
     assert right.mean() > 0.9
     assert support[right].mean() > 5.0 > 2.0 > support[~right].mean() if (~right).any() else True
+
+
+def test_seeds_of_simulated_views_lead_to_matches_of_an_oblique_and_turned_photograph():
+    gray, detector, variant = texture(300, 420, 5), MultiScaleCorners(upsample_below_px=0), SeedsAndGrowth()
+    c, s = np.cos(0.6), np.sin(0.6)
+    A = np.array([[c, -s], [s, c]]) @ np.diag([0.3, 0.95]) @ np.array([[c, s], [-s, c]])
+    B, centre = np.linalg.inv(A), np.array([209.5, 149.5])
+    fine = gaussian_filter(gray, 0.8)
+    seen = affine_transform(fine, B[::-1, ::-1], (centre - B @ centre)[::-1], order=1, cval=128.0)
+    images = photograph(gray), photograph(seen)
+    one, two = (
+        variant.prepare(image, replace(detector.detect(image), oblique=detector.oblique_seeds(image)))
+        for image in images
+    )
+    ((found, support),) = seed_matches(one.features, two.features, (0, 1), orientation="auto", ratio=0.8)
+    right = np.linalg.norm(found.xy2 - ((found.xy1 - centre) @ A.T + centre), axis=1) < 4.0
+    off = np.linalg.norm(found.affine[right] - A, axis=(1, 2))
+    assert right.sum() > 60
+    supported = support(found) >= 2.0
+    assert right[supported].mean() > 0.8 > 0.6 > right.mean()
+    assert supported[right].mean() > 0.5
+    assert np.median(off) < 0.35
+
+    def fit(xy1, xy2, rng):
+        del rng
+        near = np.linalg.norm(xy2 - ((xy1 - centre) @ A.T + centre), axis=1) < 4.0
+        # Any F = [e]x H explains a plane.
+        H = np.eye(3)
+        H[:2, :2], H[:2, 2] = A, centre - A @ centre
+        return FundamentalFit(cross_matrix(np.array([1.0, 0.3, 0.0])) @ H, near, 0.1, np.zeros((9, 9)))
+
+    rng = np.random.default_rng(0)
+    matches = variant.match(one, two, pair=(0, 1), estimate_fundamental=fit, rng=rng)
+    error = np.linalg.norm(matches.xy2 - ((matches.xy1 - centre) @ A.T + centre), axis=1)
+    assert len(error) > 60
+    assert np.median(error) < 0.15
+    assert (error < 1.0).mean() > 0.95
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,9 @@ from thesisrecon.matching.pair_selection import (
     _overlap_evidence,
     _pair_array,
     _subset_seeds,
+    pairs_to_connect,
 )
-from thesisrecon.records import Features
+from thesisrecon.records import Features, TwoView
 
 SIDE, CROPS = 260, 14
 NO_FEATURES = Features(np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.float32))
@@ -53,6 +54,11 @@ def choose(selector, n, features=None, map_all=one_by_one):
 
 def as_set(pairs):
     return {(int(i), int(j)) for i, j in pairs}
+
+
+def pair_of(i, j, accepted):
+    none, xy = np.zeros(0, np.int64), np.zeros((0, 2))
+    return TwoView(i, j, np.eye(3), 1.0, none, none, xy, xy, np.zeros((0, 2, 2)), 0, 0.0, accepted)
 
 
 # ---------------------------------------------------------------- what the user can say
@@ -140,6 +146,18 @@ def windows():
     detector = MultiScaleCorners(full_corners=300, half_corners=100, seeds_per_level=400)
     images = [photograph(walls[w][y : y + SIDE, x : x + SIDE]) for w, (x, y) in zip(wall, place, strict=True)]
     return Windows([detector.detect(image) for image in images], wall, place.astype(float))
+
+
+def test_only_pairs_between_groups_are_tried_again_the_likeliest_first(windows):
+    alone, features = 0, windows.features
+    # All but one image are linked to the next of their wall, and the walls to each other.
+    linked = {(k, k + 2) for k in range(1, CROPS - 2)} | {(1, 2)}
+    pairs = [pair_of(i, j, (i, j) in linked) for i, j in combinations(range(CROPS), 2)]
+    assert pairs_to_connect(features, pairs, CROPS) == list(range(CROPS - 1))
+    (best,) = pairs_to_connect(features, pairs, 1)
+    assert windows.wall[pairs[best].j] == windows.wall[alone]
+    assert not pairs_to_connect(features, pairs, 0)
+    assert not pairs_to_connect(features, [pair_of(0, 4, True), *pairs], CROPS)
 
 
 ESTIMATE = OverlapEstimate(all_up_to=2, nearest=1, shortlist=9, words=256)

@@ -247,7 +247,7 @@ def test_prepared_views_stay_within_their_memory_bound(monkeypatch):
             return np.zeros(100)
 
     monkeypatch.setattr(preparing, "CACHE_BYTES", 4 * 800)
-    views = PreparedViews(Counting(), {i: (None, i) for i in range(6)})
+    views = PreparedViews(Counting().prepare, {i: (None, i) for i in range(6)})
     assert [len(view) for view in views] == [100] * 6
     assert [views[5] is views[5], made] == [True, [0, 1, 2, 3, 4, 5]]
     assert len(views[0]) == 100

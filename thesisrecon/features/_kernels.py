@@ -212,3 +212,21 @@ def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
             kept[n] = i
             n += 1
     return kept[:n]
+
+
+@kernel(fastmath=FAST)
+def sample_affinely(image: F32, to_image: F64, offset: F64, shape: tuple[int, int]) -> F32:
+    """Image (h, w) whose pixel x shows ``image`` at ``to_image`` x + ``offset``, clamped, bilinearly."""
+    height, width = image.shape
+    out = empty(shape, np.float32)
+    for row in range(shape[0]):
+        for column in range(shape[1]):
+            u = to_image[0, 0] * column + to_image[0, 1] * row + offset[0]
+            v = to_image[1, 0] * column + to_image[1, 1] * row + offset[1]
+            u, v = min(max(u, 0.0), width - 1.001), min(max(v, 0.0), height - 1.001)
+            x0, y0 = int(u), int(v)
+            p, q = np.float32(u - x0), np.float32(v - y0)
+            top = image[y0, x0] + p * (image[y0, x0 + 1] - image[y0, x0])
+            low = image[y0 + 1, x0] + p * (image[y0 + 1, x0 + 1] - image[y0 + 1, x0])
+            out[row, column] = top + q * (low - top)
+    return out

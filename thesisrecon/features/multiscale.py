@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features._kernels import sample_patches
 from thesisrecon.features.harris import CornerMeasure, select_spread
+from thesisrecon.features.oblique import ObliqueView, oblique_views
 from thesisrecon.geometry._image_filters import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
+
+PATCH_SIDE = 8
+# Seeds of a simulated view, relative to those of the image on the same area: many views show each place.
+OBLIQUE_DENSITY = 0.5
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,8 @@ class MultiScaleCorners:
         Number of levels.
     upsample_below_px : int
         Long side below which the image is doubled; 0 for never.
+    oblique_tilts : tuple of float
+        Compressions of the simulated views that give seeds for pairs with a wide step; () for none.
     measure : CornerMeasure
         Response and its parameters at every size.
     """
@@ -57,6 +65,7 @@ class MultiScaleCorners:
     seeds_per_level: int = 1400
     levels: int = 5
     upsample_below_px: int = 1000
+    oblique_tilts: tuple[float, ...] = (1.414, 2.828)
     measure: CornerMeasure = field(default_factory=CornerMeasure)
 
     def __post_init__(self) -> None:
@@ -69,6 +78,8 @@ class MultiScaleCorners:
             )
         if self.seeds_per_level < 0:
             raise ValueError(f"seeds_per_level must be at least 0; got {self.seeds_per_level}")
+        if not all(tilt > 1.0 for tilt in self.oblique_tilts):
+            raise ValueError(f"oblique_tilts must be above 1; got {self.oblique_tilts}")
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
@@ -111,8 +122,8 @@ class MultiScaleCorners:
             xy.append(level.to_image(corners[kept]))
             scale.append(np.full(len(kept), np.sqrt(np.prod(level.scale)), np.float32))
             angle.append(direction)
-            upright.append(sample_patches(blurred, corners[kept], np.zeros_like(direction), 8, 4.0))
-            turned.append(sample_patches(blurred, corners[kept], direction, 8, 4.0))
+            upright.append(sample_patches(blurred, corners[kept], np.zeros_like(direction), PATCH_SIDE, 4.0))
+            turned.append(sample_patches(blurred, corners[kept], direction, PATCH_SIDE, 4.0))
         patches, structured = _normalize_patches(np.concatenate(upright + turned))
         zeros = np.zeros(sum(len(a) for a in angle), np.float32)
         return Seeds(
@@ -121,6 +132,45 @@ class MultiScaleCorners:
             angle=np.concatenate([zeros, *angle])[structured],
             patches=patches[structured],
         )
+
+    def oblique_seeds(self, image: Image) -> Seeds:
+        """Seeds of simulated oblique views, in the orientation of the image and rotated to their gradient."""
+        enlargement = 2.0 if max(image.size) < self.upsample_below_px else 1.0
+        views = oblique_views(image.gray, self.oblique_tilts, enlargement)
+        parts = [self._seeds_of_view(view, image.size) for view in views]
+        none = np.empty(0, np.float32)
+        empty = np.empty((0, 2)), none, none, np.empty((0, PATCH_SIDE**2), np.float32), np.empty((0, 2, 2))
+        columns = zip(empty, *chain(*parts), strict=True)
+        xy, scale, angle, raw, frame = (np.concatenate(column) for column in columns)
+        patches, ok = _normalize_patches(raw)
+        return Seeds(xy[ok], scale[ok], angle[ok], patches[ok], frame[ok])
+
+    def _seeds_of_view(
+        self, view: ObliqueView, size: tuple[int, int]
+    ) -> list[tuple[F64, F32, F32, F32, F64]]:
+        """Fields of the seeds of each level of one simulated view, the patches as they are."""
+        parts, to_image = [], np.linalg.inv(view.to_view)
+        grays, scales = _image_pyramid(view.gray, self.levels, doubled=False)
+        for index, (gray, scale) in enumerate(zip(grays, scales, strict=True)):
+            corners, response = self.measure._find(gray[None])
+            xy = (_PyramidLevel(gray[None], gray, scale).to_image(corners) - view.offset) @ to_image.T
+            spacing = np.sqrt(np.prod(scale))
+            # Half a patch of the image's own pixels: what lies outside repeats its border.
+            margin = PATCH_SIDE * spacing * np.sqrt(np.linalg.det(to_image))
+            inside = ((xy > margin) & (xy < np.array(size) - 1.0 - margin)).all(axis=1)
+            corners, response, xy = corners[inside], response[inside], xy[inside]
+            count = int(OBLIQUE_DENSITY * self.seeds_per_level / view.tilt / np.sqrt(2.0) ** index)
+            kept = self._select(corners, response, count)
+            blurred, corners, xy = smooth(gray, 2.0), corners[kept], xy[kept]
+            upright = np.full(len(kept), -view.direction, np.float32)
+            for turned, angle in ((False, upright), (True, _dominant_direction(blurred, corners))):
+                c, s = np.cos(angle), np.sin(angle)
+                turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2).astype(np.float64)
+                patches = sample_patches(blurred, corners, angle, PATCH_SIDE, 4.0)
+                size_px = np.full(len(kept), spacing * np.sqrt(np.linalg.det(to_image)), np.float32)
+                label = angle if turned else np.zeros_like(angle)
+                parts.append((xy, size_px, label, patches, spacing * (to_image @ turn)))
+        return parts
 
 
 def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> tuple[list[F32], list[F64]]:

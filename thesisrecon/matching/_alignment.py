@@ -298,13 +298,13 @@ def align_matches(
     return select_matches(good, strongest_distinct(good))
 
 
-def strongest_distinct(matches: Matches) -> I64:
+def strongest_distinct(matches: Matches, apart_px: float = APART_PX) -> I64:
     """Rows, sorted, of the matches that do not repeat a stronger one."""
     rows = np.argsort(-matches.score, kind="stable")
     keep = np.ones(len(rows), np.bool_)
     if len(rows) >= 2:
         places = np.hstack([matches.xy1, matches.xy2])[rows]
-        for a, b in sorted(scipy.spatial.cKDTree(places).query_pairs(APART_PX)):
+        for a, b in sorted(scipy.spatial.cKDTree(places).query_pairs(apart_px)):
             if keep[a]:
                 keep[b] = False
     kept: I64 = np.sort(rows[keep])

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields, replace
+from typing import Literal
 
 import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.kernels import full, kernel, zeros
-from thesisrecon.matching._prepared import empty_matches
-from thesisrecon.records import Matches, Seeds
+from thesisrecon.matching._alignment import strongest_distinct
+from thesisrecon.matching._prepared import empty_matches, select_matches
+from thesisrecon.records import Features, Matches, Seeds
 
 BLOCK, CHUNK = 256, 64
 """Rows multiplied at a time, and columns compared at once."""
 NEIGHBOURS, TOLERANCE = 10, 0.3
 # Maximum distance of a corner from its seed or prediction.
 REACH_PX = 4.0
+SeedSet = tuple[Matches, Callable[[Matches], F64]]
+"""Matched seeds, and the function that computes their strength of match."""
 
 
 @kernel(fastmath={"nnan", "nsz"}, forceinline=True)
@@ -97,7 +102,7 @@ def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32,
 def match_seeds(
     seeds1: Seeds, seeds2: Seeds, pair: tuple[int, int], *, rotated: bool, ratio: float
 ) -> Matches:
-    """Match seeds that are mutually nearest and pass the ratio test; their maps are similarities.
+    """Match seeds that are mutually nearest and pass the ratio test; with their local maps.
 
     The distance of unit patches is sqrt(2 - 2 correlation). Other seeds count as elsewhere beyond a quarter
     of the patch (8 pixels of its level). ``rotated``: use the patches rotated to their dominant gradient.
@@ -113,9 +118,54 @@ def match_seeds(
     distinct = (1.0 - value) < ratio**2 * (1.0 - second_best)
     rows = np.flatnonzero((index >= 0) & distinct & (value > 0.5))
     one, two = use1[rows], use2[index[rows]]
-    turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
-    grow = (seeds2.scale[two] / seeds1.scale[one]).astype(np.float64)
-    return Matches(*pair, one, two, seeds1.xy[one], seeds2.xy[two], value[rows], _similarity(grow, turn))
+    if seeds1.frame is None and seeds2.frame is None:
+        turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
+        affine = _similarity((seeds2.scale[two] / seeds1.scale[one]).astype(np.float64), turn)
+    else:
+        affine = _frame(seeds2)[two] @ np.linalg.inv(_frame(seeds1)[one])
+    return Matches(*pair, one, two, seeds1.xy[one], seeds2.xy[two], value[rows], affine)
+
+
+def _frame(seeds: Seeds) -> F64:
+    """Maps (S, 2, 2) of patches to image pixels."""
+    if seeds.frame is not None:
+        return seeds.frame
+    return _similarity(seeds.scale.astype(np.float64), seeds.angle.astype(np.float64))
+
+
+def seed_matches(
+    features1: Features,
+    features2: Features,
+    pair: tuple[int, int],
+    *,
+    orientation: Literal["auto", "upright", "rotated"],
+    ratio: float,
+) -> Iterator[SeedSet]:
+    """Sets of matched seeds: one of each orientation, or one of all if there are simulated oblique views.
+
+    These are matched with the other image itself: compressing one of two images makes any two views of a
+    plane alike but for a similarity.
+    """
+    seeds1, seeds2 = features1.seeds, features2.seeds
+    assert seeds1 is not None
+    assert seeds2 is not None
+    orientations = {"auto": (False, True), "upright": (False,), "rotated": (True,)}[orientation]
+    if features1.oblique is None or features2.oblique is None:
+        for rotated in orientations:
+            yield match_seeds(seeds1, seeds2, pair, rotated=rotated, ratio=ratio), neighbour_support
+        return
+    ways = (_joined(seeds1, features1.oblique), seeds2), (seeds1, _joined(seeds2, features2.oblique))
+    found = [
+        match_seeds(*way, pair, rotated=rotated, ratio=ratio) for rotated in orientations for way in ways
+    ]
+    arrays = (np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches)[2:])
+    matches = Matches(*pair, *arrays)
+    yield select_matches(matches, strongest_distinct(matches, REACH_PX)), map_support
+
+
+def _joined(seeds: Seeds, oblique: Seeds) -> Seeds:
+    both = replace(seeds, frame=_frame(seeds)), oblique
+    return Seeds(*(np.concatenate([getattr(part, f.name) for part in both]) for f in fields(Seeds)))
 
 
 def _similarity(scale: F64, angle: F64) -> F64:
@@ -157,6 +207,29 @@ def neighbour_support(matches: Matches) -> F64:
         near = scipy.spatial.cKDTree(here).query(here, k)[1][:, 1:]
         apart = np.linalg.norm(here[near] - here[:, None], axis=2)
         strain = np.linalg.norm((there[near] - there[:, None]) - (here[near] - here[:, None]), axis=2)
+        support += np.exp(-0.5 * (strain / (TOLERANCE * apart + 1.0)) ** 2).sum(axis=1)
+    return 0.5 * support
+
+
+def map_support(matches: Matches) -> F64:
+    """Number (M,) of neighbours that each match predicts by its own map, as in :func:`neighbour_support`.
+
+    Unlike a common rotation and scale it holds for oblique surfaces, but needs maps that are affine.
+    """
+    count = len(matches.xy1)
+    support = np.zeros(count)
+    if count < 2:
+        return support
+    k = min(2 * NEIGHBOURS + 1, count)
+    ways = (
+        (matches.xy1, matches.xy2, matches.affine),
+        (matches.xy2, matches.xy1, np.linalg.inv(matches.affine)),
+    )
+    for here, there, maps in ways:
+        near = scipy.spatial.cKDTree(here).query(here, k)[1][:, 1:]
+        led = np.einsum("mij,mkj->mki", maps, here[near] - here[:, None])
+        strain = np.linalg.norm(there[near] - there[:, None] - led, axis=2)
+        apart = np.linalg.norm(led, axis=2)
         support += np.exp(-0.5 * (strain / (TOLERANCE * apart + 1.0)) ** 2).sum(axis=1)
     return 0.5 * support
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ import scipy
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.kernels import empty, full, kernel, zeros
-from thesisrecon.matching._alignment import align_matches, strongest_distinct
+from thesisrecon.matching._alignment import align_corners, align_matches, strongest_distinct
 from thesisrecon.matching._prepared import (
     SAMPLES,
     SIDE,
@@ -27,16 +28,20 @@ from thesisrecon.matching._prepared import (
     sample_window,
     select_matches,
 )
-from thesisrecon.matching._seeds import corners_of_seeds, match_seeds, neighbour_support
+from thesisrecon.matching._seeds import SeedSet, corners_of_seeds, map_support, seed_matches
 from thesisrecon.numerics._small_solvers import solve_damped
-from thesisrecon.records import Features, Image, Matches, Seeds
+from thesisrecon.records import Features, Image, Matches
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
 APART = 3.0
 # Minimum strength of match (at most 10) of a seed in the filtered trial, and verified seeds of a pair.
 MIN_SUPPORT, MIN_SEEDS = 2.0, 12
+# The same of seeds whose maps are affine.
+MIN_MAP_SUPPORT = 1.0
 # Maximum search radius around a prediction relative to the long side, and minimum correlation there.
 RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
+# Pairs with a wide step have few seeds, whose maps are known to a fifth and positions to a few pixels.
+OBLIQUE_NEIGHBOURS, SEED_AFFINE_STD, GROWN_AFFINE_STD, SEED_SHIFT = 3, 0.2, 0.1, 5.0
 # Rounds of least squares of a local map: the first unweighted, the others reweighted.
 ROUNDS = 3
 # Weight of the prior of a local map, relative to the neighbours' weights along one direction.
@@ -311,6 +316,9 @@ class SeedsAndGrowth:
         Repeat the guided matching with the F and the maps of its own matches.
     align : bool
         Align positions in image 2 by least-squares matching, else keep the corners.
+    oblique_pairs : int
+        Number of pairs that each image outside the largest group of matched images is tried in again, with
+        seeds of simulated oblique views; 0 for none.
     """
 
     ratio: float = 0.8
@@ -324,10 +332,12 @@ class SeedsAndGrowth:
     coarse_first: bool = True
     rematch: bool = True
     align: bool = True
+    oblique_pairs: int = 6
 
     def __post_init__(self) -> None:
-        if self.neighbours < 1:
-            raise ValueError(f"neighbours must be at least 1; got {self.neighbours}")
+        for name, least in (("neighbours", 1), ("oblique_pairs", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
         for name in ("ratio", "grown_ratio", "band_rel"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
@@ -348,17 +358,19 @@ class SeedsAndGrowth:
         rng: np.random.Generator,
     ) -> Matches:
         """See `thesisrecon.config.Matcher.match`."""
-        seeds1, seeds2 = view1.features.seeds, view2.features.seeds
-        if seeds1 is None or seeds2 is None:
+        features1, features2 = view1.features, view2.features
+        if features1.seeds is None or features2.seeds is None:
             raise UsageError(
                 "seeds-and-growth matching needs features with seeds; set "
                 "features.kind=multi-scale-corners, or matching.kind=strength-of-match"
             )
-        start = self._verified_seeds(seeds1, seeds2, pair, estimate_fundamental, rng)
+        sets = seed_matches(features1, features2, pair, orientation=self.orientation, ratio=self.ratio)
+        start = self._verified_seeds(sets, estimate_fundamental, rng)
         if start is None:
             return empty_matches(pair)
         if self.growth:
-            matches = self._grow_in_rounds(view1, view2, start, estimate_fundamental, rng)
+            grow = self._grow_in_rounds if features1.oblique is None else self._grow_around_seeds
+            matches = grow(view1, view2, start, estimate_fundamental, rng)
         else:
             matches = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
         if not self.align:
@@ -366,19 +378,13 @@ class SeedsAndGrowth:
         return align_matches(view1, view2, matches, affine_std=self.affine_std)
 
     def _verified_seeds(
-        self,
-        seeds1: Seeds,
-        seeds2: Seeds,
-        pair: tuple[int, int],
-        estimate: EstimateFundamental,
-        rng: np.random.Generator,
+        self, sets: Iterable[SeedSet], estimate: EstimateFundamental, rng: np.random.Generator
     ) -> tuple[Matches, F64] | None:
-        """Most seeds that agree with one F, and F."""
+        """Most seeds that agree with one F, and F; later sets only if the earlier ones agree little."""
         best: tuple[Matches, F64] | None = None
         most = 0
-        for rotated in {"auto": (False, True), "upright": (False,), "rotated": (True,)}[self.orientation]:
-            seeds = match_seeds(seeds1, seeds2, pair, rotated=rotated, ratio=self.ratio)
-            for trial in self._trials(seeds):
+        for seeds, support in sets:
+            for trial in self._trials(seeds, support):
                 try:
                     fit = estimate(trial.xy1, trial.xy2, rng)
                 except StageFailure:
@@ -389,15 +395,45 @@ class SeedsAndGrowth:
                 break
         return best
 
-    def _trials(self, seeds: Matches) -> tuple[Matches, ...]:
+    def _trials(self, seeds: Matches, support: Callable[[Matches], F64]) -> tuple[Matches, ...]:
         """Sets of seeds to estimate F from; none if there are too few."""
         if self.support == "never":
             return (seeds,) if len(seeds.xy1) >= MIN_SEEDS else ()
-        supported = neighbour_support(seeds) >= MIN_SUPPORT
+        wide = support is map_support
+        supported = support(seeds) >= (MIN_MAP_SUPPORT if wide else MIN_SUPPORT)
         if supported.sum() < MIN_SEEDS:
             return ()
         chosen = select_matches(seeds, supported)
-        return (chosen, seeds) if self.support == "auto" else (chosen,)
+        # So few seeds of simulated views are right that a wrong F of all may have more inliers.
+        return (chosen, seeds) if self.support == "auto" and not wide else (chosen,)
+
+    def _grow_around_seeds(
+        self,
+        view1: PreparedImage,
+        view2: PreparedImage,
+        start: tuple[Matches, F64],
+        estimate: EstimateFundamental,
+        rng: np.random.Generator,
+    ) -> Matches:
+        """Match corners near few seeds, whose maps count: align them, then the matches of a first pass."""
+        known, F = start
+        near = replace(self, neighbours=min(self.neighbours, OBLIQUE_NEIGHBOURS))
+        scale = np.full(len(known.xy1), view1.features.scale.max(), np.float32)
+        places = (known.xy1, scale, known.xy2, known.affine)
+        xy2, affine, score = align_corners(
+            view1, view2, places, affine_std=SEED_AFFINE_STD, max_shift=SEED_SHIFT
+        )
+        aligned = np.flatnonzero(score >= MIN_CORRELATION)
+        if len(aligned) >= 8:
+            known = select_matches(replace(known, xy2=xy2, affine=affine), aligned)
+        grown = near._grow_in_rounds(view1, view2, (known, F), estimate, rng)
+        aligned_matches = align_matches(view1, view2, grown, affine_std=GROWN_AFFINE_STD)
+        try:
+            fit = estimate(aligned_matches.xy1, aligned_matches.xy2, rng)
+        except StageFailure:
+            return grown
+        known = select_matches(aligned_matches, fit.inliers)
+        return near._grow_in_rounds(view1, view2, (known, fit.F), estimate, rng)
 
     def _grow_in_rounds(
         self,

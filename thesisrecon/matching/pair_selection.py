@@ -19,7 +19,7 @@ from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.kernels import kernel
 from thesisrecon.matching._seeds import mutual_best
-from thesisrecon.records import Features, PairChoice, Seeds
+from thesisrecon.records import Features, PairChoice, Seeds, TwoView
 
 # ruff: noqa: ARG002 (all selectors have the same arguments)
 
@@ -203,7 +203,7 @@ class OverlapEstimate:
                 similarity += _bow_similarity(patches, self.words, map_all=map_all, rng=rng)
         compared = _most_similar(similarity, self.shortlist)
         evidence = np.array(
-            map_all(lambda pair: self._evidence(subsets[pair[0]], subsets[pair[1]]), compared.tolist())
+            map_all(lambda pair: _evidence(subsets[pair[0]], subsets[pair[1]]), compared.tolist())
         )
         chosen = self._choose(similarity, compared, evidence)
         how = (
@@ -218,13 +218,7 @@ class OverlapEstimate:
                 f"the overlap of more than {self.all_up_to} images is estimated from seeds, which these "
                 "features do not have; set features.kind=multi-scale-corners, or pairs.kind=all-pairs"
             )
-        return _subset_seeds(features.seeds, rotated=False), _subset_seeds(features.seeds, rotated=True)
-
-    def _evidence(
-        self, a: tuple[_FeatureSubset, _FeatureSubset], b: tuple[_FeatureSubset, _FeatureSubset]
-    ) -> float:
-        upright = _overlap_evidence(a[0], b[0])
-        return upright if upright >= DECIDED else max(upright, _overlap_evidence(a[1], b[1]))
+        return _subsets(features.seeds)
 
     def _choose(self, similarity: F64, compared: I64, evidence: F64) -> I64:
         """Pairs (M, 2) with enough evidence, the best of each image, and those that connect the set."""
@@ -312,6 +306,15 @@ def _subset_seeds(seeds: Seeds, *, rotated: bool) -> _FeatureSubset:
     )
 
 
+def _subsets(seeds: Seeds) -> tuple[_FeatureSubset, _FeatureSubset]:
+    return _subset_seeds(seeds, rotated=False), _subset_seeds(seeds, rotated=True)
+
+
+def _evidence(a: tuple[_FeatureSubset, _FeatureSubset], b: tuple[_FeatureSubset, _FeatureSubset]) -> float:
+    upright = _overlap_evidence(a[0], b[0])
+    return upright if upright >= DECIDED else max(upright, _overlap_evidence(a[1], b[1]))
+
+
 def _overlap_evidence(a: _FeatureSubset, b: _FeatureSubset) -> float:
     """Evidence that mutually best patches agree with one similarity, -log10 of the number of false alarms.
 
@@ -390,3 +393,24 @@ def _count_words(patches: F32, vocabulary: F32) -> F64:
     words = len(vocabulary)
     nearest = np.argpartition(-(patches @ vocabulary.T), min(2, words - 1), axis=1)[:, :3]
     return np.bincount(nearest.ravel(), minlength=words).astype(np.float64)
+
+
+def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView], most: int) -> list[int]:
+    """Numbers, ascending, of the rejected pairs that would connect the groups of matched images.
+
+    Each image outside the largest group is in at most ``most``, those with the strongest overlap evidence.
+    """
+    if not most:
+        return []
+    accepted = [(pair.i, pair.j) for pair in two_views if pair.accepted]
+    i, j = np.array(accepted, dtype=np.int64).reshape(-1, 2).T
+    graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (len(features), len(features)))
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    between = [n for n, pair in enumerate(two_views) if group[pair.i] != group[pair.j]]
+    subsets = {v: _subsets(f.seeds) for v, f in enumerate(features) if f.seeds is not None and between}
+    evidence = {n: _evidence(subsets[two_views[n].i], subsets[two_views[n].j]) for n in between}
+    chosen = set[int]()
+    for view in np.flatnonzero(group != np.argmax(np.bincount(group))):
+        of_view = [n for n in between if view in (two_views[n].i, two_views[n].j)]
+        chosen.update(sorted(of_view, key=lambda n: -evidence[n])[:most])
+    return sorted(chosen)

@@ -65,25 +65,47 @@ def match_pair(
     config = as_config(config)
     size = config.images.max_size_px
     images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
-    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
-    masks = images[0].mask, images[1].mask
-    pair = match_views(config, views[0], views[1], (0, 1), seed, masks)
+    pair = match_images(config, (images[0], images[1]), seed)
     if not pair.accepted:
         raise StageFailure("the two images do not match", pair.reason)
     return pair
 
 
+def match_images(config: PipelineConfig, images: tuple[Image, Image], seed: int) -> TwoView:
+    """Match two images; if they do not match, again with seeds of simulated oblique views."""
+    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+    masks = images[0].mask, images[1].mask
+    pair = match_views(config, views[0], views[1], (0, 1), seed, masks)
+    if pair.accepted or not oblique_pairs(config):
+        return pair
+    features = [view.features for view in views]
+    views = [prepare_oblique(config, *given) for given in zip(images, features, strict=True)]
+    again = match_views(config, views[0], views[1], (0, 1), seed, masks)
+    return again if again.accepted else pair
+
+
 def detect_features(config: PipelineConfig, image: Image) -> Features:
     """Detect the features of an image; those with a masked pixel within ``MASK_REACH`` are dropped."""
-    found = config.features.detect(image)
+    found = _unmasked(config.features.detect(image), image)
+    return found if found.seeds is None else replace(found, seeds=_unmasked(found.seeds, image))
+
+
+def oblique_pairs(config: PipelineConfig) -> int:
+    """Number of pairs of an image that are matched again with seeds of simulated oblique views."""
+    wanted: int = getattr(config.matching, "oblique_pairs", 0)
+    return wanted if getattr(config.features, "oblique_tilts", ()) else 0
+
+
+def prepare_oblique(config: PipelineConfig, image: Image, features: Features) -> Any:
+    """Prepare an image for matching with seeds of simulated oblique views."""
+    seeds = _unmasked(config.features.oblique_seeds(image), image)  # type: ignore[attr-defined]
+    return config.matching.prepare(image, replace(features, oblique=seeds))
+
+
+def _unmasked(found: Found, image: Image) -> Found:
     if image.mask is None or image.mask.all():
         return found
     clear = scipy.ndimage.distance_transform_cdt(image.mask, "chessboard")
-    corners = _unmasked(found, clear)
-    return corners if found.seeds is None else replace(corners, seeds=_unmasked(found.seeds, clear))
-
-
-def _unmasked(found: Found, clear: Any) -> Found:
     keep = values_at(clear, found.xy) > MASK_REACH * found.scale
     arrays = {field.name: getattr(found, field.name) for field in fields(found)}
     return replace(found, **{name: a[keep] for name, a in arrays.items() if isinstance(a, np.ndarray)})

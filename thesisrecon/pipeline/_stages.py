@@ -17,8 +17,14 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.matching.pair_selection import pairs_to_connect
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
-from thesisrecon.pipeline._image_pair import detect_features, match_views
+from thesisrecon.pipeline._image_pair import (
+    detect_features,
+    match_views,
+    oblique_pairs,
+    prepare_oblique,
+)
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
 from thesisrecon.records import (
     DepthMap,
@@ -96,23 +102,36 @@ def select_pairs(state: PipelineState) -> None:
 
 def match_pairs(state: PipelineState) -> None:
     """Match the pairs and estimate their epipolar geometry (4.2.2, chapter 5); sets ``result.pairs``."""
-    run, result = state.run, state.result
-    assert result.pair_choice is not None
-    pairs = [(int(i), int(j)) for i, j in result.pair_choice.pairs]
+    assert state.result.pair_choice is not None
+    pairs = [(int(i), int(j)) for i, j in state.result.pair_choice.pairs]
+    found = _matched(state, pairs, "", lambda: _prepared(state))
+    again = pairs_to_connect(state.result.features, found, oblique_pairs(state.config))
+    if again:
+        second = _matched(state, [pairs[n] for n in again], "-oblique", lambda: _prepared_oblique(state))
+        for n, pair in zip(again, second, strict=True):
+            found[n] = pair if pair.accepted else found[n]
+    finish_matches(state, found)
+
+
+def _matched(
+    state: PipelineState, pairs: Sequence[tuple[int, int]], kind: str, prepared: Callable[[], Sequence[Any]]
+) -> list[TwoView]:
+    """Match pairs of prepared views; ``kind`` names another way of preparation."""
+    run = state.run
     variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
     features = list(run.logs["features"].keys.values())
-    inputs = {(i, j): (features[i], features[j], run.seed, i, j) for i, j in pairs}
-    keys = {f"{i:05d}-{j:05d}": run.key("matches", variants, *inputs[i, j]) for i, j in pairs}
+    inputs = {(i, j): (features[i], features[j], run.seed, i, j, *([kind] if kind else [])) for i, j in pairs}
+    keys = {f"{i:05d}-{j:05d}{kind}": run.key("matches", variants, *inputs[i, j]) for i, j in pairs}
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
-        views, shared = _prepared(state), run.workers.in_process
+        views, shared = prepared(), run.workers.in_process
         assert isinstance(views, PreparedViews)
         for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel()):
             some = [pairs[n] for n in numbers]
             given = views if shared else views.subset({view for pair in some for view in pair})
             yield numbers, (state.config, given, some, run.seed)
 
-    finish_matches(state, run.map_cached("matches", keys, _match_all, batches))
+    return run.map_cached("matches", keys, _match_all, batches)
 
 
 def finish_matches(state: PipelineState, two_views: Sequence[TwoView]) -> None:
@@ -142,9 +161,16 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
 
 def _prepared(state: PipelineState) -> Sequence[Any]:
     if state.prepared is None:
-        given = zip(state.result.images, state.result.features, strict=True)
-        state.prepared = PreparedViews(state.config.matching, dict(enumerate(given)))
+        state.prepared = PreparedViews(state.config.matching.prepare, _given(state))
     return state.prepared
+
+
+def _prepared_oblique(state: PipelineState) -> PreparedViews:
+    return PreparedViews(partial(prepare_oblique, state.config), _given(state))
+
+
+def _given(state: PipelineState) -> dict[int, tuple[Image, Features]]:
+    return dict(enumerate(zip(state.result.images, state.result.features, strict=True)))
 
 
 def _match_all(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
 
 from thesisrecon.arrays import B8
-from thesisrecon.config import Matcher, PipelineConfig
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
@@ -23,6 +23,7 @@ from thesisrecon.runtime._run import Run
 
 CACHE_BYTES = 2**30
 """Prepared views take several times the memory of their image and are quickly prepared again."""
+Prepare = Callable[[Image, Features], Any]
 MAX_BATCH = 64
 BATCHES_PER_WORKER = 8
 
@@ -30,13 +31,13 @@ BATCHES_PER_WORKER = 8
 class PreparedViews(Sequence[Any]):
     """Views prepared for matching on demand, in a least-recently-used cache that is never pickled."""
 
-    def __init__(self, matching: Matcher, given: Mapping[int, tuple[Image, Features]]) -> None:
-        self._matching, self._given = matching, dict(given)
+    def __init__(self, prepare: Prepare, given: Mapping[int, tuple[Image, Features]]) -> None:
+        self._prepare, self._given = prepare, dict(given)
         self._kept: OrderedDict[int, tuple[Any, int]] = OrderedDict()
         self._lock, self._bytes = threading.Lock(), 0
 
-    def __reduce__(self) -> tuple[type[PreparedViews], tuple[Matcher, dict[int, tuple[Image, Features]]]]:
-        return PreparedViews, (self._matching, self._given)
+    def __reduce__(self) -> tuple[type[PreparedViews], tuple[Prepare, dict[int, tuple[Image, Features]]]]:
+        return PreparedViews, (self._prepare, self._given)
 
     def __len__(self) -> int:
         return len(self._given)
@@ -49,7 +50,7 @@ class PreparedViews(Sequence[Any]):
                 self._kept.move_to_end(view)
                 return self._kept[view][0]
         # Two threads may both prepare a view: cheaper than one waiting for the other.
-        made = self._matching.prepare(*self._given[view])
+        made = self._prepare(*self._given[view])
         with self._lock:
             if view not in self._kept:
                 self._kept[view] = made, _size_of(made)
@@ -64,7 +65,7 @@ class PreparedViews(Sequence[Any]):
 
     def subset(self, views: Iterable[int]) -> PreparedViews:
         """The same for some views, with an empty cache."""
-        return PreparedViews(self._matching, {view: self._given[view] for view in views})
+        return PreparedViews(self._prepare, {view: self._given[view] for view in views})
 
 
 def _size_of(value: Any) -> int:

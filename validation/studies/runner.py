@@ -56,6 +56,7 @@ MODULES = {
     "subsets": "subsets",
     "surfaces": "surfaces",
     "tensor-views": "tensor_views",
+    "wide-steps": "wide_steps",
 }
 """Name of a study -> the module of this folder that holds its function."""
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
