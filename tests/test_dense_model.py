@@ -20,10 +20,9 @@ ANGLES = (-14.0, -5.0, 4.0, 13.0)
 
 
 def example(title):
-    """Return the code of docs/api.md that begins with this title."""
-    blocks = re.findall(
-        r"```python\n# example: (.*?)```", (ROOT / "docs" / "api.md").read_text("utf-8"), re.DOTALL
-    )
+    """Return the code of docs/recipes/plain-arrays.md that begins with this title."""
+    page = ROOT / "docs" / "recipes" / "plain-arrays.md"
+    blocks = re.findall(r"```python\n# example: (.*?)```", page.read_text("utf-8"), re.DOTALL)
     return next("#" + block for block in blocks if block.startswith(title))
 
 

@@ -1,4 +1,4 @@
-"""The examples of docs/plug-ins.md run as they stand there."""
+"""The examples of docs/recipes/plug-ins.md run as they stand there."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ from thesisrecon.config import ImageOptions
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.matching.tracks import AlignedTracks
 
-PAGE = Path(__file__).parents[1] / "docs" / "plug-ins.md"
+PAGE = Path(__file__).parents[1] / "docs" / "recipes" / "plug-ins.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 GIVEN = {"until": "matches", "max_size": 400}
 

@@ -1,4 +1,4 @@
-"""The ten tasks of docs/tasks.md: short, and they run as they stand, three on smaller or fewer images."""
+"""The ten tasks of docs/recipes/tasks.md are short and run as they stand, three on fewer images."""
 
 import os
 import re
@@ -12,7 +12,7 @@ import pytest
 
 from thesisrecon.io._images import demo_images
 
-PAGE = Path(__file__).parent.parent / "docs" / "tasks.md"
+PAGE = Path(__file__).parent.parent / "docs" / "recipes" / "tasks.md"
 BLOCKS = dict(re.findall(r"^## (.+?)\n.*?```python\n(.*?)```", PAGE.read_text("utf-8"), re.M | re.S))
 FOCAL_PX = 908.6
 pytestmark = pytest.mark.slow
