@@ -385,12 +385,9 @@ class SeedsAndGrowth:
         most = 0
         for seeds, support in sets:
             for trial in self._trials(seeds, support):
-                try:
-                    fit = estimate(trial.xy1, trial.xy2, rng)
-                except StageFailure:
-                    continue
-                if fit.inliers.sum() >= max(MIN_SEEDS, most + 1):
-                    best, most = (select_matches(trial, fit.inliers), fit.F), int(fit.inliers.sum())
+                found = _verified(trial, estimate, rng)
+                if found is not None and len(found[0].xy1) >= max(MIN_SEEDS, most + 1):
+                    best, most = found, len(found[0].xy1)
             if most >= max(50, 0.5 * len(seeds.xy1)):
                 break
         return best
@@ -427,13 +424,8 @@ class SeedsAndGrowth:
         if len(aligned) >= 8:
             known = select_matches(replace(known, xy2=xy2, affine=affine), aligned)
         grown = near._grow_in_rounds(view1, view2, (known, F), estimate, rng)
-        aligned_matches = align_matches(view1, view2, grown, affine_std=GROWN_AFFINE_STD)
-        try:
-            fit = estimate(aligned_matches.xy1, aligned_matches.xy2, rng)
-        except StageFailure:
-            return grown
-        known = select_matches(aligned_matches, fit.inliers)
-        return near._grow_in_rounds(view1, view2, (known, fit.F), estimate, rng)
+        verified = _verified(align_matches(view1, view2, grown, affine_std=GROWN_AFFINE_STD), estimate, rng)
+        return grown if verified is None else near._grow_in_rounds(view1, view2, verified, estimate, rng)
 
     def _grow_in_rounds(
         self,
@@ -453,11 +445,7 @@ class SeedsAndGrowth:
             grown = self._grow(view1, view2, chosen, known, F)
             if len(grown.xy1) < 8:
                 continue
-            try:
-                fit = estimate(grown.xy1, grown.xy2, rng)
-            except StageFailure:
-                continue
-            F, known = fit.F, select_matches(grown, fit.inliers)
+            known, F = _verified(grown, estimate, rng) or (known, F)
         return self._grow(view1, view2, everything, known, F)
 
     def _grow(
@@ -483,3 +471,14 @@ class SeedsAndGrowth:
         rows = one_to_one(index, score)
         one, two, found = chosen[rows], index[rows], view2.features.xy[index[rows]]
         return Matches(known.i, known.j, one, two, xy1[rows], found, score[rows], affine[rows])
+
+
+def _verified(
+    matches: Matches, estimate: EstimateFundamental, rng: np.random.Generator
+) -> tuple[Matches, F64] | None:
+    """The matches that agree with one F, and F; None if no F is found."""
+    try:
+        fit = estimate(matches.xy1, matches.xy2, rng)
+    except StageFailure:
+        return None
+    return select_matches(matches, fit.inliers), fit.F
