@@ -196,19 +196,10 @@ def neighbour_support(matches: Matches) -> F64:
     Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (TOLERANCE |u_m - u_k|))^2), with d the displacement
     after removing the common rotation and scale; both images serve as the first in turn.
     """
-    count = len(matches.xy1)
-    support = np.zeros(count)
-    if count < 2:
-        return support
-    a = _common_similarity(matches)
-    u, v = matches.xy1 @ a.T, matches.xy2
-    k = min(NEIGHBOURS + 1, count)
-    for here, there in ((u, v), (v, u)):
-        near = scipy.spatial.cKDTree(here).query(here, k)[1][:, 1:]
-        apart = np.linalg.norm(here[near] - here[:, None], axis=2)
-        strain = np.linalg.norm((there[near] - there[:, None]) - (here[near] - here[:, None]), axis=2)
-        support += np.exp(-0.5 * (strain / (TOLERANCE * apart + 1.0)) ** 2).sum(axis=1)
-    return 0.5 * support
+    if len(matches.xy1) < 2:
+        return np.zeros(len(matches.xy1))
+    u, v = matches.xy1 @ _common_similarity(matches).T, matches.xy2
+    return 0.5 * (_agreement(u, v, None, NEIGHBOURS) + _agreement(v, u, None, NEIGHBOURS))
 
 
 def map_support(matches: Matches) -> F64:
@@ -216,22 +207,25 @@ def map_support(matches: Matches) -> F64:
 
     Unlike a common rotation and scale it holds for oblique surfaces, but needs maps that are affine.
     """
-    count = len(matches.xy1)
-    support = np.zeros(count)
-    if count < 2:
-        return support
-    k = min(2 * NEIGHBOURS + 1, count)
-    ways = (
-        (matches.xy1, matches.xy2, matches.affine),
-        (matches.xy2, matches.xy1, np.linalg.inv(matches.affine)),
-    )
-    for here, there, maps in ways:
-        near = scipy.spatial.cKDTree(here).query(here, k)[1][:, 1:]
-        led = np.einsum("mij,mkj->mki", maps, here[near] - here[:, None])
-        strain = np.linalg.norm(there[near] - there[:, None] - led, axis=2)
-        apart = np.linalg.norm(led, axis=2)
-        support += np.exp(-0.5 * (strain / (TOLERANCE * apart + 1.0)) ** 2).sum(axis=1)
-    return 0.5 * support
+    if len(matches.xy1) < 2:
+        return np.zeros(len(matches.xy1))
+    xy1, xy2, back = matches.xy1, matches.xy2, np.asarray(np.linalg.inv(matches.affine), np.float64)
+    forth = _agreement(xy1, xy2, matches.affine, 2 * NEIGHBOURS)
+    return 0.5 * (forth + _agreement(xy2, xy1, back, 2 * NEIGHBOURS))
+
+
+def _agreement(here: F64, there: F64, maps: F64 | None, neighbours: int) -> F64:
+    """Number (M,) of the nearest neighbours, in part, that are where the ``maps`` (M, 2, 2) lead.
+
+    None: maps that leave all offsets as they are.
+    """
+    near = scipy.spatial.cKDTree(here).query(here, min(neighbours + 1, len(here)))[1][:, 1:]
+    offset = here[near] - here[:, None]
+    led = offset if maps is None else np.einsum("mij,mkj->mki", maps, offset)
+    strain = np.linalg.norm((there[near] - there[:, None]) - led, axis=2)
+    apart = np.linalg.norm(led, axis=2)
+    support: F64 = np.exp(-0.5 * (strain / (TOLERANCE * apart + 1.0)) ** 2).sum(axis=1)
+    return support
 
 
 def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
