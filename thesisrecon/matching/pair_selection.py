@@ -395,6 +395,13 @@ def _count_words(patches: F32, vocabulary: F32) -> F64:
     return np.bincount(nearest.ravel(), minlength=words).astype(np.float64)
 
 
+def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:
+    """Number (V,) of the group of each view, 0-based: the views that ``pairs`` connect."""
+    i, j = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (views, views))
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
 def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView], most: int) -> list[int]:
     """Numbers, ascending, of the rejected pairs that would connect the groups of matched images.
 
@@ -403,9 +410,7 @@ def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView],
     if not most:
         return []
     accepted = [(pair.i, pair.j) for pair in two_views if pair.accepted]
-    i, j = np.array(accepted, dtype=np.int64).reshape(-1, 2).T
-    graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (len(features), len(features)))
-    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    group = connected_groups(len(features), accepted)
     between = [n for n, pair in enumerate(two_views) if group[pair.i] != group[pair.j]]
     subsets = {v: _subsets(f.seeds) for v, f in enumerate(features) if f.seeds is not None and between}
     evidence = {n: _evidence(subsets[two_views[n].i], subsets[two_views[n].j]) for n in between}

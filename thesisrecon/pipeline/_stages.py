@@ -10,14 +10,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 
 from thesisrecon._code_digest import code_digest
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.matching.pair_selection import pairs_to_connect
+from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._image_pair import (
     detect_features,
@@ -184,8 +183,7 @@ def split_groups(state: PipelineState) -> None:
     views, links = len(state.result.images), [(p.i, p.j) for p in state.result.pairs if p.accepted]
     if not links or not state.config.images.groups:
         return
-    graph = scipy.sparse.coo_array((np.ones(len(links)), np.transpose(links)), shape=(views, views))
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    label = connected_groups(views, links)
     groups = [np.flatnonzero(label == k).tolist() for k in range(label.max() + 1)]
     large = sorted((group for group in groups if len(group) >= MIN_GROUP), key=lambda group: -len(group))
     state.groups = large if len(large) > 1 else ()
