@@ -86,8 +86,9 @@ def match_images(config: PipelineConfig, images: tuple[Image, Image], seed: int)
 
 def detect_features(config: PipelineConfig, image: Image) -> Features:
     """Detect the features of an image; those with a masked pixel within ``MASK_REACH`` are dropped."""
-    found = _unmasked(config.features.detect(image), image)
-    return found if found.seeds is None else replace(found, seeds=_unmasked(found.seeds, image))
+    found, clear = config.features.detect(image), _distance_to_mask(image)
+    corners = _unmasked(found, clear)
+    return corners if found.seeds is None else replace(corners, seeds=_unmasked(found.seeds, clear))
 
 
 def oblique_pairs(config: PipelineConfig) -> int:
@@ -98,14 +99,21 @@ def oblique_pairs(config: PipelineConfig) -> int:
 
 def prepare_oblique(config: PipelineConfig, image: Image, features: Features) -> Any:
     """Prepare an image for matching with seeds of simulated oblique views."""
-    seeds = _unmasked(config.features.oblique_seeds(image), image)  # type: ignore[attr-defined]
+    found: Seeds = config.features.oblique_seeds(image)  # type: ignore[attr-defined]
+    seeds = _unmasked(found, _distance_to_mask(image))
     return config.matching.prepare(image, replace(features, oblique=seeds))
 
 
-def _unmasked(found: Found, image: Image) -> Found:
+def _distance_to_mask(image: Image) -> Any:
+    """Distance (H, W) px of each pixel to the nearest masked one; None without a mask."""
     if image.mask is None or image.mask.all():
+        return None
+    return scipy.ndimage.distance_transform_cdt(image.mask, "chessboard")
+
+
+def _unmasked(found: Found, clear: Any) -> Found:
+    if clear is None:
         return found
-    clear = scipy.ndimage.distance_transform_cdt(image.mask, "chessboard")
     keep = values_at(clear, found.xy) > MASK_REACH * found.scale
     arrays = {field.name: getattr(found, field.name) for field in fields(found)}
     return replace(found, **{name: a[keep] for name, a in arrays.items() if isinstance(a, np.ndarray)})
