@@ -108,6 +108,15 @@ class SiftCorners:
         return Features(found.xy[order], found.size[order], found.response[order])
 
 
+def _alike_matches(
+    view1: SiftKeypoints, view2: SiftKeypoints, pair: tuple[int, int], one: I64, two: I64
+) -> Matches:
+    """Matches of keypoints without scores and local maps."""
+    affine = np.broadcast_to(np.eye(2), (len(one), 2, 2)).copy()
+    score = np.ones(len(one), np.float32)
+    return Matches(*pair, one, two, view1.xy[one], view2.xy[two], score, affine)
+
+
 @dataclass(frozen=True)
 class SiftRatioTest:
     """Matches of SIFT descriptors, each the other's nearest, that pass the ratio test."""
@@ -129,9 +138,7 @@ class SiftRatioTest:
     ) -> Matches:
         """Matches by descriptors alone."""
         one, two = match_sift(view1, view2, ratio=self.ratio, mutual=True).T
-        affine = np.broadcast_to(np.eye(2), (len(one), 2, 2)).copy()
-        score = np.ones(len(one), np.float32)
-        return Matches(*pair, one, two, view1.xy[one], view2.xy[two], score, affine)
+        return _alike_matches(view1, view2, pair, one, two)
 
 
 def sift_front_end(config: PipelineConfig) -> PipelineConfig:
@@ -178,9 +185,7 @@ class AffineSift(SiftRatioTest):
             place = np.rint((view1.xy[one], view2.xy[two])[side] / 2.0)
             rows = np.sort(np.unique(place, axis=0, return_index=True)[1])
             one, two = one[rows], two[rows]
-        affine = np.broadcast_to(np.eye(2), (len(one), 2, 2)).copy()
-        score = np.ones(len(one), np.float32)
-        return Matches(*pair, one, two, view1.xy[one], view2.xy[two], score, affine)
+        return _alike_matches(view1, view2, pair, one, two)
 
 
 AFFINE_KEYPOINTS = 2000

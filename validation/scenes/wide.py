@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from thesisrecon.records import Image
 from validation.references.libraries import cv2
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.image_files import read_rgb, write_png
+from validation.scenes.many_views import YARDS
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.raycast import World, trace
 from validation.scenes.real import data_root
@@ -148,7 +148,7 @@ def _yard_pose(step: WideStep) -> Pose:
 
 
 def _rendered(world: World, pose: Pose, name: str) -> U8:
-    file = Path(tempfile.gettempdir()) / "thesisrecon-yards" / "wide" / f"{name}.png"
+    file = YARDS / "wide" / f"{name}.png"
     if not file.is_file():
         rng = np.random.default_rng([2005, len(name)])
         file.parent.mkdir(parents=True, exist_ok=True)

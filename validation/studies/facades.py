@@ -16,11 +16,9 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.records import MetricResult
+from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.intervals import LEVEL, interval_scores
 from validation.scenes.many_views import load_facade
 from validation.scenes.real import Scene
@@ -58,37 +56,30 @@ def lens_error(kind: str, xy: F64, K: F64, rng: np.random.Generator) -> F64:
     return np.asarray(K[0, 0] * moved)
 
 
-def centre_error_mm(metric: MetricResult, C: F64) -> float:
-    """Mean distance of the centres from the truth ``C`` (V, 3) m after a similarity, mm."""
-    views = metric.reconstruction.registered
-    centres = dehomogenize(camera_centre(metric.reconstruction.P[views]))
-    moved = estimate_similarity(centres, C[views]).apply(centres)
-    return float(1e3 * np.linalg.norm(moved - C[views], axis=1).mean())
-
-
 def facades_study(
     out: Path,
     *,
     scenes: int = 3,
-    kinds: Sequence[str] = ("none", "decentring", "aspect", "smooth"),
+    kinds: Sequence[str] = KINDS,
     threads: int = 2,
 ) -> Iterator[Part]:
     """Compare unknown with true calibration on rendered facades, with lens errors that no model has."""
     z: dict[str, list[F64]] = {kind: [] for kind in kinds}
-    errors: dict[str, list[tuple[float, float]]] = {kind: [] for kind in kinds}
+    errors: dict[str, list[list[float | None]]] = {kind: [] for kind in kinds}
     for number in range(scenes):
         scene = load_facade(number)
         matched = match_scene(scene, out, threads=threads)
         for kind in kinds:
             report_progress(f"{scene.name}, {kind}")
             unknown, known = _solved(matched, scene, kind, number)
-            K, _, C = scene.cameras
+            truth = TrueCameras(*scene.cameras)
             # One camera: its first view stands for all.
-            z[kind].append(interval_scores(unknown, K).z[0])
-            errors[kind].append((centre_error_mm(unknown, C), centre_error_mm(known, C)))
+            z[kind].append(interval_scores(unknown, truth.K).z[0])
+            measured = [measure_cameras(one.reconstruction, truth) for one in (unknown, known)]
+            errors[kind].append([one.centre_error_mm for one in measured])
     for kind in kinds:
         rows = Rows(f"lens error: {kind}", UNKNOWN)
-        mean = np.mean(errors[kind], axis=0)
+        mean = np.mean(np.array(errors[kind], dtype=np.float64), axis=0)
         rows.add("error of the camera centres, mean", {UNKNOWN: mean[0], KNOWN: mean[1]}, "mm")
         scores = np.abs(np.array(z[kind]))
         held = float(np.mean(scores <= LEVEL))
