@@ -10,7 +10,7 @@ import pytest
 
 import thesisrecon
 from tests.conftest import refuses
-from tests.given_scene import given_scene
+from tests.given_scene import SIZE, given_scene
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.cli.main import run_command
 
@@ -230,3 +230,31 @@ def test_the_command_takes_one_source_of_images(tmp_path, refused):
         (["a", "--images", "b", "-o", tmp_path], "give the folder of the images, or --from"),
     ):
         assert sentence in refused(["reconstruct", *arguments])
+
+
+def with_few_matches(index):
+    """Matches in which pairs with one image have too few to be accepted."""
+    few = {pair: rows[30 * sum(pair) % 100 :][:40] for pair, rows in SCENE.matches.items()}
+    return {pair: few[pair] if index in pair else rows for pair, rows in SCENE.matches.items()}
+
+
+def test_an_image_of_rejected_pairs_joins_the_finished_model(tmp_path):
+    matches = with_few_matches(4)
+    result = reconstruct_from_matches(SCENE.keypoints, matches, SCENE.sizes, tmp_path)
+    assert not any(pair.accepted for pair in result.pairs if pair.j == 4)
+    assert not result.projective.registered[4]
+    assert focal_is_right(result)
+    found, true = ([c.R for c in cameras] for cameras in (result.cameras.values(), SCENE.cameras))
+    difference = np.degrees(np.arccos((np.trace(found[0] @ found[4].T @ true[4] @ true[0].T) - 1) / 2))
+    assert difference < 0.3
+    loaded = thesisrecon.load(tmp_path)
+    assert np.array_equal(loaded.points, result.points)
+    again = reconstruct_from_matches(SCENE.keypoints, matches, SCENE.sizes, tmp_path)
+    assert "metric" in again.summary["resumed"]
+
+
+def test_an_image_of_another_scene_does_not_join():
+    keypoints, rng = list(SCENE.keypoints), np.random.default_rng(1)
+    keypoints[4] = rng.uniform(0, SIZE, keypoints[4].shape)
+    result = reconstruct_from_matches(keypoints, with_few_matches(4), SCENE.sizes)
+    assert list(result.metric.reconstruction.registered) == [True] * 4 + [False]

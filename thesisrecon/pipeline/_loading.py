@@ -93,7 +93,7 @@ def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) ->
             result,
             projective=stages["projective"][item],
             calibration=stages["selfcalibration"].get(item),
-            metric=stages["metric"].get(item),
+            metric=stages["metric"].get(f"{item}-more", stages["metric"].get(item)),
         )
         for item in stages["projective"]
     ]

@@ -167,7 +167,7 @@ def _write_results(
     colors = point_colors(result.metric.reconstruction, result.images)
     warnings = _write_model(directory, result, result.metric.reconstruction, colors)
     affine = upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
-    write_affine(directory.path / "affine.ply", affine, colors)
+    write_affine(directory.path / "affine.ply", affine, point_colors(affine, result.images))
     if result.mesh is not None:
         write_mesh(directory.path / "model.glb", result.mesh)
     else:

@@ -24,6 +24,7 @@ from thesisrecon.pipeline._image_pair import (
     oblique_pairs,
     prepare_oblique,
 )
+from thesisrecon.pipeline._second_pass import register_more
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
 from thesisrecon.records import (
     DepthMap,
@@ -103,7 +104,7 @@ def match_pairs(state: PipelineState) -> None:
     """Match the pairs and estimate their epipolar geometry (4.2.2, chapter 5); sets ``result.pairs``."""
     assert state.result.pair_choice is not None
     pairs = [(int(i), int(j)) for i, j in state.result.pair_choice.pairs]
-    found = _matched(state, pairs, "", lambda: _prepared(state))
+    found = _matched(state, pairs, "", lambda: state.prepared_views())
     again = pairs_to_connect(state.result.features, found, oblique_pairs(state.config))
     if again:
         second = _matched(state, [pairs[n] for n in again], "-oblique", lambda: _prepared_oblique(state))
@@ -158,18 +159,8 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
     return [f"The epipolar geometry of {of_all} is degenerate ({listed})"]
 
 
-def _prepared(state: PipelineState) -> Sequence[Any]:
-    if state.prepared is None:
-        state.prepared = PreparedViews(state.config.matching.prepare, _given(state))
-    return state.prepared
-
-
 def _prepared_oblique(state: PipelineState) -> PreparedViews:
-    return PreparedViews(partial(prepare_oblique, state.config), _given(state))
-
-
-def _given(state: PipelineState) -> dict[int, tuple[Image, Features]]:
-    return dict(enumerate(zip(state.result.images, state.result.features, strict=True)))
+    return PreparedViews(partial(prepare_oblique, state.config), state.given())
 
 
 def _match_all(
@@ -215,7 +206,9 @@ def build_tracks(state: PipelineState) -> None:
     group = [list(state.groups[0])] if state.groups else []
     key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed, *group)
     build, rng = state.config.tracks.build, stream(run.seed, "tracks")
-    finish_tracks(state, run.cached("tracks", "tracks", key, lambda: build(_prepared(state), pairs, rng)))
+    finish_tracks(
+        state, run.cached("tracks", "tracks", key, lambda: build(state.prepared_views(), pairs, rng))
+    )
 
 
 def require_accepted_pair(state: PipelineState) -> None:
@@ -296,17 +289,14 @@ def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
 
 
 def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) -> MetricResult:
-    run, prior = state.run, state.prior
+    prior = state.prior
     assert state.result.projective is not None
     projective = calibrated_part(state.result.projective, calibration)
     metric: MetricResult = _cached(
-        state, "metric", attempt, run.logs["selfcalibration"].keys[f"attempt-{attempt}"],
+        state, "metric", attempt, state.run.logs["selfcalibration"].keys[f"attempt-{attempt}"],
         lambda rng: state.config.metric.refine(projective, calibration, prior=prior, rng=rng),
     )  # fmt: skip
     state.result = replace(state.result, metric=metric)
-    warnings = [name_images(text, state.names) for text in metric.warnings]
-    best = metric.reconstruction
-    run.finish("metric", counts=_sizes_of(best), metrics={"sigma_px": best.sigma_px}, warnings=warnings)
     return metric
 
 
@@ -325,9 +315,17 @@ def reconstruct_metric(state: PipelineState) -> None:
         tried.append(state.result)
         if trusted:
             break
-    state.result = best_result(tried)
-    if state.result.metric is None:
+    state.result = best = best_result(tried)
+    if best.metric is None:
         raise failures[0]
+    attempt = next(k for k, result in enumerate(tried) if result is best)
+    metric = register_more(state, attempt, best.metric)
+    state.result = replace(best, metric=metric)
+    warnings = [name_images(text, state.names) for text in metric.warnings]
+    found = metric.reconstruction
+    state.run.finish(
+        "metric", counts=_sizes_of(found), metrics={"sigma_px": found.sigma_px}, warnings=warnings
+    )
     if len(tried) > 1:
         state.run.warnings.append(f"{len(tried)} initial pairs were tried; the best result is used")
 

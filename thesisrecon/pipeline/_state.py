@@ -117,6 +117,16 @@ class PipelineState:
         pairs = self.result.pairs
         return tuple(p for p in pairs if {p.i, p.j} <= set(self.groups[0])) if self.groups else pairs
 
+    def given(self) -> dict[int, tuple[Image, Features]]:
+        """Image and features of each view."""
+        return dict(enumerate(zip(self.result.images, self.result.features, strict=True)))
+
+    def prepared_views(self) -> Sequence[Any]:
+        """The views prepared for matching, which tracks are aligned with."""
+        if self.prepared is None:
+            self.prepared = PreparedViews(self.config.matching.prepare, self.given())
+        return self.prepared
+
     @property
     def prior(self) -> IntrinsicsPrior:
         """Prior of the intrinsics at working size."""

@@ -43,7 +43,7 @@ class ReportData:
     reconstruction: Reconstruction | None = None  # projective; ``metric`` takes precedence
     metric: MetricResult | None = None
     colors: U8 | None = None  # (N, 3) of the metric points, valid or not
-    affine: Reconstruction | None = None  # with the same points
+    affine: Reconstruction | None = None
     model: TexturedMesh | None = None  # 45,000 faces with 2048 x 2048 texels add about 2 MB
     depth_maps: Mapping[int, F32] = field(default_factory=dict)  # a long side of 400 px is enough
     held_out: HeldOut | None = None

@@ -35,7 +35,7 @@ from thesisrecon.report._assessment import (
     plus_minus,
     significant,
 )
-from thesisrecon.report._data import ReportData, reprojection_distances, summarize_distances
+from thesisrecon.report._data import ReportData, point_colors, reprojection_distances, summarize_distances
 from thesisrecon.report._drawing import (
     DIFFERENCE_LIMIT,
     SCALE,
@@ -198,9 +198,13 @@ def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
     scene = build_scene(data.metric.reconstruction) if data.metric is not None else None
     if scene is not None:
         figures["scene-figure"] = scene_figure(scene, names, data.colors)
-    affine = build_scene(data.affine, max_points=_AFFINE_POINTS) if data.affine is not None else None
-    if scene is not None and affine is not None:
-        figures["affine-figure"] = scene_figure(affine, names, data.colors)
+    if scene is not None and data.affine is not None:
+        affine, colors = (
+            build_scene(data.affine, max_points=_AFFINE_POINTS),
+            point_colors(data.affine, data.images),
+        )
+        if affine is not None:
+            figures["affine-figure"] = scene_figure(affine, names, colors)
     if data.pairs:
         figures["matrix-figure"] = pair_matrix_figure(data.pairs, names)
     return figures, len(scene.points) if scene is not None else 0
