@@ -1,7 +1,7 @@
 """The second pass for images that the metric model lacks: the matches of rejected pairs meet known cameras.
 
-A pair with few matches cannot prove its own epipolar geometry. The same matches lead to points of the finished
-model, where one camera must explain them with twice as many equations. They are used for missing images only.
+A pair with few matches cannot prove its own epipolar geometry. The same matches lead to points of the model,
+where one camera must explain them with twice as many equations. They are used for missing images only.
 """
 
 from __future__ import annotations
