@@ -54,6 +54,7 @@ CHANGES = {
     "inner function": "def chosen(x):\n    def inner(y): return y [+|-] 1\n    return inner(x)",
     "base class": "class A:\n    @property\n    def p(self): return [1|2]\nclass chosen(A): pass",
     "static method": "class chosen:\n    @staticmethod\n    def f(): return [1|2]",
+    "relative import": "def chosen(x):\n    from . import other\n    return x + [1|2]",
     "module function": "import math\ndef chosen(x): return math.[sin|cos](x)",
 }
 

@@ -149,7 +149,7 @@ def test_wrong_tracks_are_refused():
         (replace(SCENE.tracks, n_views=4), "tracks are of 4 images, the sizes of 5"),
         (replace(SCENE.tracks, view_index=SCENE.tracks.view_index + 1), "beyond the 5 views"),
         (replace(SCENE.tracks, xy=SCENE.tracks.xy[:9]), r"xy \(K, 2\)"),
-        (np.stack(SCENE.keypoints), "must be thesisrecon.Tracks; got a ndarray"),
+        (SCENE.keypoints, r"must be thesisrecon.Tracks or an array of pixels \(V, N, 2\)"),
     ):
         refuses(UsageError, words, reconstruct_from_tracks, wrong, SCENE.sizes)
 

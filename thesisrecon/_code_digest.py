@@ -207,7 +207,8 @@ class _Walk:
             if operation == _IMPORT and argument < len(code.co_names):
                 name = code.co_names[argument]
                 with contextlib.suppress(ImportError):
-                    modules += [importlib.import_module(name)] if self._followed(name) else []
+                    # `from . import name` has no module name.
+                    modules += [importlib.import_module(name)] if name and self._followed(name) else []
         for module in modules:
             if self._followed(module.__name__):
                 for name in code.co_names:

@@ -15,7 +15,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry._homography import require_parallax_of_matches
 from thesisrecon.geometry.two_view import epipoles
-from thesisrecon.io._images import read_pixels
+from thesisrecon.io._images import read_image, read_pixels
 from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo._planar import PlanarRectification
@@ -149,7 +149,7 @@ def _reduced(image: U8) -> F32:
 
 
 def prepare_pair(
-    first: Image, second: Image, *, config: Config | None = None, seed: int = 0
+    image1: Any, image2: Any, *, config: Config | None = None, seed: int = 0
 ) -> InterpolatedPair:
     """Match and rectify two images of any pose for any number of views between them.
 
@@ -157,7 +157,7 @@ def prepare_pair(
 
     Parameters
     ----------
-    first, second : Image
+    image1, image2 : str, Path, ndarray (H, W, 3) uint8 or Image
         Images of one size.
     config, seed : PipelineConfig or str or path, int
         Configuration (None: the default) and random seed.
@@ -175,6 +175,10 @@ def prepare_pair(
         images, scaled.
     """
     config = as_config(config)
+    first, second = (
+        one if isinstance(one, Image) else read_image(one, max_size_px=config.images.max_size_px).images[0]
+        for one in (image1, image2)
+    )
     require_comparable_images((first, second))
     pair = match_pair(first.rgb, second.rgb, config=config, seed=seed)
     _require_sideways_motion(pair, (first, second))

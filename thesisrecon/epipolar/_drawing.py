@@ -29,7 +29,7 @@ def _drawn(image: U8, lines: F64, xy: F64) -> U8:
 
     canvas = PIL.Image.fromarray(image)
     draw = PIL.ImageDraw.Draw(canvas)
-    reach, thick = float(np.hypot(*canvas.size)), max(1, round(max(canvas.size) / 800))
+    reach, thick = float(np.hypot(*canvas.size)), max(1, round(max(canvas.size) / 400))
     middle = (np.array(canvas.size) - 1.0) / 2.0
     for k, (line, point) in enumerate(zip(lines, xy, strict=True)):
         # The golden ratio spreads hues evenly for any number of matches.

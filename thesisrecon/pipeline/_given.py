@@ -208,11 +208,15 @@ def _forward(m: Matches) -> Matches:
     return m if m.i < m.j else _match_record((m.j, m.i), m.index2, m.index1, m.xy2, m.xy1)
 
 
-def given_tracks(tracks: Tracks, views: Views) -> Given:
+def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
     """The matches of all pairs of images that share enough points."""
     count = len(views.names)
     if not isinstance(tracks, Tracks):
-        raise UsageError(f"tracks must be thesisrecon.Tracks; got a {type(tracks).__name__}")
+        if not isinstance(tracks, np.ndarray) or tracks.ndim != 3 or tracks.shape[2] != 2:
+            kinds = "thesisrecon.Tracks or an array of pixels (V, N, 2), NaN where a point is not seen"
+            raise UsageError(f"tracks must be {kinds}; got a {type(tracks).__name__}")
+        point, view = np.nonzero(np.isfinite(tracks).all(axis=2).T)
+        tracks = Tracks(view, point, tracks[view, point], *tracks.shape[:2])
     view, point = np.asarray(tracks.view_index), np.asarray(tracks.point_index)
     if tracks.n_views != count:
         raise UsageError(f"the tracks are of {tracks.n_views} images, the sizes of {count}")

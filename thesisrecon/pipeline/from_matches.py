@@ -127,7 +127,7 @@ def reconstruct_from_matches(
 
 
 def reconstruct_from_tracks(
-    tracks: Tracks,
+    tracks: Tracks | F64,
     sizes: Sequence[tuple[int, int]] | I64,
     out: str | Path | None = None,
     *,
@@ -142,9 +142,9 @@ def reconstruct_from_tracks(
 
     Parameters
     ----------
-    tracks : Tracks
-        Observations in pixels of the images; wrong ones are found. Pairs of images are verified by the points
-        that they share.
+    tracks : Tracks or ndarray (V, N, 2)
+        Observations in pixels of the images, in an array NaN where a point is not seen; wrong ones are found.
+        Pairs of images are verified by the points that they share.
     sizes, out, names, images, config, seed, progress, **options
         As for :func:`reconstruct_from_matches`.
 
@@ -163,10 +163,8 @@ def reconstruct_from_tracks(
     ``keypoints`` as in the example of `thesisrecon.reconstruct_from_matches`:
 
     >>> import numpy as np
-    >>> from thesisrecon import Tracks, reconstruct_from_tracks
-    >>> view, point = np.repeat(np.arange(5), 200), np.tile(np.arange(200), 5)
-    >>> tracks = Tracks(view, point, np.concatenate(keypoints), 5, 200)
-    >>> result = reconstruct_from_tracks(tracks, [(640, 480)] * 5)
+    >>> from thesisrecon import reconstruct_from_tracks
+    >>> result = reconstruct_from_tracks(np.stack(keypoints), [(640, 480)] * 5)
     >>> bool(abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"])
     True
     """
