@@ -81,9 +81,12 @@ class BundleAdjustment:
         return np.asarray((self.row_prior(model).std > 0.0).any(axis=0))
 
     def run(
-        self, model: MetricEstimate, *, free: B8 | None = None, iterations: int
+        self, model: MetricEstimate, *, free: B8 | None = None, fixed: B8 | None = None, iterations: int
     ) -> tuple[MetricEstimate, MetricBundleResult]:
-        """Adjust the model to its inliers, by default all that the prior leaves ``free``; measure noise."""
+        """Adjust the model to its inliers, by default all that the prior leaves ``free``; measure noise.
+
+        ``fixed`` (V,) cameras do not move.
+        """
         prior, moves = self.row_prior(model), self.free(model)
         result = refine_metric_bundle(
             model.cameras,
@@ -92,6 +95,7 @@ class BundleAdjustment:
             free=moves if free is None else moves & free,
             prior=prior,
             options=self.options(model, iterations=iterations),
+            fixed=fixed,
         )
         norms = np.linalg.norm(result.residual_px, axis=1)
         sigma = max(noise_from_distances(norms), self.noise_floor_px)

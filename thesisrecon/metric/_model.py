@@ -20,6 +20,8 @@ EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0
 """Residual gates of the early and the late rounds in noise sigmas."""
 MIN_ANGLE = float(np.radians(0.05))
 """Smallest triangulation angle of a point."""
+MAX_OBSERVATIONS, MIN_PER_VIEW, CELLS = 400_000, 1000, 8
+"""Observations above which points are chosen for adjustment, the least of a view, and cells along a side."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,48 @@ class MetricEstimate:
     def gate_px(self) -> float:
         """Noise times tail width: the unit of gates in sigmas."""
         return self.sigma_px * self.tail
+
+
+def restrict_points(model: MetricEstimate, points: I64) -> MetricEstimate:
+    """The model with only ``points``, in this order."""
+    t, number = model.tracks, np.full(model.tracks.n_points, -1)
+    number[points] = np.arange(len(points))
+    k = np.flatnonzero(number[t.point_index] >= 0)
+    tracks = Tracks(t.view_index[k], number[t.point_index[k]], t.xy[k], t.n_views, len(points))
+    return replace(model, tracks=tracks, X=model.X[points], valid=model.valid[points], inlier=model.inlier[k])
+
+
+def with_enough_points(model: MetricEstimate) -> MetricEstimate:
+    """The model with points that hold every view: of each cell of its image in turn, the longest tracks.
+
+    All points up to ``MAX_OBSERVATIONS``; of more, the rest adds little to the precision of the cameras.
+    Points that are known come before others.
+    """
+    t = model.tracks
+    quota = max(MIN_PER_VIEW, MAX_OBSERVATIONS // t.n_views)
+    if len(t.xy) <= MAX_OBSERVATIONS:
+        return model
+    length = np.bincount(t.point_index, minlength=t.n_points)
+    shortness = -(length + t.n_views * model.valid)[t.point_index]
+    cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
+    cell[:, 0] += CELLS * (cell[:, 1] + CELLS * t.view_index)
+    rank = _ranks(cell[:, 0], shortness, np.zeros_like(shortness))
+    chosen = _ranks(t.view_index, rank, shortness) < quota
+    return restrict_points(model, np.unique(t.point_index[chosen]))
+
+
+def _ranks(group: I64, first: I64, second: I64) -> I64:
+    """Rank (K,) of each observation in its group by the keys ``first``, then ``second``."""
+    order = np.lexsort((second, first, group))
+    ranked, rank = group[order], np.empty(len(group), dtype=np.int64)
+    rank[order] = np.arange(len(group)) - np.searchsorted(ranked, ranked)
+    return rank
+
+
+def observations_of_views(tracks: Tracks) -> list[I64]:
+    """The observations of each view, in their order."""
+    ends = np.cumsum(np.bincount(tracks.view_index, minlength=tracks.n_views))
+    return np.split(np.argsort(tracks.view_index, kind="stable"), ends[:-1])
 
 
 def reproject_observations(model: MetricEstimate, view: I64, point: I64) -> tuple[F64, F64]:
@@ -100,6 +144,15 @@ def _triangulate(poses: F64, xy: F64, view: I64, point: I64, n_points: int, loss
     with np.errstate(divide="ignore", invalid="ignore"):
         X = Xh[:, :3] / Xh[:, 3:]
     return np.where(np.isfinite(X).all(axis=1, keepdims=True), X, 0.0)
+
+
+def with_tracks(model: MetricEstimate, tracks: Tracks) -> MetricEstimate:
+    """The cameras of a model with the points of all ``tracks``."""
+    if model.tracks.n_points == tracks.n_points:
+        return model
+    X, none = np.zeros((tracks.n_points, 3)), np.zeros(tracks.n_points, dtype=bool)
+    model = replace(model, tracks=tracks, X=X, valid=none, inlier=none[tracks.point_index])
+    return retriangulate_tracks(model, sigmas=LATE_SIGMAS)
 
 
 def inlier_mask(model: MetricEstimate, *, sigmas: float) -> B8:

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import counted
 from thesisrecon.geometry.robust_resection import resect_calibrated
-from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, BundleAdjustment
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
@@ -18,6 +18,8 @@ from thesisrecon.metric._model import (
     MetricEstimate,
     inlier_ratios,
     normalized_observations,
+    observations_of_views,
+    restrict_points,
     retriangulate_tracks,
 )
 from thesisrecon.numerics._partial_bundle import refine_pose
@@ -32,6 +34,8 @@ MAX_ROUNDS = 6
 MIN_GAIN = 0.003
 """Increase of the inlier ratio below which the rounds end."""
 MIN_INLIER_RATIO = 0.5
+MANY_VIEWS, GLOBAL_GROWTH = 40, 1.2
+"""Of more views than the first, everything is adjusted only after this growth of the number of cameras."""
 
 
 def _pose_and_focal(
@@ -74,26 +78,49 @@ def _grow(
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
     model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
-    rejected: dict[int, str] = {}
-    share = 0.0
-    for n in range(MAX_ROUNDS):
-        before = int(model.registered.sum())
-        model, rejected = _register_missing(model, rng, allowed)
-        joined = int(model.registered.sum()) > before
-        if joined:
+    rows, share, rounds, adjusted = observations_of_views(model.tracks), 0.0, 0, model.registered
+    while True:
+        before = model.registered
+        model, rejected = _register_missing(model, rng, allowed, rows)
+        joined = model.registered & ~before
+        grown = model.registered.sum() > GLOBAL_GROWTH * adjusted.sum()
+        if joined.any() and not grown and adjusted.sum() > MANY_VIEWS:
+            model = _adjust_window(model, adjustment, joined)
+            continue
+        if joined.any():
             model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
         model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=6)[0]
         # A wide gate in the first round readmits observations that a wrong model had excluded.
-        model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS if n == 0 else LATE_SIGMAS)
+        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS if rounds else EARLY_SIGMAS)
         now = float(model.inlier.mean())
-        if not joined and n > 0 and now - share < MIN_GAIN:
-            break
-        share = now
-    return model, rejected
+        rounds, gain, share, adjusted = rounds + 1, now - share, now, model.registered
+        if not joined.any() and rounds > 1 and (gain < MIN_GAIN or rounds >= MAX_ROUNDS):
+            return model, rejected
+
+
+def _adjust_window(model: MetricEstimate, adjustment: BundleAdjustment, views: B8) -> MetricEstimate:
+    """Triangulate the points of some views and adjust both; other cameras and shared intrinsics are fixed."""
+    t, cameras = model.tracks, model.cameras
+    points = np.unique(t.point_index[views[t.view_index]])
+    part = retriangulate_tracks(restrict_points(model, points), sigmas=EARLY_SIGMAS)
+    if part.inlier.sum() < MIN_OBSERVATIONS:
+        return model
+    assert cameras.shared is not None
+    inside, outside = (cameras.shared[cameras.group[model.registered & v]] for v in (views, ~views))
+    own = np.array([not np.isin(a, b).any() for a, b in zip(inside.T, outside.T, strict=True)])
+    part = adjustment.run(part, free=WITHOUT_K2_K3 & own, fixed=~views, iterations=6)[0]
+    part = retriangulate_tracks(
+        replace(part, sigma_px=model.sigma_px, loss_sigmas=model.loss_sigmas, tail=model.tail),
+        sigmas=LATE_SIGMAS,
+    )
+    X, valid, inlier = model.X.copy(), model.valid.copy(), model.inlier.copy()
+    X[points], valid[points] = part.X, part.valid
+    inlier[np.isin(t.point_index, points)] = part.inlier
+    return replace(model, cameras=part.cameras, X=X, valid=valid, inlier=inlier)
 
 
 def _register_missing(
-    model: MetricEstimate, rng: np.random.Generator, allowed: B8
+    model: MetricEstimate, rng: np.random.Generator, allowed: B8, rows: list[I64]
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Register every ``allowed`` view that sees enough of the model by calibrated resection."""
     t = model.tracks
@@ -108,7 +135,7 @@ def _register_missing(
                 "needed): too little overlap"
             )
             continue
-        added = _register(model, view, rng)
+        added = _register(model, view, rows[view], rng)
         if isinstance(added, str):
             rejected[view] = added
         else:
@@ -116,10 +143,10 @@ def _register_missing(
     return model, rejected
 
 
-def _register(model: MetricEstimate, view: int, rng: np.random.Generator) -> MetricEstimate | str:
-    """Add a camera to the model; otherwise the reason against it."""
+def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Generator) -> MetricEstimate | str:
+    """Add the camera of observations ``rows`` to the model; otherwise return the reason against it."""
     t, cameras = model.tracks, model.cameras
-    k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
+    k = rows[model.valid[t.point_index[rows]]]
     row = int(cameras.group[view])
     assert cameras.shared is not None
     focals = cameras.shared[:, 0]

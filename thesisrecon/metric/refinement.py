@@ -34,6 +34,8 @@ from thesisrecon.metric._model import (
     select_inliers,
     truncated_cost,
     upgraded_model,
+    with_enough_points,
+    with_tracks,
 )
 from thesisrecon.metric._resection import register_missing_cameras
 from thesisrecon.metric._shared_camera import (
@@ -109,6 +111,7 @@ class MetricRefinement:
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
         intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
+        model = with_tracks(model, reconstruction.tracks)
         check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
@@ -127,6 +130,7 @@ def _start(
     model = upgraded_model(reconstruction, upgrade, adjustment.prior, MAX_ROTATION_RESIDUAL)
     if model is None:
         return None
+    model = with_enough_points(model)
     # Without distortion the noise is overestimated: keep the gate at least as wide as before.
     gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
     model = with_initial_gate(model)

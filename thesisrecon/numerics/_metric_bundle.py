@@ -98,7 +98,7 @@ class _MetricProblem:
 
     layout: BundleLayout
     columns: IntrinsicColumns
-    observed: B8
+    moves: B8
     values: IntrinsicUnknowns
     weighting: Weighting
     jacobians: Jacobians
@@ -128,7 +128,7 @@ class _MetricProblem:
         camera_step, point_step = step
         own = camera_step[: layout.size - layout.border].reshape(-1, layout.width)
         poses = np.zeros((len(m.t), POSE_DOF))
-        poses[self.observed] = own[:, :POSE_DOF]
+        poses[self.moves] = own[:, :POSE_DOF]
         R, t = np.empty_like(m.R), np.empty_like(m.t)
         move_poses(m.R, m.t, poses, R, t)
         values = self.values.step(state.values, camera_step[self.columns.place])
@@ -149,7 +149,7 @@ class _MetricProblem:
         leverage = np.empty_like(residual)
         self.linearize(state)
         sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
-        dof = POSE_DOF * int(self.observed.sum()) + self.values.size - SIMILARITY_DOF
+        dof = POSE_DOF * int(self.moves.sum()) + self.values.size - SIMILARITY_DOF
         return robust_sigma(residual, leverage, dof)
 
 
@@ -161,19 +161,23 @@ def refine_metric_bundle(
     free: B8,
     prior: IntrinsicsPrior | None = None,
     options: BundleOptions | None = None,
+    fixed: B8 | None = None,
 ) -> MetricBundleResult:
     """Minimise reprojection errors and prior deviations over poses, points and ``free`` intrinsics.
 
     The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
     Levenberg-Marquardt; the focal length is stepped as log f, the seven gauge freedoms are left to the
-    damping, and the scene is centred and scaled inside. The cost never rises; views and points without
-    observations do not change.
+    damping, and the scene is centred and scaled inside. The cost never rises; ``fixed`` (V,) views, and views
+    and points without observations, do not change.
     """
     options = options or BundleOptions()
     o = sort_observations(observations, len(cameras.R), len(X))
     seen_points = np.diff(o.start) > 0
     origin, scale = scene_frame(X[seen_points])
-    problem, values, table = _metric_problem(cameras, o, np.asarray(free, dtype=bool), prior, options)
+    moves = np.bincount(o.seen.view_index, minlength=len(cameras.R)) > 0
+    if fixed is not None:
+        moves &= ~fixed
+    problem, values, table = _metric_problem(cameras, o, (moves, np.asarray(free, bool)), prior, options)
     start = MetricModel(
         np.ascontiguousarray(cameras.R),
         scale * (cameras.t + cameras.R @ origin),
@@ -182,7 +186,7 @@ def refine_metric_bundle(
         np.ascontiguousarray(scale * (X - origin)),
     )
     state, cost = _minimize(problem, _State(start, values), options.max_iterations)
-    end, moved = state.model, problem.observed
+    end, moved = state.model, problem.moves
     refined = replace(
         cameras,
         R=np.where(moved[:, None, None], end.R, cameras.R),
@@ -215,21 +219,23 @@ def _minimize(problem: _MetricProblem, state: _State, most: int) -> tuple[_State
 def _metric_problem(
     cameras: MetricCameras,
     o: SortedObservations,
-    free: B8,
+    unknown: tuple[B8, B8],
     prior: IntrinsicsPrior | None,
     options: BundleOptions,
 ) -> tuple[_MetricProblem, F64, F64]:
-    """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics."""
-    group = np.asarray(cameras.group, dtype=np.int64)
-    observed = np.bincount(o.seen.view_index, minlength=len(group)) > 0
-    used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
+    """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics.
+
+    ``unknown``: the views (V,) that move, and the intrinsics (C,) that do.
+    """
+    group, (moves, free) = np.asarray(cameras.group, dtype=np.int64), unknown
+    used = np.bincount(group[moves], minlength=len(cameras.intrinsics)) > 0
     values, start, table = number_unknowns(cameras, used, free, prior)
-    columns = assign_columns(values, group, np.flatnonzero(free), observed)
+    columns = assign_columns(values, group, np.flatnonzero(free), moves)
     layout = build_layout(
         o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border
     )
     weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
-    return _MetricProblem(layout, columns, observed, values, weighting, layout.jacobians()), start, table
+    return _MetricProblem(layout, columns, moves, values, weighting, layout.jacobians()), start, table
 
 
 def _covariances(
@@ -238,7 +244,7 @@ def _covariances(
     """Return the covariances, lengths in the caller's unit."""
     problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
     reduced, sums, _ = problem.linearize(state).reduce(1e-10)
-    m, seen, layout = state.model, problem.observed, problem.layout
+    m, seen, layout = state.model, problem.moves, problem.layout
     number = problem.columns.columns_of(problem.values.number)
     own = np.arange(int(seen.sum()))
     row, column = (layout.row, layout.column) if points else (own, own)

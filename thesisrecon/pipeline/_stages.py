@@ -247,7 +247,10 @@ def _sizes_of(reconstruction: Reconstruction) -> dict[str, int]:
 
 
 def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
-    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
+    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair.
+
+    Of many views only a core (``projective.core_views``): the metric stage registers the others, calibrated.
+    """
     run, result = state.run, state.result
     assert result.tracks is not None
     tracks, pairs, sizes = (

@@ -55,6 +55,24 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
     return ranked
 
 
+def select_core(pairs: Sequence[TwoView], n_views: int, size: int) -> B8:
+    """Select ``size`` well-connected views (V,): from the best pair on, the one with most ties to the chosen.
+
+    The tie of two views is the number of their matches that no homography explains: it needs both many
+    matches and a baseline.
+    """
+    tie = np.zeros((n_views, n_views))
+    for pair in pairs:
+        if pair.accepted:
+            tie[pair.i, pair.j] = tie[pair.j, pair.i] = pair.inliers * (1.0 - pair.homography_inlier_ratio)
+    core = np.zeros(n_views, dtype=bool)
+    core[int(tie.max(axis=1).argmax())] = True
+    for _ in range(size - 1):
+        gain = np.where(core, -1.0, tie[core].sum(axis=0))
+        core[int(np.argmax(gain))] |= gain.max() > 0.0
+    return core
+
+
 def require_pair_with_parallax(pairs: Sequence[TwoView]) -> None:
     """Raise ``StageFailure`` if every accepted pair is planar, a pure rotation or nearly a homography."""
     accepted = [pair for pair in pairs if pair.accepted]
@@ -163,12 +181,23 @@ def working_tracks(tracks: Tracks, pairs: Sequence[TwoView], *, points_per_view:
     return Tracks(tracks.view_index[chosen], point, tracks.xy[chosen], tracks.n_views, int(keep.sum())), keep
 
 
-def expand_to_all_tracks(reconstruction: Reconstruction, tracks: Tracks, keep: B8) -> Reconstruction:
-    """Express the reconstruction of :func:`working_tracks` in the numbers of all tracks."""
+def tracks_of_views(tracks: Tracks, views: B8) -> Tracks:
+    """Return the observations of some views (V,); views and points keep their numbers."""
+    k = np.flatnonzero(views[tracks.view_index])
+    return replace(
+        tracks, view_index=tracks.view_index[k], point_index=tracks.point_index[k], xy=tracks.xy[k]
+    )
+
+
+def expand_to_all_tracks(
+    reconstruction: Reconstruction, tracks: Tracks, keep: B8, views: B8 | None = None
+) -> Reconstruction:
+    """Express the reconstruction of :func:`working_tracks`, all or of ``views``, in the numbers of all."""
     X = np.zeros((tracks.n_points, 4))
     X[keep] = reconstruction.X
     valid = np.zeros(tracks.n_points, dtype=bool)
     valid[keep] = reconstruction.valid
     inlier = np.zeros(len(tracks.xy), dtype=bool)
-    inlier[keep[tracks.point_index]] = reconstruction.inlier
+    chosen = keep[tracks.point_index]
+    inlier[chosen if views is None else chosen & views[tracks.view_index]] = reconstruction.inlier
     return replace(reconstruction, X=X, valid=valid, inlier=inlier, tracks=tracks)

@@ -31,6 +31,8 @@ from thesisrecon.projective._track_selection import (
     initial_cameras,
     rank_initial_pairs,
     require_pair_with_parallax,
+    select_core,
+    tracks_of_views,
     working_tracks,
 )
 from thesisrecon.records import Reconstruction, Tracks, TwoView
@@ -75,6 +77,7 @@ def _find_inconsistent_view(
 _MIN_INLIER_RATIO = 0.3
 # Quantile over all points of the projection standard deviations that is tested.
 _STD_QUANTILE = 0.8
+OUTSIDE_CORE = "is outside the core: it is registered after self-calibration"
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,9 @@ class IncrementalProjective:
         Levenberg-Marquardt steps after each camera; final rounds of triangulation, adjustment and filtering.
     global_bundle_growth, local_bundle_views : float, int
         Everything is adjusted after this growth of the number of cameras, this many views with a new one.
+    core_views : int
+        Of more views, a core of so many well-connected ones is reconstructed, twice as many at each further
+        attempt; the metric stage registers the others. 0: all views are reconstructed.
     """
 
     points_per_view: int = 1500
@@ -111,12 +117,15 @@ class IncrementalProjective:
     global_bundle_growth: float = 1.2
     local_bundle_views: int = 4
     max_initial_pairs: int = 3
+    core_views: int = 40
 
     def reconstruct(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
     ) -> Reconstruction:
         """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
-        ranked = rank_initial_pairs(tracks, pairs)
+        core = self._core(pairs, tracks.n_views, attempt)
+        inside = [pair for pair in pairs if core[pair.i] and core[pair.j]]
+        ranked = rank_initial_pairs(tracks, inside)
         if not ranked:
             raise StageFailure(
                 "no image pair was accepted",
@@ -128,9 +137,18 @@ class IncrementalProjective:
             raise StageFailure(
                 "no other initial pair is left", f"all {len(ranked)} accepted image pairs were tried"
             )
-        selected, keep = working_tracks(tracks, pairs, points_per_view=self.points_per_view)
-        best = self._best_model(selected, pairs, sizes, ranked[attempt:], rng)
-        return expand_to_all_tracks(to_reconstruction(best), tracks, keep)
+        selected, keep = working_tracks(
+            tracks_of_views(tracks, core), inside, points_per_view=self.points_per_view
+        )
+        best = self._best_model(selected, inside, sizes, ranked[attempt:], rng)
+        for view in np.flatnonzero(~core):
+            best.reasons[view] = OUTSIDE_CORE
+        return expand_to_all_tracks(to_reconstruction(best), tracks, keep, core)
+
+    def _core(self, pairs: Sequence[TwoView], n_views: int, attempt: int) -> B8:
+        """(V,) the views to reconstruct: all of a small set, else a core, larger at each attempt."""
+        size = self.core_views * 2**attempt if self.core_views else n_views
+        return np.ones(n_views, dtype=bool) if n_views <= size else select_core(pairs, n_views, size)
 
     def _best_model(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, starts: Sequence[TwoView], rng: Generator

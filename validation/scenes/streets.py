@@ -40,10 +40,12 @@ class Walk:
         return MetricCameras(turn @ c.R, t, q, c.group, c.shared), X
 
 
-def make_walk(n: int, kind: Kind, rng: np.random.Generator, *, sigma_px: float = 0.5) -> Walk:
-    """n images with noise ``sigma_px`` in each coordinate, some 60 points for each."""
+def make_walk(
+    n: int, kind: Kind, rng: np.random.Generator, *, sigma_px: float = 0.5, denser: int = 1
+) -> Walk:
+    """n images with noise ``sigma_px`` in each coordinate, some 60 points for each, or ``denser``."""
     R, t = _poses(n, kind, rng)
-    X = _facade(n, kind, 200 * n // 3, rng)
+    X = _facade(n, kind, denser * (200 * n // 3), rng)
     view, point = _tracks(R, t, X, rng)
     used, point = np.unique(point, return_inverse=True)
     X = X[used]

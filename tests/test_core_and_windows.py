@@ -1,0 +1,113 @@
+"""Many views: a core is reconstructed projectively, the others join calibrated, in windows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.metric.test_metric_refinement import centre_error
+from tests.synthetic import TrueScene, make_scene, true_pairs
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.metric import _model, _resection
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.numerics._metric_bundle import refine_metric_bundle
+from thesisrecon.projective._track_selection import select_core
+from thesisrecon.projective.incremental import OUTSIDE_CORE, IncrementalProjective
+from thesisrecon.records import Tracks
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from validation.scenes.streets import SIZE, make_walk
+
+
+def street(views):
+    """A street whose images share points with their neighbours only."""
+    walk = make_walk(views, "street", np.random.default_rng(1), sigma_px=0.3, denser=4)
+    c, seen = walk.cameras, walk.seen
+    tracks = Tracks(seen.view_index, seen.point_index, seen.xy, views, len(walk.X))
+    return TrueScene(c.K, c.R, c.t, walk.X, 0.02, tracks, np.tile(SIZE, (views, 1)))
+
+
+def reconstruct(scene, core_views, *, options=None):
+    """The projective and the metric result."""
+    method = IncrementalProjective(core_views=core_views)
+    pairs = [pair for pair in true_pairs(scene) if pair.inliers >= 16]
+    found = method.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
+    prior, rng = prior_for(found, options or IntrinsicsOptions()), np.random.default_rng(0)
+    calibration = HypothesesAndRefinement().calibrate(found, prior=prior, rng=rng)
+    return found, MetricRefinement().refine(found, calibration, prior=prior, rng=rng)
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.2])
+def test_a_core_and_resections_give_the_cameras_of_the_whole(zoom):
+    scene = make_scene(views=24, points=250, sigma_px=0.4, zoom=zoom, seed=11)
+    options = IntrinsicsOptions(focal="free" if zoom else "constant")
+    whole, metric = reconstruct(scene, 0, options=options)
+    core, metric_of_core = reconstruct(scene, 8, options=options)
+    assert whole.registered.all()
+    assert core.registered.sum() == 8
+    assert {core.reasons[v] for v in np.flatnonzero(~core.registered)} == {OUTSIDE_CORE}
+    assert metric_of_core.trusted
+    assert metric_of_core.reconstruction.registered.all()
+    assert centre_error(metric_of_core, scene) < 1.05 * centre_error(metric, scene)
+    focals = np.array([[r.reconstruction.K[:, 0, 0]] for r in (metric, metric_of_core)])
+    np.testing.assert_allclose(*focals, rtol=1e-4)
+    std = np.array([[v["focal_px"].std for v in r.intrinsics] for r in (metric, metric_of_core)])
+    np.testing.assert_allclose(*std, rtol=0.2)
+
+
+def test_a_long_street_grows_from_its_core_in_windows(monkeypatch):
+    scene = street(60)
+    monkeypatch.setattr(_resection, "MANY_VIEWS", 12)
+    windows = []
+    adjust = _resection._adjust_window
+
+    def counted(model, adjustment, views):
+        windows.append(int(views.sum()))
+        return adjust(model, adjustment, views)
+
+    monkeypatch.setattr(_resection, "_adjust_window", counted)
+    found, metric = reconstruct(scene, 12)
+    assert found.registered.sum() <= 12
+    assert metric.reconstruction.registered.all()
+    assert centre_error(metric, scene) < 0.005
+    assert 0 < sum(windows) < 48
+
+
+def test_points_that_hold_every_view_are_enough(monkeypatch):
+    scene = make_scene(views=12, points=900, sigma_px=0.4, seed=12)
+    monkeypatch.setattr(_model, "MAX_OBSERVATIONS", 3000)
+    monkeypatch.setattr(_model, "MIN_PER_VIEW", 100)
+    kept = []
+    restrict = _model.restrict_points
+    monkeypatch.setattr(_model, "restrict_points", lambda m, p: kept.append(len(p)) or restrict(m, p))
+    _, metric = reconstruct(scene, 0)
+    assert 250 <= kept[0] < 600
+    r = metric.reconstruction
+    assert metric.trusted
+    assert r.tracks is scene.tracks
+    assert min(r.valid.mean(), r.inlier.mean()) > 0.99
+    assert centre_error(metric, scene) < 2e-3
+
+
+def test_a_core_has_ties_with_parallax_and_doubles():
+    pairs = true_pairs(make_scene(views=12, points=60))
+    core = select_core(pairs, 12, 5)
+    assert core.sum() == 5
+    # Views whose matches one homography explains stay outside; so do views without any pair.
+    flat = [p for p in pairs if p.i >= 2]
+    assert not select_core(flat, 12, 12)[:2].any()
+    method = IncrementalProjective(core_views=3)
+    assert [int(method._core(pairs, 12, attempt).sum()) for attempt in range(3)] == [3, 6, 12]
+
+
+def test_fixed_cameras_stay_and_the_others_converge():
+    walk = make_walk(12, "street", np.random.default_rng(0), sigma_px=0.0)
+    cameras, X = walk.start(np.random.default_rng(1), size=0.01)
+    fixed = np.arange(12) < 9
+    for name in ("R", "t"):
+        getattr(cameras, name)[fixed] = getattr(walk.cameras, name)[fixed]
+    cameras = replace(cameras, intrinsics=walk.cameras.intrinsics)
+    fit = refine_metric_bundle(cameras, X, walk.seen, free=np.zeros(6, bool), fixed=fixed)
+    np.testing.assert_array_equal(fit.cameras.t[fixed], cameras.t[fixed])
+    np.testing.assert_array_equal(fit.cameras.R[fixed], cameras.R[fixed])
+    np.testing.assert_allclose(fit.cameras.t, walk.cameras.t, atol=1e-5)
+    assert np.abs(fit.residual_px).max() < 1e-3
