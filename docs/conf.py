@@ -29,9 +29,11 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx_gallery.gen_gallery",
     "_site.mathml",
+    "_site.modules",
 ]
 exclude_patterns = ["_build", "_site", "**/GALLERY_HEADER.*", "tutorial/*.ipynb", "tutorial/*.py"]
 nitpicky = True
+smartquotes = False  # x2' is the transpose of x2
 templates_path = ["_site/templates"]
 
 myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
