@@ -29,6 +29,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx_gallery.gen_gallery",
     "_site.mathml",
+    "_site.interface",
     "_site.modules",
 ]
 exclude_patterns = ["_build", "_site", "**/GALLERY_HEADER.*", "tutorial/*.ipynb", "tutorial/*.py"]

@@ -108,7 +108,15 @@ class StageFailure(Exception):
 
 
 class UsageError(ValueError):
-    """A wrong option, path or setting; exit code 2 on the command line."""
+    """A wrong option, path or setting; exit code 2 on the command line.
+
+    Examples
+    --------
+    >>> from thesisrecon import reconstruct
+    >>> reconstruct("images", preset="best")
+    Traceback (most recent call last):
+    thesisrecon.errors.UsageError: unknown preset 'best'; known are default, thesis
+    """
 
 
 class WorkersLost(UsageError):

@@ -22,6 +22,11 @@ class Image:
         File name, pixels, and (width, height) of the file after EXIF rotation.
     mask : ndarray (H, W) of bool, optional
         Pixels to use; None: all.
+
+    Examples
+    --------
+    >>> Image("a.png", np.zeros((480, 640, 3), np.uint8), (1280, 960)).size
+    (640, 480)
     """
 
     name: str

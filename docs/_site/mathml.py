@@ -18,12 +18,15 @@ from sphinx.errors import SphinxError
 FONT = "STIXTwoMath-Regular.ttf"
 TAG = re.compile(r"\\tag\*?\{([^{}]*)\}")
 ALIGN = re.compile(r"\\(begin|end)\{(align|equation|gather)\}")
+PRIMED = re.compile(r"('+)\^(\{[^{}]*\}|\\[A-Za-z]+|[^\\{}\s])")
+"""A prime with a superscript, which TeX joins."""
 ARG = re.compile(r"\\(arg|sgn|rank|diag)(?![A-Za-z])")
 
 
 def mathml(latex: str, display: str, where: str) -> str:
     """Convert one formula, or fail with its place and text."""
-    text = ALIGN.sub(r"\\\1{\2*}", ARG.sub(r"\\operatorname{\1}", latex))
+    text = PRIMED.sub(lambda m: "^{" + r"\prime " * len(m[1]) + m[2] + "}", latex)
+    text = ALIGN.sub(r"\\\1{\2*}", ARG.sub(r"\\operatorname{\1}", text))
     try:
         found = convert(text, display=display)
     except Exception as error:

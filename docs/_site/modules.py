@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import typing
 from pathlib import Path
 
 from sphinx.util.nodes import make_refnode
 
-from _site.code import PACKAGE, summary
+import thesisrecon
+from _site.code import PACKAGE, summary, write
+from _site.examples import RETURNED_BY
 
 LEFT_OUT = ("cli", "report", "runtime")
 """Folders without functions for callers."""
@@ -35,18 +38,17 @@ def write_pages(folder: Path) -> None:
         text = f"{title}\n{'=' * len(title)}\n\n.. automodule:: {name}\n   :members:\n"
         write(folder / f"{name}.rst", text)
         groups.setdefault(relative.parts[0] if len(relative.parts) > 1 else "", []).append(name)
-    lines = ["# Modules", "", "The algorithms of each chapter, beyond the functions of `thesisrecon` itself.", ""]
+    lines = [
+        "# Modules",
+        "",
+        "The algorithms of each chapter, beyond the functions of `thesisrecon` itself.",
+        "",
+    ]
     for group, names in groups.items():
         title = f"{group}/" if group else "The package itself"
         about = summary(PACKAGE / group / "__init__.py") if group else ""
         lines += [f"## {title}", "", about, "", "```{toctree}", ":maxdepth: 1", "", *names, "```", ""]
     write(folder / "index.md", "\n".join(lines))
-
-
-def write(path: Path, text: str) -> None:
-    """Write a file unless it has this text already."""
-    if not path.is_file() or path.read_text(encoding="utf-8") != text:
-        path.write_text(text, encoding="utf-8")
 
 
 def skip_aliases(app, what, name, obj, skip, options):
@@ -65,6 +67,16 @@ def escape_bars(app, what, name, obj, options, lines) -> None:
             pieces = re.split(r"(``.+?``|`.+?`)", line)
             pieces[::2] = [piece.replace("|", r"\|") for piece in pieces[::2]]
             lines[k] = "".join(pieces)
+
+
+def add_example(app, what, name, obj, options, lines) -> None:
+    """Show the example of a function on the page of the record that it returns or takes."""
+    short = name.rpartition(".")[2]
+    if what == "class" and name == f"thesisrecon.{short}" and short in RETURNED_BY:
+        text = inspect.getdoc(getattr(thesisrecon, RETURNED_BY[short])) or ""
+        example = text.partition("Examples\n--------\n")[2].splitlines()
+        role = f"Of :func:`thesisrecon.{RETURNED_BY[short]}`:"
+        lines += ["", "Examples", "--------", role, "", *example, ""]
 
 
 def resolve(app, env, node, contnode):
@@ -91,6 +103,7 @@ def setup(app):
     """Write the pages before the sources are read, and connect what reads docstrings."""
     app.connect("builder-inited", lambda app: write_pages(Path(app.srcdir) / "reference" / "modules"))
     app.connect("autodoc-skip-member", skip_aliases)
+    app.connect("autodoc-process-docstring", add_example, priority=300)
     app.connect("autodoc-process-docstring", escape_bars, priority=400)
     app.connect("missing-reference", resolve)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -197,7 +197,7 @@ def select_spread(xy: F64, response: F32, count: int) -> I64:
     References
     ----------
     .. [1] M. Brown, R. Szeliski and S. Winder, "Multi-image matching using multi-scale oriented patches",
-    CVPR 2005.
+       CVPR 2005.
     """
     members = _shared_pool(xy, int(POOL_RATIO * count))
     if len(members) <= count:

@@ -20,12 +20,12 @@ _ANY_NEIGHBOUR = np.ones((3, 3), dtype=np.int64)
 
 @dataclass(frozen=True)
 class LineSegments:
-    """Detector of straight line segments; ``min_length`` is a share of the long side."""
+    """Detector of straight line segments."""
 
-    sigma_px: float = 1.0
-    min_gradient: float = 3.0
-    min_length: float = 0.02
-    max_rms_px: float = 0.5
+    sigma_px: float = 1.0  #: smoothing before the gradient
+    min_gradient: float = 3.0  #: least gradient of an edge, grey levels per pixel
+    min_length: float = 0.02  #: least length, as a share of the long side
+    max_rms_px: float = 0.5  #: largest RMS distance of the edge points from the segment
 
     def detect(self, gray: F32) -> F64:
         """Return segments (S, 4) x1, y1, x2, y2 in pixels of a grey image (H, W), longest first."""

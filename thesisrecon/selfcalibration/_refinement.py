@@ -49,11 +49,11 @@ def _unit(conic: F64) -> F64:
 class RotationCriterion:
     """Robust distance of upgraded cameras from scaled rotations, linear beyond ``scale``, and priors."""
 
-    scale: float = 0.05
-    focal_log_mean: float = 0.2
-    focal_log_std: float = 1.0
-    focal_weight: float = 2e-3
-    noise: float = 0.01
+    scale: float = 0.05  #: distance at which the loss changes from quadratic to linear
+    focal_log_mean: float = 0.2  #: weak prior of an unknown focal length: mean of its logarithm
+    focal_log_std: float = 1.0  #: standard deviation of that prior
+    focal_weight: float = 2e-3  #: weight of that prior
+    noise: float = 0.01  #: weight of a given focal length in units of its standard deviation
 
     def camera_residuals(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
         """Return the weighted entries (B, R, 6) of 3 C C' / tr(C C') - I for planes (B, 3), log_f (B, G)."""

@@ -1,0 +1,47 @@
+"""The documentation site: pages for every exported name, an example on each, every command and setting."""
+
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+import thesisrecon
+from thesisrecon.config import KINDS
+
+DOCS = Path(__file__).parent.parent / "docs"
+EXPORTED = sorted(set(thesisrecon.__all__) - {"__version__"})
+
+
+@pytest.fixture(scope="module")
+def site():
+    """The modules that make pages; those that need Sphinx are imported where it is installed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(DOCS))
+        yield lambda name: importlib.import_module(f"_site.{name}")
+    for name in [name for name in sys.modules if name.split(".")[0] == "_site"]:
+        del sys.modules[name]
+
+
+def test_every_exported_name_has_a_page_with_an_example(site):
+    listed = re.findall(r"^   (\w+)$", (DOCS / "reference" / "api.md").read_text("utf-8"), re.M)
+    assert sorted(listed) == EXPORTED
+    borrowed = site("examples").RETURNED_BY
+    own = {name for name in EXPORTED if ">>>" in (getattr(thesisrecon, name).__doc__ or "")}
+    assert own | set(borrowed) == set(EXPORTED)
+    assert not own & set(borrowed)
+    assert set(borrowed.values()) <= own
+
+
+def test_the_pages_of_commands_and_settings_name_all_of_them(site):
+    interface = site("interface")
+    commands, settings = interface.command_page(), interface.settings_page()
+    for command, option in (("reconstruct", "--from"), ("export", "--to"), ("interpolate", "--frames")):
+        assert re.search(rf"^## {command}$.*?`{option}`", commands, re.M | re.S)
+    for stage, kinds in KINDS.items():
+        assert f"## {stage}\n" in settings
+        assert all(f"`{stage}.kind={word}`" in settings for word in kinds)
+    rows = re.findall(r"^\| (`.*)", settings, re.M)
+    assert len(rows) > 100
+    assert [row for row in rows if row.rstrip().endswith("|  |")] == []
