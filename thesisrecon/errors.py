@@ -113,7 +113,7 @@ class UsageError(ValueError):
     Examples
     --------
     >>> from thesisrecon import reconstruct
-    >>> reconstruct("images", preset="best")
+    >>> reconstruct("images", "out", preset="best")
     Traceback (most recent call last):
     thesisrecon.errors.UsageError: unknown preset 'best'; known are default, thesis
     """
