@@ -69,7 +69,7 @@ class Seeds:
     xy: F64  #: (S, 2) positions, px
     scale: F32  #: (S,) pixels per sample of the pyramid level
     angle: F32  #: (S,) rotation of the patch, rad; 0 = upright
-    patches: F32  #: (S, D) patches of zero mean and unit norm
+    patches: F32  #: (S, D) cosine coefficients of each patch, without the mean, unit norm
     frame: F64 | None = None  #: (S, 2, 2) px per sample along the patch's axes; None: by scale and angle
 
 

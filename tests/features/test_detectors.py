@@ -4,7 +4,12 @@ from scipy.special import erf
 
 from tests.synthetic import photograph, texture
 from thesisrecon.features.harris import CornerMeasure, HarrisCorners, select_spread
-from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.features.multiscale import (
+    PATCH_VALUES,
+    MultiScaleCorners,
+    _low_frequencies,
+    _normalize_patches,
+)
 from thesisrecon.features.oblique import simulate_view
 from thesisrecon.records import Image
 
@@ -83,7 +88,6 @@ def test_two_sizes_and_seeds_twice_in_the_pixels_of_the_photograph(width, scales
     seeds = features.seeds
     assert seeds is not None
     assert seeds.patches.dtype == np.float32
-    assert np.abs(seeds.patches.sum(axis=1)).max() < 1e-3
     assert np.abs(np.linalg.norm(seeds.patches, axis=1) - 1).max() < 1e-4
     assert (seeds.angle == 0).mean() == pytest.approx(0.5, abs=0.01)
     assert (seeds.xy <= (width - 1, 299)).all()
@@ -108,6 +112,18 @@ def test_turned_patches_turn_with_the_photograph():
             agreement.append(float(one.patches[first][n] @ two.patches[second][m]))
     assert len(agreement) > 50
     assert np.median(agreement) > 0.95
+
+
+def test_patches_are_their_low_frequencies_whatever_the_exposure():
+    rows = np.random.default_rng(0).normal(100, 20, (5, 64)).astype(np.float32)
+    flat = np.full((1, 64), 70.0, np.float32)
+    patches, structured = _normalize_patches(np.concatenate([rows, 0.5 * rows + 30, flat]))
+    assert structured.tolist() == [True] * 10 + [False]
+    assert patches[:5] == pytest.approx(patches[5:10], abs=1e-5)
+    waves = _low_frequencies()
+    assert waves.T @ waves == pytest.approx(np.eye(PATCH_VALUES), abs=1e-6)
+    checkerboard = (-1.0) ** np.add(*np.indices((8, 8))).ravel()
+    assert np.abs(checkerboard @ waves).max() < 0.2 * np.linalg.norm(checkerboard)
 
 
 @pytest.mark.parametrize("formula", ["noble", "harris"])

@@ -160,7 +160,7 @@ def test_only_pairs_between_groups_are_tried_again_the_likeliest_first(windows):
     assert not pairs_to_connect(features, [pair_of(0, 4, True), *pairs], CROPS)
 
 
-ESTIMATE = OverlapEstimate(all_up_to=2, nearest=1, shortlist=9, words=256)
+ESTIMATE = OverlapEstimate(all_up_to=2, nearest=1, shortlist=10, words=256)
 
 
 def test_pairs_that_overlap_are_chosen_and_few_others(windows):

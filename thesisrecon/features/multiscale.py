@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features._kernels import sample_patches
@@ -15,6 +16,8 @@ from thesisrecon.geometry._image_filters import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
 PATCH_SIDE = 8
+PATCH_VALUES = 32
+"""Values of a patch: half of its cosine coefficients, those of low frequency, which a small shift keeps."""
 # Seeds of a simulated view, relative to those of the image on the same area: many views show each place.
 OBLIQUE_DENSITY = 0.5
 
@@ -203,8 +206,19 @@ def _dominant_direction(blurred: F32, xy: F64) -> F32:
 
 
 def _normalize_patches(patches: F32) -> tuple[F32, B8]:
-    """Rows of zero mean and unit norm, and whether each had contrast above a grey level."""
-    centred = patches - patches.mean(axis=1, keepdims=True)
-    norm = np.linalg.norm(centred, axis=1, keepdims=True)
-    structured = norm[:, 0] > np.sqrt(patches.shape[1])
-    return (centred / np.maximum(norm, 1e-6)).astype(np.float32), structured
+    """The ``PATCH_VALUES`` lowest cosine coefficients (S, PATCH_VALUES) but the mean, of unit norm.
+
+    Also returns whether each patch had contrast above a grey level.
+    """
+    contrast = patches.std(axis=1)
+    coefficients = (patches - patches.mean(axis=1, keepdims=True)) @ _low_frequencies()
+    norm = np.linalg.norm(coefficients, axis=1, keepdims=True)
+    return (coefficients / np.maximum(norm, 1e-6)).astype(np.float32), contrast > 1.0
+
+
+def _low_frequencies() -> F32:
+    """Cosine functions (PATCH_SIDE^2, PATCH_VALUES) of the lowest frequencies except zero, orthonormal."""
+    rows = scipy.fft.dct(np.eye(PATCH_SIDE), norm="ortho", axis=0)
+    u, v = np.divmod(np.arange(PATCH_SIDE**2), PATCH_SIDE)
+    order = np.argsort(u**2 + v**2, kind="stable")[1 : PATCH_VALUES + 1]
+    return np.asarray(np.kron(rows, rows)[order].T, dtype=np.float32)
