@@ -111,3 +111,22 @@ def test_fixed_cameras_stay_and_the_others_converge():
     np.testing.assert_array_equal(fit.cameras.R[fixed], cameras.R[fixed])
     np.testing.assert_allclose(fit.cameras.t, walk.cameras.t, atol=1e-5)
     assert np.abs(fit.residual_px).max() < 1e-3
+
+
+def test_points_are_chosen_until_every_cell_has_enough():
+    rng = np.random.default_rng(3)
+    length = rng.integers(2, 9, 400)
+    start = np.concatenate([[0], np.cumsum(length)])
+    cell = np.concatenate([rng.choice(50, n, replace=False) for n in length])
+    order, keep, needed = rng.permutation(400), np.zeros(400, dtype=bool), np.full(50, 12)
+    left, expected = needed.copy(), np.zeros(400, dtype=bool)
+    for j in order:
+        mine = cell[start[j] : start[j + 1]]
+        if np.mean(left[mine] > 0) >= 0.5:
+            expected[j] = True
+            np.subtract.at(left, mine, 1)
+    _model.choose_points(order, start, cell, needed, keep)
+    np.testing.assert_array_equal(keep, expected)
+    np.testing.assert_array_equal(needed, left)
+    assert 0.2 < keep.mean() < 0.6
+    assert left.max() <= 3

@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics import _metric_kernels, _schur
+from thesisrecon.numerics import _levenberg_marquardt, _metric_kernels, _schur
 from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
-from thesisrecon.numerics._block_scatter import block_scatter
+from thesisrecon.numerics._block_scatter import _gram_matrix, block_scatter
 from thesisrecon.numerics._elimination import ReducedSums, revert_crossing_points, sum_leverages
+from thesisrecon.numerics._levenberg_marquardt import invert_information
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._noise import huber
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting, sort_observations
@@ -350,3 +352,17 @@ def test_noise_that_neighbours_share_is_seen():
     field = np.sin(np.einsum("kab,kb->ka", wave[block.view], block.xy / 150.0))
     _, scatter = _scatter(block, block.xy + 0.3 * SIGMA * rng.normal(size=field.shape) + SIGMA * field)
     assert scatter.overdispersion > 2.0
+
+
+def test_the_gram_matrix_of_sparse_rows_is_that_of_dense_ones():
+    A = scipy.sparse.random_array((300, 40), density=0.2, format="csr", rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(_gram_matrix(A), (A.T @ A).toarray())
+
+
+def test_large_information_is_inverted_like_small(monkeypatch):
+    A = np.random.default_rng(0).normal(size=(300, 60))
+    information, flat = A.T @ A, np.diag([1.0, 1.0, 0.0])
+    small = [invert_information(S) for S in (information, flat)]
+    monkeypatch.setattr(_levenberg_marquardt, "_MANY", 2)
+    np.testing.assert_allclose(invert_information(information), small[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(invert_information(flat), small[1])

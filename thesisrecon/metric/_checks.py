@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.metric._model import MetricEstimate, inlier_mask, reproject_observations, residual_norms
+from thesisrecon.metric._model import (
+    MetricEstimate,
+    inlier_mask,
+    reproject_observations,
+    residual_norms,
+    rows_of_views,
+)
 from thesisrecon.metric._uncertainty import USUAL_INFLATION
 from thesisrecon.numerics._noise import MAD_FACTOR, noise_from_distances
 from thesisrecon.numerics._partial_bundle import refine_pose
@@ -86,7 +92,8 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     # Wrong matches of two views meet behind them as often as before them.
     known = near & fixed & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
     _, depth = reproject_observations(model, t.view_index, t.point_index)
-    own = [_own_camera(model, view, np.flatnonzero(agree & (t.view_index == view))) for view in range(n)]
+    rows = rows_of_views(t.view_index, n)
+    own = [_own_camera(model, view, k[agree[k]]) for view, k in enumerate(rows)]
     return PerViewChecks(
         _share(t.view_index, agree, near, n),
         _share(t.view_index, agree, near & fixed, n),
@@ -144,9 +151,9 @@ def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
     size = np.abs(seen - t.xy[k])[usable] / np.sqrt(left[usable])
     whose = np.repeat(view[:, None], 2, axis=1)[usable]
     noise = np.full(t.n_views, np.nan)
-    for v in range(t.n_views):
-        if np.count_nonzero(whose == v) >= MIN_OBSERVATIONS:
-            noise[v] = MAD_FACTOR * np.median(size[whose == v])
+    for v, rows in enumerate(rows_of_views(whose, t.n_views)):
+        if len(rows) >= MIN_OBSERVATIONS:
+            noise[v] = MAD_FACTOR * np.median(size[rows])
     return noise
 
 

@@ -10,6 +10,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.camera_matrix import distort, undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.records import Reconstruction, Tracks, Upgrade
@@ -59,36 +60,41 @@ def restrict_points(model: MetricEstimate, points: I64) -> MetricEstimate:
 
 
 def with_enough_points(model: MetricEstimate) -> MetricEstimate:
-    """The model with points that hold every view: of each cell of its image in turn, the longest tracks.
+    """The model with points that hold every view all over its image: known points first, then long tracks.
 
     All points up to ``MAX_OBSERVATIONS``; of more, the rest adds little to the precision of the cameras.
-    Points that are known come before others.
     """
     t = model.tracks
-    quota = max(MIN_PER_VIEW, MAX_OBSERVATIONS // t.n_views)
     if len(t.xy) <= MAX_OBSERVATIONS:
         return model
-    length = np.bincount(t.point_index, minlength=t.n_points)
-    shortness = -(length + t.n_views * model.valid)[t.point_index]
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
-    cell[:, 0] += CELLS * (cell[:, 1] + CELLS * t.view_index)
-    rank = _ranks(cell[:, 0], shortness, np.zeros_like(shortness))
-    chosen = _ranks(t.view_index, rank, shortness) < quota
-    return restrict_points(model, np.unique(t.point_index[chosen]))
+    cell = (t.view_index * CELLS + cell[:, 0]) * CELLS + cell[:, 1]
+    occupied = np.bincount(np.unique(cell) // CELLS**2, minlength=t.n_views)
+    wanted = max(MIN_PER_VIEW, MAX_OBSERVATIONS // t.n_views)
+    needed = np.repeat(-(-wanted // np.maximum(occupied, 1)), CELLS**2)
+    length, keep = np.bincount(t.point_index, minlength=t.n_points), np.zeros(t.n_points, dtype=bool)
+    start = np.concatenate([[0], np.cumsum(length)])
+    choose_points(np.lexsort((-length, ~model.valid)), start, cell, needed, keep)
+    return restrict_points(model, np.flatnonzero(keep))
 
 
-def _ranks(group: I64, first: I64, second: I64) -> I64:
-    """Rank (K,) of each observation in its group by the keys ``first``, then ``second``."""
-    order = np.lexsort((second, first, group))
-    ranked, rank = group[order], np.empty(len(group), dtype=np.int64)
-    rank[order] = np.arange(len(group)) - np.searchsorted(ranked, ranked)
-    return rank
+@kernel
+def choose_points(order: I64, start: I64, cell: I64, needed: I64, keep: B8) -> None:
+    """Mark points that half of their cells need; point j has those of start[j] <= k < start[j + 1]."""
+    for j in order:
+        missing = 0
+        for k in range(start[j], start[j + 1]):
+            missing += 1 if needed[cell[k]] > 0 else 0
+        keep[j] = 2 * missing >= start[j + 1] - start[j]
+        if keep[j]:
+            for k in range(start[j], start[j + 1]):
+                needed[cell[k]] -= 1
 
 
-def observations_of_views(tracks: Tracks) -> list[I64]:
-    """The observations of each view, in their order."""
-    ends = np.cumsum(np.bincount(tracks.view_index, minlength=tracks.n_views))
-    return np.split(np.argsort(tracks.view_index, kind="stable"), ends[:-1])
+def rows_of_views(view: I64, n_views: int) -> list[I64]:
+    """The rows of ``view`` (K,) with each view, in their order."""
+    ends = np.cumsum(np.bincount(view, minlength=n_views))
+    return np.split(np.argsort(view, kind="stable"), ends[:-1])
 
 
 def reproject_observations(model: MetricEstimate, view: I64, point: I64) -> tuple[F64, F64]:

@@ -18,9 +18,9 @@ from thesisrecon.metric._model import (
     MetricEstimate,
     inlier_ratios,
     normalized_observations,
-    observations_of_views,
     restrict_points,
     retriangulate_tracks,
+    rows_of_views,
 )
 from thesisrecon.numerics._partial_bundle import refine_pose
 
@@ -78,7 +78,8 @@ def _grow(
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
     model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
-    rows, share, rounds, adjusted = observations_of_views(model.tracks), 0.0, 0, model.registered
+    rows = rows_of_views(model.tracks.view_index, model.tracks.n_views)
+    share, rounds, adjusted = 0.0, 0, model.registered
     while True:
         before = model.registered
         model, rejected = _register_missing(model, rng, allowed, rows)

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I32, I64
 from thesisrecon.geometry._conditioning import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._covariance import gauge_directions, invert_in_inner_gauge
 from thesisrecon.numerics._intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
@@ -98,7 +99,7 @@ def block_scatter(
     frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
     place = np.where(observed, np.cumsum(observed) - 1, -1)
     system = _linearise(frame, scale * (X - origin), o, (values, place), noise)
-    S = (system.J.T @ system.J).toarray() - (system.taken.T @ system.taken).toarray()
+    S = _gram_matrix(system.J) - _gram_matrix(system.taken)
     S[first:, first:] += values.terms.information(values.size)
     C = _covariance(S, frame, views)
     poses = np.arange(0, first, max(first // _MAX_POSES, 1))
@@ -116,6 +117,24 @@ def block_scatter(
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )
+
+
+def _gram_matrix(A: scipy.sparse.csr_matrix) -> F64:
+    """Return A'A, dense: most cameras of a place share points."""
+    G = np.zeros((A.shape[1], A.shape[1]))
+    add_gram(A.indptr, A.indices, A.data, G)
+    return G + np.tril(G, -1).T
+
+
+@kernel
+def add_gram(start: I32, column: I32, value: F64, G: F64) -> None:
+    """Add the lower triangle of A'A; row i of A has the values of start[i] <= k < start[i + 1]."""
+    for i in range(len(start) - 1):
+        for k in range(start[i], start[i + 1]):
+            row, factor = G[column[k]], value[k]
+            for m in range(start[i], start[i + 1]):
+                if column[m] <= column[k]:
+                    row[column[m]] += factor * value[m]
 
 
 def _linearise(

@@ -15,6 +15,8 @@ from thesisrecon.numerics._reduced_solvers import ReducedSystem, order_views
 SIMILARITY_DOF = 7
 # Largest number of unknowns for dense inversion.
 MAX_DENSE = 1200
+# Of more, the largest share 1 / BAND of the views that a band may span to be less work.
+BAND = 5
 # Pairs of observations at a time.
 PAIRS = 16384
 MAD_TO_SIGMA = 1.4826
@@ -51,8 +53,9 @@ def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64)
     b, C, e = reduced.sums.border.shape
     if not b:
         return np.zeros((0, C + e, C + e))
-    compute = _dense_blocks if b * C + e <= MAX_DENSE else _band_blocks
-    return compute(reduced, R, t, row, column)
+    if b * C + e <= MAX_DENSE or BAND * order_views(reduced.row, reduced.column, b).reach > b:
+        return _dense_blocks(reduced, R, t, row, column)
+    return _band_blocks(reduced, R, t, row, column)
 
 
 def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.numerics._small_solvers import floored_diagonal, solve_positive
@@ -16,6 +17,8 @@ Step = TypeVar("Step")
 StepOut = TypeVar("StepOut", covariant=True)
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
+# Unknowns above which information is inverted by Cholesky.
+_MANY = 1200
 
 
 class _LinearSystem(Protocol[StepOut]):
@@ -108,7 +111,14 @@ def invert_information(information: F64) -> F64:
     if not np.isfinite(information).all():
         return np.full_like(information, np.inf)
     scale = 1.0 / np.sqrt(floored_diagonal(np.diag(information)))
-    values, vectors = np.linalg.eigh(information * scale * scale[:, None])
+    scaled = information * scale * scale[:, None]
+    if len(scaled) > _MANY:
+        # A tenth of the work. It fails if an eigenvalue is near the floor.
+        factor, fault = scipy.linalg.lapack.dpotrf(scaled, lower=1)
+        if not fault:
+            lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=1)[0])
+            return np.asarray((lower + np.tril(lower, -1).T) * scale * scale[:, None])
+    values, vectors = np.linalg.eigh(scaled)
     inverse = (vectors / np.maximum(values, 1e-14 * max(float(values[-1]), 1e-300))) @ vectors.T
     return np.asarray(inverse * scale * scale[:, None])
 
