@@ -31,6 +31,7 @@ extensions = [
     "_site.mathml",
     "_site.interface",
     "_site.modules",
+    "_site.theory_tables",
 ]
 exclude_patterns = ["_build", "_site", "**/GALLERY_HEADER.*", "tutorial/*.ipynb", "tutorial/*.py"]
 nitpicky = True

@@ -33,10 +33,10 @@ for axis, s in zip(axes, (0.0, 0.5, 1.0), strict=True):
 # *The trilinear tensor* leaves the baseline (Avidan and Shashua 1997). For cameras :math:`[I \; 0]`,
 # :math:`[a \; a_4]` and :math:`[b \; b_4]` the coordinates of a point in three images are tied by (HZ 15.1)
 #
-# .. math:: T_i^{jk} = a_i^j b_4^k - a_4^j b_i^k, \qquad x''^k = x^i\, l'_j\, T_i^{jk},
+# .. math:: T_i^{jk} = a_i^j b_4^k - a_4^j b_i^k, \qquad {x''}^k = x^i\, l'_j\, T_i^{jk},
 #
 # with any line :math:`l'` through :math:`x'`: the third image follows from the other two. Two images alone
-# give the seed :math:`b = a`; a motion :math:`(R, t)` of the third camera turns it into :math:`T_i'^{jk} =
+# give the seed :math:`b = a`; a motion :math:`(R, t)` of the third camera turns it into :math:`{T'}_i^{jk} =
 # R^k_l T_i^{jl} + t^k a_i^j`. Here the virtual camera is moved to where image 0006 was really taken, which
 # shows what is wrong, and then up and back.
 

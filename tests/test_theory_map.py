@@ -1,22 +1,30 @@
-"""docs/theory-map.md names only code and tests that exist, and every numbered equation of its chapters."""
+"""The pages of docs/theory: every equation has code with a test, and all that they name exists."""
 
-import ast
 import importlib
 import re
 from functools import cache
 from pathlib import Path
 
-TESTS = Path(__file__).parent
-TEXT = (TESTS.parent / "docs" / "theory-map.md").read_text(encoding="utf-8")
-ROWS = [[cell.strip() for cell in line.split("|")[1:-1]] for line in TEXT.splitlines() if "`" in line]
-ROWS = [cells for cells in ROWS if len(cells) == 4]
-NAMES = sorted(
-    {name for cells in ROWS for name in re.findall(r"`([a-z_0-9.]+[A-Za-z_0-9]+)`", "".join(cells))}
-)
-CODE = [name for name in NAMES if "/" not in name and not name.endswith(".py")]
-NAMED_TESTS = sorted({name for cells in ROWS for name in re.findall(r"`([^`]+\.py[^`]*)`", cells[3])})
+import pytest
+
+from docs._site import theory
+
+PAGES = Path(__file__).parent.parent / "docs" / "theory"
+SECTIONS = {
+    "views": ["1.2", "1.3"],
+    "stereo": ["2.5"],
+    "surfaces": ["2.6"],
+    "geometry": ["3.2", "3.4.2", "3.4.3", "3.4.4", "3.5", "3.6", "3.6.3", "3.6.4"],
+    "features": ["4.2.1", "4.2.2"],
+    "fundamental-matrix": ["5.2", "5.3", "5.4", "5.5"],
+    "bundle-adjustment": ["6.7"],
+    "projective": ["6.2", "6.3", "6.3.1", "6.3.2", "6.3.3", "6.4", "6.5", "6.6"],
+    "self-calibration": ["7.3"],
+}
+"""Sections of the thesis that a page must cover."""
 
 
+@cache
 def exists(name):
     """Say whether a dotted name is a module of thesisrecon or an attribute of one."""
     parts = ["thesisrecon", *name.split(".")]
@@ -33,33 +41,49 @@ def exists(name):
     return False
 
 
-@cache
-def functions_of(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+def test_every_numbered_equation_has_code_with_a_test():
+    covered = {r.number for row in theory.rows() if row.tests for r in row.references if r.kind == "equation"}
+    wanted = {f"3.{k}" for k in range(1, 43)} | {"4.1"} | {f"5.{k}" for k in range(1, 7)}
+    assert wanted - covered == set()
 
 
-def test_all_named_code_exists():
-    assert [name for name in CODE if not exists(name)] == []
+def test_every_section_has_code():
+    for page, sections in SECTIONS.items():
+        numbers = {r.number for row in theory.table(page) for r in row.references}
+        assert [s for s in sections if s not in numbers] == []
 
 
-def test_all_named_tests_exist():
-    missing = []
-    for name in NAMED_TESTS:
-        file, _, function = name.partition("::")
-        if not (TESTS / file).is_file() or (function and function not in functions_of(TESTS / file)):
-            missing.append(name)
-    assert missing == []
+def test_rows_name_code_and_tests_that_exist():
+    rows = theory.rows()
+    assert len(rows) > 150
+    assert [row.name for row in rows if not exists(row.name)] == []
+    assert [row.name for row in rows if not row.tests and "_" not in row.name] == []
+    for file, test in {test for row in rows for test in row.tests}:
+        assert re.search(rf"^def {test}\(", (Path(__file__).parent / file).read_text("utf-8"), re.M)
 
 
-def test_every_row_names_code_and_every_equation_has_a_row():
-    assert len(CODE) > 80
-    assert len(NAMED_TESTS) > 50
-    assert all("`" in cells[2] or "`" in cells[3] for cells in ROWS)
-    covered = set()
-    for cells in ROWS:
-        numbers = [(int(a), int(b)) for a, b in re.findall(r"\((\d)\.(\d+)\)", cells[0])]
-        covered.update(numbers)
-        if " - " in cells[0] and len(numbers) == 2:
-            covered.update((numbers[0][0], k) for k in range(numbers[0][1], numbers[1][1]))
-    assert covered >= {(3, k) for k in range(1, 43)} | {(5, k) for k in range(1, 7)}
+def test_references_are_read_from_docstrings():
+    def labels(doc):
+        return [r.label for r in theory.references_of(doc)]
+
+    assert labels("Return P = K [R t] (3.18 - 3.21), table 3.1.") == [
+        *["(3.18)", "(3.19)", "(3.20)", "(3.21)"],
+        "table 3.1",
+    ]
+    assert labels("Match (4.2.2); section 5.4, (5.4); HZ 11.4 (HZ 3.2).") == ["4.2.2", "5.4", "(5.4)"]
+    assert labels("Two views (2.5). f(2.0, 3.0)\n\nExamples\n--------\n>>> f(3.4)") == ["2.5"]
+    assert labels("Only chapter 7.") == ["chapter 7"]
+
+
+@pytest.mark.parametrize("page", sorted(theory.PAGES))
+def test_a_page_has_its_table_and_names_what_exists(page):
+    text = (PAGES / f"{page}.md").read_text("utf-8")
+    assert f"```{{theory-table}} {page}\n" in text
+    assert len(theory.table(page)) >= 5
+    named = re.findall(r"\{py:(?:func|class)\}`thesisrecon\.([\w.]+)`", text)
+    assert named
+    assert [name for name in named if not exists(name)] == []
+    for heading in ("The problem", "Equations", "Code", "When it fails", "From the thesis to the code"):
+        assert re.search(rf"^## {heading}", text, re.M), heading
+    paths = re.findall(r"`(tests/[\w/]+\.py)`", text)
+    assert all((PAGES.parent.parent / path).is_file() for path in paths)

@@ -209,7 +209,7 @@ def upgrade_affine(
     images: Sequence[Image] = (),
     seed: int = 0,
 ) -> Reconstruction:
-    """Upgrade a projective reconstruction to an affine one (3.3, chapter 7).
+    """Upgrade a projective reconstruction to an affine one (3.4.3, chapter 7).
 
     Parallel lines and ratios of lengths along them are then those of the scene.
 

@@ -298,7 +298,7 @@ def refine(
 
 
 def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
-    """Covariance (9, 9) of vec(F), px and unit norm, to first order: sigma^2 B (J'J)^-1 B', of rank 7.
+    """Covariance (9, 9) of vec(F), px, unit norm, first order: sigma^2 B (J'J)^-1 B' (section 5.5).
 
     J are the derivatives of the Sampson distances by the seven parameters and B those of vec(F). ``f`` (9,),
     inliers (N, 4) and the noise ``sigma`` of a coordinate are in the frame.

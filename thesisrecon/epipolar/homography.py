@@ -51,7 +51,7 @@ class HomographyFit:
 def estimate_homography(
     xy1: F64, xy2: F64, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
 ) -> HomographyFit:
-    """Estimate the homography x2 ~ H x1 of matches with outliers.
+    """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4).
 
     RANSAC over samples of four, then the least Sampson distance of the inliers, which is to first order the
     maximum likelihood for Gaussian noise in both images.

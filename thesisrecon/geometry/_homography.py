@@ -1,4 +1,4 @@
-"""Homographies of matches: linear estimate, residuals, and the test for parallax (3.6.4, 5.5)."""
+"""Homographies of matches: linear estimate, residuals, and the test for parallax (sections 3.6.4 and 5.5)."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ _CONVERGED = 1e-9
 
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
-    """Return P = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.21).
+    """Return P = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.18 - 3.21).
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
 
 
 def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: float = 0.0) -> F64:
-    """Return K of (3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]].
+    """Return K (3.16, 3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]].
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def rq(M: F64) -> tuple[F64, F64]:
 
 
 def camera_centre(P: F64) -> F64:
-    """Return the centre C with P C = 0, by minors (3.24).
+    """Return the centre C with P C = 0, by minors (3.24 - 3.26).
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
 
 
 def bilinear_form(C: F64, x: F64, y: F64) -> F64:
-    """Return S(x, y) = x'C y (3.5); S(x, x) is 0 on the conic or quadric (3.1, 3.8).
+    """Return S(x, y) = x'C y (3.5); S(x, x) is 0 on the conic (3.1, 3.2) or quadric (3.8).
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def bilinear_form(C: F64, x: F64, y: F64) -> F64:
 
 
 def dual(C: F64) -> F64:
-    """Return the dual C* ~ C^-1 (3.4) or Q* ~ Q^-1 (3.10): tangent lines or tangent planes.
+    """Return the dual C* ~ C^-1 (3.4) or Q* ~ Q^-1 (3.10): tangent lines C x or tangent planes (3.7).
 
     It is the adjugate, by singular values: the dual of two lines (rank 2) is their common point, twice.
 
@@ -113,7 +113,7 @@ def curvature_sign(Q: F64) -> int:
 
 
 def image_of_absolute_conic(K: F64, *, is_dual: bool = False) -> F64:
-    """Return omega = K^-T K^-1 (3.13), or its inverse omega* = K K' (3.14, 3.15).
+    """Return omega = K^-T K^-1 (3.11 - 3.13), or its inverse omega* = K K' (3.14, 3.15).
 
     Parameters
     ----------

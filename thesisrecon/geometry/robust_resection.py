@@ -227,7 +227,7 @@ def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
 def resect_calibrated(
     X: F64, normalized: F64, *, threshold: float, rng: Generator
 ) -> tuple[F64, F64, B8] | None:
-    """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score.
+    """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score (6.4).
 
     ``normalized`` (M, 2) are the image points of ``X`` (M, 3), ``threshold`` is in their unit. Returns R, t
     and inliers (M,), or None below four points or if no sample has a pose.

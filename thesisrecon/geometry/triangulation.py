@@ -1,7 +1,7 @@
 """Section 6.3: triangulation of space points by five methods with one entry point, :func:`triangulate`.
 
 Points with fewer than two observations are zeros, all others have unit norm (mid-points X4 = 1). Near an
-epipole "optimal" may end in a higher minimum than "polynomial". docs/triangulation.md compares the methods.
+epipole "optimal" may end in a higher minimum than "polynomial". docs/theory/projective.md compares them.
 
 References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 """
@@ -168,16 +168,16 @@ _SortedPixels = tuple[I64, I64, F64]
 
 
 def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
-    """Triangulate space points by one of the methods of section 6.3.
+    """Triangulate space points by one of the methods of section 6.3 (HZ 12).
 
     Parameters
     ----------
     P, xy : ndarray (V, 3, 4) and (V, N, 2)
         V >= 2 cameras of any scale, and pixels; NaN for not observed.
     method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}, optional
-        "polynomial": optimal for exactly two views; "linear" and "iterated": algebraic; "midpoint": metric
-        frames only; "optimal": least reprojection error from any number of views. None: "polynomial" for two
-        views, else "optimal".
+        "polynomial": optimal for exactly two views (6.3.3); "linear" and "iterated": algebraic (6.3.1);
+        "midpoint": metric frames only (6.3.2); "optimal": least reprojection error from any number of views.
+        None: "polynomial" for two views, else "optimal".
 
     Returns
     -------

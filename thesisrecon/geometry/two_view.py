@@ -178,7 +178,7 @@ def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
-    """Return the homography x2 ~ H x1 of unit norm between two images induced by a plane.
+    """Return the homography x2 ~ H x1 of unit norm between two images induced by a plane (3.29 - 3.32).
 
     H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane and the point
     is projected. For P1 = [I 0], P2 = [M m] and the plane (pi, 1) it is H_Pi = M - m pi' (3.29), which maps

@@ -289,7 +289,7 @@ def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> 
 
 @dataclass(frozen=True)
 class SeedsAndGrowth:
-    """Seeds give F; F and local affine maps of known matches guide the search for each corner.
+    """Seeds give F; F and local affine maps of known matches guide the search for each corner (4.2.2).
 
     Parameters
     ----------

@@ -183,7 +183,7 @@ def self_check(
     *,
     sigmas: float,
 ) -> tuple[dict[str, float], list[str], list[str]]:
-    """Check a metric model: numbers by name, sentences for failed checks (none: trusted) and for limitations.
+    """Check a metric model: numbers, sentences for failed checks (none: trusted), limitations (chapter 7).
 
     A limitation is what the camera model does not describe although the cameras are right.
     ``intervals`` are the intrinsics of each view as in ``MetricResult``; ``sigmas`` is the gate of inliers.

@@ -82,7 +82,7 @@ NO_COMMON_POINTS = "shares no points with the model"
 
 @dataclass(frozen=True)
 class MetricRefinement:
-    """Metric refinement of a calibrated projective reconstruction."""
+    """Metric refinement of a calibrated projective reconstruction (6.7)."""
 
     def refine(
         self,

@@ -81,7 +81,7 @@ def block_scatter(
     prior: IntrinsicsPrior,
     noise: tuple[float, float],
 ) -> BlockScatter:
-    """Measure the scatter of the intrinsics' gradients between blocks of points after an adjustment.
+    """Measure the scatter of the intrinsics' gradients between blocks of points after an adjustment (6.7).
 
     With S_b the information of block b on the cameras (its points eliminated), g_b its gradient and C the
     covariance, the pull of a block on value a is c_a' g_b; without correlation between blocks sum (c_a'

@@ -59,7 +59,7 @@ def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64)
 
 
 def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
-    """Covariances of intrinsics (G, C, C) and poses (b, 6, 6); the unit of length is 1 / ``scale``."""
+    """Covariances of intrinsics (G, C, C) and poses (b, 6, 6); the unit of length is 1 / ``scale`` (6.7)."""
     intrinsics, edge = np.zeros((*number.shape, number.shape[1])), len(blocks) * width
     if not len(blocks):
         return intrinsics, np.zeros((0, POSE_DOF, POSE_DOF))

@@ -48,7 +48,7 @@ def run_levenberg_marquardt(
     tolerance: float = 1e-7,
     initial_damping: float = 1e-4,
 ) -> tuple[State, float, int]:
-    """Minimise a problem by Levenberg-Marquardt; return the final state, its cost and the linear solves.
+    """Minimise a problem by Levenberg-Marquardt; return the final state, its cost, linear solves (6.7).
 
     The cost never rises and singular systems raise nothing. The damping multiplies the diagonal (Marquardt
     1963), so that units do not matter and gauge freedoms need no other treatment; it follows Nielsen

@@ -163,7 +163,7 @@ def refine_metric_bundle(
     options: BundleOptions | None = None,
     fixed: B8 | None = None,
 ) -> MetricBundleResult:
-    """Minimise reprojection errors and prior deviations over poses, points and ``free`` intrinsics.
+    """Minimise reprojection errors and prior deviations over poses, points and ``free`` intrinsics (6.7).
 
     The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
     Levenberg-Marquardt; the focal length is stepped as log f, the seven gauge freedoms are left to the

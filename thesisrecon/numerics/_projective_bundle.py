@@ -79,7 +79,7 @@ def refine_projective_bundle(
     max_iterations: int = 10,
     fixed_views: B8 | None = None,
 ) -> ProjectiveBundleResult:
-    """Minimise sum rho(|x - P X|^2) over all points and cameras but ``fixed_views`` with Huber's loss.
+    """Minimise sum rho(|x - P X|^2) over all points and cameras but ``fixed_views`` with Huber's loss (6.7).
 
     Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the
     damping handles the 15 gauge freedoms (methods 6.7). The cost never rises; views and points without

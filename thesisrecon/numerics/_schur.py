@@ -108,7 +108,7 @@ BundleStep = tuple[F64, F64]
 
 @dataclass(frozen=True)
 class BundleSystem:
-    """A bundle problem linearised at one state; the Jacobian buffers belong to the latest one."""
+    """A bundle problem linearised at one state (6.7; HZ A6.3); Jacobian buffers belong to the latest."""
 
     cost: float
     layout: BundleLayout

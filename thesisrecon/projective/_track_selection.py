@@ -27,7 +27,7 @@ _NO_PARALLAX_REASONS = {
 
 
 def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView]:
-    """Rank the accepted pairs as initial pairs, best first.
+    """Rank the accepted pairs as initial pairs, best first (6.2).
 
     The score is the number of shared points (those seen in a third view count twice) times the share that no
     homography explains; pairs whose matches leave F undetermined count a tenth. If one initial pair fails,

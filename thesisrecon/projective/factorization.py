@@ -139,7 +139,7 @@ def _rank_four(wx: F64) -> tuple[F64, float]:
 
 @dataclass(frozen=True)
 class Factorization:
-    """Projective factorization of a core of views; the others are added by resection.
+    """Projective factorization of a core of views; the others are added by resection (6.2).
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
 def _projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
-    """Standard deviations (N,) px of projections by a camera's covariance (12, 12); inf if undetermined."""
+    """Std (N,) px of projections by a camera's covariance (12, 12) (6.4); inf if undetermined."""
     xh = X @ P.T
     with np.errstate(divide="ignore", invalid="ignore"):
         uv = xh[:, :2] / xh[:, 2:]
@@ -82,7 +82,7 @@ OUTSIDE_CORE = "is outside the core: it is registered after self-calibration"
 
 @dataclass(frozen=True)
 class IncrementalProjective:
-    """Incremental projective reconstruction with a covariance test of each camera.
+    """Incremental projective reconstruction with a covariance test of each camera (6.6).
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 @dataclass(frozen=True)
 class SequentialProjective:
-    """Projective reconstruction of one view after the other in image order.
+    """Projective reconstruction of one view after the other in image order (6.6).
 
     The pair of neighbours with most matches begins; each further view is resected, new points are
     triangulated and outliers removed. One bundle adjustment at the end replaces the lost chapter on it.

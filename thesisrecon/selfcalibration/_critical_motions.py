@@ -88,7 +88,7 @@ class UpgradedCameras:
 
 
 def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
-    """Return the measures of ``TOLERANCES`` by name, and the largest rotation."""
+    """Return the measures of ``TOLERANCES`` by name, and the largest rotation (chapter 7)."""
     axis, angle, spread = _common_rotation_axis(metric.R)
     H, offset = metric.infinite_homographies(), metric.C - metric.C.mean(axis=0)
     return {
@@ -106,7 +106,7 @@ def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
 
 
 def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
-    """The nearest critical motion of some measures, and its largest measure over its tolerance."""
+    """The nearest critical motion, and its largest measure over its tolerance (chapter 7)."""
     near: dict[str, float] = {}
     for name, needed in _MEASURES_OF.items():
         if all(key in measures for key in needed):

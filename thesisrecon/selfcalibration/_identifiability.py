@@ -116,7 +116,7 @@ _RESOLVED_BY_ASPECT = (TURNTABLE, PLANAR, PARALLEL_AXES)
 def check_identifiability(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> IdentifiabilityReport:
-    """Check whether a self-calibration is determined by the images and the prior.
+    """Check whether a self-calibration is determined by the images and the prior (chapter 7).
 
     A metric bundle adjustment of a subset of the observations gives cameras and the covariance of their focal
     lengths under the prior; a second covariance, with free aspect ratio and principal point, shows what

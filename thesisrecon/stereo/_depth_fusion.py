@@ -47,7 +47,7 @@ def fuse_neighbours(
     correspond: Correspond,
     pool: Executor | None = None,
 ) -> InverseDepth:
-    """Robust weighted mean of the inverse depths measured with all neighbours.
+    """Robust weighted mean of the inverse depths measured with all neighbours (2.5).
 
     The largest group of estimates that agree is averaged, the more certain one among equals. A measurement
     with a single neighbour is kept; the depth map of another view must confirm it.
@@ -69,7 +69,7 @@ def _with_idle_threads(pool: Executor | None, function: Callable[[A], B], items:
 def link_sequence(
     view: int, views: Mapping[int, PinholeView], links: int, correspond: Correspond
 ) -> InverseDepth:
-    """Link correspondences through the views in order of their numbers with a Kalman filter per pixel.
+    """Link correspondences through the views in order of their numbers with a Kalman filter per pixel (2.5).
 
     Koch, Pollefeys and Van Gool, "Multi viewpoint stereo from uncalibrated video sequences", ECCV 1998. The
     disparities of consecutive pairs are chained up and down the sequence from the reference view, at most

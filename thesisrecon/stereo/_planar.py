@@ -97,7 +97,7 @@ def common_orientation(pair: EpipolarPair) -> PlanarRectification:
 
 
 def hartley(pair: EpipolarPair) -> PlanarRectification:
-    """Rectify from F and matches (Hartley, IJCV 1999).
+    """Rectify from F and matches (2.5; Hartley, IJCV 1999).
 
     The second image is mapped by G R T: rigidly about its centre except for the projective part that sends
     the epipole to infinity along x. The homography of the first is the compatible one with the least sum of
@@ -131,7 +131,7 @@ def _perpendicular(pair: EpipolarPair, phi: float) -> float:
 
 
 def loop_zhang(pair: EpipolarPair) -> PlanarRectification:
-    """Rectify with least projective distortion (Loop and Zhang, CVPR 1999).
+    """Rectify with least projective distortion (2.5; Loop and Zhang, CVPR 1999).
 
     The line at infinity minimises the variation of the third coordinate over both images, the sum of w'PP'w /
     w'p p'w (variance of w'x over its squared mean). Similarity and shear make the affine part a similarity.

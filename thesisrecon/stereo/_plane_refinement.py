@@ -45,7 +45,7 @@ _Search = tuple[PatchViews, PatchWindow]
 
 
 def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth) -> InverseDepth:
-    """Refine and extend the inverse depths of a view by propagation and refinement of a plane per pixel.
+    """Refine and extend the inverse depths of a view by propagating and refining a plane per pixel (2.6).
 
     Stereo matching of rectified images assumes fronto-parallel windows and loses slanted surfaces. A plane in
     space is linear in inverse depth, so each pixel has an inverse depth and its gradient. Its window is

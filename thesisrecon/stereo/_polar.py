@@ -96,7 +96,7 @@ class PolarRectification(Rectification):
 
 
 def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
-    """Rectify in polar coordinates with bounded reduction.
+    """Rectify in polar coordinates with bounded reduction (2.5).
 
     Adjacent rows are at most one pixel apart in the middle of each half-line, and closer where its end would
     be reduced by more than ``MAX_SHRINK`` (1: no pixel is lost, as in the paper). The row spacing is a

@@ -39,7 +39,7 @@ MIN_SCALE = 0.05
 
 @dataclass(frozen=True)
 class TextureAtlas:
-    """Texture at the resolution of the view that shows each part of the surface best.
+    """Texture at the resolution of the view that shows each part of the surface best (2.6).
 
     Parameters
     ----------
