@@ -161,8 +161,15 @@ def _reported(
 def inspect(
     out: Annotated[Path, typer.Argument(parser=parse_folder, metavar="OUT", help="Output folder of a run.")],
 ) -> None:
-    """Print the summary of a run."""
+    """Print the summary of a run, or where it stands if it has not finished."""
+    from thesisrecon.runtime._run_folder import is_running
+    from thesisrecon.runtime._run_position import run_position
+
     summary = read_json(out / "summary.json")
+    position = run_position(out) if summary is None or is_running(out) else ""
+    if position:
+        typer.echo(printable(position))
+        return
     if not isinstance(summary, dict):
         raise UsageError(f"{out} holds no summary.json; no run has finished in this folder")
     try:

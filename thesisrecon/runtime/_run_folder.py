@@ -308,6 +308,18 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def is_running(folder: Path) -> bool:
+    """Whether a run is writing to an output folder."""
+    try:
+        with (folder / LOCK_FILE).open() as handle:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Create and lock the folder; the lock ends with the process."""

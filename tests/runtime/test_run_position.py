@@ -1,0 +1,62 @@
+"""Where an unfinished run stands, from its folder: stage, items done, time left, running or interrupted."""
+
+import os
+import re
+import time
+
+import numpy as np
+import pytest
+
+from thesisrecon.cli.main import run_command
+from thesisrecon.io._files import write_json
+from thesisrecon.records import PairChoice, StageReport
+from thesisrecon.runtime._run_folder import RunDirectory, StageFolder
+from thesisrecon.runtime._run_position import run_position
+
+IMAGES = 10
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run whose features were done 100 s ago, and 5 of 45 pairs since."""
+    now = time.time()
+    write_json(tmp_path / "run.json", {"images": {f"{i}.jpg": "" for i in range(IMAGES)}})
+    os.utime(tmp_path / "run.json", (now - 300, now - 300))
+    pairs = np.array([(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)])
+    stages = {"01-features": IMAGES, "02-matches": 5}
+    for name, count in stages.items():
+        for n in range(count):
+            path = tmp_path / name / f"{n:05d}.npz"
+            path.parent.mkdir(exist_ok=True)
+            path.touch()
+            os.utime(path, (now - 100 - n, now - 100 - n) if name == "01-features" else (now - n, now - n))
+    choice = StageFolder(tmp_path / "02-pairs")
+    choice.save("choice", "key", PairChoice(pairs, "all"))
+    choice.finish(StageReport("pairs", 0.0, {}, {}, ()), {}, {"choice": "key"})
+    for path in (tmp_path / "02-pairs").iterdir():
+        os.utime(path, (now - 100, now - 100))
+    return tmp_path
+
+
+def test_a_running_folder_tells_its_stage_and_the_time_left(folder, capsys):
+    with RunDirectory(folder).claim({}, overwrite=True):
+        assert run_command(["inspect", str(folder)]) == 0
+    # 5 pairs in 100 s, 40 are left: 800 s.
+    assert re.match(
+        r"running: matches, 5 of 45 done, about 1[34] min left in this stage\n", capsys.readouterr().out
+    )
+
+
+def test_a_killed_run_tells_how_to_go_on(folder):
+    expected = "interrupted: matches, 5 of 45 done; repeat the command to resume"
+    assert run_position(folder) == expected
+
+
+def test_resumed_items_do_not_count_for_the_rate(folder):
+    os.utime(folder / "run.json")
+    with RunDirectory(folder).claim({}, overwrite=True):
+        assert run_position(folder) == "running: matches, 5 of 45 done"
+
+
+def test_a_folder_without_a_run_has_no_position(tmp_path):
+    assert run_position(tmp_path) == ""
