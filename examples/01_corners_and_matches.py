@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter
 
 import thesisrecon
 
-folder = Path(__file__).resolve().parent.parent / "fixtures" / "courtyard" / "images"
+folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard" / "images"
 paths = [folder / "0000.jpg", folder / "0001.jpg"]
 left, right = (np.asarray(Image.open(path)) for path in paths)
 crop = np.s_[300:440, 180:360]

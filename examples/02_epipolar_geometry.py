@@ -20,7 +20,7 @@ import numpy as np
 
 import thesisrecon
 
-folder = Path(__file__).resolve().parent.parent / "fixtures" / "courtyard"
+folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 paths = [folder / "images" / name for name in ("0000.jpg", "0001.jpg")]
 pair = thesisrecon.match_pair(*paths)
 fit = thesisrecon.estimate_fundamental(pair.xy1, pair.xy2)

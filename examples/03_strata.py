@@ -22,7 +22,7 @@ import numpy as np
 import thesisrecon
 from thesisrecon.geometry.strata import transform
 
-cube = np.load(Path(__file__).resolve().parent.parent / "fixtures" / "cube" / "cube.npz")
+cube = np.load(Path(thesisrecon.__file__).parents[1] / "fixtures" / "cube" / "cube.npz")
 views = np.flatnonzero(np.isfinite(cube["xy"][..., 0]).sum(axis=1) > 200)[::2]
 noisy = cube["xy"][views] + np.random.default_rng(0).normal(0, 0.5, (len(views), 360, 2))
 run = thesisrecon.reconstruct_from_tracks(noisy, [(800, 600)] * len(views), until="projective")

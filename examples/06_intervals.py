@@ -21,7 +21,7 @@ import numpy as np
 
 import thesisrecon
 
-cube = np.load(Path(__file__).resolve().parent.parent / "fixtures" / "cube" / "cube.npz")
+cube = np.load(Path(thesisrecon.__file__).parents[1] / "fixtures" / "cube" / "cube.npz")
 views = np.flatnonzero(np.isfinite(cube["xy"][..., 0]).sum(axis=1) > 200)[::2]
 exact, K, R, C, sigma = cube["xy"][views], cube["K"], cube["R"][views], cube["C"][views], 0.5
 t, rng, trials = -np.einsum("vij,vj->vi", R, C), np.random.default_rng(0), 100

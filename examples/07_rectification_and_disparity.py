@@ -16,7 +16,7 @@ from PIL import Image
 
 import thesisrecon
 
-folder = Path(__file__).resolve().parent.parent / "fixtures" / "courtyard"
+folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 names = ["0010.jpg", "0011.jpg"]
 images = [np.asarray(Image.open(folder / "images" / name).reduce(2)) for name in names]
 pair = thesisrecon.match_pair(*images)

@@ -18,7 +18,7 @@ from PIL import Image
 
 import thesisrecon
 
-folder = Path(__file__).resolve().parent.parent / "fixtures" / "courtyard"
+folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 paths = [folder / "images" / f"{i:04d}.jpg" for i in range(3, 7)]
 all_cameras = thesisrecon.read_cameras(folder / "cameras.json")
 cameras = [all_cameras[path.name] for path in paths]

@@ -20,7 +20,7 @@ from thesisrecon.view_interpolation import prepare_pair
 from thesisrecon.view_synthesis import match_images, prepare_trilinear_views
 from thesisrecon.views.trilinear import VirtualCamera
 
-folder = Path(__file__).resolve().parent.parent / "fixtures" / "courtyard"
+folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 names = ["0005.jpg", "0007.jpg", "0006.jpg"]
 first, second, real = (np.asarray(Image.open(folder / "images" / name).reduce(2)) for name in names)
 pair = prepare_pair(first, second)

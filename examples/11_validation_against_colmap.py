@@ -20,7 +20,7 @@ try:
     import pycolmap
 except ImportError:
     pycolmap = print("pycolmap is not installed (extra validation): no comparison with COLMAP")
-folder = Path(__file__).resolve().parent.parent / "fixtures" / "courtyard"
+folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 images = sorted((folder / "images").glob("*.jpg"))[:6]
 
 
