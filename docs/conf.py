@@ -78,6 +78,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_signature": False,
     "remove_config_comments": True,
+    "capture_repr": (),
     "min_reported_time": 1,
     "doc_module": ("thesisrecon",),
     "backreferences_dir": "tutorial/uses",

@@ -27,7 +27,7 @@ from validation.ablation.tasks.fundamental import FundamentalOfCube
 
 @dataclass(frozen=True)
 class EveryMatch:
-    def estimate(self, xy1, xy2, rng):  # noqa: ARG002
+    def estimate(self, xy1, xy2, rng):
         return thesisrecon.estimate_fundamental(xy1, xy2, method="gold-standard")
 
 
