@@ -83,7 +83,15 @@ def test_a_page_has_its_table_and_names_what_exists(page):
     named = re.findall(r"\{py:(?:func|class)\}`thesisrecon\.([\w.]+)`", text)
     assert named
     assert [name for name in named if not exists(name)] == []
+    assert all(page in theory.chapters_of(name) for name in named)  # they link back
     for heading in ("The problem", "Equations", "Code", "When it fails", "From the thesis to the code"):
         assert re.search(rf"^## {heading}", text, re.M), heading
     paths = re.findall(r"`(tests/[\w/]+\.py)`", text)
     assert all((PAGES.parent.parent / path).is_file() for path in paths)
+
+
+def test_functions_link_to_the_chapter_of_their_equations():
+    assert theory.chapters_of("estimate_fundamental") == ["fundamental-matrix"]
+    assert theory.chapters_of("geometry.conics.dual") == ["geometry"]
+    assert theory.chapters_of("bundle_adjust") == ["bundle-adjustment"]
+    assert theory.chapters_of("load") == []

@@ -231,3 +231,16 @@ def row_of(name: str) -> Row | None:
     """The row of an exported or dotted name, without the package."""
     full = _full(name)
     return next((row for row in rows() if row.name == full), None)
+
+
+@cache
+def _named_on_pages() -> dict[str, set[str]]:
+    texts = {page: (ROOT / "docs" / "theory" / f"{page}.md").read_text(encoding="utf-8") for page in PAGES}
+    return {page: set(re.findall(r"`thesisrecon\.([\w.]+)`", text)) for page, text in texts.items()}
+
+
+def chapters_of(name: str) -> list[str]:
+    """The pages that a docstring refers to, and those that link to the name."""
+    row = row_of(name)
+    referred = {page_of(reference) for reference in row.references} if row else set()
+    return [page for page in PAGES if page in referred or name in _named_on_pages()[page]]

@@ -55,10 +55,9 @@ def words(test: str) -> str:
 
 
 def link_to_chapter(_app, what, name, _obj, _options, lines):
-    """Add the chapters that the docstring of an exported name or of its home refers to."""
-    own = theory.row_of(name.removeprefix("thesisrecon.")) if what in ("function", "class") else None
-    pages = dict.fromkeys(theory.page_of(reference) for reference in own.references) if own else {}
-    links = ", ".join(f":doc:`/theory/{page}`" for page in pages if page)
+    """Add the chapters that the docstring of a function or class refers to, or that link to it."""
+    pages = theory.chapters_of(name.removeprefix("thesisrecon.")) if what in ("function", "class") else []
+    links = ", ".join(f":doc:`/theory/{page}`" for page in pages)
     if links:
         lines += ["", ".. rubric:: Theory", "", links, ""]
 
