@@ -112,7 +112,7 @@ def block_scatter(
     estimated, number = values.number >= 0, values.number
     return BlockScatter(
         np.where(estimated, np.diag(C)[np.where(estimated, first + number, 0)], 0.0),
-        _shared_variances(S, values, frame, views),
+        _shared_variances(S, C, values, frame, views),
         np.where(estimated, ratio[np.where(estimated, len(poses) + number, 0)], np.nan),
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
@@ -188,17 +188,21 @@ def _covariance(S: F64, cameras: MetricCameras, views: I64) -> F64:
     return invert_in_inner_gauge(S, N)
 
 
-def _shared_variances(S: F64, values: IntrinsicUnknowns, cameras: MetricCameras, views: I64) -> F64:
-    """Return the variances (C,) of the intrinsics if all cameras were one."""
-    first = len(S) - values.size
+def _shared_variances(S: F64, C: F64, values: IntrinsicUnknowns, cameras: MetricCameras, views: I64) -> F64:
+    """Return the variances (C,) of the intrinsics if all cameras were one, from S and its inverse C."""
+    first, width = len(S) - values.size, values.number.shape[1]
     column = values.column[: values.n_table]
-    T = np.zeros((len(S), first + values.number.shape[1]))
+    if values.size == len(np.unique(column)):
+        variances = np.zeros(width)
+        variances[column] = np.diag(C)[first:]
+        return variances
+    T = np.zeros((len(S), first + width))
     T[np.arange(first), np.arange(first)] = 1.0
     T[first + np.arange(values.n_table), first + column] = 1.0
-    moves = np.concatenate([np.ones(first, dtype=bool), np.isin(np.arange(values.number.shape[1]), column)])
-    C = _covariance(T[:, moves].T @ S @ T[:, moves], cameras, views)
+    moves = np.concatenate([np.ones(first, dtype=bool), np.isin(np.arange(width), column)])
+    together = _covariance(T[:, moves].T @ S @ T[:, moves], cameras, views)
     shared = np.zeros(T.shape[1])
-    shared[moves] = np.diag(C)
+    shared[moves] = np.diag(together)
     return shared[first:]
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import copy_to, empty, full, kernel
+from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 from thesisrecon.numerics._observations import Jacobians
 from thesisrecon.numerics._small_solvers import invert_cholesky_3x3, multiply_transposed_3x3
 
@@ -123,39 +123,61 @@ def _sum_points(
                 left.residual[k - left.first, i] = J.residual[k, i] - t0 * g0 - t1 * g1 - t2 * g2
 
 
+@kernel
+def _sort_by_view(first: int, last: int, index: BlockIndex, order: I64, end: I64) -> int:
+    """Fill the observations of free views by view, and the end of the point of each; return how many."""
+    next_of, base = zeros(len(index.pair) + 1, np.int64), index.start[first]
+    for j in range(first, last):
+        for k in range(index.start[j], index.start[j + 1]):
+            end[k - base] = index.start[j + 1]
+            next_of[index.block[index.view_index[k]] + 1] += 1
+    next_of[0] = 0
+    for b in range(len(index.pair)):
+        next_of[b + 1] += next_of[b]
+    for k in range(base, index.start[last]):
+        b = index.block[index.view_index[k]]
+        if b >= 0:
+            order[next_of[b]] = k
+            next_of[b] += 1
+    return next_of[len(index.pair) - 1] if len(index.pair) > 0 else 0
+
+
 @kernel(forceinline=True)
 def _add_views(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
-    """Add the blocks of all pairs of views that observe a point, and the views' right-hand side."""
-    C = J.A.shape[2]
-    for j in range(first, last):
-        for k in range(index.start[j], index.start[j + 1]):
-            v = index.block[index.view_index[k]]
-            if v < 0:
+    """Add the blocks of all pairs of views that observe a point, and the views' right-hand side.
+
+    View by view: the blocks of one stay in the cache.
+    """
+    C, n = J.A.shape[2], index.start[last] - left.first
+    order, end = empty(n, np.int64), empty(n, np.int64)
+    total = _sort_by_view(first, last, index, order, end)
+    for i in range(total):
+        k = order[i]
+        v = index.block[index.view_index[k]]
+        r0, r1 = J.residual[k, 0], J.residual[k, 1]
+        t0, t1 = left.residual[k - left.first, 0], left.residual[k - left.first, 1]
+        for a in range(C):
+            a0, a1 = J.A[k, 0, a], J.A[k, 1, a]
+            sums.gradient[v * C + a] += a0 * r0 + a1 * r1
+            sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
+            sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
+        b = left.Bt[k - left.first]
+        for m in range(k, end[k - left.first]):
+            w = index.block[index.view_index[m]]
+            if w < 0:
                 continue
-            r0, r1 = J.residual[k, 0], J.residual[k, 1]
-            t0, t1 = left.residual[k - left.first, 0], left.residual[k - left.first, 1]
-            for a in range(C):
-                a0, a1 = J.A[k, 0, a], J.A[k, 1, a]
-                sums.gradient[v * C + a] += a0 * r0 + a1 * r1
-                sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
-                sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
-            b = left.Bt[k - left.first]
-            for m in range(k, index.start[j + 1]):
-                w = index.block[index.view_index[m]]
-                if w < 0:
-                    continue
-                c = left.Bt[m - left.first]
-                same = 1.0 if m == k else 0.0
-                q00 = same - b[0, 0] * c[0, 0] - b[0, 1] * c[0, 1] - b[0, 2] * c[0, 2]
-                q01 = -b[0, 0] * c[1, 0] - b[0, 1] * c[1, 1] - b[0, 2] * c[1, 2]
-                q10 = -b[1, 0] * c[0, 0] - b[1, 1] * c[0, 1] - b[1, 2] * c[0, 2]
-                q11 = same - b[1, 0] * c[1, 0] - b[1, 1] * c[1, 1] - b[1, 2] * c[1, 2]
-                S = sums.blocks[index.pair[v, w]]
-                _add_block(S, J.A[k], J.A[m], q00, q01, q10, q11)
-                if v == w and m > k:
-                    _add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
+            c = left.Bt[m - left.first]
+            same = 1.0 if m == k else 0.0
+            q00 = same - b[0, 0] * c[0, 0] - b[0, 1] * c[0, 1] - b[0, 2] * c[0, 2]
+            q01 = -b[0, 0] * c[1, 0] - b[0, 1] * c[1, 1] - b[0, 2] * c[1, 2]
+            q10 = -b[1, 0] * c[0, 0] - b[1, 1] * c[0, 1] - b[1, 2] * c[0, 2]
+            q11 = same - b[1, 0] * c[1, 0] - b[1, 1] * c[1, 1] - b[1, 2] * c[1, 2]
+            S = sums.blocks[index.pair[v, w]]
+            _add_block(S, J.A[k], J.A[m], q00, q01, q10, q11)
+            if v == w and m > k:
+                _add_block(S, J.A[m], J.A[k], q00, q10, q01, q11)
 
 
 @kernel(inline="always", fastmath={"contract"}, forceinline=True)
