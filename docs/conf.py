@@ -29,6 +29,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx_gallery.gen_gallery",
     "_site.mathml",
+    "_site.failures",
     "_site.interface",
     "_site.modules",
     "_site.theory_tables",

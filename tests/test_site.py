@@ -45,3 +45,19 @@ def test_the_pages_of_commands_and_settings_name_all_of_them(site):
     rows = re.findall(r"^\| (`.*)", settings, re.M)
     assert len(rows) > 100
     assert [row for row in rows if row.rstrip().endswith("|  |")] == []
+
+
+def test_the_page_of_failures_has_a_remedy_for_each_message_of_the_code(site):
+    failures = site("failures")
+    known = failures.remedies()
+    found = {text for texts in failures.messages().values() for text in texts}
+    assert found == set(known) - {"failures", "parts"}
+    of_stages = [row for rows in failures.stage_failures().values() for row in rows]
+    assert len(of_stages) > 60
+    without = {reason for reason, _, advice in of_stages if not re.search(r"\w", advice)}
+    assert without == set(known["failures"])
+    page = failures.page()
+    assert all(f"| {reason} |" in page for reason, _, _ in of_stages)
+    # A file that makes warnings is read, or known to pass them on.
+    read = {file for files in failures.SOURCES.values() for file in files}
+    assert failures.warning_sinks() <= read | failures.PASSED_ON

@@ -1,0 +1,243 @@
+"""Every failure, warning and failed check of the package, with cause and remedy, read from its source.
+
+A message is a template: "…" stands for a value. The advice of a ``StageFailure`` stands in the code; that of
+the other messages stands in `remedies.toml`, which has an entry for each.
+"""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from _site.code import PACKAGE, summary, tree_of, write
+
+REMEDIES = Path(__file__).with_name("remedies.toml")
+SOURCES = {
+    "Images that are left out": {
+        "io/_images.py": ("read_images", "_read", "decode_file", "_too_large", "_decoded_image"),
+        "io/_pixels.py": ("resized_to",),
+        "io/_masks.py": ("find_masks",),
+        "io/_frames.py": ("_decoded",),
+        "pipeline/reconstruction.py": ("_read_inputs", "_exif_warnings"),
+        "pipeline/_stages.py": ("finish_features",),
+    },
+    "Pairs of images": {
+        "epipolar/verification.py": ("_objection", "_assess_pair"),
+        "pipeline/_stages.py": ("_degenerate_pairs",),
+        "pipeline/_steps.py": ("_run_groups", "_with_group_reasons"),
+    },
+    "Calibration": {
+        "pipeline/_outputs.py": ("_failure_warnings",),
+        "selfcalibration/_identifiability.py": ("_failure", "_resolution", "_sentences"),
+        "metric/_shared_camera.py": (
+            "_focals_differ", "_centres_differ", "_untestable", "contradicted_focal_priors",
+            "inconsistent_principal_point",
+        ),
+        "metric/_camera_model.py": ("differences_of_images",),
+        "metric/_uncertainty.py": ("warnings",),
+    },
+    "The self-check": {"metric/_checks.py": ("_failed_model", "_failed_views")},
+    "Results and files": {
+        "pipeline/_stages.py": ("reconstruct_metric", "estimate_depth_maps"),
+        "pipeline/_steps.py": ("_run_all",),
+        "pipeline/_outputs.py": ("_write_model", "write_outputs"),
+        "runtime/_run.py": ("_loaded",),
+    },
+}  # fmt: skip
+"""Functions whose sentences are warnings, failed checks or reasons to leave an image out."""
+PASSED_ON = {
+    "cli/view_files.py", "pipeline/_loading.py", "pipeline/from_matches.py", "runtime/_run_folder.py",
+    "metric/refinement.py",
+    "report/_page.py", "report/_data.py", "records.py", "results.py", "cli/main.py",
+}  # fmt: skip
+"""Files that only pass warnings on."""
+FOLDERS = (
+    "pipeline", "io", "matching", "epipolar", "geometry", "projective", "selfcalibration", "metric", "stereo",
+    "surface", "views", "",
+)  # fmt: skip
+
+
+def functions_of(path: Path) -> list[ast.FunctionDef]:
+    """All functions and methods of a file."""
+    return [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.FunctionDef)]
+
+
+def texts(node: ast.expr | None, names: dict[str, list[ast.expr]], depth: int = 0) -> list[str]:
+    """Return the texts that an expression may have; "…" for a value."""
+    if node is None:
+        return [""]
+    if isinstance(node, ast.Constant):
+        return [str(node.value)] if isinstance(node.value, str) else ["…"]
+    if isinstance(node, ast.JoinedStr):
+        parts = [
+            texts(v.value if isinstance(v, ast.FormattedValue) else v, names, depth + 1) for v in node.values
+        ]
+        return ["".join(chosen) for chosen in product(*parts)][:12]
+    if isinstance(node, ast.IfExp):
+        return texts(node.body, names, depth) + texts(node.orelse, names, depth)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return [a + b for a, b in product(texts(node.left, names, depth), texts(node.right, names, depth))]
+    if isinstance(node, ast.Name) and node.id in names and depth < 3:
+        found = [text for value in names[node.id] for text in texts(value, names, depth + 1)]
+        return found if any(any(c.isalpha() for c in text) for text in found) else ["…"]
+    return ["…"]
+
+
+def assigned(scope: ast.AST) -> dict[str, list[ast.expr]]:
+    """Names and the expressions that are assigned to them, also of tuples."""
+    found: dict[str, list[ast.expr]] = {}
+    for node in ast.walk(scope):
+        if isinstance(node, ast.Assign):
+            for target in node.targets:
+                pairs = [(target, node.value)]
+                if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    pairs = list(zip(target.elts, node.value.elts, strict=True))
+                for name, value in pairs:
+                    if isinstance(name, ast.Name):
+                        found.setdefault(name.id, []).append(value)
+    return found
+
+
+def stage_failures() -> dict[str, list[tuple[str, str, str]]]:
+    """Return (reason, evidence, advice) of every failure by folder, without those that are passed on."""
+    found: dict[str, list[tuple[str, str, str]]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        constants = {k: v for k, v in assigned(tree_of(path)).items() if k.isupper() or k.startswith("_")}
+        folder = path.relative_to(PACKAGE).parts[0] if path.parent != PACKAGE else ""
+        inner = [(function, function) for function in functions_of(path)]
+        seen: set[int] = set()
+        for function, scope in reversed(inner):
+            names = constants | assigned(scope)
+            for node in ast.walk(function):
+                if (
+                    not isinstance(node, ast.Call)
+                    or ast.unparse(node.func) != "StageFailure"
+                    or id(node) in seen
+                ):
+                    continue
+                seen.add(id(node))
+                given = dict(zip(("reason", "evidence", "advice"), node.args, strict=False))
+                given |= {word.arg: word.value for word in node.keywords}
+                if isinstance(given["reason"], ast.Starred | ast.Attribute):
+                    continue
+                evidence, advice = (joined(given.get(word), names) for word in ("evidence", "advice"))
+                for reason in texts(given["reason"], names):
+                    found.setdefault(folder, []).append((reason, evidence, advice))
+    return {folder: sorted(set(rows)) for folder, rows in found.items()}
+
+
+def joined(node: ast.expr | None, names: dict[str, list[ast.expr]]) -> str:
+    """All texts of an expression in one."""
+    return " / ".join(dict.fromkeys(texts(node, names))).strip()
+
+
+def sentences(path: Path, names: tuple[str, ...]) -> list[str]:
+    """Return the sentences within functions of a file; parts of sentences and of failures are left out."""
+    found: list[str] = []
+    for function in functions_of(path):
+        if function.name not in names:
+            continue
+        skipped = {id(part) for node in ast.walk(function) if is_left_out(node) for part in ast.walk(node)}
+        inner = {id(v) for n in ast.walk(function) if isinstance(n, ast.JoinedStr) for v in ast.walk(n)}
+        for node in ast.walk(function):
+            text = texts(node, {})[0] if isinstance(node, ast.Constant | ast.JoinedStr) else ""
+            own = id(node) not in inner or isinstance(node, ast.JoinedStr)
+            if own and id(node) not in skipped and text.count(" ") >= 2 and text[0] not in " ,;:":
+                found.append(text)
+    return sorted(set(found))
+
+
+def is_left_out(node: ast.AST) -> bool:
+    """Is a node a docstring, an error, or something that is assigned for one?"""
+    if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+        return ast.unparse(node.exc.func) in ("StageFailure", "UsageError", "ValueError")
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+
+
+def warning_sinks() -> set[str]:
+    """Files with code that makes or passes on warnings."""
+    found = set()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(tree_of(path)):
+            if (
+                isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node).split(".")[-1] == "warnings"
+            ) or (isinstance(node, ast.keyword) and node.arg == "warnings"):
+                found.add(str(path.relative_to(PACKAGE)))
+    return found
+
+
+def remedies() -> dict[str, Any]:
+    """Return message -> cause and remedy, "failures" -> reason -> remedy, and "parts" of other messages."""
+    return tomllib.loads(REMEDIES.read_text(encoding="utf-8"))
+
+
+def messages() -> dict[str, list[str]]:
+    """Return the messages of `SOURCES` by title."""
+    parts = remedies()["parts"]["of"]
+    found = {
+        title: {text for file, names in files.items() for text in sentences(PACKAGE / file, names)}
+        for title, files in SOURCES.items()
+    }
+    return {title: sorted(texts - set(parts), key=str.lower) for title, texts in found.items()}
+
+
+def page() -> str:
+    """Return the page of all failures and warnings."""
+    known, lines = remedies(), [HEAD]
+    for title, found in messages().items():
+        lines += [f"### {title}", "", "| message | cause and remedy |", "| --- | --- |"]
+        lines += [f"| {cell(text)} | {cell(known.get(text, ''))} |" for text in found]
+        lines.append("")
+    lines += [FAILURES]
+    failures = stage_failures()
+    for folder in sorted(failures, key=lambda name: FOLDERS.index(name)):
+        title = (
+            summary(PACKAGE / folder / "__init__.py").rstrip(".") if folder else "Functions of plain arrays"
+        )
+        lines += [f"### {title}", "", "| reason | evidence | what to do |", "| --- | --- | --- |"]
+        for reason, evidence, advice in failures[folder]:
+            what_to_do = advice if any(c.isalpha() for c in advice) else known["failures"].get(reason, "")
+            lines.append(f"| {cell(reason)} | {cell(evidence)} | {cell(what_to_do)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def cell(text: str) -> str:
+    """Text for a cell of a table."""
+    return " ".join(text.split()).replace("|", r"\|")
+
+
+HEAD = """# When a run fails or warns
+
+This page is made from the code, so it holds every message; "…" stands for a value. Look for a few
+words of yours.
+
+A run ends in one of four ways:
+
+- `"trusted": true` in `summary.json`: all checks passed. Read the warnings all the same.
+- `"trusted": false`: cameras and points are written, and `failed_checks` names what is wrong with them.
+- A failure, exit code 3: the images cannot be reconstructed. The report and `summary.json` are written up to
+  the last stage that finished, and the message says what was measured and what to do. In Python it is a
+  {py:class}`~thesisrecon.StageFailure` with `reason`, `evidence` and `advice`.
+- Wrong options or settings, exit code 2 ({py:class}`~thesisrecon.UsageError`): the message names the rule and
+  the way out; nothing was computed.
+
+Most failures are of the images: too little overlap, no sideways motion, or one of the critical motions of
+[how to take good images](photographing.md).
+
+## Warnings and failed checks
+"""
+FAILURES = """## Failures
+
+A failure says what happened (reason), what was measured (evidence) and what to do. "/" separates variants.
+
+"""
+
+
+def setup(app):
+    """Write the page before the sources are read."""
+    app.connect("builder-inited", lambda app: write(Path(app.srcdir) / "start" / "failures.md", page()))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
