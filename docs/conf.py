@@ -33,6 +33,7 @@ extensions = [
     "_site.interface",
     "_site.modules",
     "_site.theory_tables",
+    "_site.pictures",
 ]
 exclude_patterns = ["_build", "_site", "**/GALLERY_HEADER.*", "tutorial/*.ipynb", "tutorial/*.py"]
 nitpicky = True

@@ -1,0 +1,149 @@
+"""Pictures of the pages, drawn when the site is built."""
+
+from __future__ import annotations
+
+import os
+import runpy
+import shutil
+import tempfile
+from pathlib import Path
+
+from _site.code import ROOT
+
+BLUE, RED, GREY = "#2b6cb0", "#c53030", "#555555"
+
+
+def draw_axes(path: Path) -> None:
+    """The frames of world and camera, and the projection of a point."""
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    figure, ax = plt.subplots(figsize=(7.2, 3.4))
+    centre, plane = np.array([0.0, 0.0]), 2.2
+    point = np.array([5.2, -1.3])
+    for end, name in (((1.3, 0.0), "z"), ((0.0, -1.3), "y"), ((-0.75, -0.55), "x")):
+        ax.annotate("", end, centre, arrowprops={"arrowstyle": "->", "color": BLUE, "lw": 2})
+        ax.text(end[0] * 1.12, end[1] * 1.16, name, color=BLUE, ha="center", va="center", fontsize=12)
+    ax.text(-0.15, 0.28, "camera centre\n$-R^T t$", ha="center", va="bottom", color=BLUE)
+    ax.plot([plane, plane], [-1.1, 1.1], color=GREY, lw=2)
+    ax.text(plane, 1.2, "image (distance: focal length)", ha="center", color=GREY)
+    ax.plot([0, point[0]], [0, point[1]], color=RED, lw=1.2)
+    ax.plot([0, 6.2], [0, 0], color=GREY, lw=0.8, ls="--")
+    ax.text(4.6, 0.1, "optical axis: depth is z", color=GREY)
+    ax.plot(*point, "o", color=RED)
+    ax.text(point[0] + 0.12, point[1], "X (world)", color=RED, va="center")
+    hit = point * plane / point[0]
+    ax.plot(*hit, "o", color=RED)
+    ax.text(hit[0] + 0.1, hit[1] - 0.55, "x ~ K [R t] X", color=RED)
+    world = np.array([4.3, 1.0])
+    for end, name in (((0.8, 0.0), "X"), ((0.0, 0.8), "Y"), ((-0.45, -0.3), "Z")):
+        ax.annotate("", world + end, world, arrowprops={"arrowstyle": "->", "color": "black", "lw": 1.5})
+        ax.text(*(world + np.array(end) * 1.25), name, ha="center", va="center")
+    ax.text(world[0] + 0.9, world[1] + 0.35, "world: any frame,\nR takes it to the camera", va="center")
+    ax.set(xlim=(-1.3, 7.6), ylim=(-1.75, 2.1), aspect="equal")
+    ax.axis("off")
+    save(figure, path)
+
+
+def draw_pixels(path: Path) -> None:
+    """The top-left pixels of an image, with their coordinates here and in COLMAP."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(7.2, 3.1))
+    labels = (("thesisrecon and OpenCV", 0.0, BLUE), ("COLMAP", 0.5, RED))
+    for ax, (title, shift, colour) in zip(axes, labels, strict=True):
+        for k in range(5):
+            ax.plot([k - 0.5, k - 0.5], [-0.5, 2.5], color=GREY, lw=0.8)
+        for k in range(4):
+            ax.plot([-0.5, 3.5], [k - 0.5, k - 0.5], color=GREY, lw=0.8)
+        for x in range(4):
+            for y in range(3):
+                ax.plot(x, y, ".", color=GREY, ms=4)
+        for x, y in ((0, 0), (3, 0), (0, 2)):
+            ax.plot(x, y, "o", color=colour)
+            ax.text(x, y + 0.3, f"({x + shift:g}, {y + shift:g})", color=colour, ha="center", fontsize=9)
+        ax.plot(-shift, -shift, "x", color="black", ms=9, mew=2)
+        ax.annotate("", (1.3, -0.75), (-0.5, -0.75), arrowprops={"arrowstyle": "->"}, annotation_clip=False)
+        ax.text(1.4, -0.75, "x", va="center")
+        ax.annotate("", (-0.75, 1.3), (-0.75, -0.5), arrowprops={"arrowstyle": "->"}, annotation_clip=False)
+        ax.text(-0.75, 1.45, "y", ha="center", va="top")
+        ax.set(xlim=(-1, 3.7), ylim=(2.7, -1.0), aspect="equal")
+        ax.set_title(f"{title} (x: the origin)", fontsize=10, color=colour)
+        ax.axis("off")
+    save(figure, path)
+
+
+def draw_chain(path: Path) -> None:
+    """The transforms from a world point to a pixel of the original image."""
+    import matplotlib.pyplot as plt
+
+    figure, ax = plt.subplots(figsize=(8.4, 1.7))
+    boxes = (
+        ("world\nX", "R X + t"),
+        ("camera\n(x, y, z)", "x/z, y/z"),
+        ("normalised\n(x, y)", "1 + k1 r²\n+ k2 r⁴ + k3 r⁶"),
+        ("distorted\n(x, y)", "K"),
+        ("pixel (u, v)\nof the original", ""),
+    )
+    for k, (name, step) in enumerate(boxes):
+        ax.text(
+            2.6 * k, 0, name, ha="center", va="center", fontsize=9,
+            bbox={"boxstyle": "round,pad=0.5", "fc": "#e8f0fa", "ec": BLUE},
+        )  # fmt: skip
+        if step:
+            ax.annotate("", (2.6 * k + 1.65, 0), (2.6 * k + 0.95, 0), arrowprops={"arrowstyle": "->"})
+            ax.text(2.6 * k + 1.3, 0.42, step, ha="center", va="bottom", fontsize=8, color=RED)
+    ax.set(xlim=(-1.0, 11.6), ylim=(-0.6, 1.1))
+    ax.axis("off")
+    save(figure, path)
+
+
+def save(figure, path: Path) -> None:
+    """Write a figure on white, which is legible on dark pages too."""
+    import matplotlib.pyplot as plt
+
+    figure.savefig(path, dpi=160, bbox_inches="tight", facecolor="white")
+    plt.close(figure)
+
+
+def make_overview(path: Path) -> None:
+    """Reconstruct the six images of the courtyard and draw input, cameras with points, and the model."""
+    import numpy as np
+    from PIL import Image
+
+    import thesisrecon
+
+    images = ROOT / "fixtures" / "courtyard" / "images"
+    script = runpy.run_path(str(ROOT / "scripts" / "make_overview"))
+    with tempfile.TemporaryDirectory() as folder:
+        result = thesisrecon.reconstruct(images, folder, max_size=480, until="model")
+        cameras = list(result.cameras.values())
+        middle = cameras[len(cameras) // 2]
+        pinhole = thesisrecon.Camera(middle.K, middle.R, middle.t, middle.size)
+        view = thesisrecon.render(result.mesh, pinhole.scaled(560 / middle.size[0]))
+        rgb = np.where(view.valid[..., None], view.color, 255).astype(np.uint8)
+        script["write_overview"](Path(folder), images, Image.fromarray(rgb), path)
+
+
+DRAWINGS = {"axes.png": draw_axes, "pixels.png": draw_pixels, "transforms.png": draw_chain}
+
+
+def make_all(app) -> None:
+    """Make the pictures that do not exist yet; without the tutorial, the overview is that of the README."""
+    folder = Path(app.srcdir) / "pictures"
+    folder.mkdir(exist_ok=True)
+    for name, draw in DRAWINGS.items():
+        draw(folder / name)
+    overview, made = folder / "overview.jpg", folder / ".overview-of-the-code"
+    if os.environ.get("DOCS_GALLERY") == "0":
+        if not overview.is_file():
+            shutil.copy(ROOT / "docs" / "overview.jpg", overview)
+    elif not made.is_file():
+        make_overview(overview)
+        made.touch()
+
+
+def setup(app):
+    """Draw before the sources are read."""
+    app.connect("builder-inited", make_all)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
