@@ -61,3 +61,22 @@ def test_the_page_of_failures_has_a_remedy_for_each_message_of_the_code(site):
     # A file that makes warnings is read, or known to pass them on.
     read = {file for files in failures.SOURCES.values() for file in files}
     assert failures.warning_sinks() <= read | failures.PASSED_ON
+
+
+def block(page):
+    """The first Python block of a page."""
+    return re.search(r"```python\n(.*?)```", (DOCS / page).read_text("utf-8"), re.S)[1]
+
+
+def test_the_example_of_the_conventions_runs():
+    exec(compile(block("reference/conventions.md"), "conventions.md", "exec"), {})
+
+
+@pytest.mark.slow
+def test_the_first_reconstruction_runs_as_it_stands(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(block("start/first-reconstruction.md"), "first-reconstruction.md", "exec"), names)
+    assert names["result"].summary["trusted"]
+    assert names["camera"].K[0, 0] == pytest.approx(908.6, rel=2e-3)
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"report.html", "cameras.json", "sparse"}
