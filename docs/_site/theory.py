@@ -37,6 +37,10 @@ _HZ = re.compile(r"\bHZ,? ((?:section |algorithm |result |table )?A?\d+(?:\.\d+)
 _EQUATIONS = {"3": 42, "4": 1, "5": 6}
 
 
+# Folders and files that hold no theory, in the package and in the tests.
+_OTHER = ("cli", "config.py", "hostile", "io", "pipeline", "report", "runtime", "validation")
+
+
 @dataclass(frozen=True)
 class Reference:
     """A place in the thesis: its kind ("equation", "section", "figure", ...) and its number."""
@@ -95,6 +99,11 @@ def page_of(reference: Reference) -> str:
     return next((page for page, start in PAGES.items() if number.startswith(start)), "")
 
 
+def _files(folder: str, pattern: str) -> list[Path]:
+    root = ROOT / folder
+    return [path for path in sorted(root.rglob(pattern)) if path.relative_to(root).parts[0] not in _OTHER]
+
+
 @cache
 def _tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
@@ -133,7 +142,7 @@ def _dotted(node: ast.Attribute) -> tuple[str, str]:
 def _uses() -> dict[str, tuple[tuple[str, str, int], ...]]:
     """Dotted name -> (test file, test, number of names that the test uses), helpers of the file included."""
     found: dict[str, list[tuple[str, str, int]]] = {}
-    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+    for path in _files("tests", "test_*.py"):
         tree, alias = _tree(path), {}
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith("thesisrecon"):
@@ -195,7 +204,7 @@ def _tests(name: str, references: tuple[Reference, ...]) -> tuple[tuple[str, str
 def rows() -> tuple[Row, ...]:
     """All rows, in the order of modules."""
     found = []
-    for path in sorted((ROOT / "thesisrecon").rglob("*.py")):
+    for path in _files("thesisrecon", "*.py"):
         tree = _tree(path)
         parts = path.relative_to(ROOT / "thesisrecon").with_suffix("").parts
         module = ".".join(part for part in parts if part != "__init__")
@@ -206,7 +215,7 @@ def rows() -> tuple[Row, ...]:
             doc = ast.get_docstring(node) or ""
             own, hidden = references_of(doc), "_" in (node.name[0], parts[-1][0])
             references = own or (() if hidden else inherited)
-            if references and parts[0] not in ("cli", "config", "pipeline", "runtime", "io"):
+            if references:
                 name = f"{module}.{node.name}"
                 summary = re.sub(r":\w+:`~?([^`]*)`", r"\1", re.sub(r"\s+", " ", doc.split("\n\n")[0]))
                 hz = tuple(dict.fromkeys(_HZ.findall(doc)))
