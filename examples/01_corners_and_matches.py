@@ -41,9 +41,9 @@ for axis, title in zip(axes, ("image", "tr M: edges and corners", "R, and the co
     axis.set(title=title, xticks=[], yticks=[])
 
 # %%
-# Corners of two images are compared by the correlation of their patches (4.1). Many patches resemble each
-# other, so a match must also agree with its neighbours: nearby points move alike. The default method grows
-# matches around reliable ones; finally all must obey one epipolar geometry, the subject of the next page.
+# Corners of two images are compared by the correlation of their patches (4.2.2). Many patches look alike, so
+# a match must also agree with its neighbours, which move alike (4.1). The default method grows matches around
+# reliable ones; finally all must obey one epipolar geometry, the subject of the next page.
 
 pair = thesisrecon.match_pair(*paths)
 shown = pair.xy1[:, 1].argsort()[:: len(pair.xy1) // 60]

@@ -34,8 +34,8 @@ distorted = np.vstack([free, plane / plane[3] + (0.5, -0.2, 0.3, 0.0)])
 frames = {"projective": distorted, "affine": affine, "metric": upgrade}
 
 # %%
-# A grid on the faces of the cube is triangulated in each frame (6.3). Residuals and cross-ratios stay,
-# the two halves of an edge are equal from the affine frame on, and angles are right in the metric frame.
+# A grid on the faces of the cube is triangulated in each frame (6.3). Residuals and cross-ratios stay, the
+# two halves of an edge are equal from the affine frame on, and angles are right in the metric frame.
 
 (s, t), ones = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)), np.ones((5, 5))
 grid = np.stack([np.dstack(axes) for axes in ((ones, s, t), (s, ones, t), (s, t, ones))]).reshape(-1, 3)

@@ -2,8 +2,8 @@ r"""
 4. Self-calibration by each method
 ==================================
 
-Which 4 x 4 matrix makes the reconstruction metric? The absolute conic lies on the plane at infinity; where
-a camera sees it depends on its calibration alone, not on its position. Its dual, the absolute dual quadric
+Which 4 x 4 matrix makes the reconstruction metric? The absolute conic lies on the plane at infinity; where a
+camera sees it depends on its calibration alone, not on its position. Its dual, the absolute dual quadric
 :math:`\Omega^*` (4 x 4, symmetric, rank 3, null vector :math:`\Pi_\infty`), is seen as (3.14; HZ 19.3)
 
 .. math:: P_i\, \Omega^* P_i^\top \simeq \omega_i^* = K_i K_i^\top, \quad
@@ -34,6 +34,9 @@ run = thesisrecon.reconstruct_from_tracks(noisy, [(800, 600)] * len(views))
 # - **cheirality-search**: first :math:`\Pi_\infty`, within the bounds of having all points on one side.
 # - **hypotheses-and-refinement**: the default: many starts, one criterion, the principal point still fixed.
 # - **metric stage**: bundle adjustment, which minimises distances in the images instead of algebraic errors.
+#
+# The intervals of the single methods are of first order and somewhat narrow; rely on those of the metric
+# stage.
 
 found, methods = {}, ["linear-quadric", "nonlinear-quadric", "kruppa-equations", "modulus-constraint"]
 for method in [*methods, "cheirality-search", "hypotheses-and-refinement"]:

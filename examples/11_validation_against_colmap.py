@@ -4,8 +4,8 @@ r"""
 
 Is the result right, and how does it compare with the best programs? Six images of the courtyard at 640 px are
 reconstructed by this library and by COLMAP (pycolmap, of the extra ``validation``; without it its bars are
-missing). Neither gets any calibration: no EXIF, no focal length. The models are compared with the truth
-after the similarity that aligns the camera centres best: images determine no world frame (3.4.4).
+missing). Neither gets any calibration: no EXIF, no focal length. The models are compared with the truth after
+the similarity that aligns the camera centres best: images determine no world frame (3.4.4).
 """
 
 from pathlib import Path
@@ -19,7 +19,8 @@ import thesisrecon
 try:
     import pycolmap
 except ImportError:
-    pycolmap = print("pycolmap is not installed (extra validation): no comparison with COLMAP")
+    pycolmap = None
+    print("pycolmap is not installed (extra validation): no comparison with COLMAP")
 folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 images = sorted((folder / "images").glob("*.jpg"))[:6]
 
@@ -41,8 +42,7 @@ with TemporaryDirectory() as temporary:
     models = {"thesisrecon": thesisrecon.reconstruct(images, out / "ours", max_size=640, until="metric").out}
     if pycolmap is not None:
         models["COLMAP"] = run_colmap(out)
-    truth = folder / "cameras.json"
-    found = {name: thesisrecon.compare_models(model, truth) for name, model in models.items()}
+    found = {name: thesisrecon.compare_models(m, folder / "cameras.json") for name, m in models.items()}
 
 # %%
 # One scene proves little: this one is rendered, sharp and small. The pages of evidence compare each stage
