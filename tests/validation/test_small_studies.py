@@ -16,9 +16,11 @@ from tests.fake_stages import CALLS, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
+from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.pipeline.reconstruction import reconstruct
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
+from validation.scenes.many_tracks import GATE_PX, make_tracks
 from validation.scenes.many_views import walk
 from validation.studies import growth, timing
 from validation.studies.facades import KINDS, lens_error
@@ -32,6 +34,19 @@ from validation.studies.timing import ratio_table, ratios_to_ours
 
 def test_the_exponent_is_that_of_a_power():
     assert exponent([10, 30, 100], [3 * n**1.5 for n in (10, 30, 100)]) == pytest.approx(1.5)
+
+
+def test_simulated_tracks_are_those_of_the_true_cameras():
+    found = make_tracks("street", 8)
+    t = found.tracks
+    assert t.n_views == 8
+    assert (np.diff(t.point_index * 8 + t.view_index) > 0).all()
+    assert np.bincount(t.point_index).min() >= 2
+    assert {(p.i, p.j) for p in found.pairs} >= {(k, k + 1) for k in range(7)}
+    for pair in found.pairs:
+        assert pair.inliers >= 0.9 * pair.candidates
+        assert np.abs(sampson_residuals(pair.F, pair.xy1, pair.xy2)).max() < GATE_PX
+        assert pair.homography_inlier_ratio < 1.0
 
 
 def matched_scene():
