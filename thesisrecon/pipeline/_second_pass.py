@@ -57,7 +57,10 @@ def _registered_more(
     rng, calibration = stream(state.run.seed, "metric", attempt, 1), state.result.calibration
     assert calibration is not None
     tracks = state.config.tracks.build(state.prepared_views(), pairs, rng)
-    start, again = with_tracks(metric.reconstruction, tracks), from_metric(metric.reconstruction, calibration)
+    start, again = (
+        cameras_on_tracks(metric.reconstruction, tracks),
+        from_metric(metric.reconstruction, calibration),
+    )
     try:
         found = state.config.metric.refine(start, again, prior=state.prior, rng=rng)
     except StageFailure:
@@ -67,7 +70,7 @@ def _registered_more(
     return found if joined and found.trusted >= metric.trusted else metric
 
 
-def with_tracks(metric: Reconstruction, tracks: Tracks) -> Reconstruction:
+def cameras_on_tracks(metric: Reconstruction, tracks: Tracks) -> Reconstruction:
     """Metric cameras with the points of other tracks, triangulated without distortion."""
     seen = metric.registered[tracks.view_index]
     view, point, xy = tracks.view_index[seen], tracks.point_index[seen], tracks.xy[seen]
