@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.metric.test_metric_refinement import centre_error
-from tests.synthetic import TrueScene, make_scene, true_pairs
+from tests.synthetic import TrueScene, make_scene, true_pairs, with_poses
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric import _model, _resection
+from thesisrecon.metric import _model, _resection, _shared_camera, refinement
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.numerics._metric_bundle import refine_metric_bundle
 from thesisrecon.projective._track_selection import select_core
@@ -130,3 +130,21 @@ def test_points_are_chosen_until_every_cell_has_enough():
     np.testing.assert_array_equal(needed, left)
     assert 0.2 < keep.mean() < 0.6
     assert left.max() <= 3
+
+
+def test_shared_intrinsics_of_many_views_are_tested_in_runs(monkeypatch):
+    scene = make_scene(views=24, points=250, sigma_px=0.4, seed=13)
+    K = scene.K.copy()
+    K[8:11, :2, :2] *= 1.02
+    zoomed = with_poses(replace(scene, K=K), scene.R, scene.centres)
+    noise = np.random.default_rng(0).normal(0.0, 0.4, zoomed.tracks.xy.shape)
+    zoomed = replace(zoomed, tracks=replace(zoomed.tracks, xy=zoomed.tracks.xy + noise))
+    monkeypatch.setattr(_shared_camera, "MAX_VIEWS", 12)
+    monkeypatch.setattr(_shared_camera, "RUN", 4)
+    tests = []
+    check = _shared_camera.check_shared_cameras
+    monkeypatch.setattr(refinement, "check_shared_cameras", lambda *a: tests.append(check(*a)) or tests[-1])
+    reconstruct(scene, 8)
+    reconstruct(zoomed, 8)
+    assert not tests[0].found
+    assert tests[1].contradicted[0]

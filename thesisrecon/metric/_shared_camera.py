@@ -25,6 +25,8 @@ from thesisrecon.numerics._observations import Observations
 CENTRE_STD = 0.1
 """Prior of free principal points in long sides; images may be crops."""
 MAX_OBSERVATIONS = 15000
+MAX_VIEWS, RUN = 200, 20
+"""Of more views, runs of neighbours are tested: 15,000 observations are too few for all."""
 ITERATIONS = 30
 """A deformed model lies in a long valley of the cost: a dozen iterations do not suffice."""
 FALSE_ALARM_RATE = 1e-3
@@ -42,6 +44,18 @@ MAX_SIGMAS = 3.0
 MAX_CENTRE_SIGMAS = 5.0
 MAX_OVERDISPERSION = 8.0
 """Variance ratio of blocks over points: 1.5 to 5 for correct models of real images, 11 to 28 if deformed."""
+
+
+def _runs_of_views(model: MetricEstimate) -> MetricEstimate:
+    """The model with about ``MAX_VIEWS`` views, in runs of neighbours; itself if it has no more."""
+    views = np.flatnonzero(model.registered)
+    if len(views) <= MAX_VIEWS:
+        return model
+    t, place = model.tracks, np.arange(len(views)) % (RUN * -(-len(views) // MAX_VIEWS))
+    registered = np.isin(np.arange(t.n_views), views[place < RUN])
+    inlier = model.inlier & registered[t.view_index]
+    inlier &= (np.bincount(t.point_index[inlier], minlength=t.n_points) >= 2)[t.point_index]
+    return replace(model, registered=registered, inlier=inlier)
 
 
 def _subsample_inliers(model: MetricEstimate) -> Observations:
@@ -123,6 +137,7 @@ class _SharedGroup:
 
 def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) -> SharedCameraTest:
     """Test shared focals and principal points of two views or more by the decrease in cost (chi-square)."""
+    everywhere, model = model.registered, _runs_of_views(model)
     views = np.flatnonzero(model.registered)
     focal_std = np.full(len(model.registered), np.nan)
     contradicted = np.zeros(WIDTH, dtype=bool)
@@ -152,6 +167,8 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
             if np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
                 found.append(_centres_differ(s, off))
                 contradicted[list(CENTRE)] |= not s.known
+    if np.isfinite(focal_std).any():
+        focal_std[everywhere & ~model.registered] = np.nanmax(focal_std)
     return SharedCameraTest(tuple(found), tuple(warnings), focal_std, contradicted, misfit)
 
 
