@@ -20,6 +20,8 @@ MAX_LOSS_SIGMAS = 20.0
 """Huber widths above this many sigmas are least squares."""
 RAYLEIGH_90 = 2.1460
 """90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
+MANY_VIEWS, LITTLE_DAMPING = 40, 1e-8
+"""Long rows of views bend against little resistance: stronger damping would hold them as they are."""
 MIN_VIEWS_PER_LENS = 3
 """k2 and k3 are estimated only if this many views share them."""
 FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
@@ -54,6 +56,7 @@ class BundleAdjustment:
             sigma_px=self.inflation * model.sigma_px,
             loss_px=model.loss_sigmas * model.sigma_px,
             max_iterations=iterations,
+            damping=LITTLE_DAMPING if model.registered.sum() > MANY_VIEWS else BundleOptions.damping,
         )
 
     def row_prior(self, model: MetricEstimate) -> IntrinsicsPrior:

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import counted
 from thesisrecon.geometry.robust_resection import resect_calibrated
-from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, BundleAdjustment
+from thesisrecon.metric._adjustment import MANY_VIEWS, MIN_OBSERVATIONS, BundleAdjustment
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
@@ -34,8 +34,8 @@ MAX_ROUNDS = 6
 MIN_GAIN = 0.003
 """Increase of the inlier ratio below which the rounds end."""
 MIN_INLIER_RATIO = 0.5
-MANY_VIEWS, GLOBAL_GROWTH = 40, 1.2
-"""Of more views than the first, everything is adjusted only after this growth of the number of cameras."""
+GLOBAL_GROWTH, ITERATIONS = 1.2, 12
+"""Of more than ``MANY_VIEWS`` views, everything is adjusted after this growth of the number of cameras."""
 
 
 def _pose_and_focal(
@@ -90,7 +90,8 @@ def _grow(
             continue
         if joined.any():
             model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
-        model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=6)[0]
+        iterations = ITERATIONS if model.registered.sum() > MANY_VIEWS else 6
+        model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=iterations)[0]
         # A wide gate in the first round readmits observations that a wrong model had excluded.
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS if rounds else EARLY_SIGMAS)
         now = float(model.inlier.mean())

@@ -52,7 +52,7 @@ _Covariances = tuple[F64, F64 | None, F64 | None]
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """Weighting, end and wanted covariances; ``noise_floor_px`` is the least noise assumed for them."""
+    """Weighting, end, first damping, wanted covariances, and the least noise assumed for them."""
 
     sigma_px: float = 1.0
     loss_px: float = 1.0
@@ -60,6 +60,7 @@ class BundleOptions:
     covariance: bool = False
     point_covariance: bool = False
     noise_floor_px: float = 0.0
+    damping: float = 1e-4
 
     def __post_init__(self) -> None:
         if not (self.sigma_px > 0.0 and self.loss_px > 0.0):
@@ -185,7 +186,7 @@ def refine_metric_bundle(
         np.ascontiguousarray(cameras.group, dtype=np.int64),
         np.ascontiguousarray(scale * (X - origin)),
     )
-    state, cost = _minimize(problem, _State(start, values), options.max_iterations)
+    state, cost = _minimize(problem, _State(start, values), options)
     end, moved = state.model, problem.moves
     refined = replace(
         cameras,
@@ -205,14 +206,17 @@ def refine_metric_bundle(
     )  # fmt: skip
 
 
-def _minimize(problem: _MetricProblem, state: _State, most: int) -> tuple[_State, float]:
+def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> tuple[_State, float]:
     """Return the minimum and its cost: by reweighting first, nearly Newton's steps where the loss bends."""
+    most, damping = options.max_iterations, options.damping
     state, cost, iterations = run_levenberg_marquardt(
-        problem, state, max_iterations=most, tolerance=_NEWTON_GAIN
+        problem, state, max_iterations=most, tolerance=_NEWTON_GAIN, initial_damping=damping
     )
     if iterations < most:
         near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
-        state, cost, _ = run_levenberg_marquardt(near, state, max_iterations=most - iterations)
+        state, cost, _ = run_levenberg_marquardt(
+            near, state, max_iterations=most - iterations, initial_damping=damping
+        )
     return state, cost
 
 
