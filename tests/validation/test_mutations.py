@@ -49,7 +49,7 @@ def test_the_faults_are_many_and_everywhere():
 
 
 def test_the_guide_names_the_file_of_every_fault():
-    guide = (ROOT / "docs" / "evidence" / "validation.md").read_text(encoding="utf-8")
+    guide = (ROOT / "docs" / "development" / "gates.md").read_text(encoding="utf-8")
     listed = guide.split("<!-- mutations: begin -->")[1].split("<!-- mutations: end -->")[0]
     rows = [line.split(" | ")[:2] for line in listed.strip().splitlines()[2:]]
     named = {name.removeprefix("| "): f"thesisrecon/{file.strip('`')}" for name, file in rows}

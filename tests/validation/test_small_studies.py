@@ -1,6 +1,7 @@
 """Studies of growth, subsets, killed runs and cost: what they compute."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -219,6 +220,13 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
     assert json.loads((tmp_path / "rows.json").read_text())[0]["verdict"] == "missed"
     assert (out / "toy.json").read_bytes() == (tmp_path / "rows.json").read_bytes()
     assert (out / "made").exists()
+    # All studies that need no file, each in a folder, with commit and machine above its tables.
+    for name in set(MODULES) - {"toy", "benchmark-table"}:
+        monkeypatch.delitem(MODULES, name)
+    assert run_studies(["all", "-o", str(tmp_path / "all")]) == 0
+    assert [path.name for path in (tmp_path / "all").iterdir()] == ["toy"]
+    text = (tmp_path / "all" / "toy" / "toy.md").read_text()
+    assert re.match(r"Commit \S+; .* cores, .*; Python [\d.]+\.\n\n3 a\n", text)
 
 
 def test_missing_data_and_unknown_names_end_with_code_2(capsys, monkeypatch):

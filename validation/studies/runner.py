@@ -1,4 +1,5 @@
 """Run the studies: ``python -m validation study NAME [--option ...]``, ``python -m validation study --list``.
+``python -m validation study all -o OUT`` runs them all, which takes hours.
 
 A study is a generator function ``NAME_study`` in a module of this folder. Its keyword parameters with their
 defaults and annotations are the options of the command, which :data:`HELP` explains. It yields parts: a list
@@ -13,6 +14,9 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import os
+import platform
+import subprocess
 import sys
 import tempfile
 import types
@@ -120,7 +124,8 @@ def run_studies(arguments: Sequence[str]) -> int:
     """Run the study that the command line names and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m validation study", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("name", nargs="?", choices=list(MODULES), metavar="NAME", help="name of the study")
+    known = [*MODULES, "all"]
+    parser.add_argument("name", nargs="?", choices=known, metavar="NAME", help="name of the study, or all")
     parser.add_argument("--list", action="store_true", help="list the studies and exit")
     options = parser.parse_args([name.replace("_", "-") for name in arguments[:1]])
     if options.list:
@@ -129,6 +134,10 @@ def run_studies(arguments: Sequence[str]) -> int:
         return 0
     if options.name is None:
         parser.error("name a study; --list shows them")
+    if options.name == "all":
+        parser = argparse.ArgumentParser(prog="python -m validation study all", description=run_all.__doc__)
+        parser.add_argument("-o", "--out", type=Path, required=True, help="folder for the tables")
+        return run_all(parser.parse_args(list(arguments[1:])).out)
     return run_study(options.name, arguments[1:])
 
 
@@ -150,7 +159,7 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
                 print(texts[-1], end="\n\n", flush=True)
                 # Written after each part, so that an interrupted study keeps what it has.
                 if out is not None:
-                    write_text(folder / f"{name}.md", "\n\n".join(texts) + "\n")
+                    write_text(folder / f"{name}.md", "\n\n".join((stamp(), *texts)) + "\n")
                     write_json(folder / f"{name}.json", metrics)
                 if json_file is not None:
                     write_json(json_file, metrics)
@@ -161,6 +170,30 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
         print(f"study {name}: the images are not on this machine (THESISRECON_DATA)", file=sys.stderr)
         return 2
     return int(any(row.verdict == "missed" for row in metrics))
+
+
+def run_all(out: Path) -> int:
+    """Run every study with its defaults into a folder of its own; studies that need a file are left out."""
+    codes = []
+    for name in MODULES:
+        parameters = inspect.signature(load_study(name)).parameters.values()
+        if any(p.default is inspect.Parameter.empty and p.name != "out" for p in parameters):
+            continue
+        report_progress(f"study {name}")
+        codes.append(run_study(name, ["-o", str(out / name)]))
+    return int(1 in codes)
+
+
+def stamp() -> str:
+    """Return the commit and the machine that tables are made with."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    try:
+        root = Path(__file__).parents[2]
+        commit = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "unknown"
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}"
+    return f"Commit {commit}; {machine}; Python {platform.python_version()}."
 
 
 def load_study(name: str) -> StudyFunction:

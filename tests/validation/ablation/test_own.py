@@ -16,7 +16,7 @@ from validation.ablation.plan import plan_study
 from validation.ablation.toml import read_study, study_from_table
 from validation.ablation.workers import pack
 
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "evidence" / "ablation.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "development" / "ablations.md"
 
 
 def write_examples(folder):
