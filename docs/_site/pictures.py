@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import runpy
 import shutil
@@ -98,6 +99,59 @@ def draw_chain(path: Path) -> None:
     save(figure, path)
 
 
+def imports_between_parts() -> dict[str, set[str]]:
+    """The parts of the package (folders and files) that each part imports, but not for types alone."""
+    package = ROOT / "thesisrecon"
+    found: dict[str, set[str]] = {}
+    for path in sorted(package.rglob("*.py")):
+        part = path.relative_to(package).parts[0].removesuffix(".py")
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        typing = [n for n in ast.walk(tree) if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.dump(n.test)]
+        skipped = {id(n) for block in typing for n in ast.walk(block)}
+        nodes = [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and id(n) not in skipped]
+        names = {n.module.split(".")[1] for n in nodes if (n.module or "").startswith("thesisrecon.")}
+        found.setdefault(part, set()).update(names - {part})
+    return {part: names & found.keys() for part, names in found.items() if part != "__init__"}
+
+
+def layers_of(imports: dict[str, set[str]]) -> list[list[str]]:
+    """Parts by layer: each imports only layers before its own; parts that import each other share one."""
+    reached = {part: {part} | names for part, names in imports.items()}
+    for _ in imports:
+        reached = {part: set().union(*(reached[n] for n in names)) for part, names in reached.items()}
+    below = {part: {n for n in names if part not in reached[n]} for part, names in reached.items()}
+    layers: list[list[str]] = []
+    while left := [part for part in imports if not any(part in layer for layer in layers)]:
+        layers.append([part for part in left if not below[part] & set(left)])
+    return layers
+
+
+def draw_layers(path: Path) -> None:
+    """The parts of the package, each above what it imports, and lines to the imports of the next layer."""
+    import matplotlib.pyplot as plt
+
+    imports = imports_between_parts()
+    layers = layers_of(imports)
+    figure, ax = plt.subplots(figsize=(9.5, 0.75 * len(layers)))
+    place = {}
+    for row, layer in enumerate(layers):
+        folders = sorted(layer, key=lambda part: (not (ROOT / "thesisrecon" / part).is_dir(), part))
+        # A wide layer is drawn in two lines, so that names do not cover each other.
+        lines = (0.0, 0.4) if len(folders) > 7 else (0.0,)
+        place |= {part: ((k + 0.5) / len(folders), row + lines[k % len(lines)]) for k, part in enumerate(folders)}
+    for part, (x, y) in place.items():
+        folder = (ROOT / "thesisrecon" / part).is_dir()
+        for other in imports[part]:
+            below = place[other][1]
+            if int(below) == int(y) - 1:
+                ax.plot([x, place[other][0]], [y, below], color="#bbbbbb", lw=0.7, zorder=0)
+        box = {"boxstyle": "round,pad=0.35", "fc": "#e8f0fa" if folder else "white", "ec": BLUE if folder else GREY}
+        ax.text(x, y, f"{part}/" if folder else part, ha="center", va="center", fontsize=7, bbox=box)
+    ax.set(xlim=(0, 1), ylim=(-0.5, len(layers) - 0.5))
+    ax.axis("off")
+    save(figure, path)
+
+
 def save(figure, path: Path) -> None:
     """Write a figure on white, which is legible on dark pages too."""
     import matplotlib.pyplot as plt
@@ -125,7 +179,12 @@ def make_overview(path: Path) -> None:
         script["write_overview"](Path(folder), images, Image.fromarray(rgb), path)
 
 
-DRAWINGS = {"axes.png": draw_axes, "pixels.png": draw_pixels, "transforms.png": draw_chain}
+DRAWINGS = {
+    "axes.png": draw_axes,
+    "pixels.png": draw_pixels,
+    "transforms.png": draw_chain,
+    "layers.png": draw_layers,
+}
 
 
 def make_all(app) -> None:
