@@ -138,14 +138,16 @@ def draw_layers(path: Path) -> None:
         folders = sorted(layer, key=lambda part: (not (ROOT / "thesisrecon" / part).is_dir(), part))
         # A wide layer is drawn in two lines, so that names do not cover each other.
         lines = (0.0, 0.4) if len(folders) > 7 else (0.0,)
-        place |= {part: ((k + 0.5) / len(folders), row + lines[k % len(lines)]) for k, part in enumerate(folders)}
+        for k, part in enumerate(folders):
+            place[part] = ((k + 0.5) / len(folders), row + lines[k % len(lines)])
     for part, (x, y) in place.items():
         folder = (ROOT / "thesisrecon" / part).is_dir()
         for other in imports[part]:
             below = place[other][1]
             if int(below) == int(y) - 1:
                 ax.plot([x, place[other][0]], [y, below], color="#bbbbbb", lw=0.7, zorder=0)
-        box = {"boxstyle": "round,pad=0.35", "fc": "#e8f0fa" if folder else "white", "ec": BLUE if folder else GREY}
+        fill, edge = ("#e8f0fa", BLUE) if folder else ("white", GREY)
+        box = {"boxstyle": "round,pad=0.35", "fc": fill, "ec": edge}
         ax.text(x, y, f"{part}/" if folder else part, ha="center", va="center", fontsize=7, bbox=box)
     ax.set(xlim=(0, 1), ylim=(-0.5, len(layers) - 0.5))
     ax.axis("off")
