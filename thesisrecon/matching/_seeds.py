@@ -10,13 +10,13 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import full, kernel, zeros
+from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import strongest_distinct
 from thesisrecon.matching._prepared import empty_matches, select_matches
 from thesisrecon.records import Features, Matches, Seeds
 
-BLOCK, CHUNK = 256, 64
-"""Rows multiplied at a time, and columns compared at once."""
+BLOCK, LANES = 64, 64
+"""Rows multiplied at a time, which stay in the cache for the scans, and columns compared at once."""
 NEIGHBOURS, TOLERANCE = 10, 0.3
 # Maximum distance of a corner from its seed or prediction.
 REACH_PX = 4.0
@@ -24,16 +24,7 @@ SeedSet = tuple[Matches, Callable[[Matches], F64]]
 """Matched seeds, and the function that computes their strength of match."""
 
 
-@kernel(fastmath={"nnan", "nsz"}, forceinline=True)
-def _largest(values: F32, first: int, last: int) -> float:
-    """Largest of some values; without branches, several are compared at once."""
-    most = np.float32(-2.0)
-    for n in range(first, last):
-        most = values[n] if values[n] > most else most
-    return float(most)
-
-
-@kernel
+@kernel(fastmath={"nnan", "nsz"})
 def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
     """Best column (B,) of each row of correlations (B, N), its value (B,) and the second best (B,) elsewhere.
 
@@ -44,29 +35,54 @@ def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F3
     index = zeros(rows, np.int64)
     value = full(rows, -1.0, np.float32)
     second_best = full(rows, -1.0, np.float32)
-    largest = full((columns + CHUNK - 1) // CHUNK, -2.0, np.float32)
+    largest = empty(LANES, np.float32)
     for b in range(rows):
         row = correlation[b]
-        best, top = 0, np.float32(-2.0)
-        for c in range(len(largest)):
-            largest[c] = _largest(row, c * CHUNK, min((c + 1) * CHUNK, columns))
-            if largest[c] > top:
-                top = largest[c]
-                best = c * CHUNK
-        while row[best] != top and best + 1 < columns:
-            best += 1
+        _largest_by_lane(row, largest)
+        top = largest.max()
+        best = columns
+        for lane in range(LANES):
+            if largest[lane] == top:
+                n = lane
+                while row[n] != top:
+                    n += LANES
+                best = min(best, n)
         second = np.float32(-1.0)
         x, y, limit = xy2[best, 0], xy2[best, 1], apart2[best]
-        for c in range(len(largest)):
-            if not largest[c] > second:
+        for lane in range(LANES):
+            if not largest[lane] > second:
                 continue
-            for n in range(c * CHUNK, min((c + 1) * CHUNK, columns)):
+            for n in range(lane, columns, LANES):
                 if row[n] > second:
                     dx, dy = xy2[n, 0] - x, xy2[n, 1] - y
                     if dx * dx + dy * dy > limit:
                         second = row[n]
         index[b], value[b], second_best[b] = best, top, second
     return index, value, second_best
+
+
+@kernel(fastmath={"nnan", "nsz"}, forceinline=True)
+def _largest_by_lane(row: F32, largest: F32) -> None:
+    """Write the largest of the values whose number has the remainder l modulo ``LANES`` to ``largest[l]``.
+
+    Four values of each lane at once; the processor compares many lanes together, but not neighbours.
+    """
+    whole = len(row) // (4 * LANES) * (4 * LANES)
+    for lane in range(LANES):
+        largest[lane] = np.float32(-2.0)
+    for first in range(0, whole, 4 * LANES):
+        one, two = row[first : first + LANES], row[first + LANES : first + 2 * LANES]
+        three, four = (
+            row[first + 2 * LANES : first + 3 * LANES],
+            row[first + 3 * LANES : first + 4 * LANES],
+        )
+        for lane in range(LANES):
+            a = one[lane] if one[lane] > two[lane] else two[lane]
+            b = three[lane] if three[lane] > four[lane] else four[lane]
+            a = a if a > b else b
+            largest[lane] = a if a > largest[lane] else largest[lane]
+    for n in range(whole, len(row)):
+        largest[n % LANES] = max(largest[n % LANES], row[n])
 
 
 @kernel

@@ -169,6 +169,9 @@ class OverlapEstimate:
         Minimum -log10 of the number of false alarms.
     nearest : int
         Pairs of each image that are always taken.
+    most : int
+        Number of pairs of each image beyond which more evidence is not needed: a pair is taken if it is among
+        the best ``most`` of one of its images.
     shortlist : int
         Number of images that each is compared with.
     words : int
@@ -178,11 +181,12 @@ class OverlapEstimate:
     all_up_to: int = 30
     min_evidence: float = 0.5
     nearest: int = 3
+    most: int = 20
     shortlist: int = 40
     words: int = 1024
 
     def __post_init__(self) -> None:
-        least = {"all_up_to": 0, "nearest": 1, "shortlist": 1, "words": 1}
+        least = {"all_up_to": 0, "nearest": 1, "most": 1, "shortlist": 1, "words": 1}
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}; got {getattr(self, name)}")
@@ -225,8 +229,9 @@ class OverlapEstimate:
         # Pairs that were not compared follow all that were, ordered by bag-of-words similarity.
         order = similarity - 1e6
         order[compared[:, 0], compared[:, 1]] = order[compared[:, 1], compared[:, 0]] = evidence
-        near = _most_similar(order, self.nearest)
-        chosen = _pair_array([*compared[evidence >= self.min_evidence].tolist(), *near.tolist()])
+        best, near = _most_similar(order, self.most), _most_similar(order, self.nearest)
+        supported = best[order[best[:, 0], best[:, 1]] >= self.min_evidence]
+        chosen = _pair_array([*supported.tolist(), *near.tolist()])
         return _pair_array([*chosen.tolist(), *_connecting_pairs(chosen, order).tolist()])
 
 

@@ -1,0 +1,142 @@
+"""A street of any length: a row of houses, each with a wall and things of its own, and a walk along it.
+
+Only the houses near a camera are built to render its image, so that memory does not grow with the length.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from validation.scenes.courtyard import SUN, WALL_HEIGHT
+from validation.scenes.image_files import write_png
+from validation.scenes.many_views import FOCAL_REL
+from validation.scenes.materials import (
+    Material,
+    add_window,
+    bricks,
+    cut_stone,
+    grid,
+    over,
+    planks,
+    plaster,
+    rubble,
+    smooth,
+)
+from validation.scenes.pose import Pose, look_at
+from validation.scenes.procedural import fractal
+from validation.scenes.raycast import Surface, World, build_world
+from validation.scenes.sensor import take_image
+
+TEXEL, WIDTH, DISTANCE = 0.01, 8.0, 5.5
+"""Side of a texel, width of a house and distance of the camera from the walls, in metres."""
+STEP = 0.5
+"""Metres between consecutive cameras: a wall point stays in view for some twelve of them."""
+NEAR = 2
+"""Houses to each side of the nearest one that a camera may see."""
+
+
+def _front(house: int) -> Material:
+    """The wall of a house: bricks, stone or peeling plaster, and windows where chance puts them."""
+    rng = np.random.default_rng([81, house])
+    shape, seed = grid((WIDTH, WALL_HEIGHT), TEXEL), 1000 * (house + 1)
+    kind = int(rng.integers(4))
+    if kind == 0:
+        wall = bricks(shape, TEXEL, seed)
+    elif kind == 1:
+        wall = cut_stone(shape, TEXEL, seed, (float(rng.uniform(0.4, 0.8)), float(rng.uniform(0.2, 0.35))))
+    elif kind == 2:
+        wall = rubble(shape, TEXEL, seed, cell_m=float(rng.uniform(0.2, 0.35)), relief_m=0.05)
+    else:
+        peel = smooth(fractal(shape, TEXEL, seed + 40, wavelengths_m=(1.9, 0.05), ratio=0.62), -0.02, 0.02)
+        wall = over(bricks(shape, TEXEL, seed), plaster(shape, TEXEL, seed + 20), peel)
+    across = np.sort(rng.uniform(0.7, WIDTH - 0.7, 3))
+    for k, x in enumerate(across[np.diff(across, prepend=-9.0) > 1.4]):
+        for low in (1.0, 3.0):
+            low = low + float(rng.uniform(-0.15, 0.15))
+            half = float(rng.uniform(0.3, 0.45))
+            add_window(wall, (x - half, low, x + half, low + 1.2), seed + 60 + 7 * k + int(low))
+    return wall
+
+
+@lru_cache(maxsize=2 * (2 * NEAR + 1))
+def _house(house: int) -> tuple[list[Material], float]:
+    """Materials of a house (wall, ground before it, crates, stones) and how far it stands back, in metres."""
+    seed, side = 1000 * (house + 1), grid((2.0, 2.0), TEXEL)
+    ground = rubble(grid((WIDTH, 8.0), TEXEL), TEXEL, seed + 500, cell_m=0.14, relief_m=0.015)
+    wood = planks(side, TEXEL, seed + 600, 0.155)
+    stone = cut_stone(side, TEXEL, seed + 700, (0.45, 0.3))
+    return [_front(house), ground, wood, stone], float(np.random.default_rng([82, house]).uniform(0.0, 1.2))
+
+
+def build_near(house: int) -> World:
+    """The houses around one, as a world of their own; x runs along the street, y into the walls."""
+    x, y, z = np.eye(3)
+    materials, walls, things = list[Material](), list[list[Surface]](), list[list[Surface]]()
+    for h in range(house - NEAR, house + NEAR + 1):
+        rng, first = np.random.default_rng([83, h]), len(materials)
+        own, back = _house(h)
+        materials += own
+        at = WIDTH * h * x
+        walls.append([Surface(at + back * y, x, z, (WIDTH, WALL_HEIGHT), first)])
+        walls.append([Surface(at - 7.0 * y, x, y, (WIDTH, 8.0), first + 1)])
+        for _ in range(int(rng.integers(2, 5))):
+            u, away = float(rng.uniform(0.5, WIDTH - 0.5)), float(rng.uniform(0.6, 1.8))
+            size = rng.uniform([0.4, 0.4, 0.4], [0.8, 0.8, 1.5])
+            angle, material = float(rng.uniform(-0.4, 0.4)), first + 2 + int(rng.integers(2))
+            things.append(_crate(at + u * x - away * y, size, angle, material))
+    return build_world(things + walls, materials, SUN)
+
+
+def _crate(place: np.ndarray, size: np.ndarray, angle: float, material: int) -> list[Surface]:
+    """Four sides and the top of a box on the ground, turned about z."""
+    z, (w, d, h) = np.eye(3)[2], size.tolist()
+    u, v = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
+    faces = [
+        (place - 0.5 * w * u - 0.5 * d * v, u, z, (w, h)),
+        (place + 0.5 * w * u + 0.5 * d * v, -u, z, (w, h)),
+        (place + 0.5 * w * u - 0.5 * d * v, v, z, (d, h)),
+        (place - 0.5 * w * u + 0.5 * d * v, -v, z, (d, h)),
+        (place - 0.5 * w * u - 0.5 * d * v + h * z, u, v, (w, d)),
+    ]
+    return [
+        Surface(o, a, b, s, material, flat=True, offset=(0.2 * k, 0.1 * k))
+        for k, (o, a, b, s) in enumerate(faces)
+    ]
+
+
+def walk_street(count: int, size: tuple[int, int]) -> list[Pose]:
+    """``count`` true cameras of one calibration along the street; the first n of any walk are the same."""
+    width, height = size
+    focal = FOCAL_REL * max(size)
+    K = np.array([[focal, 0.0, 0.51 * width], [0.0, focal, 0.48 * height], [0.0, 0.0, 1.0]])
+    poses = []
+    for k in range(count):
+        rng, along = np.random.default_rng([84, k]), (NEAR + 1) * WIDTH + STEP * k
+        C = np.array([along, -DISTANCE, 1.6]) + rng.normal(0.0, [0.05, 0.2, 0.15])
+        heading = 0.35 * np.sin(along / 3.5) + rng.normal(0.0, 0.08)
+        ahead = np.array([np.sin(heading), np.cos(heading), rng.normal(0.06, 0.05)])
+        roll = float(np.tan(0.5 * np.radians(rng.uniform(-4.0, 4.0))))
+        poses.append(Pose(K, look_at(C, C + ahead, roll), C, float(rng.uniform(0.88, 1.12))))
+    return poses
+
+
+def write_street(folder: Path, count: int, *, size: tuple[int, int] = (480, 360), threads: int = 2) -> None:
+    """Images ``0000.png`` and so on of :func:`walk_street`; those that are there stay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    poses = walk_street(count, size)
+    missing = [k for k in range(count) if not (folder / f"{k:04d}.png").is_file()]
+    houses = [int(pose.C[0] // WIDTH) for pose in poses]
+    for house in sorted({houses[k] for k in missing}):
+        world = build_near(house)
+
+        def write(k: int, world: World = world) -> None:
+            gain, rng = 0.82 * poses[k].exposure, np.random.default_rng([2006, k])
+            rgb = take_image(world, poses[k], size, gains=(gain, gain, gain), rng=rng)
+            write_png(folder / f"{k:04d}.png", rgb)
+
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(write, [k for k in missing if houses[k] == house]))
