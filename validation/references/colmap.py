@@ -27,12 +27,12 @@ DEFAULT_FOCAL_REL = 1.2
 
 
 def match_with_pycolmap(
-    images: Path, out: Path, *, shared_camera: bool = True, threads: int = 2
+    images: Path, out: Path, *, shared_camera: bool = True, threads: int = 2, pairs: Path | None = None
 ) -> dict[str, float]:
-    """SIFT and exhaustive matching of all pairs with their verification; the seconds of both.
+    """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both.
 
     ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database and
-    the times.
+    the times, ``pairs`` a file with two names of images in each line.
     """
     _begin(out)
     database, seconds, start = out / "database.db", {}, time.perf_counter()
@@ -46,7 +46,13 @@ def match_with_pycolmap(
     seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
-    pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+    if pairs is None:
+        pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+    else:
+        listed = pycolmap.ImportedPairingOptions(match_list_path=str(pairs))
+        pycolmap.match_image_pairs(
+            database, matching_options=matching, pairing_options=listed, device=pycolmap.Device.cpu
+        )
     seconds["match"] = time.perf_counter() - start
     write_text(out / "seconds.json", json.dumps(seconds))
     return seconds
@@ -165,14 +171,20 @@ def give_calibration(database: Path, K: Mapping[str, F64]) -> None:
 
 
 def reconstruct_with_pycolmap(
-    images: Path, out: Path, *, refine_principal_point: bool = False, threads: int = 2
+    images: Path,
+    out: Path,
+    *,
+    refine_principal_point: bool = False,
+    threads: int = 2,
+    pairs: Path | None = None,
 ) -> ReferenceRun:
-    """SIFT, exhaustive matching and incremental mapping with COLMAP's default options, on the CPU.
+    """SIFT, matching (of a list of ``pairs``, else of all) and incremental mapping with COLMAP's default
+    options, on the CPU.
 
     ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database, the
     models and the times. Raises ``StageFailure`` if COLMAP makes no model.
     """
-    match_with_pycolmap(images, out, threads=threads)
+    match_with_pycolmap(images, out, threads=threads, pairs=pairs)
     return _map(images, out, Start(refine_principal_point), threads=threads, mapper="incremental")
 
 
@@ -183,10 +195,11 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--refine-principal-point", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--pairs", type=Path, help="file with two names of images in each line")
     parsed = parser.parse_args()
     refine = parsed.refine_principal_point
     reconstruct_with_pycolmap(
-        parsed.images, parsed.out, refine_principal_point=refine, threads=parsed.threads
+        parsed.images, parsed.out, refine_principal_point=refine, threads=parsed.threads, pairs=parsed.pairs
     )
 
 

@@ -1,27 +1,35 @@
-"""Growth of time and memory with the number of images.
+"""Growth of time and memory with the number of images, beside COLMAP on the same images and pairs.
 
-The first n images of a long walk around the courtyard become metric cameras. All sizes show the same yard, so
-each image overlaps with ever more others. Exponents are slopes of lines fitted to the logarithms; those of
-time use processor time, which other load disturbs less.
+The first n images of a long walk become metric cameras: around the courtyard, where each image overlaps with
+ever more others, or along a street, where it overlaps with a few. Exponents are slopes of lines fitted to the
+logarithms; those of time use processor time, which other load disturbs less.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image as PillowImage
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io._files import write_text
 from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.records import Reconstruction
+from validation.harness.process import own_cores, run_process
+from validation.metrics.cameras import TrueCameras, measure_cameras
+from validation.references.colmap import read_run
 from validation.scenes.many_views import walk, write_views
-from validation.studies.measuring import call_apart, exponent
+from validation.scenes.street import walk_street, write_street
+from validation.studies.measuring import ONE_BLAS_THREAD, call_apart, exponent
 from validation.studies.runner import Part, text_table
 
 STAGES = (
@@ -76,7 +84,9 @@ class Cost:
     """One number of images.
 
     ``cpu_s``, ``peak_mb``: processor seconds and highest memory by stage; ``counts``: numbers of pairs,
-    matches, cameras and points; ``failure``: message of a run without cameras.
+    matches, cameras and points; ``focal_error_rel``, ``centre_error_rel``: of the true focal length and of
+    the extent of the true centres; ``failure``: message of a run without cameras; ``colmap``: the same of
+    COLMAP.
     """
 
     images: int
@@ -85,27 +95,75 @@ class Cost:
     counts: Mapping[str, int]
     wall_s: float
     focal_error_rel: float
+    centre_error_rel: float = float("nan")
     failure: str = ""
+    colmap: Mapping[str, float] = field(default_factory=dict)
 
 
-def measure_cost(images: str, count: int, threads: int, long_side: int) -> dict[str, Any]:
-    """Reconstruct cameras in this process, its kernels loaded before; return the fields of :class:`Cost`."""
+def measure_cost(images: str, count: int, threads: int, scene: str) -> dict[str, Any]:
+    """Reconstruct cameras in this process, its kernels loaded before; return the fields of :class:`Cost`.
+
+    The matched pairs are listed in ``pairs-COUNT.txt`` beside the images.
+    """
     paths = sorted(Path(images).glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
         reconstruct(paths[:4], Path(place) / "warm", until="metric", threads=threads)
-        meter, failure = Meter(), ""
+        meter, failure, errors = Meter(), "", (float("nan"), float("nan"))
         try:
-            reconstruct(paths, Path(place) / "run", until="metric", threads=threads, progress=meter.progress)
+            result = reconstruct(
+                paths, Path(place) / "run", until="metric", threads=threads, progress=meter.progress
+            )
+            errors = _errors(result.reconstruction, scene, _size(paths))
+            listed = [f"{paths[pair.i].name} {paths[pair.j].name}\n" for pair in result.pairs]
+            write_text(Path(images) / f"pairs-{count}.txt", "".join(listed))
         except StageFailure as error:
             failure = str(error)
         meter.enter("end")
         summary = json.loads((Path(place) / "run" / "summary.json").read_text(encoding="utf-8"))
-    known = [view["focal_px"]["value"] for view in summary["cameras"] if "focal_px" in view]
-    truth = float(walk(1, (long_side, long_side * 3 // 4))[0].K[0, 0])
-    error_rel = abs(float(np.median(known)) / truth - 1.0) if known else float("nan")
     seconds = summary["elapsed_seconds"]
-    found = Cost(len(paths), meter.cpu_s, meter.peak_mb, counts_of(summary), seconds, error_rel, failure)
+    found = Cost(len(paths), meter.cpu_s, meter.peak_mb, counts_of(summary), seconds, *errors, failure)
     return asdict(found)
+
+
+def _size(paths: Sequence[Path]) -> tuple[int, int]:
+    with PillowImage.open(paths[0]) as image:
+        return image.size
+
+
+def _errors(found: Reconstruction, scene: str, size: tuple[int, int]) -> tuple[float, float]:
+    """Errors of the focal length and, of the extent, of the centres."""
+    poses = WALKS[scene][0](len(found.P), size)
+    K, R, C = (np.array([getattr(pose, name) for pose in poses]) for name in "KRC")
+    errors = measure_cameras(found, TrueCameras(K, R, C))
+    extent = 2.0 * float(np.linalg.norm(C - C.mean(axis=0), axis=1).max())
+    return errors.focal_error_pct / 100.0, (errors.centre_error or float("nan")) / extent
+
+
+def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[str, float]:
+    """COLMAP on the first ``count`` images and the pairs that :func:`measure_cost` listed."""
+    paths = sorted(images.glob("*.png"))[:count]
+    with tempfile.TemporaryDirectory() as place:
+        folder, out, log = (Path(place) / name for name in ("images", "out", "log"))
+        folder.mkdir()
+        for path in paths:
+            (folder / path.name).symlink_to(path.resolve())
+        command = [sys.executable, "-m", "validation.references.colmap", str(folder), str(out)]
+        command += ["--threads", str(threads), "--pairs", str(images / f"pairs-{count}.txt")]
+        process = run_process(command, log=log, cores=own_cores()[:threads], environment=ONE_BLAS_THREAD)
+        if process.code != 0:
+            raise RuntimeError(log.read_text(encoding="utf-8")[-2000:])
+        run = read_run(folder, out)
+    focal, centre = _errors(run.reconstruction, scene, _size(paths))
+    costs = {"wall s": process.wall_s, "processor s": process.cpu_s, "peak MB": process.peak_mb}
+    parts = {f"{name}, wall s": seconds for name, seconds in run.seconds.items()}
+    registered = float(run.reconstruction.registered.sum())
+    return {
+        **costs,
+        **parts,
+        "registered": registered,
+        "focal error, %": 100 * focal,
+        "centres, %": 100 * centre,
+    }
 
 
 def counts_of(summary: Mapping[str, Any]) -> dict[str, int]:
@@ -132,19 +190,38 @@ def cost_table(costs: Sequence[Cost]) -> str:
     for name in costs[0].counts:
         row(name, [float(cost.counts[name] or 0) for cost in costs], 0)
     row("focal error, %", [100.0 * cost.focal_error_rel for cost in costs], 3)
+    row("centres, % of their extent", [100.0 * cost.centre_error_rel for cost in costs], 4)
     row("wall s", [cost.wall_s for cost in costs], 0)
+    for name in costs[0].colmap:
+        row(f"COLMAP, {name}", [cost.colmap[name] for cost in costs], 4 if "%" in name else 0)
+    if costs[0].colmap:
+        row("wall over COLMAP's", [cost.wall_s / cost.colmap["wall s"] for cost in costs], 2)
     failures = [f"\n{cost.images} images: {cost.failure}" for cost in costs if cost.failure]
     return "\n".join([text_table(["", *(f"{n:.0f}" for n in sizes), "power of N"], lines), *failures])
 
 
+WALKS = {"place": (walk, write_views), "street": (walk_street, write_street)}
+"""True cameras and the writer of the images of each kind of scene."""
+
+
 def growth_of_cost_study(
-    out: Path, sizes: Sequence[int] = (10, 30, 100, 300), long_side: int = 480, threads: int = 2
+    out: Path,
+    sizes: Sequence[int] = (10, 30, 100, 300),
+    scene: str = "place",
+    long_side: int = 480,
+    threads: int = 2,
+    colmap: bool = False,
 ) -> Iterator[Part]:
-    """Measure what each stage costs by the number of images of one place."""
-    write_views(out, max(sizes), size=(long_side, long_side * 3 // 4), threads=threads)
+    """Measure what each stage costs by the number of images of one place or of a street."""
+    if scene not in WALKS:
+        raise UsageError(f"the scene is {' or '.join(WALKS)}; got {scene!r}")
+    WALKS[scene][1](out, max(sizes), size=(long_side, long_side * 3 // 4), threads=threads)
     costs = []
     for count in sorted(sizes):
-        costs.append(Cost(**call_apart(measure_cost, out, count, threads, long_side, cores=threads)[0]))
-        yield f"{count} images: {sum(costs[-1].cpu_s.values()):.0f} processor s"
-    yield f"long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
+        cost = Cost(**call_apart(measure_cost, out, count, threads, scene, cores=threads)[0])
+        if colmap and not cost.failure:
+            cost = replace(cost, colmap=measure_colmap(out, count, threads, scene))
+        costs.append(cost)
+        yield f"{count} images: {sum(cost.cpu_s.values()):.0f} processor s"
+    yield f"{scene}, long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
     yield cost_table(costs)
