@@ -15,19 +15,21 @@ from tests.synthetic import photograph, texture
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.matching import pair_selection
 from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.matching.pair_selection import (
     AllPairs,
     ListedPairs,
     OverlapEstimate,
     SequenceWindow,
-    _bow_similarity,
+    _best_of_each,
     _connecting_pairs,
     _count_agreeing,
     _most_similar,
     _overlap_evidence,
     _pair_array,
     _subset_seeds,
+    _word_weights,
     pairs_to_connect,
 )
 from thesisrecon.records import Features, TwoView
@@ -223,9 +225,10 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
 
 def test_photographs_of_one_wall_use_the_same_words(windows):
     sketches = [_subset_seeds(f.seeds, rotated=False) for f in windows.features if f.seeds]
-    alike = _bow_similarity(
+    words = _word_weights(
         [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
     )
+    alike = words @ words.T
     np.testing.assert_allclose(alike, alike.T, atol=1e-12)
     np.testing.assert_allclose(np.diag(alike), 1.0)
     pairs = list(combinations(range(CROPS), 2))
@@ -239,29 +242,44 @@ def test_photographs_of_one_wall_use_the_same_words(windows):
 
 @given(st.integers(2, 9), st.integers(1, 9), st.integers(0, 2**31))
 def test_the_most_alike_of_each(n, count, seed):
-    alike = np.random.default_rng(seed).random((n, n))
-    alike += alike.T
-    pairs = as_set(_most_similar(alike, count))
+    words = np.random.default_rng(seed).random((n, 4))
+    alike = words @ words.T
+    pairs = as_set(_most_similar(words, count))
+    every = list(combinations(range(n), 2))
+    best = _best_of_each(np.array(every), np.array([alike[pair] for pair in every]), n, count)
+    assert pairs == {pair for pair, taken in zip(every, best, strict=True) if taken}
     for i in range(n):
         others = sorted((j for j in range(n) if j != i), key=lambda j: -alike[i, j])[:count]
         assert {(min(i, j), max(i, j)) for j in others} <= pairs
     assert len(pairs) <= n * count
 
 
-@given(st.integers(2, 9), st.integers(0, 2**31))
-def test_connecting_pairs_join_separate_groups_by_their_best_pairs_only(n, seed):
+def test_the_similarities_of_many_images_are_never_in_memory_at_once(monkeypatch):
+    words = np.random.default_rng(3).random((50, 8))
+    whole = _most_similar(words, 5)
+    monkeypatch.setattr(pair_selection, "ROWS_AT_ONCE", 7)
+    assert _most_similar(words, 5).tolist() == whole.tolist()
+
+
+@given(st.integers(2, 9), st.integers(0, 2**31), st.floats(0.0, 1.0))
+def test_connecting_pairs_join_separate_groups_by_their_best_pairs_only(n, seed, share):
     rng = np.random.default_rng(seed)
-    order = rng.random((n, n))
-    order += order.T
-    every = list(combinations(range(n), 2))
-    chosen = _pair_array([pair for pair in every if rng.random() < 0.2])
-    added = _connecting_pairs(chosen, order)
+    words, every = rng.random((n, 4)), list(combinations(range(n), 2))
+    compared = _pair_array([pair for pair in every if rng.random() < share])
+    evidence = rng.random(len(compared))
+    chosen = compared[rng.random(len(compared)) < 0.2]
+    added = _connecting_pairs(chosen, compared, evidence, words)
     parts, part = _parts(n, chosen)
     assert len(added) == parts - 1
     assert _parts(n, np.concatenate([chosen, added]))[0] == 1
     if parts == 2:
-        across = [pair for pair in every if part[pair[0]] != part[pair[1]]]
-        assert as_set(np.sort(added, axis=1)) == {max(across, key=lambda pair: order[pair])}
+        across = [k for k, (i, j) in enumerate(compared) if part[i] != part[j]]
+        if across:
+            wanted = tuple(compared[max(across, key=lambda k: evidence[k])].tolist())
+        else:
+            apart = [pair for pair in every if part[pair[0]] != part[pair[1]]]
+            wanted = max(apart, key=lambda pair: words[pair[0]] @ words[pair[1]])
+        assert as_set(np.sort(added, axis=1)) == {wanted}
 
 
 def _parts(n, pairs):

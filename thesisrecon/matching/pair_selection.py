@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.kernels import kernel
 from thesisrecon.matching._seeds import mutual_best
@@ -200,16 +200,16 @@ class OverlapEstimate:
             how = f"all pairs (at most {self.all_up_to} images)"
             return PairChoice(_pair_array(combinations(range(n), 2)), how)
         subsets = map_all(self._subsets, features)
-        similarity = np.zeros((n, n))
-        if n - 1 > self.shortlist:
-            for kind in (0, 1):
-                patches = [subset[kind].patches for subset in subsets]
-                similarity += _bow_similarity(patches, self.words, map_all=map_all, rng=rng)
-        compared = _most_similar(similarity, self.shortlist)
-        evidence = np.array(
-            map_all(lambda pair: _evidence(subsets[pair[0]], subsets[pair[1]]), compared.tolist())
-        )
-        chosen = self._choose(similarity, compared, evidence)
+        if n - 1 <= self.shortlist:
+            words, compared = np.zeros((n, 0)), _pair_array(combinations(range(n), 2))
+        else:
+            kinds = [[subset[kind].patches for subset in subsets] for kind in (0, 1)]
+            words = np.hstack([_word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds])
+            compared = _most_similar(words, self.shortlist)
+        evidence = np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), compared.tolist()))
+        best, near = (_best_of_each(compared, evidence, n, count) for count in (self.most, self.nearest))
+        chosen = compared[best & (evidence >= self.min_evidence) | near]
+        chosen = _pair_array([*chosen, *_connecting_pairs(chosen, compared, evidence, words)])
         how = (
             f"pairs with overlap evidence among {len(compared)} compared pairs, and the best "
             f"{self.nearest} of each image"
@@ -224,42 +224,59 @@ class OverlapEstimate:
             )
         return _subsets(features.seeds)
 
-    def _choose(self, similarity: F64, compared: I64, evidence: F64) -> I64:
-        """Pairs (M, 2) with enough evidence, the best of each image, and those that connect the set."""
-        # Pairs that were not compared follow all that were, ordered by bag-of-words similarity.
-        order = similarity - 1e6
-        order[compared[:, 0], compared[:, 1]] = order[compared[:, 1], compared[:, 0]] = evidence
-        best, near = _most_similar(order, self.most), _most_similar(order, self.nearest)
-        supported = best[order[best[:, 0], best[:, 1]] >= self.min_evidence]
-        chosen = _pair_array([*supported.tolist(), *near.tolist()])
-        return _pair_array([*chosen.tolist(), *_connecting_pairs(chosen, order).tolist()])
 
+def _most_similar(words: F64, count: int) -> I64:
+    """Pairs (M, 2) of each image with the ``count`` most similar ones by word weights (N, W); sorted.
 
-def _most_similar(similarity: F64, count: int) -> I64:
-    """Pairs (M, 2) of each image with the ``count`` most similar ones of an (N, N) matrix; sorted."""
-    n = len(similarity)
-    others = similarity.copy()
-    np.fill_diagonal(others, -np.inf)
-    best = np.argsort(-others, axis=1, kind="stable")[:, : min(count, n - 1)]
-    return _pair_array(np.column_stack([np.repeat(np.arange(n), best.shape[1]), best.ravel()]).tolist())
-
-
-def _connecting_pairs(chosen: I64, order: F64) -> I64:
-    """Pairs (M, 2) of highest ``order`` that connect the components of the chosen pairs.
-
-    The edges that a maximum spanning tree of all pairs adds to the chosen ones if these cost nothing.
+    Only the similarities of some rows are in memory.
     """
-    n = len(order)
-    i, j = np.triu_indices(n, 1)
-    rank = np.empty(len(i))
+    n, pairs = len(words), list[F64]()
+    for first in range(0, n, ROWS_AT_ONCE):
+        similarity = words[first : first + ROWS_AT_ONCE] @ words.T
+        rows = np.arange(first, first + len(similarity))
+        similarity[rows - first, rows] = -np.inf
+        best = np.argsort(-similarity, axis=1, kind="stable")[:, : min(count, n - 1)]
+        pairs += np.column_stack([np.repeat(rows, best.shape[1]), best.ravel()]).tolist()
+    return _pair_array(pairs)
+
+
+def _best_of_each(pairs: I64, value: F64, n: int, count: int) -> B8:
+    """Whether each pair (M, 2) is among the ``count`` of highest value of one of its images."""
+    image, number = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
+    order = np.lexsort((number, -value[number], image))
+    start = np.searchsorted(image[order], np.arange(n))
+    rank = np.arange(len(order)) - start[image[order]]
+    best = np.zeros(len(pairs), dtype=bool)
+    best[number[order[rank < count]]] = True
+    return best
+
+
+def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: F64) -> I64:
+    """Pairs (M, 2) that connect the groups of the ``chosen``: of most evidence, else of most similar words.
+
+    The edges that a maximum spanning tree of the compared pairs adds to the chosen ones if these cost
+    nothing; groups without a compared pair are joined by their most similar images, the smallest first.
+    """
+    n, m = len(words), len(compared)
+    cost = np.empty(m)
     # Ranks instead of values: no two costs are equal, so the tree is unique and independent of rounding.
-    rank[np.argsort(-order[i, j], kind="stable")] = np.arange(1, len(i) + 1)
-    cost = np.zeros((n, n))
-    cost[i, j] = rank + len(i)
-    cost[chosen[:, 0], chosen[:, 1]] -= len(i)
-    tree = scipy.sparse.csgraph.minimum_spanning_tree(cost).tocoo()
-    new = tree.data > len(i)
-    return np.column_stack([tree.row[new], tree.col[new]]).astype(np.int64).reshape(-1, 2)
+    cost[np.argsort(-evidence, kind="stable")] = np.arange(1, m + 1)
+    known = {(i, j) for i, j in chosen.tolist()}
+    cost += [0 if (i, j) in known else m for i, j in compared.tolist()]
+    graph = scipy.sparse.coo_array((cost, compared.T), (n, n))
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph).tocoo()
+    added = np.column_stack([tree.row, tree.col])[tree.data > m].tolist()
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    while group.any():
+        sizes = np.bincount(group)
+        inside = np.flatnonzero(group == np.argmin(np.where(sizes > 0, sizes, n + 1)))
+        outside = np.flatnonzero(group != group[inside[0]])
+        similarity = words[inside] @ words[outside].T
+        i, j = np.unravel_index(np.argmax(similarity), similarity.shape)
+        added.append([inside[i], outside[j]])
+        joined = group[inside[i]], group[outside[j]]
+        group[np.isin(group, joined)] = min(joined)
+    return np.array(added, dtype=np.int64).reshape(-1, 2)
 
 
 @kernel
@@ -357,22 +374,21 @@ def _match_subsets(a: _FeatureSubset, b: _FeatureSubset) -> tuple[I64, I64]:
     return one, index[one]
 
 
-def _bow_similarity(patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator) -> F64:
-    """Bag-of-words similarity (N, N) of all pairs of images with unit patches (S, D).
+def _word_weights(patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator) -> F64:
+    """Weighted word counts (N, W) of images with unit patches (S, D); products of the rows are cosines.
 
-    Cosine of the weighted word counts; a word is weighted by how few images contain it. A patch counts for
-    its three nearest words, and square roots of the counts limit the effect of repeated structure.
+    A word is weighted by how few images contain it. A patch counts for its three nearest words, and square
+    roots of the counts limit the effect of repeated structure.
     """
     everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
     if not len(everything):
-        return np.zeros((len(patches), len(patches)))
+        return np.zeros((len(patches), 1))
     vocabulary = _vocabulary(everything, min(words, len(everything)), rng)
     counts = np.stack(map_all(lambda given: _count_words(given, vocabulary), patches))
     used = np.maximum((counts > 0).sum(axis=0), 1)
     weighed = np.sqrt(counts) * np.log(len(patches) / used)
-    weighed /= np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-12)
-    similarity: F64 = weighed @ weighed.T
-    return similarity
+    normalised: F64 = weighed / np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-12)
+    return normalised
 
 
 def _vocabulary(patches: F32, words: int, rng: np.random.Generator) -> F32:
