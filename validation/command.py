@@ -17,7 +17,7 @@ from validation.harness.gates import read_gates
 from validation.harness.page import write_pages
 from validation.harness.process import own_cores
 from validation.harness.records import ReportOptions
-from validation.harness.results import Results, collect, write_results
+from validation.harness.results import Results, collect, read_results, write_results
 from validation.harness.scenes import load_images
 from validation.harness.schedule import run_tasks
 from validation.harness.stages import STAGES, available_scenes
@@ -45,9 +45,9 @@ def main(arguments: list[str] | None = None) -> int:
         except ValueError as error:
             print(f"validation: {error}", file=sys.stderr)
             return 2
-    results = collect(options, judged, gates)
+    results, earlier = collect(options, judged, gates), _last_results(options)
     write_results(options.out, results)
-    page = write_pages(options, STAGES, judged, results)
+    page = write_pages(options, STAGES, judged, results, earlier)
     if parsed.command == "check":
         _print_gates(results)
     broken = counted(len(results.broken) + len(results.missing), "gate")
@@ -119,6 +119,16 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
         resume="" if parsed.resume is None else str(parsed.resume.resolve()),
         side_px=parsed.max_side,
     )
+
+
+def _last_results(options: ReportOptions) -> Results | None:
+    """Results of the last run in the output folder, else of the resumed one; None without either."""
+    for folder in (options.out, *([Path(options.resume)] if options.resume else [])):
+        try:
+            return read_results(folder)
+        except ValueError:
+            continue
+    return None
 
 
 def _print_progress(line: str) -> None:

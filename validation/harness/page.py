@@ -15,6 +15,7 @@ from thesisrecon import __version__
 from thesisrecon.errors import counted
 from thesisrecon.io._files import write_text
 from thesisrecon.report._page import plotly_script, render_page
+from validation.harness.overview import cost_ratio, overview
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, key_of, slug
 from validation.harness.results import Results, Row
 from validation.metrics.record import number
@@ -35,9 +36,13 @@ class _Verdict:
 
 
 def write_pages(
-    options: ReportOptions, stages: Mapping[str, Stage], judged: Judged, results: Results
+    options: ReportOptions,
+    stages: Mapping[str, Stage],
+    judged: Judged,
+    results: Results,
+    earlier: Results | None = None,
 ) -> Path:
-    """Write all pages and return the path of the first."""
+    """Write all pages and return the path of the first, which opens with an overview of all stages."""
     scenes = [s for s in options.scenes if any(scene == s for _, scene in judged)]
     links = [("All scenes", "index.html"), *((s, f"scene-{slug(s)}.html") for s in scenes)]
     names = {
@@ -67,7 +72,10 @@ def write_pages(
     write_page(
         options.out / "index.html",
         TEMPLATE,
-        [section for section in whole if section["rows"]],
+        [
+            overview(results, earlier),
+            *(section for section in whole if section["rows"]),
+        ],
         title="Ours beside the references",
         links=links,
         verdict=_verdict(results.rows, results.missing),
@@ -132,17 +140,8 @@ def _row(row: Row, names: Mapping[str, str]) -> dict[str, Any]:
         "name": names.get(row.key, last),
         "scene": scene,
         "definition": row.source or "as its name says",
-        "ratio": _ratio(row),
+        "ratio": cost_ratio(row),
     }
-
-
-def _ratio(row: Row) -> float | None:
-    """Return ours over the best reference (not a variant of ours), or None."""
-    others = [v for name, v in row.reference.items() if v is not None and not name.startswith("ours")]
-    if row.value is None or not others:
-        return None
-    best = max(others) if row.direction == "at least" else min(others)
-    return row.value / best if best else None
 
 
 def plot_at(place: str, plot: Plot) -> dict[str, Any]:

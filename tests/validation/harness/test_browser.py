@@ -79,7 +79,11 @@ def test_the_plots_are_drawn(scene):
 
 
 def test_the_whole_leads_to_the_scene(browser, pages):
-    whole = Witness(browser, pages / "index.html", 1300, drawn=())
+    whole = Witness(browser, pages / "index.html", 1300, drawn=("plot-overview",))
+    assert (
+        whole.page.locator("main > section").nth(1).locator("h2").inner_text()
+        == "Ours over the best reference"
+    )
     whole.page.get_by_role("link", name="yard").click()
     assert whole.page.locator("h1").inner_text() == "yard"
     assert whole.errors == []
