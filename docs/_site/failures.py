@@ -7,6 +7,7 @@ the other messages stands in `remedies.toml`, which has an entry for each.
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from itertools import product
 from pathlib import Path
@@ -24,10 +25,19 @@ SOURCES = {
         "pipeline/reconstruction.py": ("_read_inputs", "_exif_warnings"),
         "pipeline/_stages.py": ("finish_features",),
     },
+    "Images that are not registered": {
+        "projective/incremental.py": (
+            "OUTSIDE_CORE", "add_next_camera", "_try_camera", "_covariance_test", "_discard_camera",
+        ),
+        "projective/_model.py": ("to_reconstruction",),
+        "metric/_resection.py": ("_register_missing", "_register", "_register_again"),
+        "metric/refinement.py": ("NO_COMMON_POINTS",),
+        "pipeline/_steps.py": ("_with_group_reasons",),
+    },
     "Pairs of images": {
         "epipolar/verification.py": ("_objection", "_assess_pair"),
         "pipeline/_stages.py": ("_degenerate_pairs",),
-        "pipeline/_steps.py": ("_run_groups", "_with_group_reasons"),
+        "pipeline/_steps.py": ("_run_groups",),
     },
     "Calibration": {
         "pipeline/_outputs.py": ("_failure_warnings",),
@@ -47,7 +57,7 @@ SOURCES = {
         "runtime/_run.py": ("_loaded",),
     },
 }  # fmt: skip
-"""Functions whose sentences are warnings, failed checks or reasons to leave an image out."""
+"""Functions and constants whose sentences are warnings, failed checks or reasons against an image."""
 PASSED_ON = {
     "cli/view_files.py", "pipeline/_loading.py", "pipeline/from_matches.py", "runtime/_run_folder.py",
     "metric/refinement.py",
@@ -124,7 +134,8 @@ def stage_failures() -> dict[str, list[tuple[str, str, str]]]:
                 if isinstance(given["reason"], ast.Starred | ast.Attribute):
                     continue
                 evidence, advice = (joined(given.get(word), names) for word in ("evidence", "advice"))
-                for reason in texts(given["reason"], names):
+                # A reason that is a value alone is one of another table, passed on.
+                for reason in (r for r in texts(given["reason"], names) if any(c.isalpha() for c in r)):
                     found.setdefault(folder, []).append((reason, evidence, advice))
     return {folder: sorted(set(rows)) for folder, rows in found.items()}
 
@@ -136,7 +147,8 @@ def joined(node: ast.expr | None, names: dict[str, list[ast.expr]]) -> str:
 
 def sentences(path: Path, names: tuple[str, ...]) -> list[str]:
     """Return the sentences within functions of a file; parts of sentences and of failures are left out."""
-    found: list[str] = []
+    constants = assigned(ast.Module([n for n in tree_of(path).body if isinstance(n, ast.Assign)], []))
+    found = [text for name in names if name in constants for text in texts(constants[name][0], {})]
     for function in functions_of(path):
         if function.name not in names:
             continue
@@ -165,6 +177,19 @@ def warning_sinks() -> set[str]:
             if (
                 isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node).split(".")[-1] == "warnings"
             ) or (isinstance(node, ast.keyword) and node.arg == "warnings"):
+                found.add(str(path.relative_to(PACKAGE)))
+    return found
+
+
+def reason_sinks() -> set[str]:
+    """Files that set the reason why an image is not registered."""
+    found = set()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(tree_of(path)):
+            target = node.targets[0] if isinstance(node, ast.Assign) else None
+            if isinstance(target, ast.Subscript) and re.search(
+                r"\b(reasons|rejected)$", ast.unparse(target.value)
+            ):
                 found.add(str(path.relative_to(PACKAGE)))
     return found
 
@@ -225,14 +250,22 @@ A run ends in one of four ways:
 - Wrong options or settings, exit code 2 ({py:class}`~thesisrecon.UsageError`): the message names the rule and
   the way out; nothing was computed.
 
-Most failures are of the images: too little overlap, no sideways motion, or one of the critical motions of
-[how to take good images](photographing.md).
+Most failures are of the images: too little overlap, no sideways motion, or one of the {term}`critical motions
+<critical motion>` of [how to take good images](photographing.md).
+
+**Why one image is missing**: see `report.html`, table "Images", or in Python `result.refused` (name ->
+reason). An image is *left out* if it cannot be read or used at all ([reasons](#images-that-are-left-out)),
+and *not registered* if it was read but has no camera in the model
+([reasons](#images-that-are-not-registered)). The rest of the model is not affected by it.
 
 ## Warnings and failed checks
 """
 FAILURES = """## Failures
 
 A failure says what happened (reason), what was measured (evidence) and what to do. "/" separates variants.
+Two different images suffice for matching; a calibration needs three
+([why](photographing.md#why-three-views)). Functions of two images (`rectify`, `draw_epipolar_lines` and
+others) refuse a file that cannot be read with the reasons of the first table.
 
 """
 
