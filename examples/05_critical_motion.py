@@ -2,16 +2,18 @@ r"""
 5. A critical motion and how it is named
 ========================================
 
-Some motions leave the calibration open, whatever the method. Let a camera translate without rotating:
-:math:`P_i = K\,[I \; {-C_i}]`. With any other calibration :math:`K'` and the affine map :math:`A = K'^{-1}
-K`,
+Some motions leave the calibration open, whatever the method. A camera with the calibration
+:math:`K`, the rotation :math:`R` and the centre :math:`C` has the matrix :math:`P = K R\,[I
+\; {-C}]`. Let it translate without rotating: :math:`P_i = K\,[I \; {-C_i}]`. With any other
+calibration :math:`K'` and the affine map :math:`A = K'^{-1} K`,
 
 .. math:: K\,(X - C_i) = K' (A X - A C_i),
 
-so a camera :math:`K'` translating through the sheared or stretched scene :math:`A X` has exactly the same
-images. A photographer who walks sideways and does not turn gets the depth of the scene, and the focal length,
-from nowhere. This is a critical motion (Sturm 1997; HZ 19.9); others rotate about one direction only, or
-about the optical axis.
+so a camera :math:`K'` translating through the sheared or stretched scene :math:`A X` has
+exactly the same images. If a photographer walks sideways and does not turn, the images
+determine neither the depth of the scene nor the focal length. This is a :term:`critical
+motion` (Sturm 1997; HZ 19.3.5, 19.5.3; turntables: 19.9); others rotate about one direction
+only, or about the optical axis.
 """
 
 import matplotlib.pyplot as plt
@@ -21,29 +23,33 @@ from scipy.spatial.transform import Rotation
 import thesisrecon
 
 rng, n, size = np.random.default_rng(0), 8, (800, 600)
-K, X = np.array([[800.0, 0, 399.5], [0, 800, 299.5], [0, 0, 1]]), rng.uniform(-1, 1, (150, 3))
-side, angle, I = np.linspace(-1, 1, n), np.linspace(-60, 60, n), np.tile(np.eye(3), (n, 1, 1))
+K = np.array([[800.0, 0, 399.5], [0, 800, 299.5], [0, 0, 1]])
+X, I = rng.uniform(-1, 1, (150, 3)), np.tile(np.eye(3), (n, 1, 1))
+side, angle = np.linspace(-1, 1, n), np.linspace(-60, 60, n)
 around = Rotation.from_euler("y", angle[:, None], degrees=True).as_matrix()
-nodding = Rotation.from_euler("xyz", np.c_[20 * np.cos(3 * side), angle, 30 * side], degrees=True).as_matrix()
+angles = np.c_[20 * np.cos(3 * side), angle, 30 * side]
+nodding = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
 rolling = Rotation.from_euler("z", 30 * side[:, None], degrees=True).as_matrix()
 sideways = np.c_[-side, rng.uniform(-0.4, 0.4, n), rng.uniform(3.6, 4.4, n)]
 motions = {
     "general": (nodding, np.tile([0, 0, 4.0], (n, 1)) + rng.uniform(-0.3, 0.3, (n, 3))),
     "turntable": (around, np.tile([0, 0, 4.0], (n, 1))),
     "translation": (I, sideways),
-    "rotation about the optical axis": (rolling, np.einsum("nij,nj->ni", rolling, sideways)),
+    "rotation about the optical axis": (rolling, (rolling @ sideways[..., None])[..., 0]),
 }
 
 # %%
-# For each motion the focal length is fixed at a wrong value and everything else is adjusted to the noisy
-# images (noise 0.5 px). If the RMS residual does not rise, nothing in the images contradicts the wrong focal
-# length. The library measures the motion in units of the noise, names it, and says what would help.
+# For each motion the focal length is fixed at a wrong value and everything else is adjusted
+# to the noisy images (noise 0.5 px). If the RMS residual does not rise, nothing in the
+# images contradicts the wrong focal length. The library measures the motion in units of the
+# noise, names it, and says what would help.
 
 focals = np.array([400, 500, 600, 700, 800, 900, 1000, 1200, 1600.0])
 figure, axis = plt.subplots(figsize=(8, 4.2), layout="constrained")
 for name, (R, t) in motions.items():
     cameras = [thesisrecon.Camera(K, *pose, size) for pose in zip(R, t, strict=True)]
-    xy = np.stack([camera.project(X) for camera in cameras]) + rng.normal(0, 0.5, (n, 150, 2))
+    xy = np.stack([camera.project(X) for camera in cameras])
+    xy += rng.normal(0, 0.5, xy.shape)
     xy[((xy < 0) | (xy > (799, 599))).any(axis=2)] = np.nan
     rms = []
     for focal in focals:
@@ -51,8 +57,10 @@ for name, (R, t) in motions.items():
         adjusted = thesisrecon.bundle_adjust((wrong, R, t), X, xy, sizes=size, free=())
         rms.append(np.sqrt(np.nanmean(adjusted.residual_px**2)))
     axis.loglog(focals, rms, "o-", label=name)
-    found = thesisrecon.self_calibrate(np.array([camera.P for camera in cameras]), size, xy=xy)
-    print(f"{name}: determined {found.identifiable}. " + "; ".join(found.identifiability.sentences))
+    P = np.array([camera.P for camera in cameras])
+    found = thesisrecon.self_calibrate(P, size, xy=xy)
+    reasons = "; ".join(found.identifiability.sentences)
+    print(f"{name}: determined {found.identifiable}. {reasons}")
 axis.set(xlabel="assumed focal length, px (truth 800)", ylabel="RMS residual, px")
 axis.set_xticks(focals[::2], focals[::2].astype(int))
 axis.set_yticks([0.5, 1, 2, 5], [0.5, 1, 2, 5])

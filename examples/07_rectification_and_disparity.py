@@ -2,10 +2,11 @@ r"""
 7. Rectification and disparity
 ==============================
 
-The match of a pixel lies on its epipolar line. If both images are warped so that corresponding epipolar lines
-become the same row, the search runs along rows (section 2.5). The remaining shift :math:`d = x_l - x_r` is
-the disparity; for parallel cameras with baseline :math:`b`, :math:`d = f b / Z`: near points move more. Only
-:math:`F` and the matches are needed, no calibration.
+The match of a pixel lies on its :term:`epipolar line`. If both images are warped so that
+corresponding epipolar lines become the same row (:term:`rectification`), the search runs
+along rows (section 2.5). The remaining shift :math:`d = x_l - x_r` is the
+:term:`disparity`; for parallel cameras with baseline :math:`b`, :math:`d = f b / Z`: near
+points move more. Only :math:`F` and the matches are needed, no calibration.
 """
 
 from pathlib import Path
@@ -21,24 +22,34 @@ names = ["0010.jpg", "0011.jpg"]
 images = [np.asarray(Image.open(folder / "images" / name).reduce(2)) for name in names]
 pair = thesisrecon.match_pair(*images)
 rectified = thesisrecon.rectify(*images, pair.F, pair.xy1, pair.xy2, planar=True)
-rows = [rectified.rectified_from_original(k, xy)[:, 1] for k, xy in enumerate((pair.xy1, pair.xy2))]
-print(f"rows of the matches differ by {np.sqrt(np.mean((rows[0] - rows[1]) ** 2)):.3f} px (RMS)")
+rows = [
+    rectified.rectified_from_original(k, xy)[:, 1]
+    for k, xy in enumerate((pair.xy1, pair.xy2))
+]
+rms = np.sqrt(np.mean((rows[0] - rows[1]) ** 2))
+print(f"rows of the matches differ by {rms:.3f} px (RMS)")
 figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), layout="constrained", sharey=True)
 for axis, image in zip(axes, (rectified.left, rectified.right), strict=True):
     axis.imshow(np.nan_to_num(image, nan=255).astype(np.uint8))
-    axis.hlines(np.linspace(50, len(image) - 50, 8), 0, image.shape[1] - 1, "yellow", linewidth=0.8)
+    axis.hlines(
+        np.linspace(50, len(image) - 50, 8), 0, image.shape[1] - 1, "yellow", linewidth=0.8
+    )
 
 # %%
-# Matching each row by itself gives streaks, so the disparities of neighbouring pixels are tied. The thesis
-# uses dynamic programming: for each row the most likely sequence of matches and occlusions in one order (Cox
-# et al. 1996). The default sums such paths over several directions (semi-global matching), leaves pixels
-# unknown where the two directions of matching disagree, and is compared here with the disparities of the true
-# scene.
+# Matching each row by itself gives streaks, so the disparities of neighbouring pixels are
+# tied. The thesis uses dynamic programming: for each row the most likely sequence of
+# matches and occlusions in one order (Cox et al. 1996). The default sums such paths over
+# several directions (semi-global matching), leaves pixels unknown where the two directions
+# of matching disagree, and is compared here with the disparities of the true scene.
 
 depth = np.asarray(Image.open(folder / "depth" / "0010.png")) * 0.00025
-first, second = (thesisrecon.read_cameras(folder / "cameras.json")[name].scaled(0.5) for name in names)
+first, second = (
+    thesisrecon.read_cameras(folder / "cameras.json")[name].scaled(0.5) for name in names
+)
 height, width = rectified.left.shape[:2]
-pixels = np.dstack(np.meshgrid(np.arange(width), np.arange(height))).reshape(-1, 2).astype(float)
+pixels = (
+    np.dstack(np.meshgrid(np.arange(width), np.arange(height))).reshape(-1, 2).astype(float)
+)
 xy = rectified.original_from_rectified(0, pixels)
 x, y = np.clip(np.rint(xy), 0, (511, 383)).astype(int).T
 seen = (np.abs(xy - (255.5, 191.5)) < (256, 192)).all(axis=1) & (depth[y, x] > 0)
@@ -55,6 +66,5 @@ for axis, preset in zip(axes[1:], ("thesis", "default"), strict=True):
     ).disparity
     error = np.abs(found - truth)[np.isfinite(found - truth)]
     axis.imshow(found, **shown)
-    axis.set(
-        title=f"{preset}: {error.size / np.isfinite(truth).sum():.0%} known, {np.mean(error > 1):.0%} wrong"
-    )
+    known, wrong = error.size / np.isfinite(truth).sum(), np.mean(error > 1)
+    axis.set(title=f"{preset}: {known:.0%} known, {wrong:.0%} wrong")
