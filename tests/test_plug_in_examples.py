@@ -28,6 +28,17 @@ def test_opencv_sift_is_a_matching_function(tmp_path):
     assert max(pair.inliers for pair in result.pairs) > 100
 
 
+@pytest.mark.references
+def test_opencv_keypoints_are_features(tmp_path):
+    definition, call = BLOCKS[1].split("result = ")
+    scope = {"__name__": "__main__"}
+    exec(definition, scope)
+    assert "config=config, set=matching, " in call
+    given = GIVEN | {"config": scope["config"], "set": scope["matching"]}
+    result = reconstruct(images(3), tmp_path / "out", **given)
+    assert sum(pair.accepted for pair in result.pairs) >= 2
+
+
 class Extractor:
     """A stub of an extractor: an image (1, 3, H, W) in, keypoints (1, N, 2) and descriptors (1, N, D) out."""
 
@@ -54,7 +65,7 @@ class Matcher:
 
 def test_a_lightglue_style_matcher_fits_with_a_class(tmp_path):
     scope = {"__name__": "__main__", "extractor": Extractor, "matcher": Matcher}
-    exec(BLOCKS[1], scope)
+    exec(BLOCKS[2], scope)
     few, images_ = PairVerification(min_inliers=20), ImageOptions(max_size_px=400)
     found = []
     for score in (0.9, 0.7):

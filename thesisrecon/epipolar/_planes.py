@@ -1,4 +1,4 @@
-"""Kernels of homographies induced by F and a scene plane (HZ 13.6), and the dominant plane of the matches.
+"""Kernels of homographies by F and a scene plane (HZ result 13.6), and the dominant plane of the matches.
 
 Points are rows (x1, y1, x2, y2); F and H are row-major vectors of 9. Distances are Sampson distances of H, so
 that noise has the standard deviation of one coordinate.

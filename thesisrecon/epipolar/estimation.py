@@ -72,7 +72,7 @@ def estimate_fundamental(
     method : str
         With wrong matches: "locally-optimised"
         (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
-        the thesis) or "least-median". Of all matches: "gold-standard" (least reprojection error, HZ 11.3),
+        the thesis) or "least-median". Of all matches: "gold-standard" (least reprojection error, HZ 11.4.1),
         "eight-point" (normalised) or "seven-point" (up to three solutions).
     threshold_px : float or None
         Sampson distance of an inlier during the search of the first two methods. None: all matches are right,

@@ -293,7 +293,7 @@ def cheirality(P: F64, X: F64) -> F64:
 
 
 def depth(P: F64, X: F64) -> F64:
-    """Return the signed distance of points from the principal plane (HZ 6.15).
+    """Return the signed distance of points from the principal plane (HZ 6.2.3).
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from thesisrecon.geometry.polynomial_triangulation import correct_matches
 
 
 def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
-    """Return T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3] (HZ 17.12), i from 0.
+    """Return T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3] (HZ 17), i from 0.
 
     For P1 = [I 0], P2 = [A a], P3 = [B b] it is A_ji b_k - a_j B_ki.
 

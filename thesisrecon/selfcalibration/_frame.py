@@ -1,6 +1,6 @@
 """Reference frame of chapter 7 (unit-free pixels, one camera at [I | 0]) and the unknowns of the solvers.
 
-With H = [[K_r, 0], [-p' K_r, 1]], P H is metric if the plane at infinity p and K_r are right (HZ 19.1).
+With H = [[K_r, 0], [-p' K_r, 1]], P H is metric if the plane at infinity p and K_r are right (HZ 19.2).
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def normalized_frame(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> 
 
 
 def metric_from_calibration(p: F64, K: F64) -> F64:
-    """Return the upgrade H^-1 (4, 4) of plane p (3,) and reference K (HZ 19.1); NaN if K is singular."""
+    """Return the upgrade H^-1 (4, 4) of plane p (3,) and reference K (HZ 19.2); NaN if K is singular."""
     H = np.eye(4)
     H[:3, :3] = K
     H[3, :3] = -p @ K
