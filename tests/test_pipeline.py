@@ -16,12 +16,17 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
+from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
+from thesisrecon.pipeline import _outputs, _stages
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.pipeline.reconstruction import _exif_warnings, reconstruct
 from thesisrecon.records import Image
 from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import stream
+from thesisrecon.runtime._run_folder import RunDirectory
+from thesisrecon.surface import fusion
+from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
 
 
@@ -136,6 +141,34 @@ def test_a_run_to_its_end_leaves_a_textured_model(tmp_path):
         other = tmp_path / f"{options}"
         run(other, until="model", **options)
         assert (other / "model.glb").read_bytes() == (tmp_path / "a" / "model.glb").read_bytes()
+
+
+def test_depth_maps_that_do_not_fit_in_memory_give_the_same_model(tmp_path, monkeypatch):
+    run(tmp_path / "a", until="model", threads=1)
+    monkeypatch.setattr(_stages, "MAP_BYTES", 0)
+    monkeypatch.setattr(fusion, "GROUP_BYTES", 1)
+    result = run(tmp_path / "b", until="model", threads=2)
+    assert (tmp_path / "a" / "model.glb").read_bytes() == (tmp_path / "b" / "model.glb").read_bytes()
+    assert [m.view for m in result.depth_maps[1:]] == [1, 2, 3]
+    (tmp_path / "b" / "07-dense" / "confirmed-00002.npz").unlink()
+    refuses(UsageError, "confirmed-00002.npz was removed or changed", result.depth_maps.__getitem__, 2)
+
+
+def test_a_model_above_the_size_limit_is_written_whole_and_reduced(tmp_path):
+    result = run(tmp_path / "a", until="model", threads=1)
+    whole = (tmp_path / "a" / "model.glb").read_bytes()
+    directory, limit_mb = RunDirectory(tmp_path / "b"), 0.6e-6 * len(whole)
+    directory.path.mkdir()
+    (sentence,) = _outputs._write_surface(directory, result, limit_mb, 1)
+    assert sentence.endswith("model-full.glb holds all")
+    assert (tmp_path / "b" / "model-full.glb").read_bytes() == whole
+    assert (tmp_path / "b" / "model.glb").stat().st_size <= 1e6 * limit_mb
+    reduced = read_mesh(tmp_path / "b" / "model.glb")
+    assert len(reduced.faces) < len(result.mesh.faces)
+    np.testing.assert_allclose(reduced.vertices[:, 2], 8.0, atol=0.05)
+    assert _outputs._write_surface(directory, result, 50.0, 1) == []
+    assert not (tmp_path / "b" / "model-full.glb").exists()
+    refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
 
 
 def test_a_run_stopped_between_depth_maps_goes_on(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,8 +113,8 @@ class RunResult:
         File name -> reason of unreadable images.
     features, pair_choice, pairs, tracks, projective, calibration, metric, mesh, held_out
         Results of the stages; ``pairs`` are all matched ones, accepted or not.
-    views, depth_maps : tuple of PinholeView, tuple of DepthMap
-        Undistorted images and their depth maps.
+    views, depth_maps : tuple of PinholeView, sequence of DepthMap
+        Undistorted images and their depth maps; of many, some are read from ``out`` when they are used.
     reports, warnings, failure : tuple of StageReport, tuple of str, str
         One report per stage, all warnings, and the failure that ended the run, empty otherwise.
     summary : mapping
@@ -134,7 +134,7 @@ class RunResult:
     calibration: SelfCalibration | None = None
     metric: MetricResult | None = None
     views: tuple[PinholeView, ...] = ()
-    depth_maps: tuple[DepthMap, ...] = ()
+    depth_maps: Sequence[DepthMap] = ()
     mesh: TexturedMesh | None = None
     held_out: HeldOut | None = None
     reports: tuple[StageReport, ...] = ()

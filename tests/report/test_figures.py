@@ -42,6 +42,7 @@ def test_the_matrix_is_symmetric_and_marks_rejected_pairs():
 def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch):
     data = made_up_run(points=300)
     monkeypatch.setattr(figures, "MAX_MATRIX", 3)
+    monkeypatch.setattr(figures, "MAX_CELLS", 3)
     figure = figures.pair_matrix_figure(data.pairs, [p.name for p in data.images])
     accepted = figure["data"][0]
     assert accepted["x"] == ["views 1–3", "views 4–6", "views 7–9"]

@@ -78,7 +78,7 @@ def test_charts_are_large_and_use_views_that_see_them(sphere):
     views = [photograph(m) for m in ring_of()]
     quality = quality_of(sphere, views)
     neighbours = face_neighbours(sphere.faces)
-    label = blending.choose_views(quality, neighbours)
+    label = blending.choose_views(sphere, views, blending.depth_buffers(sphere, views), neighbours)
     seen = quality.max(axis=1) > 0.0
     np.testing.assert_array_equal(label >= 0, seen)
     assert (quality[seen, label[seen]] > 0.0).all()
@@ -252,6 +252,19 @@ def test_combine_colors_matches_its_twin():
             middle[k] = c[order[np.searchsorted(np.cumsum(w[order]), 0.5 * w.sum())], k]
         final = w**2 / (1 + ((c - middle) ** 2).mean(axis=1) / 30.0**2) ** 2
         np.testing.assert_allclose(out[n], final @ c / final.sum(), rtol=1e-4)
+
+
+def test_of_many_views_those_of_the_largest_weights_are_blended():
+    rng = np.random.default_rng(5)
+    weight, color = rng.random((50, 40)).astype(np.float32), np.full((50, 40, 3), 90, np.float32)
+    weight[rng.random(weight.shape) < 0.2] = 0.0
+    few = np.sort(np.argsort(-weight, axis=0, kind="stable")[: kernels.MAX_BLENDED], axis=0)
+    color += rng.normal(0, 9, color.shape).astype(np.float32)
+    out, wanted = np.zeros((2, 40, 3), np.float32)
+    kernels.combine_colors(weight, color, 2.0, 30.0, out)
+    best = np.take_along_axis(weight, few, axis=0)
+    kernels.combine_colors(best, np.take_along_axis(color, few[..., None], axis=0), 2.0, 30.0, wanted)
+    np.testing.assert_array_equal(out, wanted)
 
 
 def test_grow_colors_matches_its_twin():

@@ -65,7 +65,7 @@ def load(out: str | Path) -> RunResult:
 
 
 def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
-    stages = {stage: _records(folder / name) for stage, name in FOLDERS.items()}
+    stages = {stage: _records(folder / name) for stage, name in FOLDERS.items() if stage != "dense"}
     reports = [StageFolder(folder / name).finished(_keys(folder / name)) for name in FOLDERS.values()]
     views, projective = summary["cameras"], list(stages["projective"].values())
     sizes = projective[0].sizes if projective else [_working_size(view) for view in views]

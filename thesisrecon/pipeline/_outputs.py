@@ -22,20 +22,21 @@ from thesisrecon.io._files import read_json, write_atomically, write_json, write
 from thesisrecon.io._meshes import write_mesh
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.records import Reconstruction, TexturedMesh
-from thesisrecon.report._data import ReportData, point_colors, summarize
+from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
 from thesisrecon.surface._simplification import reduce_faces
+from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas
 
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
 SUMMARY, PAGE = "summary.json", "report.html"
 COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
-MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", "model.glb")
+MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", "model.glb", "model-full.glb")
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 MAX_AFFINE = 1e3
 """Largest affine coordinate written to affine.ply, in standard deviations of the points."""
@@ -112,7 +113,8 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         for_page = beside.submit(_model_for_page, result, max(run.workers.threads - 1, 1))
         if run.workers.threads == 1:
             wait([for_page])
-        colors, affine, warnings = _write_results(run.directory, result)
+        max_mb = getattr(run.config.model, "max_glb_mb", SurfaceModel.max_glb_mb)
+        colors, affine, warnings = _write_results(run.directory, result, max_mb, run.workers.threads)
         run.warnings.extend(warnings)
         result = _described(run, result, until, failure)
         config = toml_from_config(run.config)
@@ -133,7 +135,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             affine=affine,
             model=for_page.result(),
             held_out=result.held_out,
-            depth_maps={m.view: _thinned(m.depth) for m in result.depth_maps},
+            depth_maps=_thinned_maps(result),
             until=None if until == "model" else until,
             failure=failure,
         )
@@ -157,8 +159,31 @@ def save_result(result: RunResult, folder: Path) -> None:
     write_json(folder / SUMMARY, result.summary)
 
 
+def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, threads: int) -> list[str]:
+    """Write the mesh as GLB; a larger one than ``max_mb`` as a whole, and reduced. Returns warnings."""
+    mesh, path, whole = result.mesh, directory.path / "model.glb", directory.path / "model-full.glb"
+    directory.remove((whole.name,) if mesh is not None else (path.name, whole.name))
+    if mesh is None:
+        return []
+    write_mesh(path, mesh)
+    if path.stat().st_size <= 1e6 * max_mb or not result.views:
+        return []
+    path.replace(whole)
+    texels = TextureAtlas.max_texels if mesh.texture is None else mesh.texture[..., 0].size
+    size, share, smaller = whole.stat().st_size, 1.0, mesh
+    while size > 1e6 * max_mb:
+        share *= 0.9 * 1e6 * max_mb / size
+        smaller = reduce_faces(mesh, int(share * len(mesh.faces)), threads=threads)
+        atlas = TextureAtlas(max_texels=int(share * texels))
+        write_mesh(path, atlas.texture(smaller, result.views, threads=threads))
+        size = path.stat().st_size
+    faces = f"{len(smaller.faces)} of {len(mesh.faces)} faces"
+    limit = f"model.max_glb_mb={max_mb:g}"
+    return [f"model.glb is reduced to {faces} and fewer texels ({limit}); {whole.name} holds all"]
+
+
 def _write_results(
-    directory: RunDirectory, result: RunResult
+    directory: RunDirectory, result: RunResult, max_mb: float = SurfaceModel.max_glb_mb, threads: int = 1
 ) -> tuple[U8 | None, Reconstruction | None, list[str]]:
     """Write cameras, points and model, or remove old ones; return colours, affine points, warnings."""
     if result.metric is None or result.projective is None or result.calibration is None:
@@ -168,11 +193,7 @@ def _write_results(
     warnings = _write_model(directory, result, result.metric.reconstruction, colors)
     affine = upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
     write_affine(directory.path / "affine.ply", affine, point_colors(affine, result.images))
-    if result.mesh is not None:
-        write_mesh(directory.path / "model.glb", result.mesh)
-    else:
-        directory.remove(("model.glb",))
-    return colors, affine, warnings
+    return colors, affine, warnings + _write_surface(directory, result, max_mb, threads)
 
 
 def _failure_warnings(result: RunResult) -> list[str]:
@@ -242,6 +263,12 @@ def _model_for_page(result: RunResult, threads: int) -> TexturedMesh | None:
     return TextureAtlas(max_texels=PAGE_TEXELS).texture(coarse, result.views, threads=threads)
 
 
-def _thinned(depth: F32) -> F32:
-    step = max(1, -(-max(depth.shape) // DEPTH_PX))
-    return depth[::step, ::step]
+def _thinned_maps(result: RunResult) -> dict[int, F32]:
+    """Depths for the page."""
+    shown, maps = set(pictured(len(result.images))), {}
+    for n, view in enumerate(result.views):
+        if view.view in shown:
+            depth = result.depth_maps[n].depth
+            step = max(1, -(-max(depth.shape) // DEPTH_PX))
+            maps[view.view] = depth[::step, ::step].copy()
+    return maps

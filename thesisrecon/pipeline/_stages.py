@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -54,6 +54,8 @@ MIN_GROUP = 3
 """Images of a group that is reconstructed for itself."""
 MIN_VIEWS = 3
 """With fewer views, others may not see the surface of the held-out one."""
+MAP_BYTES = 2**29
+"""Depth maps in memory, those before and those after confirmation; more are read when they are used."""
 
 
 def find_features(state: PipelineState) -> None:
@@ -131,7 +133,7 @@ def _matched(
             given = views if shared else views.subset({view for pair in some for view in pair})
             yield numbers, (state.config, given, some, run.seed)
 
-    return run.map_cached("matches", keys, _match_all, batches)
+    return list(run.map_cached("matches", keys, _match_all, batches))
 
 
 def finish_matches(state: PipelineState, two_views: Sequence[TwoView]) -> None:
@@ -380,42 +382,47 @@ def _depths(
     return [config.dense.depth_map(scene, view, pool=pool)]
 
 
+def _confirmed(
+    config: PipelineConfig, scene: MultiViewScene, maps: Mapping[int, DepthMap], view: int
+) -> list[DepthMap]:
+    return [config.dense.confirm(scene, maps, view)]
+
+
 def estimate_depth_maps(state: PipelineState) -> None:
     """Estimate and cross-check the depth maps of all registered views (2.5)."""
     run, result = state.run, state.result
     assert result.metric is not None
-    reconstruction = result.metric.reconstruction
+    reconstruction, dense = result.metric.reconstruction, state.config.dense
     with run.clock("dense"):
-        scene = state.config.dense.prepare(result.images, reconstruction, threads=run.workers.threads)
-    order = sorted(scene.views)
+        scene = dense.prepare(result.images, reconstruction, threads=run.workers.threads)
+        order = sorted(scene.views)
+        near = {view: dense.required_views(scene, view) for view in order}
     r, pixels = reconstruction, [(image.rgb, image.mask) for image in result.images]
     given = [r.P, r.K, r.distortion, r.X, r.registered, r.valid, r.inlier, pixels]
-    keys = {f"{i:05d}": run.key("dense", run.variant_key("dense"), given, i) for i in order}
+    key = run.key("dense", run.variant_key("dense"), given)
+    place = {view: n for n, view in enumerate(order)}
 
-    def seen_from(view: int) -> tuple[MultiViewScene, frozenset[int]]:
+    def part(view: int) -> MultiViewScene:
         """Part of the scene that the depth map of one view needs."""
-        near = state.config.dense.required_views(scene, view)
-        return (scene if run.workers.in_process else scene.subset(near)), near
+        return scene if run.workers.in_process else scene.subset(near[view])
 
-    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+    def estimated(missing: Sequence[int]) -> Iterator[Batch]:
         for n in missing:
-            yield [n], (state.config, seen_from(order[n])[0], order[n], run.workers.pool)
+            yield [n], (state.config, part(order[n]), order[n], run.workers.pool)
 
-    found = run.map_cached("dense", keys, _depths, batches)
-    maps, confirmed = dict(zip(order, found, strict=True)), dict[int, DepthMap]()
+    def confirmed(missing: Sequence[int]) -> Iterator[Batch]:
+        for n in missing:
+            own = {j: maps[place[j]] for j in sorted(near[order[n]])}
+            yield [n], (state.config, part(order[n]), own, order[n])
 
-    def confirmations() -> Iterator[tuple[object, ...]]:
-        for view in order:
-            part, near = seen_from(view)
-            yield part, {j: maps[j] for j in sorted(near)}, view
-
-    confirm = state.config.dense.confirm
-    with run.clock("dense"):
-        run.workers.run(confirm, confirmations(), lambda n, depths: confirmed.update({order[n]: depths}))
-    final = [confirmed[i] for i in order]
-    state.result = replace(result, depth_maps=tuple(final), views=tuple(scene.views[i] for i in order))
-    known = [float(np.isfinite(m.depth).mean()) for m in final]
-    counts = {"views": len(order), "depths": int(sum(np.isfinite(m.depth).sum() for m in final))}
+    keys = {f"{i:05d}": run.key("dense", key, i) for i in order}
+    maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
+    keys = {f"confirmed-{i:05d}": run.key("dense", key, i, "confirmed") for i in order}
+    final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True)
+    state.result = replace(result, depth_maps=final, views=tuple(scene.views[i] for i in order))
+    finite = [np.isfinite(m.depth) for m in final]
+    known = [float(mask.mean()) for mask in finite]
+    counts = {"views": len(order), "depths": int(sum(mask.sum() for mask in finite))}
     empty = [result.images[i].name for i, share in zip(order, known, strict=True) if not share]
     warnings = [f"Image {name} has no depth values" for name in empty]
     metrics = {"median_share_known": float(np.median(known))}

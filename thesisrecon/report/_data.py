@@ -26,6 +26,15 @@ from thesisrecon.records import (
 )
 from thesisrecon.results import RunResult, in_original_pixels
 
+MAX_PICTURED = 100
+"""Images with pictures on the page; of more, these are evenly spread, and a table lists the others."""
+
+
+def pictured(images: int) -> list[int]:
+    """Numbers of the images with pictures on the page."""
+    spread = np.rint(np.linspace(0, images - 1, min(images, MAX_PICTURED)))
+    return [int(number) for number in np.unique(spread)]
+
 
 @dataclass(frozen=True)
 class ReportData:

@@ -28,7 +28,10 @@ _INK, _ACCENT, _PANEL = "#1b2733", "#ff9f43", "#131a22"
 # Lightness falls evenly, so that the order is visible in grey and for colour-blind readers.
 _PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1f8089"], [1.0, "#0b4a5c"]]
 _REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
-MAX_MATRIX = 200
+MAX_MATRIX, MAX_CELLS = 200, 100
+"""Largest number of views in the matrix of pairs, and cells per side for more."""
+MAX_PYRAMIDS = 250
+"""Cameras that are drawn as pyramids; of more, these are evenly spread."""
 _MAX_ANNOTATED = 14
 
 
@@ -167,9 +170,11 @@ def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
 
 
 def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
-    """Draw all pyramids as one line trace: rim, roof over the upper edge, four edges; None interrupts it."""
+    """Draw pyramids as one line trace: rim, roof over the upper edge, four edges; None interrupts it."""
     rows: list[list[float] | None] = []
-    for centre, corners in zip(scene.centres, scene.corners, strict=True):
+    count = len(scene.centres)
+    shown = np.unique(np.rint(np.linspace(0, count - 1, min(count, MAX_PYRAMIDS))).astype(int))
+    for centre, corners in zip(scene.centres[shown], scene.corners[shown], strict=True):
         top = corners[:2].mean(axis=0) + 0.25 * (corners[:2].mean(axis=0) - corners.mean(axis=0))
         strokes = [[*corners, corners[0]], [corners[0], top, corners[1]]]
         strokes += [[centre, corner] for corner in corners]
@@ -184,7 +189,7 @@ def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
 
 def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:
     """Matrix of verified matches on a logarithmic scale, rejected pairs in red, of many views by blocks."""
-    block = max(1, -(-len(names) // MAX_MATRIX))
+    block = 1 if len(names) <= MAX_MATRIX else -(-len(names) // MAX_CELLS)
     labels = [_block_label(first, block, names) for first in range(0, len(names), block)]
     accepted, refused = (_count_matrix(pairs, len(labels), block, wanted) for wanted in (True, False))
     refused[accepted >= 0] = -1

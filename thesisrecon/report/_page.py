@@ -35,7 +35,14 @@ from thesisrecon.report._assessment import (
     plus_minus,
     significant,
 )
-from thesisrecon.report._data import ReportData, point_colors, reprojection_distances, summarize_distances
+from thesisrecon.report._data import (
+    MAX_PICTURED,
+    ReportData,
+    pictured,
+    point_colors,
+    reprojection_distances,
+    summarize_distances,
+)
 from thesisrecon.report._drawing import (
     DIFFERENCE_LIMIT,
     SCALE,
@@ -46,7 +53,14 @@ from thesisrecon.report._drawing import (
     embed_jpeg,
     thumbnail,
 )
-from thesisrecon.report._figures import MAX_POINTS, build_scene, histograms, pair_matrix_figure, scene_figure
+from thesisrecon.report._figures import (
+    MAX_POINTS,
+    MAX_PYRAMIDS,
+    build_scene,
+    histograms,
+    pair_matrix_figure,
+    scene_figure,
+)
 from thesisrecon.report._viewer import viewer_data
 
 _FRAME_SIDE_PX, _FRAME_QUALITY = 960, 85
@@ -154,9 +168,11 @@ def render_report(data: ReportData) -> str:
     if data.model is not None and len(data.model.faces) and data.metric is not None:
         names = [image.name for image in data.images]
         model = viewer_data(data.model, data.metric.reconstruction, names)
-    depths, side = sorted(data.depth_maps.items()), depth_side(len(data.depth_maps))
+    depths = [(i, data.depth_maps[i]) for i in pictured(len(data.images)) if i in data.depth_maps]
+    side = depth_side(_sharing(len(data.depth_maps)))
     figure_scripts, drawing = figure_content(figures)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
+    cards = _cards(data, distances, bars)
     return render_page(
         page_resource("template.html.j2"),
         [*figure_scripts, *model_scripts],
@@ -166,7 +182,8 @@ def render_report(data: ReportData) -> str:
         assessment=assess(data),
         facts=key_facts(data, overall),
         overall=overall,
-        cards=_cards(data, distances, bars),
+        cards=cards,
+        unpictured=[card for card in cards if card["picture"] is None],
         intrinsic_columns=_intrinsic_columns(data),
         limit_px=limit_px,
         model=model,
@@ -178,6 +195,7 @@ def render_report(data: ReportData) -> str:
         **drawing,
         shown_points=shown,
         most_points=MAX_POINTS,
+        most_pyramids=MAX_PYRAMIDS,
         all_points=int(best.valid.sum()) if best is not None else 0,
         pair_selection=pair_selection_text(data),
         drawn_pairs=_drawn_pairs(data),
@@ -185,10 +203,25 @@ def render_report(data: ReportData) -> str:
         stages=_stages(data.reports),
         warnings=_warnings(data),
         self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
-        summary_text=json.dumps(data.summary, indent=2, ensure_ascii=False, default=str),
+        summary_text=json.dumps(_shortened(data.summary), indent=2, ensure_ascii=False, default=str),
         model_scripts=model_scripts,
         histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
     )
+
+
+def _sharing(images: int) -> int:
+    """The number of pictures for which a kind of picture has space; half of it if not all are shown."""
+    return min(images, 2 * MAX_PICTURED)
+
+
+def _shortened(summary: Mapping[str, object]) -> dict[str, object]:
+    """The summary without lists of more entries than images with pictures."""
+    return {
+        name: f"{len(value)} entries, see summary.json"
+        if isinstance(value, list) and len(value) > MAX_PICTURED
+        else value
+        for name, value in summary.items()
+    }
 
 
 def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
@@ -211,8 +244,9 @@ def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
 
 
 def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict[str, Any]]:
-    """Each image on the page: its state, the reason, and its residuals if it has a camera."""
+    """Each image: its state, the reason, its residuals if it has a camera, and perhaps its picture."""
     cards, intrinsics = [], data.original_intrinsics
+    shown = pictured(len(data.images))
     for i, image in enumerate(data.images):
         state, level, reason = _state(data, i)
         (width, height), (w, h) = image.original_size, image.size
@@ -225,7 +259,7 @@ def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict
             "level": level,
             "reason": reason,
             "size": f"{width} × {height} px{processed}{masked}",
-            "picture": thumbnail(image, len(data.images)),
+            "picture": thumbnail(image, _sharing(len(data.images))) if i in shown else None,
             "residuals": summarize_distances(distances[i]),
             "bars": bars[i],
             "intrinsics": {name: plus_minus(v.value, v.std) for name, v in intrinsics[i].items()},

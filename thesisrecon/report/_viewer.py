@@ -14,6 +14,7 @@ from PIL import Image as PillowImage
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import Reconstruction, TexturedMesh
+from thesisrecon.report._data import pictured
 from thesisrecon.report._drawing import embed_jpeg
 from thesisrecon.report._figures import upright_rotation
 
@@ -39,8 +40,8 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
 
     ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
     uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints`` of the
-    images, the most central one as ``start``. Faces beyond 8 times the 95 % quantile from the median are left
-    out.
+    images with pictures, the most central one as ``start``. Faces beyond 8 times the 95 % quantile from the
+    median are left out.
     """
     mesh = _without_outliers(mesh)
     views = np.flatnonzero(reconstruction.registered).tolist()
@@ -51,7 +52,8 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     steps = np.where(high > low, high - low, 1.0) / LEVELS
     positions = np.rint(np.clip((vertices - low) / steps, 0, LEVELS)).astype("<u2")
     color, faces, vertex = _colored(mesh)
-    places = _viewpoints(mesh, reconstruction, upright, names)
+    shown = sorted(set(views) & set(pictured(len(names)))) or views[:1]
+    places = _viewpoints(mesh, reconstruction, upright, names, shown)
     eyes = np.array([place["eye"] for place in places])
     middle = int(np.argmin(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
     return {
@@ -104,11 +106,11 @@ def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
 
 
 def _viewpoints(
-    mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str]
+    mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str], views: list[int]
 ) -> list[dict[str, Any]]:
-    """The viewpoints of the registered images, in the axes of the viewer, with target and field of view."""
+    """The viewpoints of images, in the axes of the viewer, with target and field of view."""
     found = []
-    for i in np.flatnonzero(reconstruction.registered).tolist():
+    for i in views:
         K, R, t = decompose_camera(reconstruction.P[i])
         size = reconstruction.sizes[i].astype(np.float64)
         field = size / 2 / np.diag(K)[:2]

@@ -19,7 +19,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import OutputError, UsageError, WorkersLost, unknown_word
 from thesisrecon.records import StageReport
 from thesisrecon.runtime._executors import Workers, available_threads
-from thesisrecon.runtime._run_folder import ChangedRecord, RunDirectory, key_of
+from thesisrecon.runtime._run_folder import ChangedRecord, RunDirectory, StageFolder, key_of
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
@@ -69,6 +69,35 @@ class _StageLog:
     seconds: float = 0.0
     keys: dict[str, str] = field(default_factory=dict)
     computed: int = 0
+
+
+class StoredRecords(Sequence[Any]):
+    """Records of items (item -> key) of a stage: up to ``max_bytes`` in memory, the others in their files."""
+
+    def __init__(self, folder: StageFolder, keys: Mapping[str, str], max_bytes: float) -> None:
+        self._folder, self._keys, self._left = folder, list(keys.items()), max_bytes
+        self._held: dict[int, Any] = {}
+
+    def hold(self, n: int, record: Any) -> None:
+        """Keep a record in memory if there is space."""
+        size = sum(value.nbytes for value in vars(record).values() if isinstance(value, np.ndarray))
+        if size <= self._left:
+            self._held[n], self._left = record, self._left - size
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def __getitem__(self, n: Any) -> Any:
+        if isinstance(n, slice):
+            return [self[k] for k in range(*n.indices(len(self)))]
+        item, key = self._keys[n]
+        record = self._held.get(n % len(self._keys))
+        if record is None:
+            record = self._folder.load(item, key)
+        if record is None:
+            place = f"{self._folder.path}/{item}.npz"
+            raise UsageError(f"{place} was removed or changed while the run used it; repeat the command")
+        return record
 
 
 @dataclass
@@ -124,22 +153,21 @@ class Run:
                 self.directory.stage(FOLDERS[stage]).save(item, key, record)
             return record
 
-    def _loaded(self, stage: str, keys: Mapping[str, str]) -> list[Any]:
+    def _loaded(self, stage: str, keys: Mapping[str, str]) -> Iterator[Any]:
         """Cached records of items, None if missing; warns of changed ones."""
         folder = self.directory.stage(FOLDERS[stage])
-        records: list[Any] = []
         changed: list[str] = []
         for item, key in keys.items():
             try:
-                records.append(folder.load(item, key))
+                record = folder.load(item, key)
             except ChangedRecord:
-                records.append(None)
+                record = None
                 changed.append(f"{FOLDERS[stage]}/{item}.npz")
+            yield record
         if changed:
             more, were = (f" and {len(changed) - 1} more", "were") if len(changed) > 1 else ("", "was")
             how = f"damaged or changed by another program and {were} computed again"
             self.warnings.append(f"{changed[0]}{more} {were} {how}")
-        return records
 
     def map_cached(
         self,
@@ -147,16 +175,28 @@ class Run:
         keys: Mapping[str, str],
         function: Callable[..., Sequence[Any]],
         batches: Callable[[Sequence[int]], Iterable[Batch]],
-    ) -> list[Any]:
-        """The records of all items (item -> key) of a stage, missing ones computed by the workers."""
+        *,
+        max_bytes: float = np.inf,
+        silent: bool = False,
+    ) -> StoredRecords:
+        """The records of all items (item -> key) of a stage, missing ones computed by the workers.
+
+        Records beyond ``max_bytes`` are read from their files when they are used; ``silent``: no progress.
+        """
+        progress = (lambda *_: None) if silent else self.progress
         with self.clock(stage) as log:
             log.keys.update(keys)
             folder = self.directory.stage(FOLDERS[stage])
             names = list(keys)
-            records = self._loaded(stage, keys)
-            missing = [n for n, record in enumerate(records) if record is None]
+            records = StoredRecords(folder, keys, max_bytes)
+            missing = []
+            for n, record in enumerate(self._loaded(stage, keys)):
+                if record is None:
+                    missing.append(n)
+                else:
+                    records.hold(n, record)
             done = len(names) - len(missing)
-            self.progress(stage, done, len(names))
+            progress(stage, done, len(names))
             submitted: list[Sequence[int]] = []
 
             def tasks() -> Iterator[tuple[Any, ...]]:
@@ -167,10 +207,10 @@ class Run:
             def finished(k: int, found: Sequence[Any]) -> None:
                 nonlocal done
                 for n, record in zip(submitted[k], found, strict=True):
-                    records[n] = record
+                    records.hold(n, record)
                     folder.save(names[n], keys[names[n]], record)
                 done, log.computed = done + len(found), log.computed + len(found)
-                self.progress(stage, done, len(names))
+                progress(stage, done, len(names))
 
             self.workers.run(function, tasks(), finished)
             return records

@@ -72,6 +72,8 @@ def _select_neighbours(
     observe count less, and so does a view whose baseline has the direction of an earlier one, because views
     from other sides see what is occluded.
     """
+    own = np.flatnonzero(points.seen[view])
+    points = replace(points, X=points.X[own], seen=points.seen[:, own])
     centres = {i: dehomogenize(camera_centre(views[i].P)) for i in views}
     worth: dict[int, F64] = {}
     direction: dict[int, F64] = {}
@@ -96,8 +98,8 @@ def _select_neighbours(
 
 
 def _weights(points: SparsePoints, centres: Mapping[int, F64], view: int, other: int) -> F64 | None:
-    """Weights (N,) of the points seen with ``other``, None if it cannot be a neighbour."""
-    common = points.seen[view] & points.seen[other]
+    """Weights (N,) of the points that ``other`` sees too, None if it cannot be a neighbour."""
+    common = points.seen[other]
     if int(common.sum()) < MIN_POINTS:
         return None
     a, b = (points.X[common] - centres[i] for i in (view, other))
@@ -291,9 +293,12 @@ class MultiViewStereo:
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
         registered = np.flatnonzero(reconstruction.registered).tolist()
 
-        def undistorted(view: int) -> list[PinholeView]:
-            sides = self.max_side, min(self.match_side, self.max_side)
-            return [pinhole_view(images[view], reconstruction, view, max_side=side) for side in sides]
+        def undistorted(view: int) -> tuple[PinholeView, PinholeView]:
+            image, side = images[view], min(self.match_side, self.max_side)
+            whole = pinhole_view(image, reconstruction, view, max_side=self.max_side)
+            if min(max(image.size), self.max_side) <= side:
+                return whole, whole
+            return whole, pinhole_view(image, reconstruction, view, max_side=side)
 
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             made = dict(zip(registered, pool.map(undistorted, registered), strict=True))
@@ -350,7 +355,8 @@ class MultiViewStereo:
         mutual = {j for j, chosen in scene.neighbours.items() if view in chosen}
         near = (mutual | set(scene.neighbours[view])) - {view}
         seen = scene.points.seen
-        common = {j: int(np.sum(seen[view] & seen[j])) for j in scene.views if j not in near | {view}}
+        both = seen[:, np.flatnonzero(seen[view])].sum(axis=1)
+        common = {j: int(both[j]) for j in scene.views if j not in near | {view}}
         order = sorted((j for j in common if common[j]), key=lambda j: (-common[j], j))
         return sorted(near | set(order[: max(self.min_comparison_views - len(near), 0)]))
 

@@ -84,28 +84,47 @@ def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequ
     return quality
 
 
-def choose_views(quality: F32, neighbours: I64) -> I64:
+def choose_views(
+    mesh: TexturedMesh,
+    views: Sequence[PinholeView],
+    buffers: Sequence[F32],
+    neighbours: I64,
+    *,
+    threads: int = 1,
+) -> I64:
     """Choose the view (M,) from which each face is textured, -1 if no view sees it.
 
     Shares of the best quality are diffused over faces among the views that see them, and small charts join
     the neighbour with the longest common border: the best view of each face alone would give many small
-    charts.
+    charts. Eight views are in memory at a time.
     """
-    if not quality.size:
-        return np.full(len(quality), -1, dtype=np.int64)
-    visible = quality > 0.0
-    share = quality / np.maximum(quality.max(axis=1, keepdims=True), np.float32(1e-20))
-    spread, other = share.copy(), np.empty_like(share)
-    for _ in range(SMOOTH_ROUNDS):
-        diffuse(share, neighbours, OWN_WEIGHT, spread, other)
-        spread, other = other, spread
-    label = np.where(visible.any(axis=1), spread.argmax(axis=1), -1)
-    # Faces that the diffusion left without shares take their best view.
-    lost = visible.any(axis=1) & (spread.max(axis=1) <= 0.0)
-    label[lost] = share[lost].argmax(axis=1)
+    visible = np.zeros((len(mesh.faces), -(-len(views) // 8)), dtype=np.uint8)
+    label = np.full(len(mesh.faces), -1, dtype=np.int64)
+    best, most = np.zeros((2, len(mesh.faces)), dtype=np.float32)
+
+    def see(first: int) -> tuple[F32, I64]:
+        quality = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
+        visible[:, first // 8] = np.packbits(quality > 0.0, axis=1)[:, 0]
+        return quality.max(axis=1), first + quality.argmax(axis=1)
+
+    def spread_shares(first: int) -> tuple[F32, I64]:
+        share = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
+        share /= np.maximum(best, np.float32(1e-20))[:, None]
+        spread, other = share.copy(), np.empty_like(share)
+        for _ in range(SMOOTH_ROUNDS):
+            diffuse(share, neighbours, OWN_WEIGHT, spread, other)
+            spread, other = other, spread
+        return spread.max(axis=1), first + spread.argmax(axis=1)
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        # Faces that the diffusion leaves without shares keep their best view.
+        for highest, work in ((best, see), (most, spread_shares)):
+            for value, view in pool.map(work, range(0, len(views), 8)):
+                higher = value > highest
+                highest[higher], label[higher] = value[higher], view[higher]
     for _ in range(3):
         label = _join_small(label, visible, neighbours)
-    return label.astype(np.int64)
+    return label
 
 
 def label_charts(label: I64, neighbours: I64) -> I64:
@@ -116,25 +135,31 @@ def label_charts(label: I64, neighbours: I64) -> I64:
     return components(face[same], other[same], len(label))
 
 
-def _join_small(label: I64, visible: B8, neighbours: I64) -> I64:
+def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
+    """Small charts join a neighbour; the bits of ``visible`` (M, V / 8) tell the views that see a face."""
     chart = label_charts(label, neighbours)
     faces = np.bincount(chart)
     small = (faces[chart] < MIN_CHART_FACES) & (label >= 0)
     # A chart can take over a view that sees all of its faces.
-    sees = np.ones((len(faces), visible.shape[1]), dtype=bool)
-    np.logical_and.at(sees, chart[small], visible[small])
-    border = np.zeros((len(faces), visible.shape[1]))
-    for k in range(3):
-        other = neighbours[:, k]
-        crossing = small & (other >= 0) & (label[other] >= 0) & (label[other] != label)
-        np.add.at(border, (chart[crossing], label[other[crossing]]), 1.0)
-    border[~sees] = 0.0
-    joins = small & (border[chart].max(axis=1) > 0.0)
-    return np.where(joins, border[chart].argmax(axis=1), label)
+    sees = np.full((len(faces), visible.shape[1]), 255, dtype=np.uint8)
+    np.bitwise_and.at(sees, chart[small], visible[small])
+    face, side = np.nonzero(small[:, None] & (neighbours >= 0))
+    view = label[neighbours[face, side]]
+    crossing = (view >= 0) & (view != label[face])
+    borders, length = np.unique(
+        np.column_stack([chart[face[crossing]], view[crossing]]), axis=0, return_counts=True
+    )
+    common = (sees[borders[:, 0], borders[:, 1] // 8] >> (7 - borders[:, 1] % 8)) & 1 > 0
+    (chart_of, view_of), length = borders[common].T, length[common]
+    # The last assignment counts: the longest border, of equal ones the first view.
+    order = np.lexsort((-view_of, length))
+    joined = np.full(len(faces), -1)
+    joined[chart_of[order]] = view_of[order]
+    return np.where(small & (joined[chart] >= 0), joined[chart], label)
 
 
-POINTS_PER_CHUNK = 1 << 17
-"""Points processed at a time, which bounds the memory."""
+POINTS_PER_CHUNK, OBSERVED = 1 << 17, 1 << 22
+"""Points, and points times views, processed at a time, which bounds the memory."""
 STRIP_ROWS = 64
 """Rows of the texture processed at a time."""
 RIM_TEXELS = 1
@@ -148,7 +173,7 @@ OUTLINE_PX = 10.0
 MIN_TRUST = 1e-3
 """Weight of pixels at outlines and image borders, which count where no other image shows the point."""
 GAIN_POINTS = 50_000
-"""Points at which image gains are estimated."""
+"""Points at which image gains are estimated, fewer of more than 80 views."""
 DARK, BRIGHT = 16.0, 240.0
 """Colours outside this range are clipped or noisy and not used for gains."""
 POWER = 2.0
@@ -197,7 +222,7 @@ def prepare_views(
     """The surface as each view sees it, with gains that equalise the brightness of the views."""
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         prepared = list(pool.map(_prepared, views, buffers))
-    stride = max(1, len(mesh.vertices) // GAIN_POINTS)
+    stride = max(1, len(mesh.vertices) // min(GAIN_POINTS, OBSERVED // max(len(views), 1)))
     points, normals = (np.ascontiguousarray(a[::stride]) for a in (mesh.vertices, vertex_normals(mesh)))
     weight, color = _observe(prepared, points, normals)
     gains = _equalizing_gains(weight, color)
@@ -217,8 +242,9 @@ def blend_colors(views: Sequence[ViewSurface], points: F64, normals: F64) -> tup
     """Colours (N, 3) of points with outward normals, and whether any view shows the point."""
     out = np.zeros((len(points), 3), dtype=np.float32)
     shown = np.zeros(len(points), dtype=bool)
-    for first in range(0, len(points), POINTS_PER_CHUNK):
-        some = slice(first, first + POINTS_PER_CHUNK)
+    chunk = min(POINTS_PER_CHUNK, OBSERVED // max(len(views), 1))
+    for first in range(0, len(points), chunk):
+        some = slice(first, first + chunk)
         weight, color = _observe(views, points[some], normals[some])
         combine_colors(weight, color, POWER, SCATTER, out[some])
         shown[some] = weight.max(axis=0, initial=0.0) > 0.0

@@ -8,11 +8,11 @@ vertex per cell, which avoids the slivers of marching cubes. :class:`DepthSheets
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,8 @@ MAX_RELATIVE = 0.02
 """Relative depth difference, or three standard deviations, up to which a sheet already shows a point."""
 VOXEL_GROWTH = 1.15
 """Factor by which voxels are enlarged until the blocks fit into memory."""
+GROUP_BYTES, MEDIAN_PIXELS = 2**30, 2**26
+"""Prepared depth maps in memory at a time, and pixels from which the voxel size is computed."""
 SLAB_BLOCKS, TASK_BLOCKS = 8192, 512
 """Blocks in memory at a time, besides a layer before and after them, and blocks of one task."""
 MAX_STD_VOXELS = 1.0
@@ -119,22 +121,26 @@ class VolumetricFusion:
     def _fused(self, depth_maps: Sequence[DepthMap], threads: int) -> tuple[TexturedMesh, F64, float]:
         """The surface of all voxels, the standard deviation at its vertices, and the voxel size."""
         with ThreadPoolExecutor(max(threads, 1)) as pool:
-            measured = list(pool.map(_measured, depth_maps))
-            grid, truncation, measured = self._lay_out(measured)
-            return *_Extraction(grid, truncation, measured, pool).surface(), grid.voxel
+            measured = _PreparedMaps(depth_maps, pool)
+            grid = self._lay_out(measured)
+            return *_Extraction(grid, measured, pool).surface(), grid.voxel
 
-    def _lay_out(self, measured: list[_FusionMap]) -> tuple[_Grid, float, list[_FusionMap]]:
-        """Voxel grid, truncation distance, and the depths that are certain enough for it."""
-        footprints = [(m.samples.depth / np.float32(m.focal))[np.isfinite(m.samples.depth)] for m in measured]
+    def _lay_out(self, measured: _PreparedMaps) -> _Grid:
+        """Voxel grid; leaves the depths that are certain enough for its truncation distance."""
+        step = max(1, -(-len(measured.maps) * measured.pixels // MEDIAN_PIXELS))
+        footprints = [
+            (m.samples.depth / np.float32(m.focal))[np.isfinite(m.samples.depth)][::step]
+            for group in measured
+            for m in group
+        ]
         if not sum(map(len, footprints)):
             raise _nothing_to_fuse()
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
-            truncation = TRUNCATION_VOXELS * voxel
-            certain = [m.without_uncertain_depths(truncation) for m in measured]
-            grid = _grid(certain, voxel, truncation)
+            measured.limit(TRUNCATION_VOXELS * voxel)
+            grid = _grid(measured, voxel)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
-                return grid, truncation, certain
+                return grid
             voxel *= VOXEL_GROWTH
 
 
@@ -153,11 +159,43 @@ class _FusionMap:
         depth = np.where(certain, self.samples.depth, np.float32(np.nan))
         return replace(self, samples=self.samples._replace(depth=depth))
 
+    def camera(self, origin: F64) -> F64:
+        """K [R t] with another origin."""
+        K, R, t = decompose_camera(self.P)
+        return np.asarray(K @ np.column_stack([R, t + R @ origin]))
+
     @property
     def rays(self) -> tuple[F64, F64]:
         """Matrix (3, 3) from (x, y, 1) to the point at depth 1 minus the centre, and the centre (3,)."""
         K, R, t = decompose_camera(self.P)
         return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
+
+
+class _PreparedMaps:
+    """Depth maps prepared for fusion, in groups of ``GROUP_BYTES``; several groups are made for each use."""
+
+    def __init__(self, maps: Sequence[DepthMap], pool: ThreadPoolExecutor) -> None:
+        self.maps, self.pool, self.truncation = maps, pool, np.inf
+        self.pixels = maps[0].depth.size if len(maps) else 0
+        self.size = max(1, GROUP_BYTES // (12 * max(self.pixels, 1)))
+        self.whole = self.certain = self._group(0) if len(maps) <= self.size else None
+
+    def _group(self, first: int) -> list[_FusionMap]:
+        some = range(first, min(first + self.size, len(self.maps)))
+        return list(self.pool.map(lambda n: _measured(self.maps[n]), some))
+
+    def limit(self, truncation: float) -> None:
+        """Leave out depths whose standard deviation across the surface exceeds the truncation."""
+        self.truncation = truncation
+        if self.whole is not None:
+            self.certain = [one.without_uncertain_depths(truncation) for one in self.whole]
+
+    def __iter__(self) -> Iterator[list[_FusionMap]]:
+        if self.certain is not None:
+            yield self.certain
+            return
+        for first in range(0, len(self.maps), self.size):
+            yield [one.without_uncertain_depths(self.truncation) for one in self._group(first)]
 
 
 def _measured(depth_map: DepthMap) -> _FusionMap:
@@ -219,10 +257,10 @@ def _without_grazing(depth_map: DepthMap, slope: float) -> F32:
     return np.where(flat, np.float32(np.nan), depth)
 
 
-def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid | None:
-    """Blocks within ``reach`` of any depth; None if their bounding box is too large."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for one in measured:
+def _grid(measured: _PreparedMaps, voxel: float) -> _Grid | None:
+    """Blocks within the truncation of any depth; None if their bounding box is too large."""
+    low, high, reach = np.full(3, np.inf), np.full(3, -np.inf), measured.truncation
+    for one in chain.from_iterable(measured):
         directions, centre = one.rays
         depth = one.samples.depth
         y, x = np.nonzero(np.isfinite(depth))
@@ -237,7 +275,7 @@ def _grid(measured: Sequence[_FusionMap], voxel: float, reach: float) -> _Grid |
     if np.prod(shape.astype(float)) > 2e8:
         return None
     marked = np.zeros(tuple(shape), dtype=np.uint8)
-    for one in measured:
+    for one in chain.from_iterable(measured):
         directions, centre = one.rays
         touched_blocks(one.samples, directions, centre - origin, reach, edge, marked)
     blocks = np.argwhere(marked).astype(np.int64)
@@ -253,13 +291,8 @@ class _Extraction:
     too: its faces use vertices of the former, and its cells voxels of the latter.
     """
 
-    def __init__(
-        self, grid: _Grid, truncation: float, measured: Sequence[_FusionMap], pool: ThreadPoolExecutor
-    ) -> None:
-        poses = [decompose_camera(one.P) for one in measured]
-        cameras = [K @ np.column_stack([R, t + R @ grid.origin]) for K, R, t in poses]
-        self.views = [(one.samples, P) for one, P in zip(measured, cameras, strict=True)]
-        self.grid, self.truncation, self.pool = grid, truncation, pool
+    def __init__(self, grid: _Grid, measured: _PreparedMaps, pool: ThreadPoolExecutor) -> None:
+        self.grid, self.measured, self.pool = grid, measured, pool
 
     def surface(self) -> tuple[TexturedMesh, F64]:
         """Return the surface and the standard deviation at each vertex: weights are inverse variances."""
@@ -302,15 +335,15 @@ class _Extraction:
             for array in (old.value, old.weight, old.vertex)
         )
 
-        def integrate(part: tuple[int, int]) -> None:
-            rows = slice(*part)
+        def integrate(group: Sequence[_FusionMap], part: tuple[int, int]) -> None:
+            rows, truncation = slice(*part), self.measured.truncation
             blocks = self.grid.blocks[begin + part[0] : begin + part[1]]
-            for samples, P in self.views:
-                integrate_view(
-                    blocks, self.grid.voxel, P, samples, self.truncation, value[rows], weight[rows]
-                )
+            for one in group:
+                P = one.camera(self.grid.origin)
+                integrate_view(blocks, self.grid.voxel, P, one.samples, truncation, value[rows], weight[rows])
 
-        list(self.pool.map(integrate, pairwise([*range(done, size, TASK_BLOCKS), size])))
+        for group in self.measured:
+            list(self.pool.map(partial(integrate, group), pairwise([*range(done, size, TASK_BLOCKS), size])))
         return old._replace(first=begin, value=value, weight=weight, vertex=vertex)
 
 

@@ -21,11 +21,19 @@ class SurfaceModel:
     ----------
     surface, fusion, atlas
         Surface fitted to each depth map, fusion of these surfaces, and texture of the result.
+    max_glb_mb : float
+        Largest size of model.glb in megabytes, at least 5; the mesh of a larger one is reduced, and
+        model-full.glb holds all of it.
     """
 
     surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)
     fusion: VolumetricFusion | DepthSheets = field(default_factory=VolumetricFusion)
     atlas: TextureAtlas = field(default_factory=TextureAtlas)
+    max_glb_mb: float = 50.0
+
+    def __post_init__(self) -> None:
+        if not self.max_glb_mb >= 5.0:
+            raise ValueError(f"max_glb_mb must be at least 5; got {self.max_glb_mb}")
 
     def build(
         self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
@@ -45,9 +53,10 @@ class SurfaceModel:
         -------
         TexturedMesh
         """
-        with ThreadPoolExecutor(max(threads, 1)) as pool:
-            fitted = list(pool.map(self.surface.smooth, depth_maps))
-        return self.fusion.fuse(fitted, threads=threads)
+        if isinstance(self.surface, BSplineSurface):
+            with ThreadPoolExecutor(max(threads, 1)) as pool:
+                depth_maps = list(pool.map(self.surface.smooth, depth_maps))
+        return self.fusion.fuse(depth_maps, threads=threads)
 
     def color(
         self,

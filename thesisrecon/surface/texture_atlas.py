@@ -19,7 +19,6 @@ from thesisrecon.surface._mesh import face_neighbours
 from thesisrecon.surface._texture_blending import (
     choose_views,
     depth_buffers,
-    face_quality,
     label_charts,
     paint_texture,
     prepare_views,
@@ -75,8 +74,7 @@ class TextureAtlas:
         """
         neighbours = face_neighbours(mesh.faces)
         buffers = depth_buffers(mesh, views, threads=threads)
-        quality = face_quality(mesh, views, buffers)
-        label = choose_views(quality, neighbours)
+        label = choose_views(mesh, views, buffers, neighbours, threads=threads)
         if not (label >= 0).any():
             raise StageFailure("the surface has no texture", "no image shows any part of it")
         chart = label_charts(label, neighbours)
