@@ -22,12 +22,12 @@ from thesisrecon.matching.pair_selection import (
     ListedPairs,
     OverlapEstimate,
     SequenceWindow,
-    _best_of_each,
     _connecting_pairs,
     _count_agreeing,
     _most_similar,
     _overlap_evidence,
     _pair_array,
+    _ranks,
     _subset_seeds,
     _word_weights,
     pairs_to_connect,
@@ -177,6 +177,24 @@ def test_pairs_that_overlap_are_chosen_and_few_others(windows):
     assert str(choice.compared) in choice.how
 
 
+def test_of_many_pairs_the_best_and_some_of_the_rest_are_taken(windows, monkeypatch):
+    every = list(combinations(range(CROPS), 2))
+    monkeypatch.setattr(pair_selection, "_evidence", lambda a, b: float(evidence[a, b]))
+    monkeypatch.setattr(OverlapEstimate, "_subsets", lambda *_: next(numbers))
+    evidence = np.random.default_rng(1).uniform(5.0, 9.0, (CROPS, CROPS))
+    for most, spread in ((2, 0), (2, 3), (CROPS, 0)):
+        numbers = iter(range(CROPS))
+        few = replace(ESTIMATE, shortlist=CROPS, most=most, spread=spread)
+        chosen = as_set(choose(few, CROPS, windows.features).pairs)
+        for k in range(CROPS):
+            mine = sorted((p for p in every if k in p), key=lambda p: -evidence[p])
+            assert set(mine[:most]) <= chosen
+            # As many steps between the taken ones of the rest.
+            rest = [mine.index(pair) for pair in mine[most:] if pair in chosen]
+            assert len(rest) >= min(spread, len(mine) - most)
+        assert len(chosen) <= CROPS * (most + spread) + CROPS
+
+
 def test_every_photograph_is_paired_and_all_hang_together(windows):
     strict = replace(ESTIMATE, min_evidence=1e9)
     pairs = choose(strict, CROPS, windows.features).pairs
@@ -246,7 +264,7 @@ def test_the_most_alike_of_each(n, count, seed):
     alike = words @ words.T
     pairs = as_set(_most_similar(words, count))
     every = list(combinations(range(n), 2))
-    best = _best_of_each(np.array(every), np.array([alike[pair] for pair in every]), n, count)
+    best = (_ranks(np.array(every), np.array([alike[pair] for pair in every]), n) < count).any(axis=0)
     assert pairs == {pair for pair, taken in zip(every, best, strict=True) if taken}
     for i in range(n):
         others = sorted((j for j in range(n) if j != i), key=lambda j: -alike[i, j])[:count]

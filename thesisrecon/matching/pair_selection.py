@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.kernels import kernel
 from thesisrecon.matching._seeds import mutual_best
@@ -169,9 +169,9 @@ class OverlapEstimate:
         Minimum -log10 of the number of false alarms.
     nearest : int
         Pairs of each image that are always taken.
-    most : int
-        Number of pairs of each image beyond which more evidence is not needed: a pair is taken if it is among
-        the best ``most`` of one of its images.
+    most, spread : int
+        Number of pairs taken for each image, the best of those with enough evidence, and number taken evenly
+        from the rest: wider steps, so that many images from nearly one place do not keep to themselves.
     shortlist : int
         Number of images that each is compared with.
     words : int
@@ -181,12 +181,13 @@ class OverlapEstimate:
     all_up_to: int = 30
     min_evidence: float = 0.5
     nearest: int = 3
-    most: int = 20
+    most: int = 12
+    spread: int = 4
     shortlist: int = 40
     words: int = 1024
 
     def __post_init__(self) -> None:
-        least = {"all_up_to": 0, "nearest": 1, "most": 1, "shortlist": 1, "words": 1}
+        least = {"all_up_to": 0, "nearest": 1, "most": 1, "spread": 0, "shortlist": 1, "words": 1}
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}; got {getattr(self, name)}")
@@ -207,8 +208,12 @@ class OverlapEstimate:
             words = np.hstack([_word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds])
             compared = _most_similar(words, self.shortlist)
         evidence = np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), compared.tolist()))
-        best, near = (_best_of_each(compared, evidence, n, count) for count in (self.most, self.nearest))
-        chosen = compared[best & (evidence >= self.min_evidence) | near]
+        rank, enough = _ranks(compared, evidence, n), evidence >= self.min_evidence
+        # Of the further pairs of an image, those at which the number that is due grows.
+        further = np.bincount(compared[enough].ravel(), minlength=n)[compared.T] - self.most
+        steps = [(rank - self.most + k) * self.spread // np.maximum(further, 1) for k in (0, 1)]
+        taken = (rank < self.most) | (steps[1] > steps[0])
+        chosen = compared[(enough & taken.any(axis=0)) | (rank < self.nearest).any(axis=0)]
         chosen = _pair_array([*chosen, *_connecting_pairs(chosen, compared, evidence, words)])
         how = (
             f"pairs with overlap evidence among {len(compared)} compared pairs, and the best "
@@ -240,15 +245,14 @@ def _most_similar(words: F64, count: int) -> I64:
     return _pair_array(pairs)
 
 
-def _best_of_each(pairs: I64, value: F64, n: int, count: int) -> B8:
-    """Whether each pair (M, 2) is among the ``count`` of highest value of one of its images."""
+def _ranks(pairs: I64, value: F64, n: int) -> I64:
+    """Rank (2, M) of each pair (M, 2) among the pairs of both of its images; 0 is the highest value."""
     image, number = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.lexsort((number, -value[number], image))
     start = np.searchsorted(image[order], np.arange(n))
-    rank = np.arange(len(order)) - start[image[order]]
-    best = np.zeros(len(pairs), dtype=bool)
-    best[number[order[rank < count]]] = True
-    return best
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - start[image[order]]
+    return rank.reshape(2, -1)
 
 
 def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: F64) -> I64:
