@@ -181,8 +181,8 @@ class OverlapEstimate:
     all_up_to: int = 30
     min_evidence: float = 0.5
     nearest: int = 3
-    most: int = 12
-    spread: int = 4
+    most: int = 10
+    spread: int = 2
     shortlist: int = 40
     words: int = 1024
 
