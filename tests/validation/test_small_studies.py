@@ -177,7 +177,7 @@ def test_a_longer_walk_begins_with_the_shorter_and_looks_at_the_yard():
 def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_path):
     CALLS.clear()
     meter = Meter()
-    reconstruct(photographs(4), tmp_path, config=fake_config(), until="metric", progress=meter.progress)
+    reconstruct(photographs(4), tmp_path, config=fake_config(), until="model", progress=meter.progress)
     meter.enter("end")
     assert set(growth.STAGES) <= set(meter.cpu_s)
     assert all(peak > 20.0 for peak in meter.peak_mb.values())

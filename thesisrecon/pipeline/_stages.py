@@ -393,6 +393,7 @@ def estimate_depth_maps(state: PipelineState) -> None:
     run, result = state.run, state.result
     assert result.metric is not None
     reconstruction, dense = result.metric.reconstruction, state.config.dense
+    run.progress("dense", 0, int(reconstruction.registered.sum()))
     with run.clock("dense"):
         scene = dense.prepare(result.images, reconstruction, threads=run.workers.threads)
         order = sorted(scene.views)

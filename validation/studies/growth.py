@@ -24,6 +24,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Reconstruction
+from thesisrecon.runtime._run import Until
 from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.references.colmap import read_run
@@ -41,9 +42,11 @@ STAGES = (
     "projective",
     "selfcalibration",
     "metric",
+    "dense",
+    "model",
     "outputs",
 )
-AFTER = {"matches": "tracks", "metric": "outputs"}
+AFTER = {"matches": "tracks", "metric": "outputs", "model": "outputs"}
 """Stage that reports its end -> the following stage, which does not report its beginning."""
 
 
@@ -100,18 +103,20 @@ class Cost:
     colmap: Mapping[str, float] = field(default_factory=dict)
 
 
-def measure_cost(images: str, count: int, threads: int, scene: str) -> dict[str, Any]:
-    """Reconstruct cameras in this process, its kernels loaded before; return the fields of :class:`Cost`.
+def measure_cost(
+    images: str, count: int, threads: int, scene: str, until: Until = "metric"
+) -> dict[str, Any]:
+    """Reconstruct in this process, its kernels loaded before; return the fields of :class:`Cost`.
 
     The matched pairs are listed in ``pairs-COUNT.txt`` beside the images.
     """
     paths = sorted(Path(images).glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
-        reconstruct(paths[:4], Path(place) / "warm", until="metric", threads=threads)
+        reconstruct(paths[:4], Path(place) / "warm", until=until, threads=threads)
         meter, failure, errors = Meter(), "", (float("nan"), float("nan"))
         try:
             result = reconstruct(
-                paths, Path(place) / "run", until="metric", threads=threads, progress=meter.progress
+                paths, Path(place) / "run", until=until, threads=threads, progress=meter.progress
             )
             errors = _errors(result.reconstruction, scene, _size(paths))
             listed = [f"{paths[pair.i].name} {paths[pair.j].name}\n" for pair in result.pairs]
@@ -120,8 +125,10 @@ def measure_cost(images: str, count: int, threads: int, scene: str) -> dict[str,
             failure = str(error)
         meter.enter("end")
         summary = json.loads((Path(place) / "run" / "summary.json").read_text(encoding="utf-8"))
-    seconds = summary["elapsed_seconds"]
-    found = Cost(len(paths), meter.cpu_s, meter.peak_mb, counts_of(summary), seconds, *errors, failure)
+        files = [Path(place) / "run" / name for name in ("report.html", "model.glb")]
+        sizes = {f"{file.name}, kB": file.stat().st_size // 1000 for file in files if file.exists()}
+    seconds, counts = summary["elapsed_seconds"], counts_of(summary) | sizes
+    found = Cost(len(paths), meter.cpu_s, meter.peak_mb, counts, seconds, *errors, failure)
     return asdict(found)
 
 
@@ -211,6 +218,7 @@ def growth_of_cost_study(
     long_side: int = 480,
     threads: int = 2,
     colmap: bool = False,
+    until: Until = "metric",
 ) -> Iterator[Part]:
     """Measure what each stage costs by the number of images of one place or of a street."""
     if scene not in WALKS:
@@ -218,7 +226,7 @@ def growth_of_cost_study(
     WALKS[scene][1](out, max(sizes), size=(long_side, long_side * 3 // 4), threads=threads)
     costs = []
     for count in sorted(sizes):
-        cost = Cost(**call_apart(measure_cost, out, count, threads, scene, cores=threads)[0])
+        cost = Cost(**call_apart(measure_cost, out, count, threads, scene, until, cores=threads)[0])
         if colmap and not cost.failure:
             cost = replace(cost, colmap=measure_colmap(out, count, threads, scene))
         costs.append(cost)
