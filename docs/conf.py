@@ -37,6 +37,7 @@ extensions = [
 ]
 exclude_patterns = ["_build", "_site", "**/GALLERY_HEADER.*", "tutorial/*.ipynb", "tutorial/*.py"]
 nitpicky = True
+highlight_language = "none"  # blocks of Python say so
 smartquotes = False  # x2' is the transpose of x2
 templates_path = ["_site/templates"]
 
