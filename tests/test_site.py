@@ -54,6 +54,8 @@ def test_the_page_of_failures_has_a_remedy_for_each_message_of_the_code(site):
     known = failures.remedies()
     found = {text for texts in failures.messages().values() for text in texts}
     assert found == set(known) - {"failures", "parts"}
+    # Messages are sorted: a remedy cannot refer to the one above it.
+    assert not re.search("as above", " ".join(known[text] for text in found), re.I)
     of_stages = [row for rows in failures.stage_failures().values() for row in rows]
     assert len(of_stages) > 60
     without = {reason for reason, _, advice in of_stages if not re.search(r"\w", advice)}
