@@ -200,8 +200,12 @@ def cost_table(costs: Sequence[Cost]) -> str:
     row("centres, % of their extent", [100.0 * cost.centre_error_rel for cost in costs], 4)
     row("wall s", [cost.wall_s for cost in costs], 0)
     for name in costs[0].colmap:
-        row(f"COLMAP, {name}", [cost.colmap[name] for cost in costs], 4 if "%" in name else 0)
-    if costs[0].colmap:
+        row(
+            f"COLMAP, {name}",
+            [cost.colmap.get(name, float("nan")) for cost in costs],
+            4 if "%" in name else 0,
+        )
+    if all(cost.colmap for cost in costs):
         row("wall over COLMAP's", [cost.wall_s / cost.colmap["wall s"] for cost in costs], 2)
     failures = [f"\n{cost.images} images: {cost.failure}" for cost in costs if cost.failure]
     return "\n".join([text_table(["", *(f"{n:.0f}" for n in sizes), "power of N"], lines), *failures])
@@ -224,12 +228,11 @@ def growth_of_cost_study(
     if scene not in WALKS:
         raise UsageError(f"the scene is {' or '.join(WALKS)}; got {scene!r}")
     WALKS[scene][1](out, max(sizes), size=(long_side, long_side * 3 // 4), threads=threads)
+    yield f"{scene}, long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
     costs = []
     for count in sorted(sizes):
-        cost = Cost(**call_apart(measure_cost, out, count, threads, scene, until, cores=threads)[0])
-        if colmap and not cost.failure:
-            cost = replace(cost, colmap=measure_colmap(out, count, threads, scene))
-        costs.append(cost)
-        yield f"{count} images: {sum(cost.cpu_s.values()):.0f} processor s"
-    yield f"{scene}, long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
+        costs.append(Cost(**call_apart(measure_cost, out, count, threads, scene, until, cores=threads)[0]))
+        yield cost_table(costs[-1:])
+        if colmap and not costs[-1].failure:
+            costs[-1] = replace(costs[-1], colmap=measure_colmap(out, count, threads, scene))
     yield cost_table(costs)
