@@ -72,6 +72,36 @@ def test_a_long_street_grows_from_its_core_in_windows(monkeypatch):
     assert 0 < sum(windows) < 48
 
 
+def with_repeated_windows(scene, here, there, count=80):
+    """Windows at view ``here`` that stand again at view ``there``, matched as if they were the same."""
+    rng, C = np.random.default_rng(4), np.array([-R.T @ t for R, t in zip(scene.R, scene.t, strict=True)])
+    shown = np.flatnonzero(scene.tracks.view_index == here)
+    X = scene.X[rng.choice(scene.tracks.point_index[shown], count, replace=False)]
+    views, points, pixels = [], [], []
+    for copy in (X, X + C[there] - C[here]):
+        for v in range(len(C)):
+            seen = copy @ scene.R[v].T + scene.t[v]
+            xy = (seen @ scene.K[v].T)[:, :2] / seen[:, 2:]
+            k = np.flatnonzero((seen[:, 2] > 0.5) & (xy > 0).all(axis=1) & (xy < scene.sizes[v]).all(axis=1))
+            k = k if abs(v - (here if copy is X else there)) < 6 else k[:0]
+            views.append(np.full(len(k), v))
+            points.append(k + len(scene.X))
+            pixels.append(xy[k] + rng.normal(0, 0.3, (len(k), 2)))
+    t = scene.tracks
+    v, p = (np.concatenate([a, *b]) for a, b in ((t.view_index, views), (t.point_index, points)))
+    xy, order = np.concatenate([t.xy, *pixels]), np.lexsort((v, p))
+    tracks = Tracks(v[order], p[order], xy[order], t.n_views, len(scene.X) + count)
+    return replace(scene, X=np.concatenate([scene.X, X]), tracks=tracks)
+
+
+def test_a_view_of_other_windows_waits_until_the_model_reaches_it(monkeypatch):
+    scene = with_repeated_windows(street(60), 12, 50)
+    monkeypatch.setattr(_resection, "MANY_VIEWS", 12)
+    _, metric = reconstruct(scene, 12)
+    assert metric.reconstruction.registered.all()
+    assert centre_error(metric, scene) < 0.01
+
+
 def test_points_that_hold_every_view_are_enough(monkeypatch):
     scene = make_scene(views=12, points=900, sigma_px=0.4, seed=12)
     monkeypatch.setattr(_model, "MAX_OBSERVATIONS", 3000)

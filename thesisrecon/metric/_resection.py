@@ -30,6 +30,9 @@ WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
 """k1 is free from the start: without it gates would have to admit wrong points."""
 MIN_POINTS = 15
 """Points of the model that a missing camera must see."""
+MIN_SHARE = 0.2
+"""Share of its points that the model should have before one of many views joins: views of other places with
+the same windows wait until the model has reached them."""
 MAX_ROUNDS = 6
 MIN_GAIN = 0.003
 """Increase of the inlier ratio below which the rounds end."""
@@ -127,21 +130,24 @@ def _register_missing(
     """Register every ``allowed`` view that sees enough of the model by calibrated resection."""
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
+    missing = allowed & ~model.registered
+    reached = missing & (counts >= MIN_SHARE * np.array([len(k) for k in rows]))
     rejected: dict[int, str] = {}
-    for view in np.argsort(-counts, kind="stable").tolist():
-        if model.registered[view] or not allowed[view]:
-            continue
-        if counts[view] < MIN_POINTS:
-            rejected[view] = (
-                f"sees only {counted(counts[view], 'point')} of the model (at least {MIN_POINTS} "
-                "needed): too little overlap"
-            )
-            continue
-        added = _register(model, view, rows[view], rng)
-        if isinstance(added, str):
-            rejected[view] = added
-        else:
-            model = added
+    for views in (reached, missing & ~reached) if t.n_views > MANY_VIEWS else (missing,):
+        for view in sorted(np.flatnonzero(views).tolist(), key=lambda v: -counts[v]):
+            if counts[view] < MIN_POINTS:
+                rejected[view] = (
+                    f"sees only {counted(counts[view], 'point')} of the model (at least {MIN_POINTS} "
+                    "needed): too little overlap"
+                )
+                continue
+            added = _register(model, view, rows[view], rng)
+            if isinstance(added, str):
+                rejected[view] = added
+            else:
+                model = added
+        if (missing & model.registered).any():
+            break
     return model, rejected
 
 
