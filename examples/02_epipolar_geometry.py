@@ -2,17 +2,15 @@ r"""
 2. Epipolar geometry and its precision
 ======================================
 
-Pixels are written in :term:`homogeneous coordinates`, :math:`x = (x, y, 1)^\top`, equal up
-to scale; a line is a vector :math:`l` of three numbers with :math:`l^\top x = 0`. A point
-:math:`x_1` of image 1 lies somewhere on a ray in space. Image 2 sees this ray as a line,
-the :term:`epipolar line` of :math:`x_1`, and the match :math:`x_2` must lie on it. All
-these lines are given by one matrix, the :term:`fundamental matrix` (3.34; HZ 9.2):
+Pixels are written in :term:`homogeneous coordinates`, :math:`x = (x, y, 1)^\top`, equal up to scale; a line
+is a vector :math:`l` of three numbers with :math:`l^\top x = 0`. Image 2 sees the ray of a point :math:`x_1`
+of image 1 as a line, the :term:`epipolar line`, and the match :math:`x_2` must lie on it. One matrix gives
+all these lines, the :term:`fundamental matrix` (3.34; HZ 9.2):
 
 .. math:: x_2^\top F\, x_1 = 0, \qquad l_2 = F x_1, \qquad \det F = 0.
 
-They meet in the :term:`epipole`, the image of the other camera. :math:`F` has nine entries,
-no scale and rank 2: seven degrees of freedom, so seven matches determine it (section 5.2),
-and more make it precise. No calibration is needed.
+They meet in the :term:`epipole`, the image of the other camera. :math:`F` has nine entries, no scale and rank
+2: seven degrees of freedom. Seven matches determine it (5.2), more make it precise; no calibration is needed.
 """
 
 from pathlib import Path
@@ -34,14 +32,11 @@ for axis, image in zip(axes, images, strict=True):
     axis.set(xticks=[], yticks=[])
 
 # %%
-# How precise is :math:`F`? If each coordinate has the noise :math:`\sigma`, no unbiased
-# estimate can bring the RMS distance of exact points to their epipolar lines below about
-# :math:`\sigma\sqrt{14/n}` (the :term:`bound` of Cramer and Rao): :math:`F` has 7
-# parameters, :math:`n` matches give one equation each, and the distance of a match to its
-# line holds the noise of both images, a variance of :math:`2\sigma^2`; hence 2 x 7. The
-# eight-point method (5.1) solves linear equations; the :term:`gold standard` minimises the
-# distances to the nearest exact matches (HZ 11.4.1). The cube's exact points show the true
-# error; for few matches it is above the bound, which holds for small noise.
+# How precise is :math:`F`? With the noise :math:`\sigma` no unbiased estimate can bring the RMS distance of
+# exact points to their epipolar lines below about :math:`\sigma\sqrt{14/n}` (the :term:`bound` of Cramer and
+# Rao): 7 parameters, one equation per match, and in each distance the noise of both images,
+# :math:`2\sigma^2`. The eight-point method (5.1) solves linear equations; the :term:`gold standard` minimises
+# the distances to the nearest exact matches (HZ 11.4.1). The bound holds for many matches.
 
 cube = np.load(folder.parent / "cube" / "cube.npz")
 exact = cube["xy"][[13, 22]][:, np.isfinite(cube["xy"][[13, 22]]).all(axis=(0, 2))]
@@ -54,16 +49,12 @@ for method in ("eight-point", "gold-standard"):
         noisy = exact[:, chosen] + rng.normal(0, sigma, (2, counts[i], 2))
         F = thesisrecon.estimate_fundamental(*noisy, method=method).F
         lines = thesisrecon.epipolar_lines(F, exact[0])
-        errors[i, trial] = np.sqrt(
-            np.mean((np.sum(lines[:, :2] * exact[1], axis=1) + lines[:, 2]) ** 2)
-        )
+        distances = np.sum(lines[:, :2] * exact[1], axis=1) + lines[:, 2]
+        errors[i, trial] = np.sqrt(np.mean(distances**2))
     axis.loglog(counts, np.sqrt(np.mean(errors**2, axis=1)), "o-", label=method)
-axis.loglog(
-    counts, sigma * np.sqrt(14 / np.array(counts)), "k--", label=r"$\sigma\sqrt{14/n}$"
-)
-axis.set(
-    xlabel="matches n", ylabel="RMS distance to the epipolar line, px", title="noise 1 px"
-)
+bound = sigma * np.sqrt(14 / np.array(counts))
+axis.loglog(counts, bound, "k--", label=r"$\sigma\sqrt{14/n}$")
+axis.set(title="noise 1 px", xlabel="matches n", ylabel="distance to epipolar lines, px")
 axis.set_xticks(counts, counts)
 axis.minorticks_off()
 axis.legend()

@@ -2,21 +2,16 @@ r"""
 3. One reconstruction in three strata
 =====================================
 
-A camera maps a point of space in :term:`homogeneous coordinates` :math:`X = (X, Y, Z,
-1)^\top` to a pixel by :math:`x \simeq P X`, equal up to scale, with a 3 x 4 matrix :math:`P
-= K\,[R \; t]`: :math:`R` and :math:`t` turn world coordinates into those of the camera, and
-:math:`K` holds the focal length and the :term:`principal point`. From matches alone the
-cameras and points are determined up to one 4 x 4 matrix, because for every invertible
-:math:`G` (section 3.3; HZ 10.2)
-
-.. math:: P X = (P G^{-1}) (G X),
-
-so both have the same images. The result is a *projective* reconstruction: lines stay lines
-and contacts stay contacts, but parallel lines may meet. It becomes *affine* if the
-:term:`plane at infinity` :math:`\Pi_\infty`, where parallel lines meet, is found and moved
-to :math:`(0, 0, 0, 1)` (3.4.3), and *metric* if the :term:`absolute conic` on that plane is
-found as well (3.4.4): angles and ratios of lengths are then true, only the scale is
-unknown.
+In :term:`homogeneous coordinates`, equal up to scale, a camera maps a point :math:`X = (X, Y, Z, 1)^\top` to
+a pixel :math:`x \simeq P X` with a 3 x 4 matrix :math:`P = K\,[R \; t]`: :math:`R` and :math:`t` turn world
+coordinates into those of the camera, :math:`K` holds the focal length and the :term:`principal point`.
+Matches leave one invertible 4 x 4 matrix :math:`G` open, because :math:`P X = (P G^{-1}) (G X)`: both have
+the same images (section 3.3; HZ 10.2). Such a *projective* reconstruction keeps lines, but parallel lines may
+meet. It is *affine* once the :term:`plane at infinity`, where they meet, is found and moved to :math:`(0, 0,
+0, 1)` (3.4.3), and *metric* once the :term:`absolute conic` on that plane is found too (3.4.4): angles and
+ratios of lengths are then true, only the scale is unknown. Below a grid on the cube is triangulated in each
+frame (6.3). Residuals and cross-ratios stay; from the affine frame on the two halves of an edge are equal; in
+the metric frame angles are right.
 """
 
 from pathlib import Path
@@ -25,7 +20,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thesisrecon
-from thesisrecon.geometry.strata import transform
 
 cube = np.load(Path(thesisrecon.__file__).parents[1] / "fixtures" / "cube" / "cube.npz")
 views = np.flatnonzero(np.isfinite(cube["xy"][..., 0]).sum(axis=1) > 200)[::2]
@@ -34,35 +28,27 @@ sizes = [(800, 600)] * len(views)
 run = thesisrecon.reconstruct_from_tracks(noisy, sizes, until="projective")
 plane = thesisrecon.plane_at_infinity(run.projective)
 upgrade = thesisrecon.self_calibrate(run.projective).metric_from_projective
-# Any three rows will do.
-free = np.array([[1.0, 0.5, 0.2, 0.0], [0.0, 0.7, -0.3, 0.0], [0.2, 0.0, 1.3, 0.0]])
+free = np.array([[1, 0.5, 0.2, 0], [0, 0.7, -0.3, 0], [0.2, 0, 1.3, 0]])  # any three rows
 affine = np.vstack([free, plane / plane[3]])
 distorted = np.vstack([free, plane / plane[3] + (0.5, -0.2, 0.3, 0.0)])
 frames = {"projective": distorted, "affine": affine, "metric": upgrade}
-
-# %%
-# A grid on the faces of the cube is triangulated in each frame (6.3). Residuals and
-# cross-ratios stay, the two halves of an edge are equal from the affine frame on, and
-# angles are right in the metric frame.
-
 (s, t), ones = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)), np.ones((5, 5))
-faces = (ones, s, t), (s, ones, t), (s, t, ones)
-grid = np.stack([np.dstack(face) for face in faces]).reshape(-1, 3)
+faces = [(ones, s, t), (s, ones, t), (s, t, ones)]
+grid = np.moveaxis(faces, 1, -1).reshape(-1, 3)
 poses = zip(cube["R"][views], cube["C"][views], strict=True)
-marked = np.stack(
-    [thesisrecon.Camera(cube["K"], R, -R @ C, (800, 600)).project(grid) for R, C in poses]
-)
-figure = plt.figure(figsize=(12, 4), layout="constrained")
-for k, (name, G) in enumerate(frames.items()):
-    X = thesisrecon.triangulate(P := transform(G, run.projective.P, "cameras"), marked)
+cameras = [thesisrecon.Camera(cube["K"], R, -R @ C, (800, 600)) for R, C in poses]
+marked = np.stack([camera.project(grid) for camera in cameras])
+view = {"projection": "3d", "proj_type": "ortho", "elev": -60, "azim": -70}
+figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout="constrained", subplot_kw=view)
+for axis, (name, G) in zip(axes, frames.items(), strict=True):
+    P = run.projective.P @ np.linalg.inv(G)
+    X = thesisrecon.triangulate(P, marked)
     images = np.einsum("vij,nj->vni", P, X)
     residual = np.sqrt(np.mean((images[..., :2] / images[..., 2:] - marked) ** 2))
     faces = (X[:, :3] / X[:, 3:]).reshape(3, 5, 5, 3)
-    axis = figure.add_subplot(1, 3, k + 1, projection="3d", title=name, proj_type="ortho")
     for face, colour in zip(faces, ("tab:red", "tab:green", "tab:blue"), strict=True):
         axis.plot_wireframe(*np.moveaxis(face, -1, 0), color=colour)
-    axis.set_aspect("equal")
-    axis.view_init(-60, -70)
+    axis.set(title=name, aspect="equal")
     axis.set_axis_off()
     edge, other = faces[0, 0], faces[0, 4, 0] - faces[0, 0, 0]
     length = np.linalg.norm(edge[:, None] - edge, axis=2)

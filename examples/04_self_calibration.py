@@ -2,18 +2,17 @@ r"""
 4. Self-calibration by each method
 ==================================
 
-Which 4 x 4 matrix makes the reconstruction :term:`metric <metric stratum>`? The
-:term:`absolute conic` lies on the plane at infinity; where a camera sees it depends on its
-calibration alone, not on its position. Its dual, the absolute dual quadric :math:`\Omega^*`
-(4 x 4, symmetric, rank 3, null vector :math:`\Pi_\infty`), is seen as (3.14; HZ 19.3)
+Which 4 x 4 matrix makes the reconstruction :term:`metric <metric stratum>`? The :term:`absolute conic` lies
+on the plane at infinity; where a camera sees it depends on its calibration alone, not on its position. Its
+dual, the absolute dual quadric :math:`\Omega^*` (4 x 4, symmetric, rank 3, null vector :math:`\Pi_\infty`),
+is seen as (3.14; HZ 19.3)
 
 .. math:: P_i\, \Omega^* P_i^\top \simeq \omega_i^* = K_i K_i^\top, \quad
    K = \begin{pmatrix} f & 0 & u \\ 0 & f & v \\ 0 & 0 & 1 \end{pmatrix},
 
-with the focal length :math:`f` and the :term:`principal point` :math:`(u, v)`, so square
-pixels, or one camera for all images, are equations for :math:`\Omega^*`. All methods below
-get one projective reconstruction and know only that: one camera, square pixels, principal
-point near the centre.
+with the focal length :math:`f` and the :term:`principal point` :math:`(u, v)`, so square pixels, or one
+camera for all images, are equations for :math:`\Omega^*`. All methods below get one projective reconstruction
+and know only that: one camera, square pixels, principal point near the centre.
 """
 
 from pathlib import Path
@@ -29,24 +28,17 @@ noisy = cube["xy"][views] + np.random.default_rng(0).normal(0, 0.5, (len(views),
 run = thesisrecon.reconstruct_from_tracks(noisy, [(800, 600)] * len(views))
 
 # %%
-# - **linear-quadric**: linear equations for :math:`\Omega^*`; biased for lenses other than
-#   60 mm.
-# - **nonlinear-quadric**: the nearest :math:`K K^\top` to all :math:`P_i \Omega^*
-#   P_i^\top`.
-# - **kruppa-equations** (:term:`Kruppa equations`): from F alone: :math:`F \omega^* F^\top
-#   \simeq [e]_\times \omega^* [e]_\times^\top`.
-# - **modulus-constraint**: first :math:`\Pi_\infty`, where two images of one camera are
-#   related by a matrix similar to a rotation: eigenvalues of one modulus, a quartic
-#   equation in :math:`\Pi_\infty` per pair.
-# - **cheirality-search**: first :math:`\Pi_\infty`, within the bounds of having all points
-#   on one side.
-# - **hypotheses-and-refinement**: the default: many starts, one criterion, the principal
-#   point still fixed.
-# - **metric stage**: :term:`bundle adjustment`, which minimises distances in the images
-#   instead of algebraic errors.
+# - **linear-quadric**: linear equations for :math:`\Omega^*`; biased for lenses other than 60 mm.
+# - **nonlinear-quadric**: the nearest :math:`K K^\top` to all :math:`P_i \Omega^* P_i^\top`.
+# - **kruppa-equations** (:term:`Kruppa equations`): from F alone: :math:`F \omega^* F^\top \simeq [e]_\times
+#   \omega^* [e]_\times^\top`.
+# - **modulus-constraint**: first :math:`\Pi_\infty`, where two images of one camera are related by a matrix
+#   similar to a rotation: eigenvalues of one modulus, a quartic equation in :math:`\Pi_\infty` per pair.
+# - **cheirality-search**: first :math:`\Pi_\infty`, within the bounds of having all points on one side.
+# - **hypotheses-and-refinement**: the default: many starts, one criterion, the principal point still fixed.
+# - **metric stage**: :term:`bundle adjustment`, which minimises distances in the images.
 #
-# The intervals of the single methods are of first order and somewhat narrow; rely on those
-# of the metric stage.
+# The intervals of single methods are of first order and somewhat narrow; rely on those of the metric stage.
 
 methods = ["linear-quadric", "nonlinear-quadric", "kruppa-equations", "modulus-constraint"]
 found = {}
@@ -61,9 +53,8 @@ for row, (method, (K, std)) in enumerate(found.items()):
     axes[0].errorbar(K[0, 0], row, xerr=1.96 * np.nan_to_num(std), fmt="o", capsize=4)
     axes[1].plot(K[0, 2], K[1, 2], "o", label=method)
 axes[0].axvline(cube["K"][0, 0], color="k", linestyle="--")
-axes[0].set(
-    yticks=range(len(found)), yticklabels=found, xlabel="focal length and 95 % interval, px"
-)
+axes[0].set_yticks(range(len(found)), found)
+axes[0].set_xlabel("focal length and 95 % interval, px")
 axes[1].plot(*cube["K"][:2, 2], "k*", markersize=14, label="truth")
 axes[1].set(xlabel="principal point x, px", ylabel="y, px")
 axes[1].legend(fontsize="small")

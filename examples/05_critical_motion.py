@@ -2,18 +2,18 @@ r"""
 5. A critical motion and how it is named
 ========================================
 
-Some motions leave the calibration open, whatever the method. A camera with the calibration
-:math:`K`, the rotation :math:`R` and the centre :math:`C` has the matrix :math:`P = K R\,[I
-\; {-C}]`. Let it translate without rotating: :math:`P_i = K\,[I \; {-C_i}]`. With any other
-calibration :math:`K'` and the affine map :math:`A = K'^{-1} K`,
+Some motions leave the calibration open, whatever the method. A camera with the calibration :math:`K`, the
+rotation :math:`R` and the centre :math:`C` has the matrix :math:`P = K R\,[I \; {-C}]`. Let it translate,
+with :math:`R = I`. Then for any other calibration :math:`K'`, with the affine map :math:`A = K'^{-1} K`,
 
-.. math:: K\,(X - C_i) = K' (A X - A C_i),
+.. math:: K\,(X - C_i) = K' (A X - A C_i):
 
-so a camera :math:`K'` translating through the sheared or stretched scene :math:`A X` has
-exactly the same images. If a photographer walks sideways and does not turn, the images
-determine neither the depth of the scene nor the focal length. This is a :term:`critical
-motion` (Sturm 1997; HZ 19.3.5, 19.5.3; turntables: 19.9); others rotate about one direction
-only, or about the optical axis.
+a camera :math:`K'` that translates through the sheared or stretched scene :math:`A X` has the same images. If
+a photographer walks sideways without turning, depth and focal length stay open: a :term:`critical motion`
+(Sturm 1997; HZ 19.3.5, 19.5.3). Others are turntables (HZ 19.9) and rotations about the optical axis.
+
+Below the focal length is fixed at wrong values and all else is adjusted to images with noise of 0.5 px. If
+the RMS residual does not rise, the images do not contradict them. The library names the motion and advises.
 """
 
 import matplotlib.pyplot as plt
@@ -38,18 +38,11 @@ motions = {
     "rotation about the optical axis": (rolling, (rolling @ sideways[..., None])[..., 0]),
 }
 
-# %%
-# For each motion the focal length is fixed at a wrong value and everything else is adjusted
-# to the noisy images (noise 0.5 px). If the RMS residual does not rise, nothing in the
-# images contradicts the wrong focal length. The library measures the motion in units of the
-# noise, names it, and says what would help.
-
 focals = np.array([400, 500, 600, 700, 800, 900, 1000, 1200, 1600.0])
 figure, axis = plt.subplots(figsize=(8, 4.2), layout="constrained")
 for name, (R, t) in motions.items():
     cameras = [thesisrecon.Camera(K, *pose, size) for pose in zip(R, t, strict=True)]
-    xy = np.stack([camera.project(X) for camera in cameras])
-    xy += rng.normal(0, 0.5, xy.shape)
+    xy = np.stack([c.project(X) for c in cameras]) + rng.normal(0, 0.5, (n, len(X), 2))
     xy[((xy < 0) | (xy > (799, 599))).any(axis=2)] = np.nan
     rms = []
     for focal in focals:
@@ -57,8 +50,7 @@ for name, (R, t) in motions.items():
         adjusted = thesisrecon.bundle_adjust((wrong, R, t), X, xy, sizes=size, free=())
         rms.append(np.sqrt(np.nanmean(adjusted.residual_px**2)))
     axis.loglog(focals, rms, "o-", label=name)
-    P = np.array([camera.P for camera in cameras])
-    found = thesisrecon.self_calibrate(P, size, xy=xy)
+    found = thesisrecon.self_calibrate(np.stack([c.P for c in cameras]), size, xy=xy)
     reasons = "; ".join(found.identifiability.sentences)
     print(f"{name}: determined {found.identifiable}. {reasons}")
 axis.set(xlabel="assumed focal length, px (truth 800)", ylabel="RMS residual, px")

@@ -2,12 +2,11 @@ r"""
 8. From depth to a textured model
 =================================
 
-With calibrated cameras a disparity becomes a depth, and each image gets a :term:`depth map`
-(section 2.6): for every pixel :math:`x` the distance :math:`Z` along its ray, so that
-:math:`X = C + Z R^\top K^{-1} x` lies on the surface. Several neighbours are matched, their
-depths are combined, each pixel is refined with a small plane through its surface point, and
-depths that no other view confirms are removed. The cameras here are the true ones of the
-courtyard, so that errors of depth are not mixed with those of the cameras;
+With calibrated cameras a disparity becomes a depth, and each image gets a :term:`depth map` (section 2.6):
+for every pixel :math:`x` the distance :math:`Z` along its ray, so that :math:`X = C + Z R^\top K^{-1} x` lies
+on the surface. Several neighbours are matched, their depths are combined, each pixel is refined with a small
+plane through its surface point, and depths that no other view confirms are removed. The cameras here are the
+true ones of the courtyard, so that errors of depth are not mixed with those of the cameras;
 ``thesisrecon.load(out).cameras`` gives estimated ones.
 """
 
@@ -40,11 +39,11 @@ print(f"{known:.0%} of the pixels have a depth; median error {median:.2f} %")
 print(f"{within:.1%} of them within 1 %")
 
 # %%
-# The maps are fused to one surface in a grid of signed distances: each map votes how far a
-# grid point is in front of or behind its surface, and the triangles of the zero level
-# become the mesh. Each part of the mesh takes its texture from the image that shows it
-# best. The model can then be rendered from anywhere: below from the camera of an image that
-# was not used, beside that image, and from a point above. What no camera saw stays empty.
+# The maps are fused to one surface in a grid of signed distances: each map votes how far a grid point is in
+# front of or behind its surface, and the triangles of the zero level become the mesh. Each part of the mesh
+# takes its texture from the image that shows it best. The model can then be rendered from anywhere: below
+# from the camera of an image that was not used, beside that image, and from a point above. What no camera saw
+# stays empty.
 
 mesh = thesisrecon.texture(thesisrecon.fuse_depth_maps(maps), paths, cameras, max_size=512)
 unused = all_cameras["0007.jpg"].scaled(0.5)

@@ -2,11 +2,10 @@ r"""
 9. New views without a model
 ============================
 
-Two images and their dense matches are enough for new views; no surface is built (chapter 1
-of the thesis). *Interpolation* (Seitz and Dyer 1995): if both images are rectified, a pixel
-at :math:`x` with disparity :math:`d` moves to :math:`x - s d`. This is exactly what a
-camera :math:`P_s = (1 - s) P_0 + s P_1` on the baseline sees, since the rectified cameras
-are parallel. The images below are rectified, interpolated and mapped back.
+Two images and their dense matches are enough for new views; no surface is built (chapter 1 of the thesis).
+*Interpolation* (Seitz and Dyer 1995): if both images are rectified, a pixel at :math:`x` with disparity
+:math:`d` moves to :math:`x - s d`. This is exactly what a camera :math:`P_s = (1 - s) P_0 + s P_1` on the
+baseline sees, as the rectified cameras are parallel. Finally the view is mapped back.
 """
 
 from pathlib import Path
@@ -22,9 +21,8 @@ from thesisrecon.views.trilinear import VirtualCamera
 
 folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 names = ["0005.jpg", "0007.jpg", "0006.jpg"]
-first, second, real = (
-    np.asarray(Image.open(folder / "images" / name).reduce(2)) for name in names
-)
+images = [np.asarray(Image.open(folder / "images" / name).reduce(2)) for name in names]
+first, second, real = images
 pair = prepare_pair(first, second)
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
 for axis, s in zip(axes, (0.0, 0.5, 1.0), strict=True):
@@ -32,17 +30,16 @@ for axis, s in zip(axes, (0.0, 0.5, 1.0), strict=True):
     axis.set(title=f"s = {s:g}" + ("" if s % 1 else " (image)"), xticks=[], yticks=[])
 
 # %%
-# *The trilinear tensor* (:term:`trifocal tensor`) leaves the :term:`baseline` (Avidan and
-# Shashua 1997). For cameras :math:`[I \; 0]`, :math:`[a \; a_4]` and :math:`[b \; b_4]` the
-# coordinates of a point in three images are tied by (HZ 15.1)
+# *The trilinear tensor* (:term:`trifocal tensor`) leaves the :term:`baseline` (Avidan and Shashua 1997). For
+# cameras :math:`[I \; 0]`, :math:`[a \; a_4]` and :math:`[b \; b_4]` the coordinates of a point in three
+# images are tied by (HZ 15.1)
 #
 # .. math:: T_i^{jk} = a_i^j b_4^k - a_4^j b_i^k, \qquad {x''}^k = x^i\, l'_j\, T_i^{jk},
 #
-# with any line :math:`l'` through :math:`x'`: the third image follows from the other two.
-# Two images alone give the seed :math:`b = a`; a motion :math:`(R, t)` of the third camera
-# turns it into :math:`{T'}_i^{jk} = R^k_l T_i^{jl} + t^k a_i^j`. Here the virtual camera is
-# moved to where image 0006 was really taken, which shows what is wrong, and then up and
-# back.
+# with any line :math:`l'` through :math:`x'`: the third image follows from the other two. Two images alone
+# give the seed :math:`b = a`; a motion :math:`(R, t)` of the third camera turns it into :math:`{T'}_i^{jk} =
+# R^k_l T_i^{jl} + t^k a_i^j`. Here the virtual camera is moved to where image 0006 was really taken, which
+# shows what is wrong, and then up and back.
 
 cameras = thesisrecon.read_cameras(folder / "cameras.json")
 one, two, three = (cameras[name].scaled(0.5) for name in names)

@@ -2,17 +2,15 @@ r"""
 10. Which part of the method matters? An ablation
 =================================================
 
-A method has many parts, and each must earn its place: replace one, keep the rest, and
-compare on the same data. Errors vary from :term:`draw` to draw, so an honest comparison
-gives all variants the same draws, many of them, and reports the mean ratio of the errors
-with a 95 % interval. Only an interval without 1 shows a difference. Here the fundamental
-matrix (chapter 5) of pairs of the cube is estimated from matches with 0.5 px of noise, 30 %
-of them wrong. The error is the RMS distance of exact points to their epipolar lines.
+A method has many parts, and each must earn its place: replace one, keep the rest, and compare on the same
+data. Errors vary from :term:`draw` to draw, so an honest comparison gives all variants the same draws, many
+of them, and reports the mean ratio of the errors with a 95 % interval. Only an interval without 1 shows a
+difference. Here the fundamental matrix (chapter 5) of pairs of the cube is estimated from matches with 0.5 px
+of noise, 30 % of them wrong. The error is the RMS distance of exact points to their epipolar lines.
 
-The variants: another threshold; the search of the thesis (Algorithm 2: random samples of
-seven matches, the largest set of :term:`inliers <inlier>` wins); least median of squares,
-which needs no threshold; and, as an example of a method of your own, no search at all. Any
-object with the method of its stage can be a variant.
+The variants: another threshold; the search of the thesis (Algorithm 2: random samples of seven matches, the
+largest set of :term:`inliers <inlier>` wins); least median of squares, which needs no threshold; and, as an
+example of a method of your own, no search at all. Any object with the method of its stage can be a variant.
 """
 
 from dataclasses import dataclass, replace
@@ -47,9 +45,9 @@ with TemporaryDirectory() as folder:
 print(report)
 
 # %%
-# The same as a picture, with a logarithmic scale. Without a search, the wrong matches ruin
-# the result: a least squares estimate has no resistance to them. Studies of whole stages
-# run from files: ``python -m validation ablate``.
+# The same as a picture, with a logarithmic scale. Without a search, the wrong matches ruin the result: a
+# least squares estimate has no resistance to them. Studies of whole stages run from files:
+# ``python -m validation ablate``.
 
 figure, axis = plt.subplots(figsize=(9, 3.2), layout="constrained")
 for row, one in enumerate(report.comparisons):
@@ -57,7 +55,5 @@ for row, one in enumerate(report.comparisons):
     axis.errorbar(middle, row, xerr=[[middle - low], [high - middle]], fmt="o", capsize=4)
 axis.axvline(1.0, color="k", linestyle="--")
 axis.set(xscale="log", xlabel="error over that of the default (ratio, 95 % interval)")
-axis.set_yticks(
-    range(len(report.comparisons)),
-    [one.variant.replace(", ", "\n") for one in report.comparisons],
-)
+names = [one.variant.replace(", ", "\n") for one in report.comparisons]
+axis.set_yticks(range(len(names)), names)

@@ -2,12 +2,11 @@ r"""
 11. Validation against COLMAP
 =============================
 
-Is the result right, and how does it compare with the best programs? Six images of the
-courtyard at 640 px are reconstructed by this library and by COLMAP (the package
-``pycolmap``, which the extras ``docs`` and ``validation`` install; without it its bars are
-missing). Neither gets any calibration: no EXIF, no focal length. The models are compared
-with the truth after the :term:`similarity` that aligns the camera centres best: images
-determine no world frame (3.4.4).
+Is the result right, and how does it compare with the best programs? Six images of the courtyard at 640 px are
+reconstructed by this library and by COLMAP (the package ``pycolmap``, which the extras ``docs`` and
+``validation`` install; without it its bars are missing). Neither gets any calibration: no EXIF, no focal
+length. The models are compared with the truth after the :term:`similarity` that aligns the camera centres
+best: images determine no world frame (3.4.4).
 """
 
 from pathlib import Path
@@ -25,33 +24,26 @@ except ImportError:
     print("pycolmap is not installed (extra docs): no comparison with COLMAP")
 folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 images = sorted((folder / "images").glob("*.jpg"))[:6]
-
-
-def run_colmap(out):
-    """SIFT, all pairs, incremental mapping; one camera with its principal point refined."""
-    names, single = [image.name for image in images], pycolmap.CameraMode.SINGLE
-    pycolmap.logging.minloglevel = 2
-    options = pycolmap.FeatureExtractionOptions(max_image_size=640)
-    place = out / "db", images[0].parent
-    pycolmap.extract_features(*place, names, single, extraction_options=options)
-    pycolmap.match_exhaustive(out / "db")
-    options = pycolmap.IncrementalPipelineOptions(ba_refine_principal_point=True)
-    pycolmap.incremental_mapping(*place, out, options)
-    return out / "0"
-
-
 with TemporaryDirectory() as temporary:
     out = Path(temporary)
     ours = thesisrecon.reconstruct(images, out / "ours", max_size=640, until="metric")
     models, truth = {"thesisrecon": ours.out}, folder / "cameras.json"
     if pycolmap is not None:
-        models["COLMAP"] = run_colmap(out)
+        # SIFT, all pairs, incremental mapping; one camera with its principal point refined.
+        pycolmap.logging.minloglevel = 2
+        place, single = (out / "db", images[0].parent), pycolmap.CameraMode.SINGLE
+        options = pycolmap.FeatureExtractionOptions(max_image_size=640)
+        names = [image.name for image in images]
+        pycolmap.extract_features(*place, names, single, extraction_options=options)
+        pycolmap.match_exhaustive(out / "db")
+        options = pycolmap.IncrementalPipelineOptions(ba_refine_principal_point=True)
+        pycolmap.incremental_mapping(*place, out, options)
+        models["COLMAP"] = out / "0"
     found = {name: thesisrecon.compare_models(m, truth) for name, m in models.items()}
 
 # %%
-# One scene proves little: this one is rendered, sharp and small. The pages of evidence
-# compare each stage with its best reference on rendered and on real scenes, at full size,
-# and say where the references win.
+# One scene proves little: this one is rendered, sharp and small. The pages of evidence compare each stage
+# with its best reference on rendered and on real scenes, at full size, and say where the references win.
 
 figure, axes = plt.subplots(1, 2, figsize=(12, 3.6), layout="constrained")
 for k, (name, comparison) in enumerate(found.items()):

@@ -1,6 +1,5 @@
 """The tutorial: each script of examples/ runs, is short, makes its figures, and shows what its text says."""
 
-import ast
 import re
 import runpy
 from pathlib import Path
@@ -12,13 +11,6 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 pytestmark = pytest.mark.slow
 
 
-def lines_of_code(path):
-    """Lines that are neither text nor empty."""
-    text = path.read_text("utf-8")
-    after = text.splitlines()[ast.parse(text).body[0].end_lineno :]
-    return sum(bool(line.strip()) and not line.startswith("#") for line in after)
-
-
 @pytest.fixture
 def run(capsys):
     """A function that runs the example of a number: its variables and what it printed."""
@@ -28,7 +20,7 @@ def run(capsys):
 
     def run_example(number):
         (path,) = EXAMPLES.glob(f"{number:02d}_*.py")
-        assert lines_of_code(path) <= 60
+        assert len(path.read_text("utf-8").splitlines()) <= 60
         names = runpy.run_path(str(path), run_name="__main__")
         figures = [plt.figure(number) for number in plt.get_fignums()]
         assert figures
