@@ -116,7 +116,7 @@ class FakeVerifier:
 
 @dataclass(frozen=True)
 class FakeTracks:
-    def build(self, prepared, pairs, rng):
+    def build(self, prepared, pairs, *, map_all, rng):
         CALLS.append("tracks")
         views = len(prepared)
         point, view = (a.ravel() for a in np.meshgrid(np.arange(POINTS), np.arange(views), indexing="ij"))

@@ -46,7 +46,7 @@ class Given:
     def truth(self):
         return MADE[self.scene].reconstruction
 
-    def build(self, prepared, pairs, rng):
+    def build(self, prepared, pairs, *, map_all, rng):
         return self.truth.tracks
 
     def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):

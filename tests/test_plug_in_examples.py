@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.synthetic import one_by_one
 from tests.test_plug_ins import images, strong, windows
 from thesisrecon import PipelineConfig, reconstruct
 from thesisrecon.config import ImageOptions
@@ -77,5 +78,5 @@ def test_a_lightglue_style_matcher_fits_with_a_class(tmp_path):
     assert result.pairs[0].accepted
     table = {"kind": "LightGlueMatching", "max_keypoints": 2048, "min_score": 0.7}
     assert result.settings["matching"] == table
-    tracks = AlignedTracks().build([None] * 3, result.pairs, np.random.default_rng(0))
+    tracks = AlignedTracks().build([None] * 3, result.pairs, map_all=one_by_one, rng=np.random.default_rng(0))
     assert tracks.n_points >= result.pairs[0].inliers

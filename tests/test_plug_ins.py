@@ -15,6 +15,7 @@ import pytest
 
 from tests.conftest import refuses
 from tests.fake_stages import photographs
+from tests.synthetic import one_by_one
 from thesisrecon import match_pair, reconstruct
 from thesisrecon._plug_ins import FunctionFundamental, FunctionMatcher
 from thesisrecon._settings import build_config, config_from_toml, tables_from_config, toml_from_config
@@ -85,14 +86,18 @@ def test_functions_detect_and_match(by_function):
 
 
 def test_matches_of_a_function_are_joined_to_tracks(by_function, caplog):
-    tracks = PlainTracks().build([None] * 3, by_function.pairs, np.random.default_rng(0))
+    tracks = PlainTracks().build(
+        [None] * 3, by_function.pairs, map_all=one_by_one, rng=np.random.default_rng(0)
+    )
     assert (np.bincount(tracks.point_index) == 3).sum() > 5
     with caplog.at_level(logging.INFO):
         assert PipelineConfig(matching=mutual).tracks == PlainTracks()
     assert "not aligned" in caplog.text
     assert PipelineConfig(matching=mutual, tracks=PlainTracks(merge_px=3.0)).tracks.merge_px == 3.0
     with caplog.at_level(logging.WARNING):
-        aligned = AlignedTracks().build([None] * 3, by_function.pairs, np.random.default_rng(0))
+        aligned = AlignedTracks().build(
+            [None] * 3, by_function.pairs, map_all=one_by_one, rng=np.random.default_rng(0)
+        )
     np.testing.assert_array_equal(aligned.xy, tracks.xy)
 
 
@@ -267,7 +272,7 @@ class Corrupt(Wrong):
 
 def test_features_without_seeds_get_a_sentence_where_seeds_are_needed(tmp_path):
     features = [Features(POINT, np.ones(1, np.float32), np.ones(1, np.float32))] * 31
-    given = {"map_all": lambda f, items: [f(item) for item in items], "rng": np.random.default_rng(0)}
+    given = {"map_all": one_by_one, "rng": np.random.default_rng(0)}
     names = [str(n) for n in range(31)]
     refuses(UsageError, "pairs.kind=all-pairs", OverlapEstimate().select, names, features, **given)
     config = PipelineConfig(images=SMALL, features=strong)

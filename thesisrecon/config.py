@@ -188,8 +188,10 @@ class Verifier(Protocol):
 class TrackBuilder(Protocol):
     """Join pairwise matches to tracks."""
 
-    def build(self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
-        """Build tracks from the accepted pairs of the prepared images.
+    def build(
+        self, prepared: Sequence[Any], pairs: Sequence[TwoView], *, map_all: MapAll, rng: np.random.Generator
+    ) -> Tracks:
+        """Join the accepted pairs of prepared images to tracks; ``map_all`` is a parallel map.
 
         Returns
         -------

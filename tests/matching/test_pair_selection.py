@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from tests.synthetic import photograph, texture
+from tests.synthetic import one_by_one, photograph, texture
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
@@ -25,6 +25,7 @@ from thesisrecon.matching.pair_selection import (
     _connecting_pairs,
     _count_agreeing,
     _most_similar,
+    _neighbours_of_neighbours,
     _overlap_evidence,
     _pair_array,
     _ranks,
@@ -36,10 +37,6 @@ from thesisrecon.records import Features, TwoView
 
 SIDE, CROPS = 260, 14
 NO_FEATURES = Features(np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.float32))
-
-
-def one_by_one(function, items):
-    return [function(item) for item in items]
 
 
 def names_of(n):
@@ -256,6 +253,28 @@ def test_photographs_of_one_wall_use_the_same_words(windows):
 
 
 # ---------------------------------------------------------------- its parts
+
+
+def test_neighbours_of_neighbours_are_compared_once_and_only_by_evidence():
+    compared = np.array([[0, 1], [1, 2], [2, 3], [3, 4]])
+    evidence = np.array([9.0, 9.0, 9.0, ESTIMATE.min_evidence - 0.1])
+    assert _neighbours_of_neighbours(compared, evidence, ESTIMATE).tolist() == [[0, 2], [1, 3]]
+    closed = np.vstack([compared, [[0, 2], [1, 3], [0, 3]]])
+    assert _neighbours_of_neighbours(closed, np.full(7, 9.0), ESTIMATE).tolist() == [[0, 4], [1, 4], [2, 4]]
+    assert _neighbours_of_neighbours(compared, np.zeros(4), ESTIMATE).shape == (0, 2)
+    few = replace(ESTIMATE, most=1)
+    assert _neighbours_of_neighbours(compared, np.array([1.0, 3.0, 2.0, 1.0]), few).tolist() == []
+
+
+def test_an_image_unlike_its_own_place_is_found_through_its_neighbours(windows, monkeypatch):
+    """With few similar images by words, the neighbours of neighbours give more of the pairs that overlap."""
+    few = replace(ESTIMATE, shortlist=3)
+    shared = []
+    for rounds in (0, 2):
+        monkeypatch.setattr(pair_selection, "EXPANSIONS", rounds)
+        pairs = choose(few, CROPS, windows.features).pairs
+        shared.append(sum(windows.shared(int(i), int(j)) > 0.4 for i, j in pairs))
+    assert shared[1] > shared[0]
 
 
 @given(st.integers(2, 9), st.integers(1, 9), st.integers(0, 2**31))

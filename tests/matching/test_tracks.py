@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tests.synthetic import photograph, sideways_fundamental, texture
+from tests.synthetic import one_by_one, photograph, sideways_fundamental, texture
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks, corners_from_matches
@@ -46,7 +46,7 @@ def spread(view_index, point_index, xy):
 
 @pytest.mark.parametrize("variant", [PlainTracks(), AlignedTracks()])
 def test_tracks_are_sorted_and_seen_once_in_at_least_two_views(scene, variant):
-    tracks = variant.build(*scene, np.random.default_rng(0))
+    tracks = variant.build(*scene, map_all=one_by_one, rng=np.random.default_rng(0))
     key = tracks.point_index * 4 + tracks.view_index
     assert (np.diff(key) > 0).all()
     assert (np.bincount(tracks.point_index) >= 2).all()
@@ -57,7 +57,10 @@ def test_tracks_are_sorted_and_seen_once_in_at_least_two_views(scene, variant):
 
 
 def test_alignment_brings_the_observations_of_a_track_to_one_spot(scene):
-    plain, aligned = (v.build(*scene, np.random.default_rng(0)) for v in (PlainTracks(), AlignedTracks()))
+    plain, aligned = (
+        v.build(*scene, map_all=one_by_one, rng=np.random.default_rng(0))
+        for v in (PlainTracks(), AlignedTracks())
+    )
     before = np.median(spread(plain.view_index, plain.point_index, plain.xy))
     after = np.median(spread(aligned.view_index, aligned.point_index, aligned.xy))
     assert after < 0.03
@@ -66,7 +69,7 @@ def test_alignment_brings_the_observations_of_a_track_to_one_spot(scene):
 
 @pytest.mark.parametrize("variant", [PlainTracks(), AlignedTracks()])
 def test_no_accepted_pair_gives_no_tracks(scene, variant):
-    tracks = variant.build(scene[0], [], np.random.default_rng(0))
+    tracks = variant.build(scene[0], [], map_all=one_by_one, rng=np.random.default_rng(0))
     assert (tracks.n_points, len(tracks.xy), tracks.n_views) == (0, 0, 4)
 
 
@@ -76,8 +79,8 @@ def test_a_false_link_does_not_join_two_corners_of_one_view(scene):
     moved = (good.index1, np.roll(good.index2, 1), good.xy1, good.xy2, good.affine)
     rows = [values[:50] for values in moved]
     wrong = TwoView(0, 1, good.F, 9.0, *rows, 50, 0.0, True)
-    with_it = PlainTracks().build(prepared, [*pairs, wrong], np.random.default_rng(0))
-    without = PlainTracks().build(prepared, pairs, np.random.default_rng(0))
+    with_it = PlainTracks().build(prepared, [*pairs, wrong], map_all=one_by_one, rng=np.random.default_rng(0))
+    without = PlainTracks().build(prepared, pairs, map_all=one_by_one, rng=np.random.default_rng(0))
     assert np.array_equal(np.unique(with_it.point_index, return_counts=True)[1].max(), 4)
     assert abs(with_it.n_points - without.n_points) <= 50
 
@@ -106,11 +109,12 @@ def test_positions_without_corners_become_corners_within_the_radius():
             assert np.linalg.norm(corners[view][index] - xy, axis=1).max() < 1.6
     again, _ = corners_from_matches(pairs[::-1], 5, 0.8)
     assert all((np.sort(a, axis=0) == np.sort(b, axis=0)).all() for a, b in zip(corners, again, strict=True))
-    tracks = PlainTracks(merge_px=0.8).build([None] * 5, pairs, rng)
+    tracks = PlainTracks(merge_px=0.8).build([None] * 5, pairs, map_all=one_by_one, rng=rng)
     assert (np.bincount(tracks.point_index) == 4).mean() > 0.97
     assert tracks.n_points < 1.02 * n
     # Equal positions only: every pair has its own tracks.
-    assert PlainTracks(merge_px=0.0).build([None] * 5, pairs, rng).n_points == 6 * n
+    equal = PlainTracks(merge_px=0.0).build([None] * 5, pairs, map_all=one_by_one, rng=rng)
+    assert equal.n_points == 6 * n
 
 
 def test_merging_keeps_equal_positions_joins_no_chains_and_matches_one_to_one():

@@ -7,7 +7,7 @@ import pytest
 
 from thesisrecon.numerics._levenberg_marquardt import invert_information, minimize_residuals
 from thesisrecon.numerics._noise import best_huber_width, effective_noise, huber, soft_l1
-from thesisrecon.numerics._observations import morton_pair_order
+from thesisrecon.numerics._observations import cached_pair_order
 from thesisrecon.numerics._small_solvers import solve_positive
 
 
@@ -46,18 +46,18 @@ def times_made(first, second, room):
 
 def test_every_pair_is_visited_once_and_a_pair_and_its_turned_one_together():
     i, j = np.array([5, 3, 9, 5, 0]), np.array([3, 5, 2, 9, 1])
-    order = morton_pair_order(i, j)
+    order = cached_pair_order(i, j)
     assert sorted(order) == [0, 1, 2, 3, 4]
     places = np.argsort(order)
     assert abs(places[0] - places[1]) == 1
-    assert len(morton_pair_order([], [])) == 0
+    assert len(cached_pair_order([], [])) == 0
 
 
 @pytest.mark.parametrize("room", [16, 60, 120])
 def test_views_are_loaded_few_times_with_any_memory(room):
     i, j = np.divmod(np.arange(300 * 300), 300)
     i, j = i[i != j], j[i != j]
-    order = morton_pair_order(i, j)
+    order = cached_pair_order(i, j)
     # Tiles with one side of half the room are the best there is, up to a factor.
     assert times_made(i[order], j[order], room) < 2.0 * 300**2 / room
     assert times_made(i, j, room) > 0.9 * len(i)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -123,41 +124,56 @@ def affine_determinant(a: F64) -> float:
 class PreparedImage:
     """An image prepared for matching.
 
-    ``size`` = (width, height); ``patches`` (N, 225) = normalised 15 x 15 window of each corner at its scale
-    (other sizes on request), zero outside the image; ``pyramid`` = pixels, levels, base and ``cells`` = side
-    px, shape, start and order of the corner cells are arguments of the kernels.
+    ``size`` = (width, height); ``pyramid`` = pixels, levels, base and ``cells`` = side px, shape, start and
+    order of the corner cells are arguments of the kernels; ``window`` is the side of the corner windows, cut
+    from the pixels of ``channels``.
     """
 
     size: tuple[int, int]
     features: Features
     pyramid: tuple[F32, I64, float]
-    patches: F32
     cells: tuple[float, I64, I64, I64]
+    window: int
+    channels: tuple[F32, ...]
 
     @property
     def long_side(self) -> int:
         return max(self.size)
 
+    @cached_property
+    def patches(self) -> F32:
+        """Normalised window (N, D) of each corner at its scale, zero outside the image.
+
+        Those of the channels stand side by side, so that products are mean correlations.
+        """
+        (_, levels, base), found = self.pyramid, self.features
+        parts = [_corner_patches(c, levels, base, found.xy, found.scale, self.window) for c in self.channels]
+        return parts[0] if len(parts) == 1 else np.hstack(parts) / np.float32(np.sqrt(len(parts)))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory with the windows, which only some stages need, and without the features."""
+        windows = len(self.channels) * len(self.features.xy) * self.window**2 * 4
+        pixels = {id(pixels): pixels.nbytes for pixels in (self.pyramid[0], *self.channels)}
+        return windows + sum(pixels.values())
+
 
 def prepare_image(
     image: Image, features: Features, *, window: int = SIDE, colour: bool = False
 ) -> PreparedImage:
-    """Compute the grey pyramid, corner windows (``window`` odd) and corner cells of an image.
+    """Compute the grey pyramid and the corner cells of an image, for corner windows of the side ``window``.
 
     The pyramid starts at twice the image size if corners were found there (scale below 1). With ``colour``
-    the windows of the three colours stand side by side, each normalised: products are mean correlations.
+    the windows are those of the three colours.
     """
     doubled = len(features.scale) > 0 and float(features.scale.min()) < 0.75
     base = 0.5 if doubled else 1.0
     pixels, levels = _pyramid(image.gray, doubled)
-    channels = [pixels]
-    if colour:
-        channels = [_pyramid(image.rgb[:, :, c].astype(np.float32), doubled)[0] for c in range(3)]
-    parts = [_corner_patches(c, levels, base, features.xy, features.scale, window) for c in channels]
-    patches = np.hstack(parts) / np.float32(np.sqrt(3.0)) if colour else parts[0]
+    grays = [image.rgb[:, :, c].astype(np.float32) for c in range(3)] if colour else []
+    channels = tuple(_pyramid(gray, doubled)[0] for gray in grays) or (pixels,)
     cell_px = max(4.0, 0.01 * max(image.size))
     cells = (cell_px, *_cells(features.xy, image.size, cell_px))
-    return PreparedImage(image.size, features, (pixels, levels, base), patches, cells)
+    return PreparedImage(image.size, features, (pixels, levels, base), cells, window, channels)
 
 
 def _pyramid(gray: F32, doubled: bool) -> tuple[F32, I64]:

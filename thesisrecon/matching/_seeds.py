@@ -13,6 +13,7 @@ from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import strongest_distinct
 from thesisrecon.matching._prepared import empty_matches, select_matches
+from thesisrecon.numerics._nearest import nearest_neighbours
 from thesisrecon.records import Features, Matches, Seeds
 
 BLOCK, LANES = 64, 64
@@ -215,7 +216,8 @@ def neighbour_support(matches: Matches) -> F64:
     if len(matches.xy1) < 2:
         return np.zeros(len(matches.xy1))
     u, v = matches.xy1 @ _common_similarity(matches).T, matches.xy2
-    return 0.5 * (_agreement(u, v, None, NEIGHBOURS) + _agreement(v, u, None, NEIGHBOURS))
+    same = np.eye(2)[None]
+    return 0.5 * (_agreement(u, v, same, NEIGHBOURS) + _agreement(v, u, same, NEIGHBOURS))
 
 
 def map_support(matches: Matches) -> F64:
@@ -230,17 +232,24 @@ def map_support(matches: Matches) -> F64:
     return 0.5 * (forth + _agreement(xy2, xy1, back, 2 * NEIGHBOURS))
 
 
-def _agreement(here: F64, there: F64, maps: F64 | None, neighbours: int) -> F64:
+@kernel
+def _agreement(here: F64, there: F64, maps: F64, neighbours: int) -> F64:
     """Number (M,) of the nearest neighbours, in part, that are where the ``maps`` (M, 2, 2) lead.
 
-    None: maps that leave all offsets as they are.
+    One map (1, 2, 2) is that of all.
     """
-    near = scipy.spatial.cKDTree(here).query(here, min(neighbours + 1, len(here)))[1][:, 1:]
-    offset = here[near] - here[:, None]
-    led = offset if maps is None else np.einsum("mij,mkj->mki", maps, offset)
-    strain = np.linalg.norm((there[near] - there[:, None]) - led, axis=2)
-    apart = np.linalg.norm(led, axis=2)
-    support: F64 = np.exp(-0.5 * (strain / (TOLERANCE * apart + 1.0)) ** 2).sum(axis=1)
+    support = zeros(len(here))
+    near = nearest_neighbours(here, here, min(neighbours + 1, len(here)))
+    for n in range(len(here)):
+        a = maps[n if len(maps) > 1 else 0]
+        for m in near[n]:
+            if m == n:
+                continue
+            dx, dy = here[m, 0] - here[n, 0], here[m, 1] - here[n, 1]
+            x, y = a[0, 0] * dx + a[0, 1] * dy, a[1, 0] * dx + a[1, 1] * dy
+            apart = np.sqrt(x * x + y * y)
+            x, y = there[m, 0] - there[n, 0] - x, there[m, 1] - there[n, 1] - y
+            support[n] += np.exp(-0.5 * (x * x + y * y) / (TOLERANCE * apart + 1.0) ** 2)
     return support
 
 

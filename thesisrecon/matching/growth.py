@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
@@ -29,7 +28,7 @@ from thesisrecon.matching._prepared import (
     select_matches,
 )
 from thesisrecon.matching._seeds import SeedSet, corners_of_seeds, map_support, seed_matches
-from thesisrecon.numerics._small_solvers import solve_damped
+from thesisrecon.numerics._nearest import nearest_neighbours
 from thesisrecon.records import Features, Image, Matches
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
@@ -71,17 +70,12 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
     are collinear. Returns the map (N, 2, 2), the position in image 2 (N, 2) and its uncertainty (N,) px.
     """
     count, k = neighbours.shape
-    affine = empty((count, 2, 2))
-    position = empty((count, 2))
-    spread = empty(count)
-    offset = empty((k, 2))
-    rest = empty((k, 2))
-    distance2 = empty(k)
-    residual2 = empty(k)
-    ordered = empty(k)
+    affine, position, spread = empty((count, 2, 2)), empty((count, 2)), empty(count)
+    offset, rest, a0, z = empty((k, 2)), empty((k, 2)), empty((2, 2)), empty((3, 2))
+    distance2, residual2, ordered = empty(k), empty(k), empty(k)
     for n in range(count):
         mean2 = 0.0
-        a0 = zeros((2, 2))
+        a0[:] = 0.0
         for m in range(k):
             i = neighbours[n, m]
             dx, dy = xy1[i, 0] - xy[n, 0], xy1[i, 1] - xy[n, 1]
@@ -98,57 +92,49 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
             rest[m, 0] = xy2[i, 0] - (a0[0, 0] * dx + a0[0, 1] * dy)
             rest[m, 1] = xy2[i, 1] - (a0[1, 0] * dx + a0[1, 1] * dy)
         scale2 = np.inf
-        a, z = affine[n], zeros((3, 2))
         for _ in range(ROUNDS):
-            z = _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2))
-            for p in range(2):
-                for q in range(2):
-                    a[p, q] = a0[p, q] + z[q, p]
+            _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2), z)
             for m in range(k):
-                i, dx, dy = neighbours[n, m], offset[m, 0], offset[m, 1]
-                ex = xy2[i, 0] - (a[0, 0] * dx + a[0, 1] * dy + z[2, 0])
-                ey = xy2[i, 1] - (a[1, 0] * dx + a[1, 1] * dy + z[2, 1])
+                dx, dy = offset[m, 0], offset[m, 1]
+                ex = rest[m, 0] - (z[0, 0] * dx + z[1, 0] * dy + z[2, 0])
+                ey = rest[m, 1] - (z[0, 1] * dx + z[1, 1] * dy + z[2, 1])
                 residual2[m] = ex * ex + ey * ey
             scale2 = _median(residual2, ordered)
+        for p in range(2):
+            for q in range(2):
+                affine[n, p, q] = a0[p, q] + z[q, p]
         position[n, 0], position[n, 1] = z[2, 0], z[2, 1]
         spread[n] = np.sqrt(scale2)
     return affine, position, spread
 
 
-@kernel
-def _solve_correction(offset: F64, rest: F64, near: tuple[F64, float], misfit: tuple[F64, float]) -> F64:
+@kernel(forceinline=True)
+def _solve_correction(
+    offset: F64, rest: F64, near: tuple[F64, float], misfit: tuple[F64, float], correction: F64
+) -> None:
     """Correction (3, 2) of the prior map, transposed, above the translation, by weighted least squares."""
     distance2, mean2 = near
     residual2, scale2 = misfit
-    s = zeros((3, 3))
-    r = zeros((2, 3))
-    total = 0.0
+    xx = xy = yy = x = y = total = 0.0
+    xu = yu = u = xv = yv = v = 0.0
     for m in range(len(offset)):
-        w = 1.0 / (distance2[m] + mean2)
-        w /= 1.0 + residual2[m] / (scale2 + 1e-9)
-        total += w
+        w = 1.0 / ((distance2[m] + mean2) * (1.0 + residual2[m] / (scale2 + 1e-9)))
         dx, dy = offset[m, 0], offset[m, 1]
-        s[0, 0] += w * dx * dx
-        s[0, 1] += w * dx * dy
-        s[1, 1] += w * dy * dy
-        s[0, 2] += w * dx
-        s[1, 2] += w * dy
-        s[2, 2] += w
-        for side in range(2):
-            e = rest[m, side]
-            r[side, 0] += w * dx * e
-            r[side, 1] += w * dy * e
-            r[side, 2] += w * e
+        wx, wy, e, f = w * dx, w * dy, rest[m, 0], rest[m, 1]
+        total, x, y = total + w, x + wx, y + wy
+        xx, xy, yy = xx + wx * dx, xy + wx * dy, yy + wy * dy
+        xu, yu, u = xu + wx * e, yu + wy * e, u + w * e
+        xv, yv, v = xv + wx * f, yv + wy * f, v + w * f
+    # Without the means, the translation leaves a symmetric system of two unknowns, positive by the ridge.
     ridge = PRIOR_SHARE * total * mean2
-    s[0, 0] += ridge
-    s[1, 1] += ridge
-    s[1, 0], s[2, 0], s[2, 1] = s[0, 1], s[0, 2], s[1, 2]
-    correction, step = zeros((3, 2)), empty(3)
-    for side in range(2):
-        if solve_damped(s, r[side], 0.0, step):
-            for i in range(3):
-                correction[i, side] = -step[i]
-    return correction
+    x, y = x / total, y / total
+    xx, xy, yy = xx - total * x * x + ridge, xy - total * x * y, yy - total * y * y + ridge
+    determinant = xx * yy - xy * xy
+    xu, yu, xv, yv = xu - x * u, yu - y * u, xv - x * v, yv - y * v
+    correction[0, 0], correction[1, 0] = (yy * xu - xy * yu) / determinant, (xx * yu - xy * xu) / determinant
+    correction[0, 1], correction[1, 1] = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
+    correction[2, 0] = u / total - correction[0, 0] * x - correction[1, 0] * y
+    correction[2, 1] = v / total - correction[0, 1] * x - correction[1, 1] * y
 
 
 @kernel
@@ -306,8 +292,8 @@ class SeedsAndGrowth:
         Seeds by upright patches, by patches rotated to their gradient, or the latter too if the upright ones
         do not relate the pair well.
     support : {"auto", "always", "never"}
-        Estimate F from seeds whose neighbours move alike, from all seeds, or from both with the better
-        result.
+        Estimate F from seeds whose neighbours move alike, from all seeds, or from the latter too, with the
+        better result, if fewer than half of the former agree.
     growth : bool
         Match all corners by guided search, else only corners at seeds.
     coarse_first : bool
@@ -388,6 +374,8 @@ class SeedsAndGrowth:
                 found = _verified(trial, estimate, rng)
                 if found is not None and len(found[0].xy1) >= max(MIN_SEEDS, most + 1):
                     best, most = found, len(found[0].xy1)
+                if most >= max(50, 0.5 * len(trial.xy1)):
+                    break
             if most >= max(50, 0.5 * len(seeds.xy1)):
                 break
         return best
@@ -453,9 +441,7 @@ class SeedsAndGrowth:
     ) -> Matches:
         """Match the ``chosen`` corners of image 1, guided by F and the local maps of known matches."""
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
-        # With a list of ranks the result keeps two dimensions even for one neighbour.
-        ranks = np.arange(1, min(self.neighbours, len(known.xy1)) + 1)
-        near = scipy.spatial.cKDTree(known.xy1).query(xy1, ranks)[1]
+        near = nearest_neighbours(known.xy1, xy1, min(self.neighbours, len(known.xy1)))
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, RADIUS_REL * long_side)

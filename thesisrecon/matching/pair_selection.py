@@ -41,6 +41,8 @@ MIN_LOG10 = -300.0
 PER_SCALE = 200
 SAMPLES_PER_WORD = 8
 ROUNDS = 4
+EXPANSIONS = 2
+"""Times that the neighbours of an image are compared with each other."""
 ROWS_AT_ONCE = 4096
 
 
@@ -207,7 +209,16 @@ class OverlapEstimate:
             kinds = [[subset[kind].patches for subset in subsets] for kind in (0, 1)]
             words = np.hstack([_word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds])
             compared = _most_similar(words, self.shortlist)
-        evidence = np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), compared.tolist()))
+
+        def evidence_of(pairs: I64) -> F64:
+            return np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), pairs.tolist()))
+
+        evidence = evidence_of(compared)
+        for _ in range(EXPANSIONS):
+            new = _neighbours_of_neighbours(compared, evidence, self)
+            compared, evidence = np.vstack([compared, new]), np.append(evidence, evidence_of(new))
+        order = np.lexsort(compared.T[::-1])
+        compared, evidence = compared[order], evidence[order]
         rank, enough = _ranks(compared, evidence, n), evidence >= self.min_evidence
         # Of the further pairs of an image, those at which the number that is due grows.
         further = np.bincount(compared[enough].ravel(), minlength=n)[compared.T] - self.most
@@ -243,6 +254,23 @@ def _most_similar(words: F64, count: int) -> I64:
         best = np.argsort(-similarity, axis=1, kind="stable")[:, : min(count, n - 1)]
         pairs += np.column_stack([np.repeat(rows, best.shape[1]), best.ravel()]).tolist()
     return _pair_array(pairs)
+
+
+def _neighbours_of_neighbours(compared: I64, evidence: F64, choice: OverlapEstimate) -> I64:
+    """Pairs (M, 2), not yet compared, of the neighbours of an image, which are its best pairs with evidence.
+
+    Where many places look alike, the most similar images may not be those of the same place: the image itself
+    is then found through its neighbours (query expansion, O. Chum et al., "Total recall", ICCV 2007).
+    """
+    n, known = int(compared.max()) + 1, {(i, j) for i, j in compared.tolist()}
+    best = (_ranks(compared, evidence, n) < choice.most) & (evidence >= choice.min_evidence)
+    neighbours: list[list[int]] = [[] for _ in range(n)]
+    for (i, j), (of_i, of_j) in zip(compared.tolist(), best.T.tolist(), strict=True):
+        neighbours[i] += [j] * of_i
+        neighbours[j] += [i] * of_j
+    near = _pair_array(pair for some in neighbours for pair in combinations(some, 2))
+    new = [pair for pair in near.tolist() if tuple(pair) not in known]
+    return np.array(new, dtype=np.int64).reshape(-1, 2)
 
 
 def _ranks(pairs: I64, value: F64, n: int) -> I64:

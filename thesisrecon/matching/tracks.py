@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,11 +15,14 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import PreparedImage
-from thesisrecon.numerics._observations import morton_pair_order
+from thesisrecon.matching.pair_selection import MapAll
+from thesisrecon.numerics._observations import cached_pair_order
 from thesisrecon.records import Matches, Tracks, TwoView
 
 MERGE_PX = 1.0
 """Default distance of positions that are one corner: the noise of positions that differ from pair to pair."""
+BATCH = 256
+"""Groups of observations that one thread aligns at a time."""
 Pair = TypeVar("Pair", Matches, TwoView)
 
 
@@ -208,9 +212,11 @@ class PlainTracks:
         if not (np.isfinite(self.merge_px) and self.merge_px >= 0.0):
             raise ValueError(f"merge_px must be at least 0; got {self.merge_px}")
 
-    def build(self, prepared: Sequence[Any], pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
+    def build(
+        self, prepared: Sequence[Any], pairs: Sequence[TwoView], *, map_all: MapAll, rng: np.random.Generator
+    ) -> Tracks:
         """See `thesisrecon.config.TrackBuilder.build`."""
-        del rng
+        del map_all, rng
         accepted = _best_first(pairs)
         features = [getattr(p, "features", None) for p in prepared] if _numbered(accepted) else [None]
         corners = [found.xy for found in features if found is not None]
@@ -230,21 +236,35 @@ class AlignedTracks:
     """
 
     def build(
-        self, prepared: Sequence[PreparedImage], pairs: Sequence[TwoView], rng: np.random.Generator
+        self,
+        prepared: Sequence[PreparedImage],
+        pairs: Sequence[TwoView],
+        *,
+        map_all: MapAll,
+        rng: np.random.Generator,
     ) -> Tracks:
         """See `thesisrecon.config.TrackBuilder.build`."""
         accepted = _best_first(pairs)
         if not (_numbered(accepted) and isinstance(prepared[0], PreparedImage)):
             logging.getLogger(__name__).warning("tracks are not aligned: the matcher prepares no windows")
-            return PlainTracks().build(prepared, pairs, rng)
+            return PlainTracks().build(prepared, pairs, map_all=map_all, rng=rng)
         chains = _link_matches([p.features.xy for p in prepared], accepted)
         start, affine, middle = _affines_from_middle_view(chains, accepted)
         xy, kept = start.copy(), np.ones(len(start), np.bool_)
-        for i, j, group in _groups(chains.view[middle], chains.view, len(prepared)):
-            view1, corner = prepared[i], chains.corner[middle[group]]
-            matches = (view1.features.xy[corner], view1.features.scale[corner], start[group], affine[group])
-            found, _, score = align_corners(view1, prepared[j], matches, affine_std=AFFINE_STD)
-            xy[group], kept[group] = found, score >= MIN_CORRELATION
+
+        def align(groups: Sequence[tuple[int, int, I64]]) -> None:
+            for i, j, group in groups:
+                view1, corner = prepared[i], chains.corner[middle[group]]
+                matches = (
+                    view1.features.xy[corner],
+                    view1.features.scale[corner],
+                    start[group],
+                    affine[group],
+                )
+                found, _, score = align_corners(view1, prepared[j], matches, affine_std=AFFINE_STD)
+                xy[group], kept[group] = found, score >= MIN_CORRELATION
+
+        map_all(align, _batches(_groups(chains.view[middle], chains.view, len(prepared))))
         return _tracks(chains, xy, kept, len(prepared))
 
 
@@ -363,8 +383,14 @@ def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64
     numbers, starts = np.unique(pair[order], return_index=True)
     groups = np.split(order, starts[1:]) if len(numbers) else []
     i, j = np.divmod(numbers, views)
-    for k in morton_pair_order(i, j):
+    for k in cached_pair_order(i, j):
         yield int(i[k]), int(j[k]), groups[k]
+
+
+def _batches(groups: Iterator[tuple[int, int, I64]]) -> Iterator[list[tuple[int, int, I64]]]:
+    """Consecutive groups, which share views."""
+    while batch := list(islice(groups, BATCH)):
+        yield batch
 
 
 def _tracks(chains: _Chains, xy: F64, kept: B8, n_views: int) -> Tracks:

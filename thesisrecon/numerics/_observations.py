@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import F64, I64
@@ -87,13 +88,21 @@ class Observations(NamedTuple):
     xy: F64
 
 
-def morton_pair_order(first: ArrayLike, second: ArrayLike) -> I64:
+def cached_pair_order(first: ArrayLike, second: ArrayLike) -> I64:
     """Indices of view pairs in an order in which cached data of a view are reused.
 
-    Ranges of Morton's curve (IBM, 1966) contain few different views: a cache of M of V computes V^2 / M.
+    Views of a pair get near numbers (reverse Cuthill-McKee), and ranges of Morton's curve (IBM, 1966) contain
+    few different views: with all pairs, a cache of M of V views computes V^2 / M.
     """
     i, j = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
-    low, high = np.minimum(i, j), np.maximum(i, j)
+    if not len(i):
+        return i
+    views, place = np.unique(np.concatenate([i, j]), return_inverse=True)
+    near, ends = np.empty(len(views), np.int64), place.reshape(2, -1)
+    graph = scipy.sparse.coo_array((np.ones(2 * len(i)), (place, ends[::-1].ravel())), shape=[len(views)] * 2)
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)
+    near[order] = np.arange(len(views))
+    low, high = np.sort(near[ends], axis=0)
     curve = np.zeros(len(i), dtype=np.int64)
     for bit in range(_MORTON_BITS):
         curve |= ((low >> bit) & 1) << (2 * bit + 1) | ((high >> bit) & 1) << (2 * bit)

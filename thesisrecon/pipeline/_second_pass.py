@@ -56,7 +56,8 @@ def _registered_more(
 ) -> MetricResult:
     rng, calibration = stream(state.run.seed, "metric", attempt, 1), state.result.calibration
     assert calibration is not None
-    tracks = state.config.tracks.build(state.prepared_views(), pairs, rng)
+    map_all = state.run.workers.map_all
+    tracks = state.config.tracks.build(state.prepared_views(), pairs, map_all=map_all, rng=rng)
     start, again = (
         cameras_on_tracks(metric.reconstruction, tracks),
         from_metric(metric.reconstruction, calibration),

@@ -207,10 +207,11 @@ def build_tracks(state: PipelineState) -> None:
     require_accepted_pair(state)
     group = [list(state.groups[0])] if state.groups else []
     key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed, *group)
-    build, rng = state.config.tracks.build, stream(run.seed, "tracks")
-    finish_tracks(
-        state, run.cached("tracks", "tracks", key, lambda: build(state.prepared_views(), pairs, rng))
+    build, map_all, rng = state.config.tracks.build, run.workers.map_all, stream(run.seed, "tracks")
+    tracks: Tracks = run.cached(
+        "tracks", "tracks", key, lambda: build(state.prepared_views(), pairs, map_all=map_all, rng=rng)
     )
+    finish_tracks(state, tracks)
 
 
 def require_accepted_pair(state: PipelineState) -> None:

@@ -16,7 +16,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
-from thesisrecon.numerics._observations import morton_pair_order
+from thesisrecon.numerics._observations import cached_pair_order
 from thesisrecon.records import Features, Image, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run
@@ -70,22 +70,22 @@ class PreparedViews(Sequence[Any]):
 
 def _size_of(value: Any) -> int:
     """Bytes of the arrays of a record."""
-    if isinstance(value, np.ndarray):
-        return value.nbytes
+    if hasattr(value, "nbytes"):
+        return int(value.nbytes)
     if is_dataclass(value):
         return sum(_size_of(getattr(value, f.name)) for f in fields(value))
-    return 0
+    return sum(_size_of(part) for part in value) if isinstance(value, tuple) else 0
 
 
 def batch_pairs(
     pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None
 ) -> list[list[int]]:
-    """Divide the numbers of pairs into batches of consecutive pairs that share views (Morton order)."""
+    """Divide the numbers of pairs into batches of pairs that share views."""
     size = 1
     if workers is not None:
         size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
-    ordered = [numbers[k] for k in morton_pair_order(first, second)]
+    ordered = [numbers[k] for k in cached_pair_order(first, second)]
     return [ordered[k : k + size] for k in range(0, len(ordered), size)]
 
 
