@@ -37,6 +37,8 @@ APART = 3.0
 MIN_SUPPORT, MIN_SEEDS = 2.0, 12
 # The same of seeds whose maps are affine.
 MIN_MAP_SUPPORT = 1.0
+# Number of supported seeds that agree at which all seeds are not tried: weak pairs gain by the second trial.
+DECIDING_SEEDS = 100
 # Maximum search radius around a prediction relative to the long side, and minimum correlation there.
 RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
 # Pairs with a wide step have few seeds, whose maps are known to a fifth and positions to a few pixels.
@@ -293,7 +295,7 @@ class SeedsAndGrowth:
         do not relate the pair well.
     support : {"auto", "always", "never"}
         Estimate F from seeds whose neighbours move alike, from all seeds, or from the latter too, with the
-        better result, if fewer than half of the former agree.
+        better result, if few or fewer than half of the former agree.
     growth : bool
         Match all corners by guided search, else only corners at seeds.
     coarse_first : bool
@@ -374,7 +376,7 @@ class SeedsAndGrowth:
                 found = _verified(trial, estimate, rng)
                 if found is not None and len(found[0].xy1) >= max(MIN_SEEDS, most + 1):
                     best, most = found, len(found[0].xy1)
-                if most >= max(50, 0.5 * len(trial.xy1)):
+                if most >= max(DECIDING_SEEDS, 0.5 * len(trial.xy1)):
                     break
             if most >= max(50, 0.5 * len(seeds.xy1)):
                 break
