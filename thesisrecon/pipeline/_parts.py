@@ -171,9 +171,12 @@ def input_of_part(
     own = Tracks(
         view[tracks.view_index[k]], point[tracks.point_index[k]], tracks.xy[k], len(views), len(points)
     )
-    none = {"index1": np.zeros(0, np.int64), "index2": np.zeros(0, np.int64), "affine": np.zeros((0, 2, 2))}
+    none, affine = np.zeros(0, np.int64), np.zeros((0, 2, 2))
     inside = [p for p in pairs if p.accepted and view[p.i] >= 0 and view[p.j] >= 0]
-    renumbered = tuple(replace(p, i=int(view[p.i]), j=int(view[p.j]), **none) for p in inside)
+    renumbered = tuple(
+        replace(p, i=int(view[p.i]), j=int(view[p.j]), index1=none, index2=none, affine=affine)
+        for p in inside
+    )
     rows = {name: getattr(prior, name)[views] for name in ("mean", "std", "shared", "kind")}
     return PartInput(own, renumbered, sizes[views], replace(prior, **rows))
 
@@ -271,7 +274,7 @@ def _align_part(a: _Part, b: _Part) -> tuple[int, Similarity]:
 def _project_each(P: F64, X: F64) -> F64:
     x = np.einsum("nij,nj->ni", P, X)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.nan_to_num(x[:, :2] / x[:, 2:], nan=np.inf)
+        return np.asarray(np.nan_to_num(x[:, :2] / x[:, 2:], nan=np.inf))
 
 
 def _poses(model: Reconstruction, views: I64) -> tuple[F64, F64]:
