@@ -258,7 +258,7 @@ def upgraded_model(
 
 
 def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F64:
-    """(V, 8) start values: calibrated focals, else the median field of view; prior means for the rest."""
+    """(V, 8) start values: calibrated focals and principal points, else the median field of view; the prior."""
     group, longest = prior.group, sizes.max(axis=1)
     typical = float(np.median(K[registered, 0, 0] / longest[registered]))
     rows = np.zeros((len(K), WIDTH))
@@ -268,4 +268,6 @@ def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F
         known = views[registered[views]]
         focal = float(np.median(K[known, 0, 0])) if len(known) else typical * longest[views[0]]
         rows[views, FOCAL] = focal
+        if len(known):
+            rows[np.ix_(views, CENTRE)] = np.median(K[known, :2, 2], axis=0)
     return rows

@@ -17,10 +17,10 @@ from thesisrecon._settings import tables_from_config
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import project_camera
 from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
-from thesisrecon.pipeline._second_pass import cameras_on_tracks
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 from thesisrecon.runtime._run import Batch, stream
@@ -46,7 +46,7 @@ ROUNDS = 5
 def cameras_from_parts(state: PipelineState, attempts: int) -> Reconstruction | None:
     """Reconstruct a large set in parts and align them; None if it is not divided or no part succeeds.
 
-    Points are triangulated from all tracks. A part is stored when it is finished.
+    A part is stored when it is finished.
     """
     run, config, tracks = state.run, state.config, state.result.tracks
     assert tracks is not None
@@ -73,8 +73,7 @@ def cameras_from_parts(state: PipelineState, attempts: int) -> Reconstruction | 
             yield [n], (config, given, n, run.seed, attempts)
 
     models: Sequence[Reconstruction] = run.map_cached("metric", keys, reconstruct_part, batches)
-    found = align_parts(tracks, sizes, own, parts, models)
-    return None if found is None else cameras_on_tracks(found, tracks)
+    return align_parts(tracks, sizes, own, parts, models)
 
 
 def neighbour_graph(tracks: Tracks) -> scipy.sparse.csr_array:
@@ -160,6 +159,11 @@ def points_of_part(tracks: Tracks, views: I64) -> I64:
     return np.flatnonzero(np.bincount(tracks.point_index[seen], minlength=tracks.n_points) >= 2)
 
 
+def _rows_of_part(tracks: Tracks, views: I64, points: I64) -> I64:
+    """The observations of a part, in the order of its own tracks."""
+    return np.flatnonzero(np.isin(tracks.view_index, views) & np.isin(tracks.point_index, points))
+
+
 def input_of_part(
     tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, prior: IntrinsicsPrior, views: I64
 ) -> PartInput:
@@ -167,7 +171,7 @@ def input_of_part(
     view, point = np.full(tracks.n_views, -1), np.full(tracks.n_points, -1)
     points = points_of_part(tracks, views)
     view[views], point[points] = np.arange(len(views)), np.arange(len(points))
-    k = np.flatnonzero((view[tracks.view_index] >= 0) & (point[tracks.point_index] >= 0))
+    k = _rows_of_part(tracks, views, points)
     own = Tracks(
         view[tracks.view_index[k]], point[tracks.point_index[k]], tracks.xy[k], len(views), len(points)
     )
@@ -214,7 +218,7 @@ def _no_cameras(given: PartInput) -> Reconstruction:
 def align_parts(
     tracks: Tracks, sizes: I64, own: Sequence[I64], parts: Sequence[I64], models: Sequence[Reconstruction]
 ) -> Reconstruction | None:
-    """The cameras of all parts that can be aligned with the largest one, in its frame; None without any.
+    """Cameras and points of all parts that can be aligned with the largest one, in its frame, or None.
 
     ``own`` are the views of each part without the overlap, which take their camera from it.
     """
@@ -320,21 +324,59 @@ def _in_one_frame(
     models: Sequence[Reconstruction],
     placed: dict[int, Similarity],
 ) -> Reconstruction:
-    n = tracks.n_views
+    """Cameras of the part that owns a view, points of the part with most inliers; inliers agree with both."""
+    n, m = tracks.n_views, tracks.n_points
     P, K, registered = np.zeros((n, 3, 4)), np.zeros((n, 3, 3)), np.zeros(n, dtype=bool)
+    X, support, seen = np.zeros((m, 4)), np.zeros(m, np.int64), np.zeros(len(tracks.xy), dtype=bool)
+    distortion = np.zeros((n, 3))
     for inner in (True, False):
         for p, similarity in placed.items():
             views, model = parts[p], models[p]
-            here = np.flatnonzero(
-                model.registered & ~registered[views] & (np.isin(views, own[p]) | (not inner))
-            )
+            free = model.registered & ~registered[views] & (np.isin(views, own[p]) | (not inner))
+            here = np.flatnonzero(free)
             R, C = _poses(model, here)
             R, C = R @ similarity.R.T, similarity.apply(C)
             assert model.K is not None
             K[views[here]] = model.K[here]
             P[views[here]] = model.K[here] @ np.concatenate([R, -(R @ C[:, :, None])], axis=2)
+            distortion[views[here]] = 0.0 if model.distortion is None else model.distortion[here]
             registered[views[here]] = True
+    for p, similarity in placed.items():
+        model, points = models[p], points_of_part(tracks, parts[p])
+        seen[_rows_of_part(tracks, parts[p], points)[model.inlier]] = True
+        count = np.bincount(model.tracks.point_index[model.inlier], minlength=len(points))
+        better = model.valid & (count > support[points])
+        moved = similarity.apply(model.X[better, :3] / model.X[better, 3:])
+        X[points[better]], support[points[better]] = (
+            np.column_stack([moved, np.ones(len(moved))]),
+            count[better],
+        )
     sigma = float(np.median([models[p].sigma_px for p in placed]))
-    none, X = np.zeros(tracks.n_points, dtype=bool), np.zeros((tracks.n_points, 4))
-    points = (X, registered, none, none[tracks.point_index], tracks, sizes)
-    return Reconstruction("metric", P, *points, sigma, ("",) * n, K, np.zeros((n, 3)))
+    found = (registered, support > 0, seen, tracks, sizes, sigma, ("",) * n, K, distortion)
+    merged = Reconstruction("metric", P, X, *found)
+    close = _reprojection_px(merged) < MAX_OFFSET_REL * sizes[tracks.view_index].max(axis=1)
+    inlier = seen & registered[tracks.view_index] & close
+    valid = (support > 0) & (np.bincount(tracks.point_index[inlier], minlength=m) >= 2)
+    return replace(merged, inlier=inlier & valid[tracks.point_index], valid=valid)
+
+
+def _reprojection_px(model: Reconstruction) -> F64:
+    """Distance (K,) of each observation from its projected point; large without a camera or a point."""
+    t, distance = model.tracks, np.full(len(model.tracks.xy), np.inf)
+    assert model.K is not None
+    assert model.distortion is not None
+    for view, rows in enumerate(
+        np.split(np.argsort(t.view_index, kind="stable"), _ends(t.view_index, t.n_views))
+    ):
+        if model.registered[view]:
+            rows = rows[model.X[t.point_index[rows], 3] != 0.0]
+            K, X = model.K[view], model.X[t.point_index[rows], :3]
+            Rt = np.linalg.solve(K, model.P[view])
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                xy = project_camera(K, Rt[:, :3], Rt[:, 3], X, distortion=model.distortion[view])
+            distance[rows] = np.nan_to_num(np.linalg.norm(xy - t.xy[rows], axis=1), nan=np.inf)
+    return distance
+
+
+def _ends(index: I64, count: int) -> I64:
+    return np.cumsum(np.bincount(index, minlength=count))[:-1]
