@@ -164,8 +164,10 @@ def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
     return np.where(small & (joined[chart] >= 0), joined[chart], label)
 
 
-PART_TEXELS, CHUNK_POINTS = 1 << 18, 1 << 15
-"""Texels of a part of the surface, and those of one task."""
+PART_TEXELS, LARGE_PART_TEXELS, CHUNK_POINTS = 1 << 17, 1 << 19, 1 << 14
+"""Texels of a part of the surface, if all views are in memory, and else; points of one task."""
+PREPARED_BYTES = 11
+"""Bytes of a pixel of a view that is prepared for blending."""
 BATCH_VIEWS, OBSERVED = 8, 1 << 22
 """Views that are used together; points times views from which the gains are estimated."""
 STRIP_ROWS = 64
@@ -213,12 +215,12 @@ def paint_texture(
     texture = cut_out.copy()
     drawn = np.zeros(texture.shape[:2], dtype=bool)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for at, face, weights in _surface_parts(mesh, uv, texture.shape[:2], pool):
-            share = weights.astype(np.float64)
-            share = np.column_stack([1.0 - share.sum(axis=1), share])[:, :, None]
-            vertex = mesh.faces[face]
-            points, towards = ((share * values[vertex]).sum(axis=1) for values in (mesh.vertices, normals))
-            near = [v for v, camera in enumerate(cameras) if _may_contain(camera, points)]
+        pixels = sum(camera.size[0] * camera.size[1] for camera in cameras)
+        texels = PART_TEXELS if PREPARED_BYTES * pixels <= SURFACE_BYTES else LARGE_PART_TEXELS
+        for at, face, weights in _surface_parts(mesh, uv, texture.shape[:2], texels, pool):
+            points, towards = _points_on_faces(mesh, normals, face, weights)
+            box = points.min(axis=0), points.max(axis=0)
+            near = [v for v, camera in enumerate(cameras) if _may_contain(camera, *box)]
             views = OnDemand(len(near), lambda n: prepared[near[n]])  # noqa: B023
             color, shown = blend_colors(views, points, towards, pool)
             texture.reshape(-1, 3)[at[shown]] = np.clip(np.rint(color[shown]), 0, 255)
@@ -286,9 +288,21 @@ def _no_observations(views: int, points: F64) -> tuple[F32, F32]:
     return np.zeros((views, len(points)), np.float32), np.zeros((views, len(points), 3), np.float32)
 
 
-def _may_contain(camera: Camera, points: F64) -> bool:
-    """Whether an image may contain some points: the box around them is not outside one of its sides."""
-    low, high = points.min(axis=0), points.max(axis=0)
+def _points_on_faces(mesh: TexturedMesh, normals: F64, face: I32, weights: F32) -> tuple[F64, F64]:
+    """Points and normals (N, 3) on faces (N,) with ``weights`` (N, 2) of corners 1 and 2."""
+    points, towards = np.empty((2, len(face), 3))
+    for first in range(0, len(face), CHUNK_POINTS):
+        some = slice(first, first + CHUNK_POINTS)
+        share = weights[some].astype(np.float64)
+        share = np.column_stack([1.0 - share.sum(axis=1), share])[:, :, None]
+        vertex = mesh.faces[face[some]]
+        points[some] = (share * mesh.vertices[vertex]).sum(axis=1)
+        towards[some] = (share * normals[vertex]).sum(axis=1)
+    return points, towards
+
+
+def _may_contain(camera: Camera, low: F64, high: F64) -> bool:
+    """Whether an image may contain points of a box: it is not completely outside one of its sides."""
     box = np.array([[(low, high)[k >> d & 1][d] for d in range(3)] for k in range(8)])
     x, y, z = camera.K @ (camera.R @ box.T + camera.t[:, None])
     width, height = camera.size
@@ -297,9 +311,12 @@ def _may_contain(camera: Camera, points: F64) -> bool:
 
 
 def _surface_parts(
-    mesh: TexturedMesh, uv: F64, shape: tuple[int, int], pool: Executor
+    mesh: TexturedMesh, uv: F64, shape: tuple[int, int], largest: int, pool: Executor
 ) -> Iterator[tuple[I32, I32, F32]]:
-    """The texels of each part of the surface: numbers (N,), faces (N,), weights (N, 2) of corners 1 and 2."""
+    """The texels of parts of the surface, of at most ``largest`` ones each.
+
+    Returns their numbers (N,), faces (N,), and weights (N, 2) of corners 1 and 2.
+    """
     top, bottom = uv[..., 1].min(axis=1) - RIM_TEXELS, uv[..., 1].max(axis=1) + RIM_TEXELS
 
     def texels(first: int) -> tuple[I32, I32, F32]:
@@ -312,8 +329,9 @@ def _surface_parts(
     at, face, weights = (np.concatenate(kind) for kind in zip(*strips, strict=True))
     del strips
     count = np.bincount(face, minlength=len(uv))
-    part = halve_surface(mesh, count, PART_TEXELS)[face]
-    order = np.argsort(part, kind="stable")
+    part = halve_surface(mesh, count, largest)[face]
+    # Small integers are sorted in linear time.
+    order = np.argsort(part.astype(np.uint16) if part.max(initial=0) < 2**16 else part, kind="stable")
     ends = np.cumsum(np.bincount(part)).tolist()
     for first, last in pairwise([0, *ends]):
         some = order[first:last]
