@@ -17,7 +17,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._image_filters import resample, smooth
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface._mesh import face_neighbours
+from thesisrecon.surface._mesh import connected_parts, face_neighbours, select_faces
 from thesisrecon.surface._texture_blending import (
     choose_views,
     depth_buffers,
@@ -189,6 +189,34 @@ def _fill(
             rgb = views[label[c]].rgb
             texture[y : y + bottom - top, x : x + right - left] = rgb[top:bottom, left:right]
     return texture
+
+
+def cut_tile(mesh: TexturedMesh, faces: I64) -> TexturedMesh:
+    """Cut the faces (K,), in increasing order, out of a mesh, with the part of the texture that they show.
+
+    Every texel is the one of the whole texture, and corners on the cut keep their places, so that tiles fit.
+    """
+    keep = np.zeros(len(mesh.faces), dtype=bool)
+    keep[faces] = True
+    tile = select_faces(mesh, keep)
+    if tile.uv is None or tile.texture is None:
+        return tile
+    # Faces with a common corner in the texture are one chart.
+    corners = np.column_stack([tile.faces.ravel(), tile.uv.reshape(-1, 2)])
+    number = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    chart = connected_parts(number, int(number.max(initial=-1)) + 1)
+    size = np.array(tile.texture.shape[1::-1])
+    low = np.full((int(chart.max(initial=-1)) + 1, 2), np.inf)
+    high = np.full_like(low, -np.inf)
+    np.minimum.at(low, chart, tile.uv.min(axis=1))
+    np.maximum.at(high, chart, tile.uv.max(axis=1))
+    first = np.clip(np.floor(low).astype(np.int64) - CHART_MARGIN, 0, size - 1)
+    last = np.clip(np.ceil(high).astype(np.int64) + 1 + CHART_MARGIN, 1, size)
+    offsets, (width, height) = _pack_rectangles(last - first)
+    texture = np.full((height, width, 3), 128, dtype=np.uint8)
+    for (left, top), (right, bottom), (x, y) in zip(first, last, offsets, strict=True):
+        texture[y : y + bottom - top, x : x + right - left] = tile.texture[top:bottom, left:right]
+    return replace(tile, uv=tile.uv + (offsets - first)[chart][:, None, :], texture=texture)
 
 
 def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
