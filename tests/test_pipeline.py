@@ -27,6 +27,7 @@ from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import stream
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.surface import fusion
+from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
 
@@ -174,8 +175,12 @@ def test_a_model_above_the_size_limit_is_written_whole_and_reduced(tmp_path):
     refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
 
 
+def of_all_faces():
+    return fake_config(model=SurfaceModel(fusion=VolumetricFusion(tolerance=0.0)))
+
+
 def test_the_tiles_hold_each_face_once_in_files_of_bounded_size(tmp_path, monkeypatch):
-    result = run(tmp_path / "a", until="model", threads=1)
+    result = run(tmp_path / "a", until="model", threads=1, config=of_all_faces())
     directory, mesh = RunDirectory(tmp_path / "b"), result.mesh
     whole = (tmp_path / "a" / "model.glb").stat().st_size
     monkeypatch.setattr(_tiles, "TILE_FACES", len(mesh.faces) // 2)
@@ -203,7 +208,7 @@ def test_the_tiles_hold_each_face_once_in_files_of_bounded_size(tmp_path, monkey
 
 def test_a_run_with_fewer_images_in_the_same_folder_leaves_no_old_tiles(tmp_path, monkeypatch):
     out, largest = tmp_path / "out", SurfaceModel.max_glb_mb
-    config = fake_config()
+    config = of_all_faces()
     object.__setattr__(config.model, "max_glb_mb", 0.03)
     monkeypatch.setattr(SurfaceModel, "max_glb_mb", 0.03)
     monkeypatch.setattr(_tiles, "TILE_FACES", 500)

@@ -274,6 +274,8 @@ def blend_colors(
                     keep_largest(one, its_color, weight, color)
 
         list(map_all(observe, chunks, *zip(*kept, strict=True)))
+        # The next batch is made without this one in memory.
+        batch.clear()
 
     def combine(some: slice, weight: F32, color: F32) -> None:
         combine_colors(weight, color, POWER, SCATTER, out[some])
