@@ -394,14 +394,20 @@ class ImageOptions:
         Larger images are reduced to this long side.
     groups : bool
         Reconstruct each group of 3 or more images without overlap with the others.
+    part_views : int
+        More images are reconstructed in overlapping parts of at most about so many, if cuts between parts
+        sever few of the common points; 0: never.
     """
 
     max_size_px: int = 1600
     groups: bool = True
+    part_views: int = 400
 
     def __post_init__(self) -> None:
         if self.max_size_px < 64:
             raise ValueError(f"max_size_px must be at least 64; got {self.max_size_px}")
+        if self.part_views < 0:
+            raise ValueError(f"part_views must be at least 0; got {self.part_views}")
 
 
 @dataclass(frozen=True)

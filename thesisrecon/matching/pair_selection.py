@@ -41,8 +41,6 @@ MIN_LOG10 = -300.0
 PER_SCALE = 200
 SAMPLES_PER_WORD = 8
 ROUNDS = 4
-EXPANSIONS = 2
-"""Times that the neighbours of an image are compared with each other."""
 ROWS_AT_ONCE = 4096
 
 
@@ -177,7 +175,7 @@ class OverlapEstimate:
     shortlist : int
         Number of images that each is compared with.
     words : int
-        Vocabulary size.
+        Largest size of the vocabulary; an eighth of the patches of the images if that is less.
     """
 
     all_up_to: int = 30
@@ -185,8 +183,8 @@ class OverlapEstimate:
     nearest: int = 3
     most: int = 10
     spread: int = 2
-    shortlist: int = 40
-    words: int = 1024
+    shortlist: int = 30
+    words: int = 65536
 
     def __post_init__(self) -> None:
         least = {"all_up_to": 0, "nearest": 1, "most": 1, "spread": 0, "shortlist": 1, "words": 1}
@@ -204,21 +202,13 @@ class OverlapEstimate:
             return PairChoice(_pair_array(combinations(range(n), 2)), how)
         subsets = map_all(self._subsets, features)
         if n - 1 <= self.shortlist:
-            words, compared = np.zeros((n, 0)), _pair_array(combinations(range(n), 2))
+            words, compared = scipy.sparse.csr_array((n, 1)), _pair_array(combinations(range(n), 2))
         else:
             kinds = [[subset[kind].patches for subset in subsets] for kind in (0, 1)]
-            words = np.hstack([_word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds])
+            weights = [_word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds]
+            words = scipy.sparse.hstack(weights, format="csr")
             compared = _most_similar(words, self.shortlist)
-
-        def evidence_of(pairs: I64) -> F64:
-            return np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), pairs.tolist()))
-
-        evidence = evidence_of(compared)
-        for _ in range(EXPANSIONS):
-            new = _neighbours_of_neighbours(compared, evidence, self)
-            compared, evidence = np.vstack([compared, new]), np.append(evidence, evidence_of(new))
-        order = np.lexsort(compared.T[::-1])
-        compared, evidence = compared[order], evidence[order]
+        evidence = np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), compared.tolist()))
         rank, enough = _ranks(compared, evidence, n), evidence >= self.min_evidence
         # Of the further pairs of an image, those at which the number that is due grows.
         further = np.bincount(compared[enough].ravel(), minlength=n)[compared.T] - self.most
@@ -241,36 +231,19 @@ class OverlapEstimate:
         return _subsets(features.seeds)
 
 
-def _most_similar(words: F64, count: int) -> I64:
+def _most_similar(words: scipy.sparse.csr_array, count: int) -> I64:
     """Pairs (M, 2) of each image with the ``count`` most similar ones by word weights (N, W); sorted.
 
     Only the similarities of some rows are in memory.
     """
-    n, pairs = len(words), list[F64]()
+    n, pairs, inverted = words.shape[0], list[F64](), words.T.tocsr()
     for first in range(0, n, ROWS_AT_ONCE):
-        similarity = words[first : first + ROWS_AT_ONCE] @ words.T
+        similarity = (words[first : first + ROWS_AT_ONCE] @ inverted).toarray()
         rows = np.arange(first, first + len(similarity))
         similarity[rows - first, rows] = -np.inf
         best = np.argsort(-similarity, axis=1, kind="stable")[:, : min(count, n - 1)]
         pairs += np.column_stack([np.repeat(rows, best.shape[1]), best.ravel()]).tolist()
     return _pair_array(pairs)
-
-
-def _neighbours_of_neighbours(compared: I64, evidence: F64, choice: OverlapEstimate) -> I64:
-    """Pairs (M, 2), not yet compared, of the neighbours of an image, which are its best pairs with evidence.
-
-    Where many places look alike, the most similar images may not be those of the same place: the image itself
-    is then found through its neighbours (query expansion, O. Chum et al., "Total recall", ICCV 2007).
-    """
-    n, known = int(compared.max()) + 1, {(i, j) for i, j in compared.tolist()}
-    best = (_ranks(compared, evidence, n) < choice.most) & (evidence >= choice.min_evidence)
-    neighbours: list[list[int]] = [[] for _ in range(n)]
-    for (i, j), (of_i, of_j) in zip(compared.tolist(), best.T.tolist(), strict=True):
-        neighbours[i] += [j] * of_i
-        neighbours[j] += [i] * of_j
-    near = _pair_array(pair for some in neighbours for pair in combinations(some, 2))
-    new = [pair for pair in near.tolist() if tuple(pair) not in known]
-    return np.array(new, dtype=np.int64).reshape(-1, 2)
 
 
 def _ranks(pairs: I64, value: F64, n: int) -> I64:
@@ -283,13 +256,13 @@ def _ranks(pairs: I64, value: F64, n: int) -> I64:
     return rank.reshape(2, -1)
 
 
-def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: F64) -> I64:
+def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: scipy.sparse.csr_array) -> I64:
     """Pairs (M, 2) that connect the groups of the ``chosen``: of most evidence, else of most similar words.
 
     The edges that a maximum spanning tree of the compared pairs adds to the chosen ones if these cost
     nothing; groups without a compared pair are joined by their most similar images, the smallest first.
     """
-    n, m = len(words), len(compared)
+    n, m = words.shape[0], len(compared)
     cost = np.empty(m)
     # Ranks instead of values: no two costs are equal, so the tree is unique and independent of rounding.
     cost[np.argsort(-evidence, kind="stable")] = np.arange(1, m + 1)
@@ -303,7 +276,7 @@ def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: F64) -> 
         sizes = np.bincount(group)
         inside = np.flatnonzero(group == np.argmin(np.where(sizes > 0, sizes, n + 1)))
         outside = np.flatnonzero(group != group[inside[0]])
-        similarity = words[inside] @ words[outside].T
+        similarity = (words[inside] @ words[outside].T).toarray()
         i, j = np.unravel_index(np.argmax(similarity), similarity.shape)
         added.append([inside[i], outside[j]])
         joined = group[inside[i]], group[outside[j]]
@@ -406,34 +379,51 @@ def _match_subsets(a: _FeatureSubset, b: _FeatureSubset) -> tuple[I64, I64]:
     return one, index[one]
 
 
-def _word_weights(patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator) -> F64:
+def _word_weights(
+    patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator
+) -> scipy.sparse.csr_array:
     """Weighted word counts (N, W) of images with unit patches (S, D); products of the rows are cosines.
 
-    A word is weighted by how few images contain it. A patch counts for its three nearest words, and square
-    roots of the counts limit the effect of repeated structure.
+    A word is weighted by how few images contain it, and square roots of the counts limit the effect of
+    repeated structure. Words must be many: if each image contains most of them, all places look alike. The
+    transpose is the inverted file: the images of each word.
     """
     everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
     if not len(everything):
-        return np.zeros((len(patches), 1))
-    vocabulary = _vocabulary(everything, min(words, len(everything)), rng)
-    counts = np.stack(map_all(lambda given: _count_words(given, vocabulary), patches))
-    used = np.maximum((counts > 0).sum(axis=0), 1)
-    weighed = np.sqrt(counts) * np.log(len(patches) / used)
-    normalised: F64 = weighed / np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-12)
-    return normalised
+        return scipy.sparse.csr_array((len(patches), 1))
+    vocabulary = _vocabulary(everything, min(words, len(everything) // SAMPLES_PER_WORD), rng)
+    found = map_all(lambda given: np.unique(_words_of(given, vocabulary), return_counts=True), patches)
+    image = np.repeat(np.arange(len(patches)), [len(word) for word, _ in found])
+    word, count = (np.concatenate([part[k] for part in found]) for k in (0, 1))
+    used = np.bincount(word)
+    weight = np.sqrt(count) * np.log(len(patches) / used[word])
+    weight /= np.sqrt(np.maximum(np.bincount(image, weight**2), 1e-24))[image]
+    return scipy.sparse.csr_array((weight, (image, word)), (len(patches), vocabulary[1][:, :, 0].size))
 
 
-def _vocabulary(patches: F32, words: int, rng: np.random.Generator) -> F32:
-    """Centres (words, D) of spherical k-means over a sample of the patches."""
-    sample = patches[rng.permutation(len(patches))[: SAMPLES_PER_WORD * words]]
-    centres = sample[:words]
+_Vocabulary = tuple[F32, F32]
+"""Unit centres (B, D) of branches, and of the words (B, B, D) of each."""
+
+
+def _vocabulary(patches: F32, words: int, rng: np.random.Generator) -> _Vocabulary:
+    """A tree of two levels with about so many words (D. Nister and H. Stewenius, CVPR 2006)."""
+    branches = max(int(np.sqrt(words)), 1)
+    sample = patches[rng.permutation(len(patches))[: SAMPLES_PER_WORD * branches**2]]
+    top = _centres(sample, branches)
+    branch = np.argmax(sample @ top.T, axis=1)
+    leaves = np.repeat(top[:, None], branches, axis=1)
+    for b in range(branches):
+        inside = sample[branch == b]
+        if len(inside):
+            leaves[b, : min(branches, len(inside))] = _centres(inside, branches)
+    return top, leaves
+
+
+def _centres(sample: F32, count: int) -> F32:
+    """Centres (at most ``count``, D) of spherical k-means; the first rows begin."""
+    centres = sample[:count]
     for _ in range(ROUNDS):
-        nearest = np.concatenate(
-            [
-                np.argmax(rows @ centres.T, axis=1)
-                for rows in np.split(sample, range(ROWS_AT_ONCE, len(sample), ROWS_AT_ONCE))
-            ]
-        )
+        nearest = np.argmax(sample @ centres.T, axis=1)
         order = np.argsort(nearest, kind="stable")
         found, start = np.unique(nearest[order], return_index=True)
         sums = centres.copy()
@@ -442,10 +432,18 @@ def _vocabulary(patches: F32, words: int, rng: np.random.Generator) -> F32:
     return centres
 
 
-def _count_words(patches: F32, vocabulary: F32) -> F64:
-    words = len(vocabulary)
-    nearest = np.argpartition(-(patches @ vocabulary.T), min(2, words - 1), axis=1)[:, :3]
-    return np.bincount(nearest.ravel(), minlength=words).astype(np.float64)
+def _words_of(patches: F32, vocabulary: _Vocabulary) -> I64:
+    """Word (S,) of each patch: the best of its best branch."""
+    top, leaves = vocabulary
+    if not len(patches):
+        return np.empty(0, np.int64)
+    branch = np.argmax(patches @ top.T, axis=1)
+    order = np.argsort(branch, kind="stable")
+    found, start = np.unique(branch[order], return_index=True)
+    word = np.empty(len(patches), np.int64)
+    for b, rows in zip(found, np.split(order, start[1:]), strict=True):
+        word[rows] = b * len(top) + np.argmax(patches[rows] @ leaves[b].T, axis=1)
+    return word
 
 
 def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:

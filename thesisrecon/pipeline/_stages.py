@@ -16,6 +16,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
@@ -25,7 +26,8 @@ from thesisrecon.pipeline._image_pair import (
     oblique_pairs,
     prepare_oblique,
 )
-from thesisrecon.pipeline._second_pass import register_more
+from thesisrecon.pipeline._parts import cameras_from_parts
+from thesisrecon.pipeline._second_pass import from_metric, register_more
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
 from thesisrecon.records import (
     DepthMap,
@@ -113,7 +115,7 @@ def match_pairs(state: PipelineState) -> None:
         second = _matched(state, [pairs[n] for n in again], "-oblique", lambda: _prepared_oblique(state))
         for n, pair in zip(again, second, strict=True):
             found[n] = pair if pair.accepted else found[n]
-    finish_matches(state, found)
+    finish_matches(state, reject_repeated_structure(found, len(state.result.images)))
 
 
 def _matched(
@@ -207,7 +209,8 @@ def build_tracks(state: PipelineState) -> None:
     run, pairs = state.run, state.used_pairs
     require_accepted_pair(state)
     group = [list(state.groups[0])] if state.groups else []
-    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, run.seed, *group)
+    accepted = [(pair.i, pair.j) for pair in pairs if pair.accepted]
+    key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, accepted, run.seed, *group)
     build, map_all, rng = state.config.tracks.build, run.workers.map_all, stream(run.seed, "tracks")
     tracks: Tracks = run.cached(
         "tracks", "tracks", key, lambda: build(state.prepared_views(), pairs, map_all=map_all, rng=rng)
@@ -298,10 +301,13 @@ def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
 def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) -> MetricResult:
     prior = state.prior
     assert state.result.projective is not None
-    projective = calibrated_part(state.result.projective, calibration)
+    aligned = None if attempt else cameras_from_parts(state, ATTEMPTS)
+    start = calibrated_part(state.result.projective, calibration) if aligned is None else aligned
+    known = calibration if aligned is None else from_metric(aligned, calibration)
+    parts = [] if aligned is None else list(state.run.logs["metric"].keys.values())
     metric: MetricResult = _cached(
-        state, "metric", attempt, state.run.logs["selfcalibration"].keys[f"attempt-{attempt}"],
-        lambda rng: state.config.metric.refine(projective, calibration, prior=prior, rng=rng),
+        state, "metric", attempt, [state.run.logs["selfcalibration"].keys[f"attempt-{attempt}"], parts],
+        lambda rng: state.config.metric.refine(start, known, prior=prior, rng=rng),
     )  # fmt: skip
     state.result = replace(state.result, metric=metric)
     return metric

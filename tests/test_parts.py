@@ -1,0 +1,136 @@
+"""Many images in overlapping parts: the cut of the view graph, the parts, and their common frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.metric.test_metric_refinement import centre_error
+from tests.synthetic import make_scene, true_pairs
+from tests.test_core_and_windows import street, with_repeated_windows
+from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.geometry.similarity import Similarity
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
+from thesisrecon.pipeline import _parts
+from thesisrecon.pipeline._parts import (
+    align_parts,
+    divide_views,
+    input_of_part,
+    neighbour_graph,
+    overlapping_parts,
+    reconstruct_part,
+)
+from thesisrecon.pipeline._second_pass import cameras_on_tracks
+from thesisrecon.records import MetricResult
+
+VIEWS, PART = 72, 45
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return street(VIEWS)
+
+
+def parts_of(scene, part_views):
+    graph = neighbour_graph(scene.tracks)
+    own = divide_views(graph, part_views)
+    return own, overlapping_parts(graph, own)
+
+
+def models_of(scene, parts):
+    config = PipelineConfig()
+    pairs = [pair for pair in true_pairs(scene) if pair.inliers >= 16]
+    n = len(scene.sizes)
+    sizes = [(int(width), int(height)) for width, height in scene.sizes]
+    prior = prior_from_options(IntrinsicsOptions(), sizes, np.full(n, np.nan), np.ones(n))
+    found = []
+    for number, views in enumerate(parts):
+        given = input_of_part(scene.tracks, pairs, scene.sizes, prior, views)
+        found += reconstruct_part(config, given, number, 0, 1)
+    return found
+
+
+@pytest.fixture(scope="module")
+def models(scene):
+    return models_of(scene, parts_of(scene, PART)[1])
+
+
+def aligned_error(found, scene):
+    return centre_error(MetricResult(found, (), None, True, (), ()), scene)
+
+
+def test_a_street_is_cut_into_stretches_that_overlap(scene):
+    own, parts = parts_of(scene, PART)
+    np.testing.assert_array_equal(np.sort(np.concatenate(own)), np.arange(VIEWS))
+    assert max(len(views) for views in own) <= PART
+    assert all((np.diff(views) == 1).all() for views in own)
+    for k, (views, grown) in enumerate(zip(own, parts, strict=True)):
+        ends = (k > 0) + (k < len(own) - 1)
+        assert set(views) < set(grown)
+        assert len(grown) - len(views) <= ends * _parts.OVERLAP
+        assert (np.diff(grown) == 1).all()
+
+
+def test_one_place_is_not_cut():
+    scene = make_scene(views=24, points=300, sigma_px=0.4, seed=5)
+    assert [len(views) for views in divide_views(neighbour_graph(scene.tracks), 8)] == [24]
+
+
+def test_repeated_windows_make_no_neighbours(scene):
+    same = with_repeated_windows(scene, 10, 60, count=25)
+    graph = neighbour_graph(same.tracks)
+    far = graph[10:12][:, 59:62]
+    assert graph[10, 11] > 0
+    assert far.nnz == 0
+
+
+def test_parts_are_put_into_one_frame(scene, models):
+    own, parts = parts_of(scene, PART)
+    assert all(model.registered.all() for model in models)
+    found = align_parts(scene.tracks, scene.sizes, own, parts, models)
+    assert found.registered.all()
+    assert aligned_error(found, scene) < 0.02
+    points = cameras_on_tracks(found, scene.tracks)
+    assert points.valid.mean() > 0.95
+
+
+def test_a_part_without_cameras_leaves_the_others_whole(scene, models):
+    own, parts = parts_of(scene, PART)
+    last = replace(models[-1], registered=np.zeros_like(models[-1].registered))
+    found = align_parts(scene.tracks, scene.sizes, own, parts, [*models[:-1], last])
+    np.testing.assert_array_equal(
+        np.flatnonzero(~found.registered), np.setdiff1d(parts[-1], np.concatenate(parts[:-1]))
+    )
+    nothing = [replace(model, registered=np.zeros_like(model.registered)) for model in models]
+    assert align_parts(scene.tracks, scene.sizes, own, parts, nothing) is None
+
+
+def test_a_part_that_contradicts_the_others_is_not_aligned(scene, models):
+    own, parts = parts_of(scene, PART)
+    rng = np.random.default_rng(0)
+    wrong = replace(models[-1], P=models[-1].P[rng.permutation(len(models[-1].P))])
+    found = align_parts(scene.tracks, scene.sizes, own, parts, [*models[:-1], wrong])
+    assert not found.registered[np.setdiff1d(parts[-1], np.concatenate(parts[:-1]))].any()
+
+
+def test_too_few_views_give_a_part_without_cameras(scene):
+    (model,) = models_of(scene, [np.arange(2)])
+    assert not model.registered.any()
+
+
+def test_similarities_of_common_cameras_need_no_centres_off_a_line():
+    rng = np.random.default_rng(2)
+    true = Similarity(1.7, np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3))
+    true = replace(true, R=true.R * np.sign(np.linalg.det(true.R)))
+    Rb = np.array([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(9)])
+    Cb = np.arange(9.0)[:, None] * np.array([1.0, 0.2, 0.0])
+    Ra, Ca = Rb @ true.R.T, true.apply(Cb)
+    Ca[4] += 3.0
+    found = _parts._similarity_of_cameras(Ra, Ca, Rb, Cb)
+    np.testing.assert_allclose(found.R, true.R, atol=1e-9)
+    np.testing.assert_allclose([found.scale, *found.t], [true.scale, *true.t], atol=1e-6)
+
+
+def test_the_number_of_views_of_a_part_is_checked():
+    with pytest.raises(ValueError, match="part_views must be at least 0; got -1"):
+        ImageOptions(part_views=-1)

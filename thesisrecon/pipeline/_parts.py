@@ -1,0 +1,340 @@
+"""Many images in overlapping parts: each is reconstructed alone, all are aligned and then adjusted together.
+
+A part is a task of its own. Wrong matches between places that look alike cannot bend a part that does not
+contain both places, and a part that fails leaves the others whole: its images join the aligned ones later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from thesisrecon._code_digest import code_digest
+from thesisrecon._settings import tables_from_config
+from thesisrecon.arrays import F64, I64
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.similarity import Similarity
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
+from thesisrecon.pipeline._second_pass import cameras_on_tracks
+from thesisrecon.pipeline._state import PipelineState
+from thesisrecon.records import Reconstruction, Tracks, TwoView
+from thesisrecon.runtime._run import Batch, stream
+
+WEAK = 0.1
+"""Two views are neighbours if they share this fraction of the points that one of them shares with its closest
+view; fewer may be repeated structure."""
+MAX_CUT = 0.1
+"""Largest fraction of the common points of a part that a cut may sever; one place has no such cut."""
+MIN_SIDE = 0.3
+"""Smallest fraction of the views on either side of a cut."""
+OVERLAP = 12
+"""Views of each of two neighbouring parts that the other one contains too."""
+MIN_COMMON = 3
+"""Common cameras that determine the similarity between two parts."""
+MAX_OFFSET_REL = 0.005
+"""Largest distance, relative to the long side, between the projections of a point that two parts agree on."""
+MIN_AGREEMENT = 0.5
+"""Fraction of the common points that must agree, otherwise two parts are not aligned."""
+ROUNDS = 5
+
+
+def cameras_from_parts(state: PipelineState, attempts: int) -> Reconstruction | None:
+    """Reconstruct a large set in parts and align them; None if it is not divided or no part succeeds.
+
+    Points are triangulated from all tracks. A part is stored when it is finished.
+    """
+    run, config, tracks = state.run, state.config, state.result.tracks
+    assert tracks is not None
+    if not 0 < config.images.part_views < int((np.bincount(tracks.view_index) > 0).sum()):
+        return None
+    graph = neighbour_graph(tracks)
+    own = divide_views(graph, config.images.part_views)
+    if len(own) < 2:
+        return None
+    parts = overlapping_parts(graph, own)
+    sizes = np.array([image.size for image in state.result.images], dtype=np.int64)
+    variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
+    code, upstream = code_digest(reconstruct_part), run.logs["tracks"].keys
+    keys = {
+        f"part-{n}": run.key(
+            "metric", variants, code, upstream, tables_from_config(config)["intrinsics"], views, run.seed
+        )
+        for n, views in enumerate(parts)
+    }
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        for n in missing:
+            given = input_of_part(tracks, state.used_pairs, sizes, state.prior, parts[n])
+            yield [n], (config, given, n, run.seed, attempts)
+
+    models: Sequence[Reconstruction] = run.map_cached("metric", keys, reconstruct_part, batches)
+    found = align_parts(tracks, sizes, own, parts, models)
+    return None if found is None else cameras_on_tracks(found, tracks)
+
+
+def neighbour_graph(tracks: Tracks) -> scipy.sparse.csr_array:
+    """Numbers of common points of neighbouring views (V, V), without the weakly connected ones."""
+    ones = np.ones(len(tracks.xy))
+    seen = scipy.sparse.coo_array(
+        (ones, (tracks.view_index, tracks.point_index)), (tracks.n_views, tracks.n_points)
+    )
+    common = (seen.tocsr() @ seen.tocsr().T).tocoo()
+    apart = common.row != common.col
+    row, column, count = common.row[apart], common.col[apart], common.data[apart]
+    most = np.zeros(tracks.n_views)
+    np.maximum.at(most, row, count)
+    strong = count >= WEAK * np.minimum(most[row], most[column])
+    return scipy.sparse.coo_array((count[strong], (row[strong], column[strong])), common.shape).tocsr()
+
+
+def divide_views(graph: scipy.sparse.csr_array, part_views: int) -> list[I64]:
+    """Divide the views until a part has at most ``part_views``, or every cut severs too many common points.
+
+    The views of a part are numbered such that neighbours are close (reverse Cuthill-McKee); the cut between
+    consecutive numbers with the smallest fraction of severed points divides it.
+    """
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    left, parts = [np.flatnonzero(label == k) for k in range(label.max() + 1)], list[I64]()
+    while left:
+        views = left.pop()
+        halves = _best_cut(graph, views) if len(views) > part_views else None
+        if halves is None:
+            parts.append(views)
+        else:
+            left += halves
+    return sorted(parts, key=lambda views: int(views[0]))
+
+
+def _best_cut(graph: scipy.sparse.csr_array, views: I64) -> list[I64] | None:
+    inside = graph[views][:, views]
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee(inside.tocsr(), symmetric_mode=True)
+    place = np.empty(len(views), np.int64)
+    place[order] = np.arange(len(views))
+    ties = inside.tocoo()
+    first, last = np.minimum(place[ties.row], place[ties.col]), np.maximum(place[ties.row], place[ties.col])
+    # Each tie stands twice in the symmetric matrix; it is severed by the cuts behind first ... last - 1.
+    change = np.bincount(first, ties.data, len(views)) - np.bincount(last, ties.data, len(views))
+    severed = np.cumsum(change)[:-1]
+    volume = np.cumsum(np.asarray(inside.sum(axis=1)).ravel()[order])[:-1]
+    ratio = severed / np.maximum(np.minimum(volume, volume[-1] - volume), 1.0)
+    sides = np.arange(1, len(views))
+    ratio[np.minimum(sides, len(views) - sides) < MIN_SIDE * len(views)] = np.inf
+    at = int(np.argmin(ratio))
+    return (
+        [np.sort(views[order[: at + 1]]), np.sort(views[order[at + 1 :]])] if ratio[at] <= MAX_CUT else None
+    )
+
+
+def overlapping_parts(graph: scipy.sparse.csr_array, parts: Sequence[I64]) -> list[I64]:
+    """Each part with the views of the others that are closest to it."""
+    grown = []
+    for views in parts:
+        ties = np.asarray(graph[views].sum(axis=0)).ravel()
+        added = [views]
+        for other in parts:
+            if other is not views:
+                nearest = other[np.argsort(-ties[other], kind="stable")[:OVERLAP]]
+                added.append(nearest[ties[nearest] > 0])
+        grown.append(np.unique(np.concatenate(added)))
+    return grown
+
+
+@dataclass(frozen=True)
+class PartInput:
+    """What the reconstruction of some views needs; views and points have numbers of their own."""
+
+    tracks: Tracks
+    pairs: tuple[TwoView, ...]
+    sizes: I64
+    prior: IntrinsicsPrior
+
+
+def points_of_part(tracks: Tracks, views: I64) -> I64:
+    """The points that two or more of the views observe, sorted."""
+    seen = np.isin(tracks.view_index, views)
+    return np.flatnonzero(np.bincount(tracks.point_index[seen], minlength=tracks.n_points) >= 2)
+
+
+def input_of_part(
+    tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, prior: IntrinsicsPrior, views: I64
+) -> PartInput:
+    """The input of a part; of the pairs only what the projective reconstruction reads."""
+    view, point = np.full(tracks.n_views, -1), np.full(tracks.n_points, -1)
+    points = points_of_part(tracks, views)
+    view[views], point[points] = np.arange(len(views)), np.arange(len(points))
+    k = np.flatnonzero((view[tracks.view_index] >= 0) & (point[tracks.point_index] >= 0))
+    own = Tracks(
+        view[tracks.view_index[k]], point[tracks.point_index[k]], tracks.xy[k], len(views), len(points)
+    )
+    none, affine = np.zeros(0, np.int64), np.zeros((0, 2, 2))
+    inside = [p for p in pairs if p.accepted and view[p.i] >= 0 and view[p.j] >= 0]
+    renumbered = tuple(
+        replace(p, i=int(view[p.i]), j=int(view[p.j]), index1=none, index2=none, affine=affine)
+        for p in inside
+    )
+    rows = {name: getattr(prior, name)[views] for name in ("mean", "std", "shared", "kind")}
+    return PartInput(own, renumbered, sizes[views], replace(prior, **rows))
+
+
+def reconstruct_part(
+    config: PipelineConfig, given: PartInput, number: int, seed: int, attempts: int
+) -> list[Reconstruction]:
+    """The metric reconstruction of a part, from other initial pairs until it is trusted.
+
+    Without a trusted one no camera is registered: the other parts then register its views.
+    """
+    for attempt in range(attempts):
+        rng = stream(seed, "part", number, attempt)
+        try:
+            projective = config.projective.reconstruct(
+                given.tracks, given.pairs, given.sizes, rng=rng, attempt=attempt
+            )
+            calibration = calibrate_with_core(config.selfcalibration, projective, prior=given.prior, rng=rng)
+            start = calibrated_part(projective, calibration)
+            metric = config.metric.refine(start, calibration, prior=given.prior, rng=rng)
+        except StageFailure:
+            continue
+        if metric.trusted:
+            return [metric.reconstruction]
+    return [_no_cameras(given)]
+
+
+def _no_cameras(given: PartInput) -> Reconstruction:
+    n, t = len(given.sizes), given.tracks
+    none, empty = np.zeros(n, dtype=bool), np.zeros((t.n_points, 4))
+    P, K, valid, inlier = np.zeros((n, 3, 4)), np.zeros((n, 3, 3)), empty[:, 0] > 0.0, none[t.view_index]
+    return Reconstruction("metric", P, empty, none, valid, inlier, t, given.sizes, 1.0, ("",) * n, K, K[:, 0])
+
+
+def align_parts(
+    tracks: Tracks, sizes: I64, own: Sequence[I64], parts: Sequence[I64], models: Sequence[Reconstruction]
+) -> Reconstruction | None:
+    """The cameras of all parts that can be aligned with the largest one, in its frame; None without any.
+
+    ``own`` are the views of each part without the overlap, which take their camera from it.
+    """
+    order = sorted(range(len(parts)), key=lambda p: -int(models[p].registered.sum()))
+    if not models[order[0]].registered.any():
+        return None
+    points = [points_of_part(tracks, views) for views in parts]
+    placed = {order[0]: Similarity(1.0, np.eye(3), np.zeros(3))}
+    links: dict[tuple[int, int], tuple[int, Similarity]] = {}
+    while True:
+        best: tuple[int, int, Similarity] | None = None
+        for a in placed:
+            for b in set(order) - placed.keys():
+                if (a, b) not in links:
+                    links[a, b] = _align_part(
+                        (parts[a], points[a], models[a]), (parts[b], points[b], models[b])
+                    )
+                agreeing, found = links[a, b]
+                if agreeing and (best is None or agreeing > best[0]):
+                    best = agreeing, b, _compose(placed[a], found)
+        if best is None:
+            break
+        placed[best[1]] = best[2]
+    return _in_one_frame(tracks, sizes, own, parts, models, placed)
+
+
+_Part = tuple[I64, I64, Reconstruction]
+
+
+def _align_part(a: _Part, b: _Part) -> tuple[int, Similarity]:
+    """The similarity that takes b to a, and the number of common points that agree; 0 if too few do."""
+    identity = Similarity(1.0, np.eye(3), np.zeros(3))
+    (views_a, points_a, model_a), (views_b, points_b, model_b) = a, b
+    _, va, vb = np.intersect1d(views_a, views_b, return_indices=True)
+    both = model_a.registered[va] & model_b.registered[vb]
+    if both.sum() < MIN_COMMON:
+        return 0, identity
+    (Ra, Ca), (Rb, Cb) = _poses(model_a, va[both]), _poses(model_b, vb[both])
+    found = _similarity_of_cameras(Ra, Ca, Rb, Cb)
+    _, pa, pb = np.intersect1d(points_a, points_b, return_indices=True)
+    known = model_a.valid[pa] & model_b.valid[pb]
+    pa, pb = pa[known], pb[known]
+    t = model_a.tracks
+    view_of = np.full(t.n_points, -1)
+    view_of[t.point_index[model_a.inlier][::-1]] = t.view_index[model_a.inlier][::-1]
+    seen = view_of[pa] >= 0
+    pa, pb = pa[seen], pb[seen]
+    if not len(pa):
+        return 0, identity
+    P = model_a.P[view_of[pa]]
+    Xb = found.apply(model_b.X[pb, :3] / model_b.X[pb, 3:])
+    offset = _project_each(P, model_a.X[pa]) - _project_each(P, np.column_stack([Xb, np.ones(len(Xb))]))
+    close = np.linalg.norm(offset, axis=1) < MAX_OFFSET_REL * model_a.sizes[view_of[pa]].max(axis=1)
+    return (int(close.sum()), found) if close.mean() >= MIN_AGREEMENT else (0, identity)
+
+
+def _project_each(P: F64, X: F64) -> F64:
+    x = np.einsum("nij,nj->ni", P, X)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.nan_to_num(x[:, :2] / x[:, 2:], nan=np.inf))
+
+
+def _poses(model: Reconstruction, views: I64) -> tuple[F64, F64]:
+    """Rotations (N, 3, 3) and centres (N, 3)."""
+    assert model.K is not None
+    M = np.linalg.inv(model.K[views]) @ model.P[views]
+    return M[:, :, :3], -np.einsum("nji,nj->ni", M[:, :, :3], M[:, :, 3])
+
+
+def _similarity_of_cameras(Ra: F64, Ca: F64, Rb: F64, Cb: F64) -> Similarity:
+    """The similarity between common cameras: rotations determine its rotation, also of centres on one line.
+
+    Cameras further off than three times the median are left out in each round.
+    """
+    use = np.ones(len(Ra), dtype=bool)
+    for _ in range(ROUNDS):
+        U, _, Vt = np.linalg.svd(np.einsum("nji,njk->ik", Ra[use], Rb[use]))
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        a, b = Ca - np.median(Ca[use], axis=0), (Cb - np.median(Cb[use], axis=0)) @ R.T
+        scale = float(
+            np.median(np.linalg.norm(a[use], axis=1)) / max(np.median(np.linalg.norm(b[use], axis=1)), 1e-12)
+        )
+        t = np.median((Ca - scale * Cb @ R.T)[use], axis=0)
+        turned = np.linalg.norm(Ra @ R - Rb, axis=(1, 2))
+        moved = np.linalg.norm(Ca - scale * Cb @ R.T - t, axis=1)
+        new = (turned <= 3.0 * np.median(turned[use]) + 1e-9) & (moved <= 3.0 * np.median(moved[use]) + 1e-9)
+        if new.sum() < MIN_COMMON or (new == use).all():
+            break
+        use = new
+    return Similarity(scale, R, t)
+
+
+def _compose(a: Similarity, b: Similarity) -> Similarity:
+    """The similarity X -> a(b(X))."""
+    return Similarity(a.scale * b.scale, a.R @ b.R, a.scale * a.R @ b.t + a.t)
+
+
+def _in_one_frame(
+    tracks: Tracks,
+    sizes: I64,
+    own: Sequence[I64],
+    parts: Sequence[I64],
+    models: Sequence[Reconstruction],
+    placed: dict[int, Similarity],
+) -> Reconstruction:
+    n = tracks.n_views
+    P, K, registered = np.zeros((n, 3, 4)), np.zeros((n, 3, 3)), np.zeros(n, dtype=bool)
+    for inner in (True, False):
+        for p, similarity in placed.items():
+            views, model = parts[p], models[p]
+            here = np.flatnonzero(
+                model.registered & ~registered[views] & (np.isin(views, own[p]) | (not inner))
+            )
+            R, C = _poses(model, here)
+            R, C = R @ similarity.R.T, similarity.apply(C)
+            assert model.K is not None
+            K[views[here]] = model.K[here]
+            P[views[here]] = model.K[here] @ np.concatenate([R, -(R @ C[:, :, None])], axis=2)
+            registered[views[here]] = True
+    sigma = float(np.median([models[p].sigma_px for p in placed]))
+    none, X = np.zeros(tracks.n_points, dtype=bool), np.zeros((tracks.n_points, 4))
+    points = (X, registered, none, none[tracks.point_index], tracks, sizes)
+    return Reconstruction("metric", P, *points, sigma, ("",) * n, K, np.zeros((n, 3)))
