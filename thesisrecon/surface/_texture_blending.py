@@ -381,7 +381,8 @@ def _equalizing_gains(weight: F32, color: F32) -> F32:
     """Gains (V, 3) of geometric mean 1 that equalise the median colours of all pairs of views."""
     views = len(weight)
     usable = (weight[..., None] > 0.0) & (color > DARK) & (color < BRIGHT)
-    log = np.log(np.maximum(color, 1.0))
+    log = np.maximum(color, 1.0)
+    np.log(log, out=log)
     gains = np.ones((views, 3), dtype=np.float32)
     for k in range(3):
         # The constant fixes the mean to 0, which the ratios leave undetermined.
