@@ -428,7 +428,9 @@ def estimate_depth_maps(state: PipelineState) -> None:
     maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
     keys = {f"confirmed-{i:05d}": run.key("dense", key, i, "confirmed") for i in order}
     final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True)
-    views = OnDemand(len(order), lambda n: scene.views[order[n]])
+    # The views for stereo matching need not stay in memory.
+    undistorted = scene.views
+    views = OnDemand(len(order), lambda n: undistorted[order[n]])
     state.result = replace(result, depth_maps=final, views=views)
     finite = [np.isfinite(m.depth) for m in final]
     known = [float(mask.mean()) for mask in finite]
