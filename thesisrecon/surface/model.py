@@ -24,7 +24,7 @@ class SurfaceModel:
         Surface fitted to each depth map, fusion of these surfaces, and texture of the result.
     max_glb_mb : float
         Largest size of model.glb in megabytes, at least 5; the mesh of a larger one is reduced, and
-        model-full.glb holds all of it.
+        model-full.glb holds all of it, as do the tiles.
     """
 
     surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)
