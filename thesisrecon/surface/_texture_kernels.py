@@ -120,6 +120,8 @@ def keep_largest(one: F32, its_color: F32, weight: F32, color: F32) -> None:
     """
     views = weight.shape[0]
     for n in range(len(one)):
+        if one[n] <= 0.0:
+            continue
         least = 0
         for v in range(1, views):
             if weight[v, n] <= weight[least, n]:
