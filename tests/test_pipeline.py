@@ -13,12 +13,13 @@ from tests import fake_stages as fakes
 from tests.conftest import refuses
 from tests.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon.camera import Camera
+from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
-from thesisrecon.pipeline import _outputs, _stages
+from thesisrecon.pipeline import _outputs, _stages, _tiles
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.pipeline.reconstruction import _exif_warnings, reconstruct
 from thesisrecon.records import Image
@@ -26,6 +27,7 @@ from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import stream
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.surface import fusion
+from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import render
 
@@ -160,6 +162,7 @@ def test_a_model_above_the_size_limit_is_written_whole_and_reduced(tmp_path):
     directory, limit_mb = RunDirectory(tmp_path / "b"), 0.6e-6 * len(whole)
     directory.path.mkdir()
     (sentence,) = _outputs._write_surface(directory, result, limit_mb, 1)
+    assert "1 tile (tiles/tiles.json) hold" in sentence
     assert sentence.endswith("model-full.glb holds all")
     assert (tmp_path / "b" / "model-full.glb").read_bytes() == whole
     assert (tmp_path / "b" / "model.glb").stat().st_size <= 1e6 * limit_mb
@@ -168,7 +171,60 @@ def test_a_model_above_the_size_limit_is_written_whole_and_reduced(tmp_path):
     np.testing.assert_allclose(reduced.vertices[:, 2], 8.0, atol=0.05)
     assert _outputs._write_surface(directory, result, 50.0, 1) == []
     assert not (tmp_path / "b" / "model-full.glb").exists()
+    assert not (tmp_path / "b" / "tiles").exists()
     refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
+
+
+def of_all_faces():
+    return fake_config(model=SurfaceModel(fusion=VolumetricFusion(tolerance=0.0)))
+
+
+def test_the_tiles_hold_each_face_once_in_files_of_bounded_size(tmp_path, monkeypatch):
+    result = run(tmp_path / "a", until="model", threads=1, config=of_all_faces())
+    directory, mesh = RunDirectory(tmp_path / "b"), result.mesh
+    whole = (tmp_path / "a" / "model.glb").stat().st_size
+    monkeypatch.setattr(_tiles, "TILE_FACES", len(mesh.faces) // 2)
+    monkeypatch.setattr(_tiles, "TILE_MB", 0.2e-6 * whole)
+    count = _tiles.write_tiles(directory, mesh, mesh)
+    coarse, *tiles = read(tmp_path / "b" / "tiles" / "tiles.json")["tiles"]
+    assert (coarse["file"], coarse["level"], coarse["faces"]) == ("../model.glb", 0, len(mesh.faces))
+    assert len(tiles) == count > 4
+    assert {path.name for path in (tmp_path / "b" / "tiles").iterdir()} == {
+        "tiles.json", *(tile["file"] for tile in tiles),
+    }  # fmt: skip
+    found = []
+    for tile in tiles:
+        path = tmp_path / "b" / "tiles" / tile["file"]
+        assert path.stat().st_size <= 0.2 * whole
+        there = read_mesh(path)
+        assert (tile["level"], tile["faces"]) == (1, len(there.faces))
+        loaded = trimesh.load(path, force="mesh", process=False)
+        np.testing.assert_array_equal(tile["box"], loaded.bounds)
+        found.append(there.vertices[there.faces].reshape(-1, 9))
+    wanted = mesh.vertices[mesh.faces].reshape(-1, 9).astype(np.float32)
+    np.testing.assert_array_equal(*(np.unique(rows, axis=0) for rows in (np.concatenate(found), wanted)))
+    assert sum(map(len, found)) == len(mesh.faces)
+
+
+def test_a_run_with_fewer_images_in_the_same_folder_leaves_no_old_tiles(tmp_path, monkeypatch):
+    out, largest = tmp_path / "out", SurfaceModel.max_glb_mb
+    config = of_all_faces()
+    object.__setattr__(config.model, "max_glb_mb", 0.03)
+    monkeypatch.setattr(SurfaceModel, "max_glb_mb", 0.03)
+    monkeypatch.setattr(_tiles, "TILE_FACES", 500)
+    result = run(out, until="model", config=config)
+    tiles = {path.name for path in (out / "tiles").iterdir()}
+    assert len(tiles) > 3
+    assert (out / "model.glb").stat().st_size <= 30_000
+    result.save(tmp_path / "copy")
+    assert {path.name for path in (tmp_path / "copy" / "tiles").iterdir()} == tiles
+    assert "all triangles are in the tiles of" in summary_text(result.summary, out)
+    object.__setattr__(config.model, "max_glb_mb", largest)
+    monkeypatch.setattr(SurfaceModel, "max_glb_mb", largest)
+    run(out, 3, until="model", config=config, overwrite=True)
+    assert (out / "model.glb").is_file()
+    assert not (out / "tiles").exists()
+    assert "tiles" not in summary_text(read(out / "summary.json"), out)
 
 
 def test_a_run_stopped_between_depth_maps_goes_on(tmp_path):

@@ -113,8 +113,9 @@ class RunResult:
         File name -> reason of unreadable images.
     features, pair_choice, pairs, tracks, projective, calibration, metric, mesh, held_out
         Results of the stages; ``pairs`` are all matched ones, accepted or not.
-    views, depth_maps : tuple of PinholeView, sequence of DepthMap
-        Undistorted images and their depth maps; of many, some are read from ``out`` when they are used.
+    views, depth_maps : sequence of PinholeView, sequence of DepthMap
+        Undistorted images and their depth maps; of many, some are undistorted, or read from ``out``, when
+        they are used.
     reports, warnings, failure : tuple of StageReport, tuple of str, str
         One report per stage, all warnings, and the failure that ended the run, empty otherwise.
     summary : mapping
@@ -133,7 +134,7 @@ class RunResult:
     projective: Reconstruction | None = None
     calibration: SelfCalibration | None = None
     metric: MetricResult | None = None
-    views: tuple[PinholeView, ...] = ()
+    views: Sequence[PinholeView] = ()
     depth_maps: Sequence[DepthMap] = ()
     mesh: TexturedMesh | None = None
     held_out: HeldOut | None = None

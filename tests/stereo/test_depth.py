@@ -12,7 +12,8 @@ from thesisrecon.dense_model import confirmed_depth_maps
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.records import Image
-from thesisrecon.stereo import correspondence
+from thesisrecon.stereo import correspondence, depth
+from thesisrecon.stereo._resampling import pinhole_view
 from thesisrecon.stereo.correspondence import PairMatching
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
@@ -90,6 +91,31 @@ def test_frames_with_many_disparities_are_reduced_and_still_match_the_scene(wall
     assert np.median(error) < 0.002
     assert np.mean(error < 0.01) > 0.95
     assert known > 0.75
+
+
+def test_views_are_undistorted_when_they_are_used_and_the_same_within_any_memory(walled, monkeypatch):
+    stereo, made = replace(STEREO, max_side=120, match_side=90), []
+
+    def counted(*given, max_side):
+        made.append(max_side)
+        return pinhole_view(*given, max_side=max_side)
+
+    monkeypatch.setattr(depth, "pinhole_view", counted)
+    whole = stereo.prepare(walled.images, walled.reconstruction)
+    assert made == []
+    monkeypatch.setattr(depth, "VIEW_BYTES", 0)
+    within = stereo.prepare(walled.images, walled.reconstruction, threads=2)
+    assert whole.neighbours == within.neighbours
+    maps = [stereo.depth_map(scene, 1) for scene in (whole, within, whole)]
+    assert np.isfinite(maps[0].depth).any()
+    assert len({one.depth.tobytes() for one in maps}) == 1
+    for i in whole.views:
+        one, other = whole.views[i], within.views[i]
+        assert (one.rgb.tobytes(), one.seen.tobytes()) == (other.rgb.tobytes(), other.seen.tobytes())
+    once = len(made)
+    assert whole.views[1] is whole.views[1]
+    assert within.views[1] is not within.views[1]
+    assert len(made) == once + 2
 
 
 @pytest.mark.parametrize("links", [0, 1])

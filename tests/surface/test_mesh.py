@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from tests.surface.sphere import ring_of
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface._bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
-from thesisrecon.surface._mesh import face_areas, simplify_mesh
+from thesisrecon.surface._mesh import face_areas, halve_surface, simplify_mesh
 from thesisrecon.surface.bspline import _basis, _energies
 from thesisrecon.surface.fusion import VolumetricFusion
 
@@ -234,3 +234,18 @@ def test_energies_are_integrals():
     assert c @ gradient @ c == pytest.approx(np.mean(f[1, 0] ** 2 + f[0, 1] ** 2), rel=1e-4)
     plane = (2.0 + 0.3 * np.arange(4)[:, None] - 0.7 * np.arange(4)).ravel()
     assert abs(plane @ bending @ plane) < 1e-12
+
+
+def test_the_surface_is_halved_into_compact_parts_of_bounded_size(sphere):
+    size = np.random.default_rng(4).integers(0, 9, len(sphere.faces))
+    size[7] = 5000  # one face is not cut
+    part = halve_surface(sphere, size, 900)
+    sums, middle = np.bincount(part, size), sphere.vertices[sphere.faces].mean(axis=1)
+    assert (np.sort(sums)[:-1] <= 900).all()
+    assert sums[part[7]] >= 5000
+    assert len(sums) < 4 * size.sum() / 900
+    spread = [np.ptp(middle[part == k], axis=0).max(initial=0.0) for k in range(len(sums))]
+    assert np.median(spread) < 0.6 * np.ptp(middle, axis=0).max()
+    assert halve_surface(sphere, size, 10**9).max() == 0
+    together = replace(sphere, vertices=np.zeros_like(sphere.vertices))
+    assert np.bincount(halve_surface(together, np.ones(len(size), int), 100)).max() <= 100

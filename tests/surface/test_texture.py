@@ -1,5 +1,6 @@
 """Texture atlas, view selection and blending."""
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -8,13 +9,15 @@ import pytest
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._zbuffer import rasterize
 from thesisrecon.io._meshes import write_mesh
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import _texture_kernels as kernels
-from thesisrecon.surface._mesh import face_neighbours, vertex_normals
+from thesisrecon.surface import texture_atlas
+from thesisrecon.surface._mesh import face_neighbours, halve_surface, vertex_normals
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.surface.texture_atlas import TextureAtlas, _pack_rectangles
+from thesisrecon.surface.texture_atlas import TextureAtlas, _pack_rectangles, cut_tile
 from thesisrecon.views.render import render
 
 GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
@@ -258,13 +261,96 @@ def test_of_many_views_those_of_the_largest_weights_are_blended():
     rng = np.random.default_rng(5)
     weight, color = rng.random((50, 40)).astype(np.float32), np.full((50, 40, 3), 90, np.float32)
     weight[rng.random(weight.shape) < 0.2] = 0.0
+    weight[:, :20] = np.ceil(4.0 * weight[:, :20])  # many are equal: the first ones stay
     few = np.sort(np.argsort(-weight, axis=0, kind="stable")[: kernels.MAX_BLENDED], axis=0)
     color += rng.normal(0, 9, color.shape).astype(np.float32)
     out, wanted = np.zeros((2, 40, 3), np.float32)
-    kernels.combine_colors(weight, color, 2.0, 30.0, out)
+    kept, kept_color = weight[: kernels.MAX_BLENDED].copy(), color[: kernels.MAX_BLENDED].copy()
+    for view in range(kernels.MAX_BLENDED, 50):
+        kernels.keep_largest(weight[view], color[view], kept, kept_color)
+    kernels.combine_colors(kept, kept_color, 2.0, 30.0, out)
     best = np.take_along_axis(weight, few, axis=0)
+    np.testing.assert_array_equal(kept, best)
     kernels.combine_colors(best, np.take_along_axis(color, few[..., None], axis=0), 2.0, 30.0, wanted)
     np.testing.assert_array_equal(out, wanted)
+
+
+@pytest.mark.parametrize("max_texels", [4096 * 4096, 20_000])
+def test_the_texture_is_the_same_bytes_within_any_memory_and_for_any_threads(sphere, monkeypatch, max_texels):
+    views, atlas, rastered = [photograph(m) for m in ring_of(40)], TextureAtlas(max_texels=max_texels), []
+
+    def counted(*given):
+        rastered.append(0)
+        return rasterize(*given)
+
+    monkeypatch.setattr(blending, "rasterize", counted)
+    whole = atlas.texture(sphere, views)
+    once = len(rastered)
+    assert once == (40 if max_texels > 1e6 else 80)
+    for name in ("BUFFER_BYTES", "SURFACE_BYTES"):
+        monkeypatch.setattr(blending, name, 0)
+    monkeypatch.setattr(texture_atlas, "REDUCED_BYTES", 0)
+    monkeypatch.setattr(blending, "LARGE_PART_TEXELS", 3000)
+    monkeypatch.setattr(blending, "CHUNK_POINTS", 500)
+    for threads in (1, 2):
+        rastered.clear()
+        within = atlas.texture(sphere, views, threads=threads)
+        assert within.texture.tobytes() == whole.texture.tobytes()
+        assert within.uv.tobytes() == whole.uv.tobytes()
+        assert len(rastered) > 2 * once
+
+
+@pytest.mark.parametrize("count", [12, 36])
+def test_views_in_memory_during_texturing_do_not_grow_with_their_number(sphere, monkeypatch, count):
+    alive, most, prepare = [], [0], blending._prepared
+
+    def followed(view, depth):
+        surface = prepare(view, depth)
+        alive[:] = [one for one in alive if one() is not None] + [weakref.ref(surface.trust)]
+        most[0] = max(most[0], len(alive))
+        return surface
+
+    monkeypatch.setattr(blending, "_prepared", followed)
+    monkeypatch.setattr(blending, "BUFFER_BYTES", 0)
+    monkeypatch.setattr(blending, "SURFACE_BYTES", 3 * 11 * 160 * 120)
+    TextureAtlas().texture(sphere, [photograph(m) for m in ring_of(count)], threads=2)
+    # Those that are kept, those of one batch, and those that two threads are making.
+    assert most[0] <= 3 + blending.BATCH_VIEWS + 2
+
+
+def test_a_part_of_the_surface_uses_no_view_away_from_it_and_each_one_that_shows_it():
+    rng, camera = np.random.default_rng(6), Camera.from_matrix(looking_at_origin(0.4, 0.3, 3.2), (160, 120))
+    used = 0
+    for _ in range(300):
+        points = rng.normal(scale=3.0, size=3) + rng.uniform(0.0, 1.0, 3) * rng.uniform(-0.5, 0.5, (20, 3))
+        x = points @ camera.P[:, :3].T + camera.P[:, 3]
+        ahead = x[:, 2] > 0
+        inside = ((x[:, :2] >= 0) & (x[:, :2] <= np.array([159, 119]) * x[:, 2:])).all(axis=1)
+        may = blending._may_contain(camera, points.min(axis=0), points.max(axis=0))
+        assert may or not (ahead & inside).any()
+        used += may
+    assert 20 < used < 150
+
+
+def test_a_tile_has_the_texels_and_corners_of_the_whole(sphere):
+    whole = TextureAtlas().texture(sphere, [photograph(m) for m in ring_of()[:5]])
+    part = halve_surface(whole, np.ones(len(whole.faces), int), len(whole.faces) // 3)
+    assert whole.untextured.any()
+    texels = 0
+    for k in range(part.max() + 1):
+        faces = np.flatnonzero(part == k)
+        tile = cut_tile(whole, faces)
+        np.testing.assert_array_equal(tile.vertices[tile.faces], whole.vertices[whole.faces[faces]])
+        np.testing.assert_array_equal(tile.untextured, whole.untextured[faces])
+        for weights in ([1, 0, 0], [0, 1, 0], [0.2, 0.3, 0.5]):
+            (x, y), (x_whole, y_whole) = (
+                np.floor(np.asarray(weights) @ uv + 0.2).astype(int).T for uv in (tile.uv, whole.uv[faces])
+            )
+            np.testing.assert_array_equal(tile.texture[y, x], whole.texture[y_whole, x_whole])
+        texels += tile.texture[..., 0].size
+    assert texels < 2.0 * whole.texture[..., 0].size
+    plain = cut_tile(sphere, np.arange(10))
+    assert (len(plain.faces), plain.texture) == (10, None)
 
 
 def test_grow_colors_matches_its_twin():

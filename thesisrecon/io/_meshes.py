@@ -163,6 +163,12 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     write_atomically(path, made.export(file_type="glb"))
 
 
+def box_in_file(mesh: TexturedMesh) -> list[list[float]]:
+    """Smallest and largest coordinates of a mesh as :func:`write_mesh` writes it."""
+    written = (mesh.vertices * _HALF_TURN).astype(np.float32)
+    return [[float(x) for x in limit] for limit in (written.min(axis=0), written.max(axis=0))]
+
+
 def read_mesh(path: Path) -> TexturedMesh:
     """Read a GLB of :func:`write_mesh`; vertices that were split at texture seams are merged again."""
     if not path.is_file():

@@ -21,6 +21,7 @@ from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import read_json, write_atomically, write_json, write_text
 from thesisrecon.io._meshes import write_mesh
 from thesisrecon.pipeline._state import name_images
+from thesisrecon.pipeline._tiles import TILE_FILES, TILES, write_tiles
 from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
@@ -36,7 +37,8 @@ DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
 SUMMARY, PAGE = "summary.json", "report.html"
 COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
-MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", "model.glb", "model-full.glb")
+SURFACE_FILES = ("model.glb", "model-full.glb", *TILE_FILES)
+MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 MAX_AFFINE = 1e3
 """Largest affine coordinate written to affine.ply, in standard deviations of the points."""
@@ -150,9 +152,9 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
 def save_result(result: RunResult, folder: Path) -> None:
     """Copy the result files of a run, or write those of a run that had no folder (without its page)."""
     if result.out is not None and (result.out / SUMMARY).is_file():
-        for name in RESULT_FILES:
-            if (result.out / name).is_file():
-                write_atomically(folder / name, (result.out / name).read_bytes())
+        for path in (path for name in RESULT_FILES for path in sorted(result.out.glob(name))):
+            if path.is_file():
+                write_atomically(folder / path.relative_to(result.out), path.read_bytes())
         return
     folder.mkdir(parents=True, exist_ok=True)
     _write_results(RunDirectory(folder), result)
@@ -160,9 +162,9 @@ def save_result(result: RunResult, folder: Path) -> None:
 
 
 def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, threads: int) -> list[str]:
-    """Write the mesh as GLB; a larger one than ``max_mb`` as a whole, and reduced. Returns warnings."""
+    """Write the mesh as GLB; one above ``max_mb`` whole, in tiles and reduced. Returns warnings."""
     mesh, path, whole = result.mesh, directory.path / "model.glb", directory.path / "model-full.glb"
-    directory.remove((whole.name,) if mesh is not None else (path.name, whole.name))
+    directory.remove(SURFACE_FILES if mesh is None else SURFACE_FILES[1:])
     if mesh is None:
         return []
     write_mesh(path, mesh)
@@ -177,9 +179,13 @@ def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, th
         atlas = TextureAtlas(max_texels=int(share * texels))
         write_mesh(path, atlas.texture(smaller, result.views, threads=threads))
         size = path.stat().st_size
+    tiles = counted(write_tiles(directory, mesh, smaller), "tile")
     faces = f"{len(smaller.faces)} of {len(mesh.faces)} faces"
     limit = f"model.max_glb_mb={max_mb:g}"
-    return [f"model.glb is reduced to {faces} and fewer texels ({limit}); {whole.name} holds all"]
+    return [
+        f"model.glb is reduced to {faces} and fewer texels ({limit}); "
+        f"{tiles} ({TILES}) hold all in parts, and {whole.name} holds all"
+    ]
 
 
 def _write_results(

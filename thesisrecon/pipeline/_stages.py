@@ -18,6 +18,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
+from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._image_pair import (
     detect_features,
@@ -427,7 +428,10 @@ def estimate_depth_maps(state: PipelineState) -> None:
     maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
     keys = {f"confirmed-{i:05d}": run.key("dense", key, i, "confirmed") for i in order}
     final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True)
-    state.result = replace(result, depth_maps=final, views=tuple(scene.views[i] for i in order))
+    # The views for stereo matching need not stay in memory.
+    undistorted = scene.views
+    views = OnDemand(len(order), lambda n: undistorted[order[n]])
+    state.result = replace(result, depth_maps=final, views=views)
     finite = [np.isfinite(m.depth) for m in final]
     known = [float(mask.mean()) for mask in finite]
     counts = {"views": len(order), "depths": int(sum(mask.sum() for mask in finite))}

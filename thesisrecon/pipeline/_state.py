@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
 from thesisrecon.numerics._observations import cached_pair_order
+from thesisrecon.numerics._on_demand import RecentlyUsed
 from thesisrecon.records import Features, Image, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run
@@ -33,8 +32,7 @@ class PreparedViews(Sequence[Any]):
 
     def __init__(self, prepare: Prepare, given: Mapping[int, tuple[Image, Features]]) -> None:
         self._prepare, self._given = prepare, dict(given)
-        self._kept: OrderedDict[int, tuple[Any, int]] = OrderedDict()
-        self._lock, self._bytes = threading.Lock(), 0
+        self._made: RecentlyUsed[int, Any] = RecentlyUsed(CACHE_BYTES)
 
     def __reduce__(self) -> tuple[type[PreparedViews], tuple[Prepare, dict[int, tuple[Image, Features]]]]:
         return PreparedViews, (self._prepare, self._given)
@@ -45,19 +43,7 @@ class PreparedViews(Sequence[Any]):
     def __getitem__(self, view: int) -> Any:  # type: ignore[override]
         if view not in self._given:
             raise IndexError(f"view {view} is not among those given")
-        with self._lock:
-            if view in self._kept:
-                self._kept.move_to_end(view)
-                return self._kept[view][0]
-        # Two threads may both prepare a view: cheaper than one waiting for the other.
-        made = self._prepare(*self._given[view])
-        with self._lock:
-            if view not in self._kept:
-                self._kept[view] = made, _size_of(made)
-                self._bytes += self._kept[view][1]
-            while self._bytes > CACHE_BYTES and len(self._kept) > 2:
-                self._bytes -= self._kept.popitem(last=False)[1][1]
-        return made
+        return self._made.get(view, lambda: self._prepare(*self._given[view]))
 
     def masks(self, i: int, j: int) -> tuple[B8 | None, B8 | None]:
         """Masks of two views, None: all pixels."""
@@ -66,15 +52,6 @@ class PreparedViews(Sequence[Any]):
     def subset(self, views: Iterable[int]) -> PreparedViews:
         """The same for some views, with an empty cache."""
         return PreparedViews(self._prepare, {view: self._given[view] for view in views})
-
-
-def _size_of(value: Any) -> int:
-    """Bytes of the arrays of a record."""
-    if hasattr(value, "nbytes"):
-        return int(value.nbytes)
-    if is_dataclass(value):
-        return sum(_size_of(getattr(value, f.name)) for f in fields(value))
-    return sum(_size_of(part) for part in value) if isinstance(value, tuple) else 0
 
 
 def batch_pairs(

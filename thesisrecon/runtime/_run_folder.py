@@ -236,9 +236,9 @@ class RunDirectory:
         write_json(self.path / RUN_FILE, identity)
 
     def remove(self, names: Sequence[str]) -> None:
-        """Remove files and the folders that are empty afterwards."""
+        """Remove files (``*`` stands for any part of a name) and the folders that are empty afterwards."""
         try:
-            for path in (self.path / name for name in names):
+            for path in (path for name in names for path in self._named(name)):
                 path.unlink(missing_ok=True)
                 for parent in path.parents[: len(path.relative_to(self.path).parents) - 1]:
                     if parent.is_dir() and not any(parent.iterdir()):
@@ -246,6 +246,9 @@ class RunDirectory:
         except OSError as error:
             place = f"the output folder {self.path}, whose old results must be removed,"
             raise OutputError(place, error) from None
+
+    def _named(self, name: str) -> list[Path]:
+        return sorted(self.path.glob(name)) if "*" in name else [self.path / name]
 
     def _check(self, identity: Mapping[str, Any], overwrite: bool) -> bool:
         """Whether the folder holds another run."""

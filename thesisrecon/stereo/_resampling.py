@@ -209,10 +209,32 @@ class Rectification(ABC):
         return warp_image(image, partial(self._lookup, side), self.size)
 
 
+def pinhole_frame(
+    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
+) -> PinholeView:
+    """The view of :func:`pinhole_view` without its pixels: black, and all of them seen."""
+    P, _, size = _pinhole_camera(image, reconstruction, view, max_side)
+    black, seen = np.broadcast_to(np.uint8(0), (*size[::-1], 3)), np.broadcast_to(np.True_, size[::-1])
+    return PinholeView(view, P, black, seen)
+
+
 def pinhole_view(
     image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
 ) -> PinholeView:
     """Undistort an image of a metric reconstruction, at most ``max_side`` long; P[2] X is the depth."""
+    P, K, size = _pinhole_camera(image, reconstruction, view, max_side)
+    distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
+    if not distortion.any() and size == image.size and image.mask is None:
+        return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
+    assert reconstruction.K is not None
+    rgb, seen = undistort_image(image.rgb, reconstruction.K[view], distortion, K, size, mask=image.mask)
+    return PinholeView(view, P, rgb, seen)
+
+
+def _pinhole_camera(
+    image: Image, reconstruction: Reconstruction, view: int, max_side: int
+) -> tuple[F64, F64, tuple[int, int]]:
+    """P (3, 4), K (3, 3) and (width, height) of an undistorted image."""
     K = reconstruction.K
     if reconstruction.stratum != "metric" or K is None:
         raise ValueError("undistorted views need a metric reconstruction with K")
@@ -223,10 +245,6 @@ def pinhole_view(
     sx, sy = np.array(size) / np.array(image.size)
     # (x + 0.5) s - 0.5 along either side.
     S = np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
-    distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
     P = reconstruction.P[view]
     P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
-    if not distortion.any() and size == image.size and image.mask is None:
-        return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
-    rgb, seen = undistort_image(image.rgb, K[view], distortion, S @ K[view], size, mask=image.mask)
-    return PinholeView(view, P, rgb, seen)
+    return P, S @ K[view], size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,18 +14,21 @@ from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.numerics._on_demand import MappingOnDemand
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link_sequence, pixel_transfer
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo._frustum_samples import frustum_samples
 from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
-from thesisrecon.stereo._resampling import pinhole_view
+from thesisrecon.stereo._resampling import pinhole_frame, pinhole_view
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 
 BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
 """Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones."""
 MIN_ANGLE_DEG, MIN_POINTS = 1.0, 12
 """A neighbour has at least so many common points of at least this angle."""
+VIEW_BYTES = 2**29
+"""Undistorted views of one size in memory; more are made again when they are used."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +241,7 @@ class MultiViewScene:
         MultiViewScene
         """
         views, matched = (
-            {i: view for i, view in given.items() if i in numbers} for given in (self.views, self.matched)
+            {i: given[i] for i in given if i in numbers} for given in (self.views, self.matched)
         )
         seen = self.points.seen[sorted(numbers)].any(axis=0)
         points = replace(self.points, X=self.points.X[seen], seen=self.points.seen[:, seen])
@@ -286,28 +289,29 @@ class MultiViewStereo:
         reconstruction: Reconstruction,
         *,
         depth_range: F64 | None = None,
-        threads: int = 1,
+        threads: int = 1,  # noqa: ARG002
     ) -> MultiViewScene:
         """See `thesisrecon.config.DepthEstimator.prepare`."""
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
         registered = np.flatnonzero(reconstruction.registered).tolist()
 
-        def undistorted(view: int) -> tuple[PinholeView, PinholeView]:
-            image, side = images[view], min(self.match_side, self.max_side)
-            whole = pinhole_view(image, reconstruction, view, max_side=self.max_side)
-            if min(max(image.size), self.max_side) <= side:
-                return whole, whole
-            return whole, pinhole_view(image, reconstruction, view, max_side=side)
+        def undistorted(side: int) -> Mapping[int, PinholeView]:
+            def make(view: int) -> PinholeView:
+                return pinhole_view(images[view], reconstruction, view, max_side=side)
 
-        with ThreadPoolExecutor(max(threads, 1)) as pool:
-            made = dict(zip(registered, pool.map(undistorted, registered), strict=True))
-        views, matched = ({i: pair[k] for i, pair in made.items()} for k in (0, 1))
+            return MappingOnDemand(registered, make, VIEW_BYTES)
+
+        frames = {i: pinhole_frame(images[i], reconstruction, i, max_side=self.max_side) for i in registered}
+        views = undistorted(self.max_side)
+        side = min(self.match_side, self.max_side)
+        longest = max((max(frame.seen.shape) for frame in frames.values()), default=0)
+        matched = undistorted(side) if longest > side else views
         if depth_range is None and reconstruction.valid.any():
             points = _sparse_points(reconstruction)
         else:
-            points = SparsePoints(*frustum_samples(views, len(images), depth_range), sampled=True)
-        chosen = {i: _select_neighbours(points, views, i, self.max_neighbours) for i in views}
+            points = SparsePoints(*frustum_samples(frames, len(images), depth_range), sampled=True)
+        chosen = {i: _select_neighbours(points, frames, i, self.max_neighbours) for i in frames}
         return MultiViewScene(views, points, chosen, matched)
 
     def depth_map(self, scene: MultiViewScene, view: int, *, pool: Executor | None = None) -> DepthMap:
@@ -316,7 +320,7 @@ class MultiViewStereo:
             raise ValueError(f"view {view} has no camera; those with one are {sorted(scene.views)}")
 
         def correspond(i: int, j: int) -> Correspondence | None:
-            a, b = (scene.matched.get(k, scene.views[k]) for k in (i, j))
+            a, b = (scene.matched[k] if k in scene.matched else scene.views[k] for k in (i, j))
             shapes = scene.views[i].seen.shape, scene.views[j].seen.shape
             try:
                 return self.pairs.correspond(a, b, *_shared_projections(scene.points, a, b), shapes=shapes)

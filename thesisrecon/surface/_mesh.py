@@ -78,6 +78,28 @@ def face_neighbours(faces: I64) -> I64:
     return neighbour.reshape(-1, 3)
 
 
+def halve_surface(mesh: TexturedMesh, size: I64, largest: int) -> I64:
+    """(M,) part of each face: boxes are halved until the sum of ``size`` (M,) in each is at most ``largest``.
+
+    They are cut across their longest side, so that parts are compact; one face is not cut.
+    """
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    part, count, open_ = np.zeros(len(mesh.faces), dtype=np.int64), 0, [np.arange(len(mesh.faces))]
+    while open_:
+        faces = open_.pop()
+        if len(faces) < 2 or size[faces].sum() <= largest:
+            part[faces] = count
+            count += 1
+            continue
+        along = middle[faces, int(np.argmax(np.ptp(middle[faces], axis=0)))]
+        faces = faces[np.argsort(along, kind="stable")]
+        total = np.cumsum(size[faces])
+        half = int(np.clip(np.searchsorted(total, total[-1] / 2) + 1, 1, len(faces) - 1))
+        # Within a part, faces stay in their order.
+        open_ += [np.sort(faces[half:]), np.sort(faces[:half])]
+    return part
+
+
 def remove_small_parts(mesh: TexturedMesh) -> TexturedMesh:
     """Remove small connected parts, which come from wrong depths."""
     if not len(mesh.faces):

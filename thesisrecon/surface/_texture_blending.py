@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import combinations
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from itertools import combinations, pairwise
 
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F32, F64, I64, U8
+from thesisrecon.arrays import B8, F32, F64, I32, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry._zbuffer import rasterize, rasterize_corners
+from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface._mesh import components, vertex_normals
+from thesisrecon.surface._mesh import components, halve_surface, vertex_normals
 from thesisrecon.surface._texture_kernels import (
+    MAX_BLENDED,
     ViewSurface,
     combine_colors,
     continue_faces,
     diffuse,
     grow_colors,
+    keep_largest,
     observe_points,
 )
 
@@ -31,6 +34,8 @@ MIN_CHART_FACES = 30
 """Smaller charts join a neighbour."""
 OWN_WEIGHT = 0.1
 """Weight of a face's own share relative to those of its neighbours."""
+BUFFER_BYTES, SURFACE_BYTES = 2**28, 2**29
+"""Depth buffers, and views prepared for blending, in memory; more are made again when they are used."""
 
 
 def view_camera(view: PinholeView) -> Camera:
@@ -47,12 +52,13 @@ def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
     return xy, depth
 
 
-def depth_buffers(mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> list[F32]:
-    """Depth of the surface in each view (H, W), infinite where there is none."""
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        return list(
-            pool.map(lambda view: rasterize(mesh.vertices, mesh.faces, view_camera(view)).depth, views)
-        )
+def depth_buffers(mesh: TexturedMesh, views: Sequence[PinholeView]) -> Sequence[F32]:
+    """Depth of the surface in each view (H, W), infinite where there is none; made when it is used."""
+
+    def depth(v: int) -> F32:
+        return rasterize(mesh.vertices, mesh.faces, view_camera(views[v])).depth
+
+    return OnDemand(len(views), depth, BUFFER_BYTES)
 
 
 def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8:
@@ -73,9 +79,9 @@ def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8
 def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32]) -> F32:
     """Count the pixels (M, V) of each face in each view, 0 if its outside is not completely visible."""
     quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
-    for v, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
+    for v, view in enumerate(views):
         xy, depth = project_to_view(view_camera(view), mesh.vertices)
-        seen = _visible_vertices(view, buffer, xy, depth)
+        seen = _visible_vertices(view, buffers[v], xy, depth)
         a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
         # y points down: faces that are anticlockwise from outside have a negative area.
         area = 0.5 * ((c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]) - (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]))
@@ -158,8 +164,12 @@ def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
     return np.where(small & (joined[chart] >= 0), joined[chart], label)
 
 
-POINTS_PER_CHUNK, OBSERVED = 1 << 17, 1 << 22
-"""Points, and points times views, processed at a time, which bounds the memory."""
+PART_TEXELS, LARGE_PART_TEXELS, CHUNK_POINTS = 1 << 17, 1 << 19, 1 << 14
+"""Texels of a part of the surface, if all views are in memory, and else; points of one task."""
+PREPARED_BYTES = 11
+"""Bytes of a pixel of a view that is prepared for blending."""
+BATCH_VIEWS, OBSERVED = 8, 1 << 22
+"""Views that are used together; points times views from which the gains are estimated."""
 STRIP_ROWS = 64
 """Rows of the texture processed at a time."""
 RIM_TEXELS = 1
@@ -185,32 +195,36 @@ FEATHER_PX = 8.0
 
 
 def paint_texture(
-    mesh: TexturedMesh, prepared: Sequence[ViewSurface], uv: F64, cut_out: U8, *, threads: int = 1
+    mesh: TexturedMesh,
+    prepared: Sequence[ViewSurface],
+    cameras: Sequence[Camera],
+    uv: F64,
+    cut_out: U8,
+    *,
+    threads: int = 1,
 ) -> U8:
     """Compute the colours of a texture (H, W, 3) as a robust blend of all images that show a point.
 
     The weight of an image is its number of pixels per area, reduced towards image borders and outlines of
     foreground objects and where its colour contradicts the others (thin objects missing from the surface,
     reflections, people). Weights vary smoothly, so no seams occur. ``uv`` (M, 3, 2): corners of the faces in
-    texels, NaN for faces that no view shows; other texels keep the colours of ``cut_out``.
+    texels, NaN for faces that no view shows; other texels keep the colours of ``cut_out``. The surface is
+    painted part by part, each with the views whose image can contain it.
     """
     normals = vertex_normals(mesh)
     texture = cut_out.copy()
     drawn = np.zeros(texture.shape[:2], dtype=bool)
-    top, bottom = uv[..., 1].min(axis=1) - RIM_TEXELS, uv[..., 1].max(axis=1) + RIM_TEXELS
-
-    def work(first: int) -> None:
-        rows = slice(first, min(first + STRIP_ROWS, len(texture)))
-        # Comparisons with NaN are false: such faces are not seen.
-        some = np.flatnonzero((bottom >= rows.start) & (top <= rows.stop))
-        at, points, towards = _points_of_rows(mesh, normals, (some, uv[some]), rows, texture.shape[1])
-        color, shown = blend_colors(prepared, points, towards)
-        at = at[shown]
-        texture[at[:, 0], at[:, 1]] = np.clip(np.rint(color[shown]), 0, 255)
-        drawn[at[:, 0], at[:, 1]] = True
-
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        list(pool.map(work, range(0, len(texture), STRIP_ROWS)))
+        pixels = sum(camera.size[0] * camera.size[1] for camera in cameras)
+        texels = PART_TEXELS if PREPARED_BYTES * pixels <= SURFACE_BYTES else LARGE_PART_TEXELS
+        for at, face, weights in _surface_parts(mesh, uv, texture.shape[:2], texels, pool):
+            points, towards = _points_on_faces(mesh, normals, face, weights)
+            box = points.min(axis=0), points.max(axis=0)
+            near = [v for v, camera in enumerate(cameras) if _may_contain(camera, *box)]
+            views = OnDemand(len(near), lambda n: prepared[near[n]])  # noqa: B023
+            color, shown = blend_colors(views, points, towards, pool)
+            texture.reshape(-1, 3)[at[shown]] = np.clip(np.rint(color[shown]), 0, 255)
+            drawn.ravel()[at[shown]] = True
     for _ in range(GROWN_TEXELS):
         grow_colors(texture, drawn)
     return texture
@@ -218,43 +232,117 @@ def paint_texture(
 
 def prepare_views(
     mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32], *, threads: int = 1
-) -> list[ViewSurface]:
-    """The surface as each view sees it, with gains that equalise the brightness of the views."""
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        prepared = list(pool.map(_prepared, views, buffers))
+) -> Sequence[ViewSurface]:
+    """The surface as each view sees it, with gains that equalise the brightness; made when it is used."""
+    prepared = OnDemand(len(views), lambda v: _prepared(views[v], buffers[v]), SURFACE_BYTES)
     stride = max(1, len(mesh.vertices) // min(GAIN_POINTS, OBSERVED // max(len(views), 1)))
     points, normals = (np.ascontiguousarray(a[::stride]) for a in (mesh.vertices, vertex_normals(mesh)))
-    weight, color = _observe(prepared, points, normals)
+    weight, color = _no_observations(len(views), points)
+
+    def observe(v: int) -> None:
+        observe_points(points, normals, prepared[v], weight[v], color[v])
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        list(pool.map(observe, range(len(views))))
     gains = _equalizing_gains(weight, color)
-    return [view._replace(gain=gain) for view, gain in zip(prepared, gains, strict=True)]
+    return OnDemand(len(views), lambda v: prepared[v]._replace(gain=gains[v]))
 
 
-def _observe(views: Sequence[ViewSurface], points: F64, normals: F64) -> tuple[F32, F32]:
-    """Weights (V, N) of points in all views, 0 where one does not show them, and colours (V, N, 3)."""
-    weight = np.zeros((len(views), len(points)), dtype=np.float32)
-    color = np.zeros((len(views), len(points), 3), dtype=np.float32)
-    for v, view in enumerate(views):
-        observe_points(points, normals, view, weight[v], color[v])
-    return weight, color
+def blend_colors(
+    views: Sequence[ViewSurface], points: F64, normals: F64, pool: Executor | None = None
+) -> tuple[F32, B8]:
+    """Colours (N, 3) of points with outward normals, and whether any view shows the point.
 
+    The views are used one after the other, and the observations of ``MAX_BLENDED`` are kept for each point.
+    """
+    slots = min(len(views), MAX_BLENDED)
+    out, shown = np.zeros((len(points), 3), dtype=np.float32), np.zeros(len(points), dtype=bool)
+    chunks = [slice(n, min(n + CHUNK_POINTS, len(points))) for n in range(0, len(points), CHUNK_POINTS)]
+    kept = [_no_observations(slots, points[some]) for some in chunks]
+    map_all = map if pool is None else pool.map
+    for first in range(0, len(views), BATCH_VIEWS):
+        numbers = range(first, min(first + BATCH_VIEWS, len(views)))
+        batch = dict(zip(numbers, map_all(views.__getitem__, numbers), strict=True))
 
-def blend_colors(views: Sequence[ViewSurface], points: F64, normals: F64) -> tuple[F32, B8]:
-    """Colours (N, 3) of points with outward normals, and whether any view shows the point."""
-    out = np.zeros((len(points), 3), dtype=np.float32)
-    shown = np.zeros(len(points), dtype=bool)
-    chunk = min(POINTS_PER_CHUNK, OBSERVED // max(len(views), 1))
-    for first in range(0, len(points), chunk):
-        some = slice(first, first + chunk)
-        weight, color = _observe(views, points[some], normals[some])
+        def observe(some: slice, weight: F32, color: F32) -> None:
+            for v, view in batch.items():  # noqa: B023
+                if v < slots:
+                    observe_points(points[some], normals[some], view, weight[v], color[v])
+                else:
+                    (one,), (its_color,) = _no_observations(1, points[some])
+                    observe_points(points[some], normals[some], view, one, its_color)
+                    keep_largest(one, its_color, weight, color)
+
+        list(map_all(observe, chunks, *zip(*kept, strict=True)))
+        # The next batch is made without this one in memory.
+        batch.clear()
+
+    def combine(some: slice, weight: F32, color: F32) -> None:
         combine_colors(weight, color, POWER, SCATTER, out[some])
         shown[some] = weight.max(axis=0, initial=0.0) > 0.0
+
+    list(map_all(combine, chunks, *zip(*kept, strict=True)))
     return out, shown
 
 
-def _points_of_rows(
-    mesh: TexturedMesh, normals: F64, faces: tuple[I64, F64], rows: slice, width: int
-) -> tuple[I64, F64, F64]:
-    """Texels (N, 2), points and normals (N, 3) of rows of the texture and of the ``faces`` there."""
+def _no_observations(views: int, points: F64) -> tuple[F32, F32]:
+    """Weights (V, N) of 0 and colours (V, N, 3) of points."""
+    return np.zeros((views, len(points)), np.float32), np.zeros((views, len(points), 3), np.float32)
+
+
+def _points_on_faces(mesh: TexturedMesh, normals: F64, face: I32, weights: F32) -> tuple[F64, F64]:
+    """Points and normals (N, 3) on faces (N,) with ``weights`` (N, 2) of corners 1 and 2."""
+    points, towards = np.empty((2, len(face), 3))
+    for first in range(0, len(face), CHUNK_POINTS):
+        some = slice(first, first + CHUNK_POINTS)
+        share = weights[some].astype(np.float64)
+        share = np.column_stack([1.0 - share.sum(axis=1), share])[:, :, None]
+        vertex = mesh.faces[face[some]]
+        points[some] = (share * mesh.vertices[vertex]).sum(axis=1)
+        towards[some] = (share * normals[vertex]).sum(axis=1)
+    return points, towards
+
+
+def _may_contain(camera: Camera, low: F64, high: F64) -> bool:
+    """Whether an image may contain points of a box: it is not completely outside one of its sides."""
+    box = np.array([[(low, high)[k >> d & 1][d] for d in range(3)] for k in range(8)])
+    x, y, z = camera.K @ (camera.R @ box.T + camera.t[:, None])
+    width, height = camera.size
+    outside = (z <= 0.0, x < -z, y < -z, x > width * z, y > height * z)
+    return not any(side.all() for side in outside)
+
+
+def _surface_parts(
+    mesh: TexturedMesh, uv: F64, shape: tuple[int, int], largest: int, pool: Executor
+) -> Iterator[tuple[I32, I32, F32]]:
+    """The texels of parts of the surface, of at most ``largest`` ones each.
+
+    Returns their numbers (N,), faces (N,), and weights (N, 2) of corners 1 and 2.
+    """
+    top, bottom = uv[..., 1].min(axis=1) - RIM_TEXELS, uv[..., 1].max(axis=1) + RIM_TEXELS
+
+    def texels(first: int) -> tuple[I32, I32, F32]:
+        rows = slice(first, min(first + STRIP_ROWS, shape[0]))
+        # Comparisons with NaN are false: such faces are not seen.
+        some = np.flatnonzero((bottom >= rows.start) & (top <= rows.stop))
+        return _texels_of_rows((some, uv[some]), rows, shape[1])
+
+    strips = list(pool.map(texels, range(0, shape[0], STRIP_ROWS)))
+    at, face, weights = (np.concatenate(kind) for kind in zip(*strips, strict=True))
+    del strips
+    count = np.bincount(face, minlength=len(uv))
+    part = halve_surface(mesh, count, largest)[face]
+    # Small integers are sorted in linear time.
+    order = np.argsort(part.astype(np.uint16) if part.max(initial=0) < 2**16 else part, kind="stable")
+    ends = np.cumsum(np.bincount(part)).tolist()
+    for first, last in pairwise([0, *ends]):
+        some = order[first:last]
+        if len(some):
+            yield at[some], face[some], weights[some]
+
+
+def _texels_of_rows(faces: tuple[I64, F64], rows: slice, width: int) -> tuple[I32, I32, F32]:
+    """Numbers (N,), faces (N,) and weights (N, 2) of the texels of some rows, and of the ``faces`` there."""
     some, uv = faces
     corners = np.concatenate([uv, np.ones((len(some), 3, 1))], axis=2)
     corners[..., 1] -= rows.start - RIM_TEXELS
@@ -265,11 +353,8 @@ def _points_of_rows(
         continue_faces(corners, BEYOND_FACE, face, weights)
     face, weights = face[RIM_TEXELS:-RIM_TEXELS], weights[RIM_TEXELS:-RIM_TEXELS]
     y, x = np.nonzero(face >= 0)
-    share = weights[y, x].astype(np.float64)
-    share = np.column_stack([1.0 - share.sum(axis=1), share])[:, :, None]
-    vertex = mesh.faces[some[face[y, x]]]
-    points, towards = ((share * values[vertex]).sum(axis=1) for values in (mesh.vertices, normals))
-    return np.column_stack([y + rows.start, x]), points, towards
+    at = ((y + rows.start) * width + x).astype(np.int32)
+    return at, some[face[y, x]].astype(np.int32), weights[y, x]
 
 
 def _prepared(view: PinholeView, depth: F32) -> ViewSurface:
@@ -296,7 +381,8 @@ def _equalizing_gains(weight: F32, color: F32) -> F32:
     """Gains (V, 3) of geometric mean 1 that equalise the median colours of all pairs of views."""
     views = len(weight)
     usable = (weight[..., None] > 0.0) & (color > DARK) & (color < BRIGHT)
-    log = np.log(np.maximum(color, 1.0))
+    log = np.maximum(color, 1.0)
+    np.log(log, out=log)
     gains = np.ones((views, 3), dtype=np.float32)
     for k in range(3):
         # The constant fixes the mean to 0, which the ratios leave undetermined.

@@ -113,32 +113,36 @@ MAX_BLENDED = 32
 
 
 @kernel
-def _keep_largest(weights: F64, order: I64) -> None:
-    """Set all weights (V,) but the ``MAX_BLENDED`` largest to 0, of equal ones the first."""
-    count = 0
-    for v in range(len(weights)):
-        k = min(count, MAX_BLENDED)
-        while k > 0 and weights[order[k - 1]] < weights[v]:
-            if k < MAX_BLENDED:
-                order[k] = order[k - 1]
-            k -= 1
-        if k < MAX_BLENDED:
-            order[k] = v
-            count += 1
-    kept = empty(MAX_BLENDED)
-    for k in range(MAX_BLENDED):
-        kept[k] = weights[order[k]]
-    weights[:] = 0.0
-    for k in range(MAX_BLENDED):
-        weights[order[k]] = kept[k]
+def keep_largest(one: F32, its_color: F32, weight: F32, color: F32) -> None:
+    """Let the observations (N,) of one more view replace the smallest kept ones (V, N) that are smaller.
+
+    Those of larger ``weight`` stay, of equal ones the first, in the order of the views.
+    """
+    views = weight.shape[0]
+    for n in range(len(one)):
+        if one[n] <= 0.0:
+            continue
+        least = 0
+        for v in range(1, views):
+            if weight[v, n] <= weight[least, n]:
+                least = v
+        if one[n] <= weight[least, n]:
+            continue
+        for v in range(least, views - 1):
+            weight[v, n] = weight[v + 1, n]
+            for k in range(3):
+                color[v, n, k] = color[v + 1, n, k]
+        weight[views - 1, n] = one[n]
+        for k in range(3):
+            color[views - 1, n, k] = its_color[n, k]
 
 
 @kernel
 def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
     """Blend the colours (V, N, 3) of points; those without positive ``weight`` (V, N) stay in ``out``.
 
-    The ``MAX_BLENDED`` views of the largest weights count. Relative weights are raised to ``power`` and
-    multiplied by 1 / (1 + (d / scatter)^2)^2 with the RMS distance d from the weighted median colour.
+    Relative weights are raised to ``power`` and multiplied by 1 / (1 + (d / scatter)^2)^2 with the RMS
+    distance d from the weighted median colour.
     """
     views = weight.shape[0]
     relative = empty(views)
@@ -152,8 +156,6 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
             continue
         for v in range(views):
             relative[v] = weight[v, n] / best
-        if views > MAX_BLENDED:
-            _keep_largest(relative, order)
         for k in range(3):
             count, sum_of_weights = _sort_weighted(color[:, n, k], relative, order)
             middle[k] = weighted_median(color[:, n, k], relative, order[:count], 0.5 * sum_of_weights)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
+from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
@@ -23,7 +24,7 @@ class SurfaceModel:
         Surface fitted to each depth map, fusion of these surfaces, and texture of the result.
     max_glb_mb : float
         Largest size of model.glb in megabytes, at least 5; the mesh of a larger one is reduced, and
-        model-full.glb holds all of it.
+        model-full.glb holds all of it, as do the tiles.
     """
 
     surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)
@@ -67,5 +68,7 @@ class SurfaceModel:
         threads: int = 1,
     ) -> TexturedMesh:
         """See `thesisrecon.config.ModelBuilder.color`."""
-        used = [view for view in views if view.view != without]
-        return self.atlas.texture(surface, used, threads=threads)
+        if without is not None:
+            used = [n for n, view in enumerate(views) if view.view != without]
+            given, views = views, OnDemand(len(used), lambda n: given[used[n]])
+        return self.atlas.texture(surface, views, threads=threads)

@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._image_filters import resample, smooth
+from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface._mesh import face_neighbours
+from thesisrecon.surface._mesh import connected_parts, face_neighbours, select_faces
 from thesisrecon.surface._texture_blending import (
     choose_views,
     depth_buffers,
@@ -23,7 +25,6 @@ from thesisrecon.surface._texture_blending import (
     paint_texture,
     prepare_views,
     project_to_view,
-    view_camera,
 )
 
 CHART_MARGIN = 2
@@ -34,6 +35,8 @@ COLOR_STEP = 16
 """Grey levels of a channel that share a patch."""
 MIN_SCALE = 0.05
 """Smallest reduction of the images."""
+REDUCED_BYTES = 2**28
+"""Reduced images in memory; more are made again when they are used."""
 
 
 @dataclass(frozen=True)
@@ -73,16 +76,17 @@ class TextureAtlas:
             If no face is visible, or the atlas is too large even with images reduced to ``MIN_SCALE``.
         """
         neighbours = face_neighbours(mesh.faces)
-        buffers = depth_buffers(mesh, views, threads=threads)
+        frames = [(view.P, (view.rgb.shape[1], view.rgb.shape[0])) for view in views]
+        buffers = depth_buffers(mesh, views)
         label = choose_views(mesh, views, buffers, neighbours, threads=threads)
         if not (label >= 0).any():
             raise StageFailure("the surface has no texture", "no image shows any part of it")
         chart = label_charts(label, neighbours)
         scale = 1.0
         while True:
-            smaller = [_reduced(view, scale) for view in views]
-            xy = _corners(mesh, smaller, label)
-            rectangles = _rectangles(xy, label, chart, smaller)
+            cameras = [_reduced_camera(P, size, scale) for P, size in frames]
+            xy = _corners(mesh, cameras, label)
+            rectangles = _rectangles(xy, label, chart, cameras)
             offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
             if size[0] * size[1] <= self.max_texels:
                 break
@@ -95,23 +99,36 @@ class TextureAtlas:
                 )
             scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), MIN_SCALE)
         uv = xy + (offsets - rectangles[:, :2])[chart][:, None, :]
-        cut_out = _fill(smaller, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
-        seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
         if scale < 1.0:
-            buffers = depth_buffers(mesh, smaller, threads=threads)
-        prepared = prepare_views(mesh, smaller, buffers, threads=threads)
-        texture = paint_texture(mesh, prepared, seen_uv, cut_out, threads=threads)
+            given = views
+            views = OnDemand(len(given), lambda v: _reduced(given[v], scale), REDUCED_BYTES)
+            buffers = depth_buffers(mesh, views)
+        cut_out = _fill(views, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
+        seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
+        prepared = prepare_views(mesh, views, buffers, threads=threads)
+        texture = paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
         uv, texture = _swatches(neighbours, label, uv, texture)
         return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 
 
-def _reduced(view: PinholeView, scale: float) -> PinholeView:
-    """The view with ``scale`` <= 1 times as many pixels per side."""
-    if scale >= 1.0:
-        return view
-    height, width = (max(1, round(scale * n)) for n in view.rgb.shape[:2])
-    S = np.diag([width / view.rgb.shape[1], height / view.rgb.shape[0], 1.0])
+def _scaling(size: tuple[int, int], scale: float) -> tuple[F64, tuple[int, int]]:
+    """Matrix (3, 3) from pixels of an image to those of the reduced one, and its (width, height)."""
+    width, height = (max(1, round(scale * n)) for n in size)
+    S = np.diag([width / size[0], height / size[1], 1.0])
     S[:2, 2] = (np.diag(S)[:2] - 1.0) / 2.0
+    return S, (width, height)
+
+
+def _reduced_camera(P: F64, size: tuple[int, int], scale: float) -> Camera:
+    if scale >= 1.0:
+        return Camera.from_matrix(P, size)
+    S, reduced = _scaling(size, scale)
+    return Camera.from_matrix(S @ P, reduced)
+
+
+def _reduced(view: PinholeView, scale: float) -> PinholeView:
+    """The view with ``scale`` < 1 times as many pixels per side."""
+    S, (width, height) = _scaling((view.rgb.shape[1], view.rgb.shape[0]), scale)
     blur = 0.5 * np.sqrt(max(1.0 / scale**2 - 1.0, 1e-6))
     planes = [resample(smooth(view.rgb[..., k].astype(np.float32), blur), width, height) for k in range(3)]
     seen = resample(view.seen.astype(np.float32), width, height) > 0.999
@@ -119,16 +136,16 @@ def _reduced(view: PinholeView, scale: float) -> PinholeView:
     return PinholeView(view.view, S @ view.P, rgb, seen)
 
 
-def _corners(mesh: TexturedMesh, views: Sequence[PinholeView], label: I64) -> F64:
+def _corners(mesh: TexturedMesh, cameras: Sequence[Camera], label: I64) -> F64:
     """(M, 3, 2) corners of each face in its view in pixels, 0 without a view."""
     xy = np.zeros((len(mesh.faces), 3, 2))
-    for v, view in enumerate(views):
+    for v, camera in enumerate(cameras):
         mine = label == v
-        xy[mine] = project_to_view(view_camera(view), mesh.vertices)[0][mesh.faces[mine]]
+        xy[mine] = project_to_view(camera, mesh.vertices)[0][mesh.faces[mine]]
     return xy
 
 
-def _rectangles(xy: F64, label: I64, chart: I64, views: Sequence[PinholeView]) -> I64:
+def _rectangles(xy: F64, label: I64, chart: I64, cameras: Sequence[Camera]) -> I64:
     """(C, 4) left, top, right, bottom of each chart in its image, the last two exclusive."""
     charts = int(chart.max()) + 1
     low = np.full((charts, 2), np.iinfo(np.int64).max)
@@ -138,7 +155,7 @@ def _rectangles(xy: F64, label: I64, chart: I64, views: Sequence[PinholeView]) -
     view[chart[seen]] = label[seen]
     np.minimum.at(low, chart[seen], np.floor(xy[seen].min(axis=1)).astype(np.int64))
     np.maximum.at(high, chart[seen], np.ceil(xy[seen].max(axis=1)).astype(np.int64) + 1)
-    sizes = np.array([[v.rgb.shape[1], v.rgb.shape[0]] for v in views])[view]
+    sizes = np.array([camera.size for camera in cameras])[view]
     low = np.where(high < 0, 0, np.maximum(low - CHART_MARGIN, 0))
     high = np.where(high < 0, 0, np.minimum(high + CHART_MARGIN, sizes))
     return np.concatenate([low, high], axis=1)
@@ -165,10 +182,41 @@ def _fill(
 ) -> U8:
     """Texture (H, W, 3): the rectangle of each chart, copied from view ``label`` to its place."""
     texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
-    for v, (left, top, right, bottom), (x, y) in zip(label, rectangles, offsets, strict=True):
-        if v >= 0:
-            texture[y : y + bottom - top, x : x + right - left] = views[v].rgb[top:bottom, left:right]
+    # View by view, so that each is made once.
+    for c in np.argsort(label, kind="stable"):
+        (left, top, right, bottom), (x, y) = rectangles[c], offsets[c]
+        if label[c] >= 0:
+            rgb = views[label[c]].rgb
+            texture[y : y + bottom - top, x : x + right - left] = rgb[top:bottom, left:right]
     return texture
+
+
+def cut_tile(mesh: TexturedMesh, faces: I64) -> TexturedMesh:
+    """Cut the faces (K,), in increasing order, out of a mesh, with the part of the texture that they show.
+
+    Every texel is the one of the whole texture, and corners on the cut keep their places, so that tiles fit.
+    """
+    keep = np.zeros(len(mesh.faces), dtype=bool)
+    keep[faces] = True
+    tile = select_faces(mesh, keep)
+    if tile.uv is None or tile.texture is None:
+        return tile
+    # Faces with a common corner in the texture are one chart.
+    corners = np.column_stack([tile.faces.ravel(), tile.uv.reshape(-1, 2)])
+    number = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    chart = connected_parts(number, int(number.max(initial=-1)) + 1)
+    size = np.array(tile.texture.shape[1::-1])
+    low = np.full((int(chart.max(initial=-1)) + 1, 2), np.inf)
+    high = np.full_like(low, -np.inf)
+    np.minimum.at(low, chart, tile.uv.min(axis=1))
+    np.maximum.at(high, chart, tile.uv.max(axis=1))
+    first = np.clip(np.floor(low).astype(np.int64) - CHART_MARGIN, 0, size - 1)
+    last = np.clip(np.ceil(high).astype(np.int64) + 1 + CHART_MARGIN, 1, size)
+    offsets, (width, height) = _pack_rectangles(last - first)
+    texture = np.full((height, width, 3), 128, dtype=np.uint8)
+    for (left, top), (right, bottom), (x, y) in zip(first, last, offsets, strict=True):
+        texture[y : y + bottom - top, x : x + right - left] = tile.texture[top:bottom, left:right]
+    return replace(tile, uv=tile.uv + (offsets - first)[chart][:, None, :], texture=texture)
 
 
 def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
