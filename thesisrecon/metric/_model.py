@@ -258,7 +258,7 @@ def upgraded_model(
 
 
 def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F64:
-    """(V, 8) start values: calibrated focals and principal points, else the median field of view; the prior."""
+    """(V, 8) start values: focals and principal points of K, else the median field of view; prior means."""
     group, longest = prior.group, sizes.max(axis=1)
     typical = float(np.median(K[registered, 0, 0] / longest[registered]))
     rows = np.zeros((len(K), WIDTH))
