@@ -28,6 +28,7 @@ from validation.scenes.many_views import walk
 from validation.studies import growth, timing
 from validation.studies.facades import KINDS, lens_error
 from validation.studies.growth import Cost, Meter
+from validation.studies.large_images import FORMATS, read_one, write_image
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
 from validation.studies.runner import (
@@ -291,3 +292,16 @@ def test_the_error_of_centres_is_after_a_similarity():
     assert error_mm(5.0 * scene.centres) < 0.05
     spoiled = 5.0 * scene.centres + [[1e-3, 0.0, 0.0]] * np.array([1, 0, 0, 0, 0, -1])[:, None]
     assert 0.2 < error_mm(spoiled) < 0.5
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_images_of_every_format_are_written_and_read(tmp_path, name):
+    path = tmp_path / f"some.{FORMATS[name][1]}"
+    write_image(name, 96, str(path))
+    assert read_one(str(path), 64) == ""
+
+
+def test_memory_of_large_images_is_measured(tmp_path, capsys):
+    assert run_study("large-images", ["--long-side", "96", "--formats", "GIF", "-o", str(tmp_path)]) == 0
+    assert re.search(r"^\| GIF \| 0\.0 \| \d+ \|  \|$", capsys.readouterr().out, re.M)
+    assert not list(tmp_path.glob("large.*"))
