@@ -175,6 +175,21 @@ def test_every_table_of_evidence_names_its_command(page):
         assert STAMP.search(section), (title, count)
 
 
+def test_papers_that_pages_name_are_among_the_references():
+    listed = re.split(r"^- ", (DOCS / "reference" / "literature.md").read_text("utf-8"), flags=re.M)
+    named = {
+        (path.name, found[1], found[2])
+        for path in PAGES
+        for found in re.finditer(r"\(([A-Z]\w+)[^()]{0,50}? ((?:19|20)\d\d)\b", path.read_text("utf-8"))
+        if path.parent.name in ("theory", "recipes", "start") and path.name != "literature.md"
+    }
+    assert len(named) > 8
+    missing = {
+        (page, name, year) for page, name, year in named if not any(name in r and year in r for r in listed)
+    }
+    assert missing == set()
+
+
 def block(page, number=0):
     """One Python block of a page."""
     return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text("utf-8"), re.S)[number]
