@@ -34,8 +34,8 @@ def test_opencv_keypoints_are_features(tmp_path):
     definition, call = BLOCKS[1].split("result = ")
     scope = {"__name__": "__main__"}
     exec(definition, scope)
-    assert "config=config, set=matching, " in call
-    given = GIVEN | {"config": scope["config"], "set": scope["matching"]}
+    assert call.startswith('thesisrecon.reconstruct("images", "out", **given)')
+    given = scope["given"] | GIVEN
     result = reconstruct(images(3), tmp_path / "out", **given)
     assert sum(pair.accepted for pair in result.pairs) >= 2
 

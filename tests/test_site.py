@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shlex
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -67,6 +68,126 @@ def test_the_page_of_failures_has_a_remedy_for_each_message_of_the_code(site):
     assert failures.warning_sinks() <= read | failures.PASSED_ON
     # So is one that sets the reason why an image has no camera.
     assert {"projective/incremental.py", "metric/_resection.py"} <= failures.reason_sinks() <= read
+
+
+CODE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.M | re.S)
+PAGES = sorted(path for path in DOCS.rglob("*.md") if not {"_build", "modules", "generated"} & {*path.parts})
+RUN_BY = {
+    "development/ablations.md": (2, "validation/ablation/test_own.py"),
+    "recipes/compare.md": (1, "test_tasks.py"),
+    "recipes/export.md": (3, "test_tasks.py"),
+    "recipes/plain-arrays.md": (2, "test_dense_model.py"),
+    "recipes/plug-ins.md": (3, "test_plug_in_examples.py"),
+    "recipes/tasks.md": (10, "test_tasks.py"),
+    "reference/conventions.md": (1, "test_site.py"),
+    "start/first-reconstruction.md": (1, "test_site.py"),
+}
+"""Page -> its blocks of Python and the tests that run all of them."""
+TABLE = re.compile(r"^\|.*\n\| ---", re.M)
+STAMP = re.compile(r"^Command: `([^`]+)`[^.]*\. Commit ([0-9a-f]{8});", re.M)
+NOT_MEASURED = {"data.md", "index.md", "validation.md"}
+"""Pages of evidence whose tables say what there is, not how large it is."""
+
+
+def test_every_block_of_python_is_run_by_a_test():
+    found = {}
+    for path in PAGES:
+        count = [language for language, _ in CODE.findall(path.read_text("utf-8"))].count("python")
+        if count:
+            found[str(path.relative_to(DOCS))] = count
+    assert found == {page: count for page, (count, _) in RUN_BY.items()}
+    for page, (_, test) in RUN_BY.items():
+        assert Path(page).name in (Path(__file__).parent / test).read_text("utf-8"), page
+
+
+def test_lines_of_code_fit_the_page():
+    made = {DOCS / "development" / "architecture.md", DOCS / "evidence" / "scaling.md"}
+    long = [
+        f"{path.relative_to(DOCS)}: {line}"
+        for path in PAGES
+        for _, text in CODE.findall(path.read_text("utf-8"))
+        for line in text.splitlines()
+        if len(line) > 92 and path not in made
+    ]
+    assert long == []
+
+
+def commands_of(text):
+    """Command lines of a page in backticks or in blocks, without what stands for something else."""
+    code = [line for _, block in CODE.findall(text) for line in block.replace("\\\n", " ").splitlines()]
+    code += re.findall(r"`([^`\n]+)`", re.sub(CODE, "", text))
+    for line in code:
+        words = shlex.split(re.sub(r"[\[\]|]", " ", line), comments=True)
+        if words[:1] == ["thesisrecon"] or "validation" in words[:3]:
+            yield words[words.index("validation" if "validation" in words else "thesisrecon") :]
+
+
+def test_commands_of_the_pages_exist(site):
+    """Names of commands, studies and ablations, and all options."""
+    pytest.importorskip("validation.studies.runner")
+    from validation.ablation.command import STUDIES
+    from validation.command import _parser
+    from validation.studies.runner import MODULES, load_study, study_parser
+
+    sections = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", site("interface").command_page(), re.M | re.S))
+    shipped, tried = {file.stem for file in STUDIES.glob("*.toml")}, 0
+    for path in [*PAGES, DOCS.parent / "README.md"]:
+        for program, *words in commands_of(path.read_text("utf-8")):
+            where = f"{path.name}: {' '.join([program, *words])}"
+            options = [word.split("=")[0] for word in words if re.match("--?[a-z]", word)]
+            tried += 1
+            if program == "thesisrecon":
+                if words and words[0].islower() and not words[0].startswith("-"):
+                    assert words[0] in sections, where
+                    known = f"{sections[words[0]]} `--help`"
+                    assert [o for o in options if f"`{o}`" not in known] == [], where
+            elif words[:1] == ["study"]:
+                if words[1:2] and words[1] in MODULES:
+                    if "--help" not in words:
+                        study_parser(words[1], load_study(words[1])).parse_args(words[2:])
+                else:
+                    assert words[1:2] in ([], ["all"], ["NAME"], ["--list"]), where
+            elif words:
+                parsed = _parser().parse_args(words if {"-o", "--out"} & {*words} else [*words, "-o", "OUT"])
+                if parsed.command == "ablate":
+                    assert parsed.study in ("NAME", "STUDY.toml", *shipped), where
+    assert tried > 60
+    named = {name for path in PAGES for name in re.findall(r"`study ([a-z-]+)", path.read_text("utf-8"))}
+    assert named - {*MODULES, "all"} == set()
+
+
+def sections_with_tables(text):
+    """The sections of a page that have a table, and the number of the tables."""
+    for section in re.split(r"^(?=##? )", text, flags=re.M):
+        if count := len(TABLE.findall(section)):
+            yield section, count
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "evidence").glob("*.md")), ids=lambda page: page.stem)
+def test_every_table_of_evidence_names_its_command(page):
+    for section, count in sections_with_tables(page.read_text("utf-8")):
+        title = section.partition("\n")[0]
+        if page.name in NOT_MEASURED or title in ("## Complexity", "## Rules", "## Tests"):
+            continue
+        if page.name == "scaling.md":
+            assert "`python -m validation study growth-of-c" in section
+            continue
+        assert STAMP.search(section), (title, count)
+
+
+def test_papers_that_pages_name_are_among_the_references():
+    listed = re.split(r"^- ", (DOCS / "reference" / "literature.md").read_text("utf-8"), flags=re.M)
+    named = {
+        (path.name, found[1], found[2])
+        for path in PAGES
+        for found in re.finditer(r"\(([A-Z]\w+)[^()]{0,50}? ((?:19|20)\d\d)\b", path.read_text("utf-8"))
+        if path.parent.name in ("theory", "recipes", "start") and path.name != "literature.md"
+    }
+    assert len(named) > 8
+    missing = {
+        (page, name, year) for page, name, year in named if not any(name in r and year in r for r in listed)
+    }
+    assert missing == set()
 
 
 def block(page, number=0):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import thesisrecon
 from thesisrecon.io._images import demo_images
 
 PAGE = Path(__file__).parent.parent / "docs" / "recipes" / "tasks.md"
@@ -146,3 +147,32 @@ def test_a_run_and_its_sparse_model_are_the_same(place, monkeypatch):
     comparison = run("Comparison of two models", place, monkeypatch)["comparison"]
     assert len(comparison.names) == 6
     assert comparison.centre_error.max() < 1e-6
+
+
+def blocks_of(page):
+    return re.findall(r"```python\n(.*?)```", (PAGE.parent / page).read_text("utf-8"), re.S)
+
+
+@pytest.mark.usefixtures("finished")
+def test_the_blocks_of_the_page_of_comparisons_run(place, monkeypatch):
+    monkeypatch.chdir(place)
+    names = {}
+    exec(compile(blocks_of("compare.md")[0], "compare.md", "exec"), names)
+    assert names["comparison"].points is not None
+
+
+def test_the_blocks_of_the_page_of_exports_run(place, monkeypatch, finished):
+    monkeypatch.chdir(place)
+    first, second, third = blocks_of("export.md")
+    names = {}
+    exec(compile(first, "export.md", "exec"), names)
+    assert names["report"].file.is_file()
+    exec(compile(second, "export.md", "exec"), names)
+    assert np.abs(names["undistorted"] - names["xy"]).max() < 20.0
+    # The page has positions of its own: here those of the cameras, in other units.
+    cameras = finished["result"].cameras
+    names["measured"] = {name: 3.0 * cameras[name].centre + 1.0 for name in cameras}
+    exec(compile(re.sub(r"positions = \{.*?\}", "positions = measured", third), "export.md", "exec"), names)
+    assert (place / "metres" / "sparse" / "0").is_dir()
+    written = thesisrecon.read_cameras(place / "metres" / "sparse" / "0")
+    assert np.linalg.norm(written["0001.jpg"].centre - written["0002.jpg"].centre) == pytest.approx(1.5)

@@ -22,9 +22,13 @@ def draw_axes(path: Path) -> None:
     figure, ax = plt.subplots(figsize=(7.2, 3.4))
     centre, plane = np.array([0.0, 0.0]), 2.2
     point = np.array([5.2, -1.3])
-    for end, name in (((1.3, 0.0), "z"), ((0.0, -1.3), "y"), ((-0.75, -0.55), "x")):
+    for end, place, name in (
+        ((1.3, 0.0), (1.2, 0.2), "z"),
+        ((0.0, -1.3), (0.0, -1.5), "y"),
+        ((-0.75, -0.55), (-0.84, -0.64), "x"),
+    ):
         ax.annotate("", end, centre, arrowprops={"arrowstyle": "->", "color": BLUE, "lw": 2})
-        ax.text(end[0] * 1.12, end[1] * 1.16, name, color=BLUE, ha="center", va="center", fontsize=12)
+        ax.text(*place, name, color=BLUE, ha="center", va="center", fontsize=12)
     ax.text(-0.15, 0.28, "camera centre\n$-R^T t$", ha="center", va="bottom", color=BLUE)
     ax.plot([plane, plane], [-1.1, 1.1], color=GREY, lw=2)
     ax.text(plane, 1.2, "image (distance: focal length)", ha="center", color=GREY)
@@ -40,7 +44,7 @@ def draw_axes(path: Path) -> None:
     for end, name in (((0.8, 0.0), "X"), ((0.0, 0.8), "Y"), ((-0.45, -0.3), "Z")):
         ax.annotate("", world + end, world, arrowprops={"arrowstyle": "->", "color": "black", "lw": 1.5})
         ax.text(*(world + np.array(end) * 1.25), name, ha="center", va="center")
-    ax.text(world[0] + 0.9, world[1] + 0.35, "world: any frame,\nR takes it to the camera", va="center")
+    ax.text(world[0] + 0.9, world[1] + 0.62, "world: any frame,\nR takes it to the camera", va="center")
     ax.set(xlim=(-1.3, 7.6), ylim=(-1.75, 2.1), aspect="equal")
     ax.axis("off")
     save(figure, path)
@@ -62,7 +66,7 @@ def draw_pixels(path: Path) -> None:
                 ax.plot(x, y, ".", color=GREY, ms=4)
         for x, y in ((0, 0), (3, 0), (0, 2)):
             ax.plot(x, y, "o", color=colour)
-            ax.text(x, y + 0.3, f"({x + shift:g}, {y + shift:g})", color=colour, ha="center", fontsize=9)
+            ax.text(x, y + 0.3, f"({x + shift:g}, {y + shift:g})", color=colour, ha="center", fontsize=8)
         ax.plot(-shift, -shift, "x", color="black", ms=9, mew=2)
         ax.annotate("", (1.3, -0.75), (-0.5, -0.75), arrowprops={"arrowstyle": "->"}, annotation_clip=False)
         ax.text(1.4, -0.75, "x", va="center")

@@ -19,6 +19,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.pipeline.reconstruction import reconstruct
+from validation import command
+from validation.ablation.command import STUDIES
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
 from validation.scenes.many_tracks import GATE_PX, make_tracks
@@ -26,9 +28,18 @@ from validation.scenes.many_views import walk
 from validation.studies import growth, timing
 from validation.studies.facades import KINDS, lens_error
 from validation.studies.growth import Cost, Meter
+from validation.studies.large_images import FORMATS, read_one, write_image
 from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
-from validation.studies.runner import MODULES, load_study, run_studies, run_study, study_parser, text_table
+from validation.studies.runner import (
+    MODULES,
+    OF_PAGES,
+    load_study,
+    run_studies,
+    run_study,
+    study_parser,
+    text_table,
+)
 from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, solve, table_row, take_views
 from validation.studies.timing import ratio_table, ratios_to_ours
 
@@ -220,13 +231,27 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
     assert json.loads((tmp_path / "rows.json").read_text())[0]["verdict"] == "missed"
     assert (out / "toy.json").read_bytes() == (tmp_path / "rows.json").read_bytes()
     assert (out / "made").exists()
-    # All studies that need no file, each in a folder, with commit and machine above its tables.
-    for name in set(MODULES) - {"toy", "benchmark-table"}:
+    # "all" runs every study with the options of the pages, every ablation and the report, each in a folder.
+    for name in set(MODULES) - {"toy"}:
         monkeypatch.delitem(MODULES, name)
+    monkeypatch.setitem(OF_PAGES, "toy", [[], ["--numbers", "7"]])
+    others = []
+    monkeypatch.setattr(command, "main", lambda arguments: others.append(arguments) or 0)
     assert run_studies(["all", "-o", str(tmp_path / "all")]) == 0
-    assert [path.name for path in (tmp_path / "all").iterdir()] == ["toy"]
+    assert sorted(path.name for path in (tmp_path / "all").iterdir()) == ["toy", "toy-2"]
     text = (tmp_path / "all" / "toy" / "toy.md").read_text()
     assert re.match(r"Commit \S+; .* cores, .*; Python [\d.]+\.\n\n3 a\n", text)
+    assert "\n\n7 a\n" in (tmp_path / "all" / "toy-2" / "toy.md").read_text()
+    assert ["ablate", "thesis-fundamental", "-o", str(tmp_path / "all" / "thesis-fundamental")] in others
+    assert others[-1] == ["report", "-o", str(tmp_path / "all" / "report")]
+    assert len(others) == 1 + len(list(STUDIES.glob("*.toml")))
+
+
+def test_studies_run_with_the_options_of_the_pages():
+    """Each has a parser that takes them and no argument that "all" lacks."""
+    for name in MODULES:
+        for options in OF_PAGES.get(name, [[]]):
+            study_parser(name, load_study(name)).parse_args([*options, "-o", "out"])
 
 
 def test_missing_data_and_unknown_names_end_with_code_2(capsys, monkeypatch):
@@ -267,3 +292,16 @@ def test_the_error_of_centres_is_after_a_similarity():
     assert error_mm(5.0 * scene.centres) < 0.05
     spoiled = 5.0 * scene.centres + [[1e-3, 0.0, 0.0]] * np.array([1, 0, 0, 0, 0, -1])[:, None]
     assert 0.2 < error_mm(spoiled) < 0.5
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_images_of_every_format_are_written_and_read(tmp_path, name):
+    path = tmp_path / f"some.{FORMATS[name][1]}"
+    write_image(name, 96, str(path))
+    assert read_one(str(path), 64) == ""
+
+
+def test_memory_of_large_images_is_measured(tmp_path, capsys):
+    assert run_study("large-images", ["--long-side", "96", "--formats", "GIF", "-o", str(tmp_path)]) == 0
+    assert re.search(r"^\| GIF \| 0\.0 \| \d+ \|  \|$", capsys.readouterr().out, re.M)
+    assert not list(tmp_path.glob("large.*"))

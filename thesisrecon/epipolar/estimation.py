@@ -109,7 +109,8 @@ def estimate_fundamental(
     >>> plane = xy1 + rng.normal([40.0, 10.0], 0.3, (60, 2))
     >>> thesisrecon.estimate_fundamental(xy1, plane).determined
     False
-    >>> thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point").covariance.shape
+    >>> linear = thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point")
+    >>> linear.covariance.shape
     (9, 9)
     """
     rng = np.random.default_rng(seed)

@@ -90,7 +90,7 @@ def epipoles(F: F64) -> tuple[F64, F64]:
 
 
 def epipolar_lines(F: F64, xy1: F64) -> F64:
-    """Return the epipolar lines F x1 with unit normals, so that l . (x, y, 1) is a distance in px.
+    """Return the epipolar lines l = F x1 with unit normals: l' (x, y, 1) is a distance in px.
 
     Parameters
     ----------

@@ -17,6 +17,7 @@ from validation.ablation.tables import comparison_text, failures_of, mean_text, 
 from validation.harness.page import plot_at, write_page
 from validation.harness.records import Plot, slug
 from validation.harness.rows import plot, scatter
+from validation.stamp import commit
 
 PAGE = "index.html"
 COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
@@ -44,7 +45,7 @@ def write_analysis(analysis: Analysis, out: str | Path) -> Path:
         findings=_findings(analysis),
         warnings=analysis.warnings,
         failures=failures_of(analysis.rows),
-        versions=list(plan.versions.items()),
+        versions=[("commit", commit()), *plan.versions.items()],
         tables=[t.name for t in tables],
     )
     return out / PAGE

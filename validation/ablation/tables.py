@@ -15,6 +15,7 @@ from thesisrecon.io._files import write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.run import Row
 from validation.ablation.study import Measure
+from validation.stamp import stamp
 from validation.studies.runner import text_table
 
 Record = Mapping[str, Any]
@@ -69,7 +70,7 @@ def _cell_record(c: Cell) -> Record:
 
 def write_tables(analysis: Analysis, out: Path) -> list[Path]:
     """Write ``rows``, ``comparisons`` and ``means`` as CSV, and the tables for people as ``tables.md``."""
-    write_text(out / "tables.md", text_of(analysis) + "\n")
+    write_text(out / "tables.md", f"{stamp()}\n\n{text_of(analysis)}\n")
     comparisons = [_comparison_record(c) for c in (*analysis.comparisons, *analysis.steps)]
     tables = {
         "rows": _row_records(analysis),

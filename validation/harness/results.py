@@ -20,6 +20,7 @@ from validation.harness.gates import Gate
 from validation.harness.records import Judgement, Outcome, ReportOptions, key_of
 from validation.metrics.record import Metric
 from validation.references.libraries import PACKAGES
+from validation.stamp import commit
 
 OWN_PACKAGES = ("thesisrecon", "numpy", "scipy", "numba")
 
@@ -98,6 +99,7 @@ def environment(options: ReportOptions) -> dict[str, Any]:
     """Return the environment of the run."""
     versions = {name: _version(name) for name in (*OWN_PACKAGES, *PACKAGES.values())}
     return {
+        "commit": commit(),
         "machine": platform.machine(),
         "processor": _processor(),
         "cores": os.cpu_count(),

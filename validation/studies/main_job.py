@@ -8,7 +8,6 @@ number is computed here from saved cameras and points.
 from __future__ import annotations
 
 import json
-import os
 import platform
 import shutil
 import sys
@@ -27,6 +26,7 @@ from validation.metrics.record import Metric
 from validation.references.colmap import read_run
 from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import REAL_SCENES, Scene
+from validation.stamp import machine
 from validation.studies.runner import Part, Rows, report_progress, scenes_here
 
 OURS, THESIS = "ours (default)", "ours (thesis)"
@@ -232,7 +232,7 @@ def main_job_study(
     first = min(found, key=lambda scene: len(scene.image_paths))
     seconds = warm_up(first, out, threads=threads, environment=environment)
     facts: dict[str, Any] = {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
+        "machine": machine(),
         "threads": threads,
         "python": platform.python_version(),
         "pycolmap": version("pycolmap"),

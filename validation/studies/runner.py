@@ -1,5 +1,5 @@
 """Run the studies: ``python -m validation study NAME [--option ...]``, ``python -m validation study --list``.
-``python -m validation study all -o OUT`` runs them all, which takes hours.
+``python -m validation study all -o OUT`` runs them all, the ablations and the report, which takes hours.
 
 A study is a generator function ``NAME_study`` in a module of this folder. Its keyword parameters with their
 defaults and annotations are the options of the command, which :data:`HELP` explains. It yields parts: a list
@@ -14,9 +14,6 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
-import os
-import platform
-import subprocess
 import sys
 import tempfile
 import types
@@ -32,6 +29,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_scene, load_real_scene
+from validation.stamp import stamp
 
 MODULES = {
     "benchmark-table": "timing",
@@ -51,6 +49,7 @@ MODULES = {
     "harsh": "harsh",
     "interpolation": "interpolation",
     "kill-anywhere": "robustness",
+    "large-images": "large_images",
     "main-job": "main_job",
     "package": "package.steps",
     "record": "record",
@@ -64,10 +63,21 @@ MODULES = {
     "wide-steps": "wide_steps",
 }
 """Name of a study -> the module of this folder that holds its function."""
+OF_PAGES = {
+    "epipolar": [["--trials", "2000"]],
+    "growth-of-cost": [
+        ["--colmap"],
+        ["--scene", "street", "--sizes", "100", "300", "--colmap"],
+        ["--until", "model", "--sizes", "12", "48", "100"],
+    ],
+    "package": [["--steps", "build", "install", "imports", "typed", "quiet", "demo"]],
+    "subsets": [["--trials", "25"]],
+}
+"""Options of the studies that the documentation shows with other ones than their defaults, for each run."""
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 """Folder that keeps SIFT matches of image pairs between studies."""
 HELP = {
-    "benchmark": "JSON file of pytest-benchmark",
+    "benchmark": "JSON file of pytest-benchmark (default: run the benchmarks)",
     "cache": "folder that keeps SIFT matches",
     "cameras": "shared: one camera for all images; per-image: one for each",
     "cold": "begin each run without compiled kernels",
@@ -77,6 +87,7 @@ HELP = {
     "every": "take every n-th one only",
     "executor": "executor of the runs",
     "gaps": "gaps of the pairs (i, i + gap)",
+    "formats": "names of file formats (default: all)",
     "functions": "rows of the tables",
     "images": "folder of images",
     "kills": "runs killed (SIGKILL) at moments spread over their time",
@@ -176,27 +187,23 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
 
 
 def run_all(out: Path) -> int:
-    """Run every study with its defaults into a folder of its own; studies that need a file are left out."""
+    """Make every table of the documentation, each in a folder of its own: all studies with the options of
+    the pages, all ablations, and the report."""
+    from validation.ablation.command import STUDIES
+    from validation.command import main
+
     codes = []
     for name in MODULES:
-        parameters = inspect.signature(load_study(name)).parameters.values()
-        if any(p.default is inspect.Parameter.empty and p.name != "out" for p in parameters):
-            continue
-        report_progress(f"study {name}")
-        codes.append(run_study(name, ["-o", str(out / name)]))
+        for number, options in enumerate(OF_PAGES.get(name, [[]])):
+            folder = out / (f"{name}-{number + 1}" if number else name)
+            report_progress(f"study {name} {' '.join(options)}".rstrip())
+            codes.append(run_study(name, ["-o", str(folder), *options]))
+    for path in sorted(STUDIES.glob("*.toml")):
+        report_progress(f"ablation {path.stem}")
+        codes.append(main(["ablate", path.stem, "-o", str(out / path.stem)]))
+    report_progress("report")
+    codes.append(main(["report", "-o", str(out / "report")]))
     return int(1 in codes)
-
-
-def stamp() -> str:
-    """Return the commit and the machine that tables are made with."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
-    try:
-        root = Path(__file__).parents[2]
-        commit = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}"
-    return f"Commit {commit}; {machine}; Python {platform.python_version()}."
 
 
 def load_study(name: str) -> StudyFunction:

@@ -1,8 +1,11 @@
-"""Ratios of the least times in a JSON file of pytest-benchmark."""
+"""Ratios of the least times of pytest-benchmark, read from a file of ``scripts/benchmark`` or measured."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -29,8 +32,25 @@ def ratio_table(groups: Mapping[str, Mapping[str, float]]) -> str:
     return text_table(["", "method", "ms a call", "ours / this"], rows)
 
 
-def benchmark_table_study(benchmark: Path, ratios: Path | None = None) -> Iterator[Part]:
+def run_benchmarks(file: Path) -> None:
+    """Run all benchmarks on one thread, with processor times, into a file."""
+    options = ["--benchmark-only", "--benchmark-min-rounds=5", "--benchmark-max-time=1"]
+    options += ["--benchmark-timer=time.process_time", f"--benchmark-json={file}"]
+    command = [sys.executable, "-m", "pytest", "benchmarks", "-q", *options]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise UsageError(f"the benchmarks failed: {(done.stdout + done.stderr).strip()[-500:]}")
+
+
+def benchmark_table_study(
+    out: Path, benchmark: Path | None = None, ratios: Path | None = None
+) -> Iterator[Part]:
     """Compare the least times of the benchmarks with those of the references."""
+    if benchmark is None:
+        benchmark = out / "benchmark.json"
+        run_benchmarks(benchmark)
     groups: dict[str, dict[str, float]] = {}
     try:
         for entry in json.loads(benchmark.read_text(encoding="utf-8"))["benchmarks"]:

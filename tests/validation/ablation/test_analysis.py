@@ -174,6 +174,8 @@ def test_tables_hold_every_row_and_comparison(tmp_path):
     assert stated[0]["axis:task.spread"] == "spread = 1"
     assert {r["failure"] for r in stated} == {"", "gone"}
     assert {r["miss"] for r in stated if r["failure"]} == {""}
-    assert "| miss, cm | spread = 1 | spread = 2 | cost, s |" in written["tables.md"].read_text()
+    text = written["tables.md"].read_text()
+    assert text.startswith("Commit ")
+    assert "| miss, cm | spread = 1 | spread = 2 | cost, s |" in text
     with written["comparisons.csv"].open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 2 * 2 * 2

@@ -36,6 +36,15 @@ def test_the_example_of_the_documentation_runs(tmp_path):
     assert verdicts["EveryMatch, normalized = no", "outliers = 0.3"] == "worse"
 
 
+def test_the_first_lines_of_the_documentation_plan_a_study():
+    code = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.S)[0]
+    names = {}
+    exec(compile(re.sub(r'"fountain.*?\]', "]", code.split("print(")[0]), DOCS.name, "exec"), names)
+    plan = plan_study(names["study"])
+    assert [v.name for v in plan.variants][1:] == ["threshold_px = 0.5", "threshold_px = 2"]
+    assert len(plan.rows) > len(plan.variants)  # the whole scene and its windows
+
+
 def test_an_edited_variant_has_new_rows(tmp_path):
     path = write_examples(tmp_path)
     before = {r.variant: r.key for r in plan_study(read_study(path)).rows}
