@@ -130,7 +130,8 @@ def _matched(
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         views, shared = prepared(), run.workers.in_process
         assert isinstance(views, PreparedViews)
-        for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel()):
+        corners = [len(f.xy) for f in state.result.features]
+        for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel(), corners):
             some = [pairs[n] for n in numbers]
             given = views if shared else views.subset({view for pair in some for view in pair})
             yield numbers, (state.config, given, some, run.seed)

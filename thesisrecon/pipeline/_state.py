@@ -26,6 +26,10 @@ CACHE_BYTES = 2**30
 Prepare = Callable[[Image, Features], Any]
 MAX_BATCH = 64
 BATCHES_PER_WORKER = 8
+MAX_RESULT_BYTES = 2**25
+"""Pickled bytes of the result of a batch of pairs, at most."""
+PAIR_BYTES, MATCH_BYTES = 2**14, 80
+"""Pickled bytes of a :class:`TwoView` without matches, at most, and of each match."""
 
 
 class PreparedViews(Sequence[Any]):
@@ -78,15 +82,25 @@ def _size_of(value: Any) -> int:
 
 
 def batch_pairs(
-    pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None
+    pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None, corners: Sequence[int]
 ) -> list[list[int]]:
-    """Divide the numbers of pairs into batches of pairs that share views."""
+    """Divide the numbers of pairs into batches of pairs that share views.
+
+    A corner is matched once in a pair, so the ``corners`` of each view bound the bytes of a result.
+    """
     size = 1
     if workers is not None:
         size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
-    ordered = [numbers[k] for k in cached_pair_order(first, second)]
-    return [ordered[k : k + size] for k in range(0, len(ordered), size)]
+    batches, left = list[list[int]](), 0
+    for n in [numbers[k] for k in cached_pair_order(first, second)]:
+        needed = PAIR_BYTES + MATCH_BYTES * min(corners[view] for view in pairs[n])
+        if not batches or len(batches[-1]) == size or needed > left:
+            batches.append([])
+            left = MAX_RESULT_BYTES
+        batches[-1].append(n)
+        left -= needed
+    return batches
 
 
 @dataclass

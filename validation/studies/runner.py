@@ -37,6 +37,7 @@ MODULES = {
     "benchmark-table": "timing",
     "calibration-coverage": "coverage",
     "calibration-real": "calibration_real",
+    "cluster-efficiency": "cluster",
     "compile-time": "compile_time",
     "critical-motions": "critical_motions",
     "dinosaur": "projective",
