@@ -378,3 +378,14 @@ def test_batches_hold_every_pair_once_and_few_views(pairs, workers_there):
     for batch in dealt:
         assert len(batch) <= preparing.MAX_BATCH
         assert len({view for n in batch for view in every[n]}) <= 6 * len(batch) ** 0.5
+
+
+def test_batches_of_a_band_of_pairs_have_near_the_fewest_views():
+    """Each view with the next eight: k + 8 views hold at most 8 k + 28 pairs."""
+    band = [(i, j) for i in range(200) for j in range(i + 1, min(i + 9, 200))]
+    for count in (4, 16):
+        batches = batch_pairs(band, range(len(band)), count, [3000] * 200)
+        assert sorted(n for batch in batches for n in batch) == list(range(len(band)))
+        views = [len({view for n in batch for view in band[n]}) for batch in batches]
+        fewest = len(batches[0]) / 8.0 + 4.5
+        assert sum(views) <= 1.5 * fewest * len(batches)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
@@ -84,23 +84,55 @@ def _size_of(value: Any) -> int:
 def batch_pairs(
     pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None, corners: Sequence[int]
 ) -> list[list[int]]:
-    """Divide the numbers of pairs into batches of pairs that share views.
+    """Divide the numbers of pairs, smaller views first, into batches of pairs of few views.
 
-    A corner is matched once in a pair, so the ``corners`` of each view bound the bytes of a result.
+    A corner is matched once in a pair, so the ``corners`` of each view bound the bytes of a result. None
+    workers: batches of one pair, in an order for cached views.
     """
-    size = 1
-    if workers is not None:
-        size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
-    batches, left = list[list[int]](), 0
-    for n in [numbers[k] for k in cached_pair_order(first, second)]:
-        needed = PAIR_BYTES + MATCH_BYTES * min(corners[view] for view in pairs[n])
-        if not batches or len(batches[-1]) == size or needed > left:
-            batches.append([])
-            left = MAX_RESULT_BYTES
-        batches[-1].append(n)
-        left -= needed
+    left = {pairs[numbers[k]]: numbers[k] for k in cached_pair_order(first, second)}
+    if workers is None:
+        return [[n] for n in left.values()]
+    size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
+    near: dict[int, set[int]] = {view: set() for pair in left for view in pair}
+    for i, j in left:
+        near[i].add(j)
+        near[j].add(i)
+    batches = []
+    while left:
+        batch, room = list[int](), MAX_RESULT_BYTES
+        for i, j in _pairs_of_few_views(left, near):
+            room -= PAIR_BYTES + MATCH_BYTES * min(corners[i], corners[j])
+            if len(batch) == size or (batch and room < 0):
+                break
+            batch.append(left.pop((i, j)))
+            near[i].remove(j)
+            near[j].remove(i)
+        batches.append(batch)
     return batches
+
+
+def _pairs_of_few_views(
+    left: Mapping[tuple[int, int], int], near: Mapping[int, set[int]]
+) -> Iterator[tuple[int, int]]:
+    """Pairs of a growing set of views: the next one has most pairs with them, and few others.
+
+    The caller removes each pair from ``left`` and from ``near`` (view -> views of its pairs).
+    """
+    views, ties = set[int](), Counter[int]()
+    while left:
+        added: tuple[int, ...]
+        if ties:
+            added = (max(ties, key=lambda view: (ties[view], -len(near[view]), -view)),)
+            for view in sorted(views & near[added[0]]):
+                yield min(view, *added), max(view, *added)
+        else:
+            added = next(iter(left))
+            yield added
+        views.update(added)
+        for view in added:
+            del ties[view]
+            ties.update(near[view])
 
 
 @dataclass

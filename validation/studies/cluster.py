@@ -189,7 +189,7 @@ def efficiency_table(serial_s: float, by_workers: Mapping[int, Mapping[str, Sequ
         rows.append(
             ["whole run", str(workers), "", f"{all_s:.1f}", "", "", "", *timed(paths, all_s, workers)]
         )
-    head = ["", "workers", "tasks", "work s", "longest s", "sent MB", "received MB"]
+    head = ["", "workers", "tasks", "work s", "longest s", "largest sent MB", "largest result MB"]
     return text_table([*head, "path s", "efficiency", "with line s", "efficiency"], rows)
 
 
