@@ -270,9 +270,9 @@ def test_results_of_real_tasks_are_as_small_as_stated(tmp_path, monkeypatch):
         matches = sum(min(corners[i], corners[j]) for i, j in pairs)
         bound = preparing.PAIR_BYTES * len(pairs) + preparing.MATCH_BYTES * matches
         assert len(answer) <= bound <= largest
-    for function in (_stages._depths, _stages._confirmed):
-        for (_, answer), image in zip(recorder.found[function], result.images, strict=True):
-            assert len(answer) <= 9 * image.rgb[..., 0].size + 4096
+    for (_, answer), image in zip(recorder.found[_stages._depths], result.images, strict=True):
+        assert len(answer) <= 9 * image.rgb[..., 0].size + 4096
+    assert set(recorder.found) == {_stages._detect, _stages._match_all, _stages._depths}
 
 
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])

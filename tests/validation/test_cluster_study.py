@@ -58,7 +58,7 @@ def test_a_toy_run_is_measured_task_by_task_and_its_result_is_the_same(tmp_path)
     assert kept_bytes(tmp_path / "a") == kept_bytes(tmp_path / "b")
     found = meter.tasks(1)
     counts = {stage: len(tasks) for stage, tasks in found.items()}
-    assert counts == {"features": 5, "depth maps": 5, "confirmation": 5, "matches": 10}
+    assert counts == {"features": 5, "depth maps": 5, "matches": 10}
     image = photographs(1)[0].rgb.nbytes
     assert all(task.sent > image and task.received > 500 for task in found["features"])
     # Of ten pairs each is a batch, with two images.

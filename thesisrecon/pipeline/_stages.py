@@ -422,12 +422,13 @@ def estimate_depth_maps(state: PipelineState) -> None:
     def confirmed(missing: Sequence[int]) -> Iterator[Batch]:
         for n in missing:
             own = {j: maps[place[j]] for j in sorted(near[order[n]])}
-            yield [n], (state.config, part(order[n]), own, order[n])
+            yield [n], (state.config, scene, own, order[n])
 
     keys = {f"{i:05d}": run.key("dense", key, i) for i in order}
     maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
     keys = {f"confirmed-{i:05d}": run.key("dense", key, i, "confirmed") for i in order}
-    final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True)
+    # The maps of 12 neighbours take longer to send than to compare.
+    final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True, here=True)
     state.result = replace(result, depth_maps=final, views=tuple(scene.views[i] for i in order))
     finite = [np.isfinite(m.depth) for m in final]
     known = [float(mask.mean()) for mask in finite]

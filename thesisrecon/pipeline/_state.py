@@ -127,8 +127,8 @@ def _pairs_of_few_views(
             for view in sorted(views & near[added[0]]):
                 yield min(view, *added), max(view, *added)
         else:
-            added = next(iter(left))
-            yield added
+            added = first = next(iter(left))
+            yield first
         views.update(added)
         for view in added:
             del ties[view]

@@ -35,7 +35,6 @@ STAGES: Mapping[Callable[..., Any], str] = {
     _stages._detect: "features",
     _parts.reconstruct_part: "parts",
     _stages._depths: "depth maps",
-    _stages._confirmed: "confirmation",
 }
 """Function of a task -> stage."""
 PREPARATIONS = {"prepare": "matches", "prepare_oblique": "oblique matches"}
@@ -87,7 +86,8 @@ class Matching:
     def tasks(self, workers: int) -> list[Task]:
         """The batches for a number of workers."""
         pairs = list(self.pairs)
-        batches = batch_pairs(pairs, range(len(pairs)), workers, self.corners)
+        corners = [self.corners.get(view, 0) for view in range(max(self.corners) + 1)]
+        batches = batch_pairs(pairs, range(len(pairs)), workers, corners)
         return [self._batch([pairs[n] for n in batch]) for batch in batches]
 
     def _batch(self, pairs: Sequence[tuple[int, int]]) -> Task:
