@@ -1,5 +1,6 @@
 """Many images in overlapping parts: the cut of the view graph, the parts, and their common frame."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -92,6 +93,15 @@ def test_parts_are_put_into_one_frame(scene, models):
     assert aligned_error(found, scene) < 0.02
     points = cameras_on_tracks(found, scene.tracks)
     assert points.valid.mean() > 0.95
+
+
+def test_the_result_of_a_part_is_small(models):
+    for model in models:
+        np.testing.assert_array_equal(model.tracks.point_index, np.unique(model.tracks.point_index))
+        assert model.inlier.all()
+        assert set(np.flatnonzero(model.valid)) <= set(model.tracks.point_index)
+        views, points = len(model.sizes), len(model.X)
+        assert len(pickle.dumps([model], 5)) < 300 * views + 66 * points + 4096
 
 
 def test_a_part_without_cameras_leaves_the_others_whole(scene, models):

@@ -4,8 +4,10 @@ import builtins
 import concurrent.futures as futures
 import hashlib
 import os
+import pickle
 import signal
 import socket
+import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +21,7 @@ from tests.fake_stages import fake_config, photographs
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io._files import read_json
+from thesisrecon.pipeline import _stages
 from thesisrecon.pipeline import _state as preparing
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
@@ -166,6 +169,112 @@ class SlowMatcher(fakes.FakeMatcher):
         return super().match(*views, **given)
 
 
+@dataclass(frozen=True)
+class UnevenMatcher(fakes.FakeMatcher):
+    """Writes the process of each pair; sleeps longer in one of them."""
+
+    reported: str = ""
+    slow: int = 0
+    slow_s: float = 0.0
+
+    def match(self, *views, **given):
+        with Path(self.reported).open("a", encoding="ascii") as file:
+            file.write(f"{os.getpid()}\n")
+        time.sleep(self.slow_s if os.getpid() == self.slow else 0.03)
+        return super().match(*views, **given)
+
+
+@pytest.mark.parametrize("how", ["slow", "stopped"])
+def test_a_slow_worker_gets_few_tasks_and_changes_no_byte(how, dask_cluster, tmp_path):
+    """One of two workers needs 0.6 s a task instead of 0.03, or stands still until most pairs are done."""
+    slow, other = (nanny.pid for nanny in dask_cluster.workers.values())
+    reported = tmp_path / "reported"
+    matcher = UnevenMatcher(reported=str(reported), slow=slow, slow_s=0.6 if how == "slow" else 0.03)
+    given = {"config": fake_config(matching=matcher), "until": "metric"}
+    reconstruct(photographs(8), tmp_path / "whole", threads=1, **given)
+    reported.unlink()
+    latest = threading.Timer(8.0, os.kill, (slow, signal.SIGCONT))
+
+    def stop(stage, done, _):
+        if how == "stopped" and stage == "matches" and done in (2, 22):
+            os.kill(slow, signal.SIGSTOP if done == 2 else signal.SIGCONT)
+
+    latest.start()
+    try:
+        executor = address(dask_cluster)
+        reconstruct(photographs(8), tmp_path / "out", executor=executor, progress=stop, **given)
+    finally:
+        latest.cancel()
+        os.kill(slow, signal.SIGCONT)
+    by = [int(line) for line in reported.read_text(encoding="ascii").split()]
+    assert len(by) >= 28
+    assert by.count(other) >= 18
+    assert results(tmp_path / "out") == results(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("reachable", [True, False])
+def test_results_pass_the_scheduler_only_if_the_workers_cannot_be_reached(
+    reachable, dask_cluster, monkeypatch
+):
+    gathered, found = [], {}
+    handlers = dask_cluster.scheduler.handlers
+    gather = handlers["gather"]
+
+    def counted_gather(keys, **given):
+        gathered.extend(keys)
+        return gather(keys, **given)
+
+    monkeypatch.setitem(handlers, "gather", counted_gather)
+    if not reachable:
+        monkeypatch.setattr(workers, "_reachable", lambda _: False)
+    with Workers(1, address(dask_cluster)) as those:
+        those.run(pow, [(n, 2) for n in range(6)], found.__setitem__)
+    assert found == {n: n * n for n in range(6)}
+    assert len(gathered) == (0 if reachable else 6)
+
+
+def test_workers_are_reachable_if_their_ports_are():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        there = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        assert workers._reachable([there])
+        assert not workers._reachable([there, "inproc://a/b/c"])
+    assert not workers._reachable([there])
+
+
+class Recorder(futures.Executor):
+    """Runs tasks at once and keeps their pickled results."""
+
+    def __init__(self):
+        self.found = {}
+
+    def submit(self, fn, key, task):
+        answer, (function, given) = futures.Future(), pickle.loads(task)
+        answer.set_result(fn(key, task))
+        self.found.setdefault(function, []).append((given, answer.result()))
+        return answer
+
+
+def test_results_of_real_tasks_are_as_small_as_stated(tmp_path, monkeypatch):
+    """Batches of pairs are cut where their results might be too large; maps need 9 bytes a pixel."""
+    largest = 400_000
+    monkeypatch.setattr(preparing, "MAX_RESULT_BYTES", largest)
+    monkeypatch.setattr(preparing, "BATCHES_PER_WORKER", 1)
+    recorder = Recorder()
+    config = replace(PipelineConfig(), images=ImageOptions(max_size_px=200))
+    images = sorted(COURTYARD.iterdir())[4:8]
+    result = reconstruct(images, tmp_path, config=config, until="dense", threads=1, executor=recorder)
+    corners = [len(features.xy) for features in result.features]
+    batches = recorder.found[_stages._match_all]
+    assert 1 < len(batches) < 6
+    for (_, _, pairs, _), answer in batches:
+        matches = sum(min(corners[i], corners[j]) for i, j in pairs)
+        bound = preparing.PAIR_BYTES * len(pairs) + preparing.MATCH_BYTES * matches
+        assert len(answer) <= bound <= largest
+    for (_, answer), image in zip(recorder.found[_stages._depths], result.images, strict=True):
+        assert len(answer) <= 9 * image.rgb[..., 0].size + 4096
+    assert set(recorder.found) == {_stages._detect, _stages._match_all, _stages._depths}
+
+
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])
 def test_an_invalid_address_is_rejected_before_any_output(port, tmp_path):
     with pytest.raises(UsageError, match=r"dask://HOST:PORT, for example .* got 'dask://there"):
@@ -262,10 +371,21 @@ def test_batches_hold_every_pair_once_and_few_views(pairs, workers_there):
     views = next(n for n in range(100) if n * (n - 1) // 2 >= pairs)
     every = [(i, j) for i in range(views) for j in range(i + 1, views)][:pairs]
     numbers = list(range(0, pairs, 2))
-    dealt = batch_pairs(every, numbers, workers_there)
+    dealt = batch_pairs(every, numbers, workers_there, [3000] * views)
     assert sorted(n for batch in dealt for n in batch) == numbers
     assert len(dealt) >= min(len(numbers), 8 * workers_there)
     assert min(len(batch) for batch in dealt[:-1]) == max(len(batch) for batch in dealt)
     for batch in dealt:
         assert len(batch) <= preparing.MAX_BATCH
         assert len({view for n in batch for view in every[n]}) <= 6 * len(batch) ** 0.5
+
+
+def test_batches_of_a_band_of_pairs_have_near_the_fewest_views():
+    """Each view with the next eight: k + 8 views hold at most 8 k + 28 pairs."""
+    band = [(i, j) for i in range(200) for j in range(i + 1, min(i + 9, 200))]
+    for count in (4, 16):
+        batches = batch_pairs(band, range(len(band)), count, [3000] * 200)
+        assert sorted(n for batch in batches for n in batch) == list(range(len(band)))
+        views = [len({view for n in batch for view in band[n]}) for batch in batches]
+        fewest = len(batches[0]) / 8.0 + 4.5
+        assert sum(views) <= 1.5 * fewest * len(batches)

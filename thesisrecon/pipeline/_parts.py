@@ -204,8 +204,16 @@ def reconstruct_part(
         except StageFailure:
             continue
         if metric.trusted:
-            return [metric.reconstruction]
+            return [_one_observation_each(metric.reconstruction)]
     return [_no_cameras(given)]
+
+
+def _one_observation_each(model: Reconstruction) -> Reconstruction:
+    """The model with the first inlier of each point: alignment reads no other, and the result is small."""
+    t, inliers = model.tracks, np.flatnonzero(model.inlier)
+    first = inliers[np.unique(t.point_index[inliers], return_index=True)[1]]
+    tracks = replace(t, view_index=t.view_index[first], point_index=t.point_index[first], xy=t.xy[first])
+    return replace(model, tracks=tracks, inlier=np.ones(len(first), dtype=bool))
 
 
 def _no_cameras(given: PartInput) -> Reconstruction:

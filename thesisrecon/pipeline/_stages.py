@@ -131,7 +131,8 @@ def _matched(
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         views, shared = prepared(), run.workers.in_process
         assert isinstance(views, PreparedViews)
-        for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel()):
+        corners = [len(f.xy) for f in state.result.features]
+        for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel(), corners):
             some = [pairs[n] for n in numbers]
             given = views if shared else views.subset({view for pair in some for view in pair})
             yield numbers, (state.config, given, some, run.seed)
@@ -422,12 +423,13 @@ def estimate_depth_maps(state: PipelineState) -> None:
     def confirmed(missing: Sequence[int]) -> Iterator[Batch]:
         for n in missing:
             own = {j: maps[place[j]] for j in sorted(near[order[n]])}
-            yield [n], (state.config, part(order[n]), own, order[n])
+            yield [n], (state.config, scene, own, order[n])
 
     keys = {f"{i:05d}": run.key("dense", key, i) for i in order}
     maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
     keys = {f"confirmed-{i:05d}": run.key("dense", key, i, "confirmed") for i in order}
-    final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True)
+    # The maps of 12 neighbours take longer to send than to compare.
+    final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True, here=True)
     # The views for stereo matching need not stay in memory.
     undistorted = scene.views
     views = OnDemand(len(order), lambda n: undistorted[order[n]])

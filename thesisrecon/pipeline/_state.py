@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,10 @@ CACHE_BYTES = 2**30
 Prepare = Callable[[Image, Features], Any]
 MAX_BATCH = 64
 BATCHES_PER_WORKER = 8
+MAX_RESULT_BYTES = 2**25
+"""Pickled bytes of the result of a batch of pairs, at most."""
+PAIR_BYTES, MATCH_BYTES = 2**14, 80
+"""Pickled bytes of a :class:`TwoView` without matches, at most, and of each match."""
 
 
 class PreparedViews(Sequence[Any]):
@@ -55,15 +60,57 @@ class PreparedViews(Sequence[Any]):
 
 
 def batch_pairs(
-    pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None
+    pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None, corners: Sequence[int]
 ) -> list[list[int]]:
-    """Divide the numbers of pairs into batches of pairs that share views."""
-    size = 1
-    if workers is not None:
-        size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
+    """Divide the numbers of pairs, smaller views first, into batches of pairs of few views.
+
+    A corner is matched once in a pair, so the ``corners`` of each view bound the bytes of a result. None
+    workers: batches of one pair, in an order for cached views.
+    """
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
-    ordered = [numbers[k] for k in cached_pair_order(first, second)]
-    return [ordered[k : k + size] for k in range(0, len(ordered), size)]
+    left = {pairs[numbers[k]]: numbers[k] for k in cached_pair_order(first, second)}
+    if workers is None:
+        return [[n] for n in left.values()]
+    size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
+    near: dict[int, set[int]] = {view: set() for pair in left for view in pair}
+    for i, j in left:
+        near[i].add(j)
+        near[j].add(i)
+    batches = []
+    while left:
+        batch, room = list[int](), MAX_RESULT_BYTES
+        for i, j in _pairs_of_few_views(left, near):
+            room -= PAIR_BYTES + MATCH_BYTES * min(corners[i], corners[j])
+            if len(batch) == size or (batch and room < 0):
+                break
+            batch.append(left.pop((i, j)))
+            near[i].remove(j)
+            near[j].remove(i)
+        batches.append(batch)
+    return batches
+
+
+def _pairs_of_few_views(
+    left: Mapping[tuple[int, int], int], near: Mapping[int, set[int]]
+) -> Iterator[tuple[int, int]]:
+    """Pairs of a growing set of views: the next one has most pairs with them, and few others.
+
+    The caller removes each pair from ``left`` and from ``near`` (view -> views of its pairs).
+    """
+    views, ties = set[int](), Counter[int]()
+    while left:
+        added: tuple[int, ...]
+        if ties:
+            added = (max(ties, key=lambda view: (ties[view], -len(near[view]), -view)),)
+            for view in sorted(views & near[added[0]]):
+                yield min(view, *added), max(view, *added)
+        else:
+            added = first = next(iter(left))
+            yield first
+        views.update(added)
+        for view in added:
+            del ties[view]
+            ties.update(near[view])
 
 
 @dataclass

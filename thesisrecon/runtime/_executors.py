@@ -16,6 +16,7 @@ import os
 import pickle
 import re
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -46,6 +47,8 @@ ANSWER_S = 10.0
 """Timeout of the scheduler, and of the first worker."""
 WORKERLESS_S = 60.0
 """Time a cluster may be without workers during a run, so that they can be restarted."""
+REACH_S = 2.0
+"""Time to connect to a worker from here."""
 _ADDRESS = re.compile(r"(?P<host>[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 
 
@@ -127,11 +130,24 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
             except (OSError, futures.TimeoutError):
                 advice = f"start some with: dask worker {address}"
                 raise UsageError(f"the Dask scheduler at {place} has no workers; {advice}") from None
+            # By default results pass the scheduler. Arguments must: scattered ones would die with a worker.
+            client.direct_to_workers = _reachable(client.nthreads())
             # pure=False: do not hash all bytes of the tasks.
             yield Cluster(place, client, client.get_executor(pure=False))
         finally:
             with suppress(Exception):
                 client.close(timeout=1.0)
+
+
+def _reachable(workers: Iterable[str]) -> bool:
+    """Whether this machine can connect to the workers, which a firewall or Kubernetes may prevent."""
+    for worker in workers:
+        host, _, port = worker.rpartition("://")[2].rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), REACH_S).close()
+        except (OSError, ValueError):
+            return False
+    return True
 
 
 @contextmanager

@@ -178,10 +178,12 @@ class Run:
         *,
         max_bytes: float = np.inf,
         silent: bool = False,
+        here: bool = False,
     ) -> StoredRecords:
         """The records of all items (item -> key) of a stage, missing ones computed by the workers.
 
-        Records beyond ``max_bytes`` are read from their files when they are used; ``silent``: no progress.
+        Records beyond ``max_bytes`` are read from their files when they are used; ``silent``: no progress;
+        ``here``: in threads of this process, for tasks of little work with large arguments.
         """
         progress = (lambda *_: None) if silent else self.progress
         with self.clock(stage) as log:
@@ -212,7 +214,8 @@ class Run:
                 done, log.computed = done + len(found), log.computed + len(found)
                 progress(stage, done, len(names))
 
-            self.workers.run(function, tasks(), finished)
+            local = self.workers if self.workers.in_process or not here else Workers(self.workers.threads)
+            local.run(function, tasks(), finished)
             return records
 
     @contextmanager

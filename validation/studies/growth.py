@@ -215,6 +215,13 @@ WALKS = {"place": (walk, write_views), "street": (walk_street, write_street)}
 """True cameras and the writer of the images of each kind of scene."""
 
 
+def write_scene(out: Path, scene: str, count: int, long_side: int, threads: int) -> None:
+    """Write the images of a walk; those that are there stay."""
+    if scene not in WALKS:
+        raise UsageError(f"the scene is {' or '.join(WALKS)}; got {scene!r}")
+    WALKS[scene][1](out, count, size=(long_side, long_side * 3 // 4), threads=threads)
+
+
 def growth_of_cost_study(
     out: Path,
     sizes: Sequence[int] = (10, 30, 100, 300),
@@ -225,9 +232,7 @@ def growth_of_cost_study(
     until: Until = "metric",
 ) -> Iterator[Part]:
     """Measure what each stage costs by the number of images of one place or of a street."""
-    if scene not in WALKS:
-        raise UsageError(f"the scene is {' or '.join(WALKS)}; got {scene!r}")
-    WALKS[scene][1](out, max(sizes), size=(long_side, long_side * 3 // 4), threads=threads)
+    write_scene(out, scene, max(sizes), long_side, threads)
     yield f"{scene}, long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
     costs = []
     for count in sorted(sizes):

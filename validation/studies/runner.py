@@ -35,6 +35,7 @@ MODULES = {
     "benchmark-table": "timing",
     "calibration-coverage": "coverage",
     "calibration-real": "calibration_real",
+    "cluster-efficiency": "cluster",
     "compile-time": "compile_time",
     "critical-motions": "critical_motions",
     "dinosaur": "projective",
