@@ -261,9 +261,7 @@ def test_views_of_places_with_the_same_windows_are_told_apart_by_the_rest():
     windows, images = rng.normal(size=(90, 32)), []
     for _ in range(60):
         own = rng.normal(size=(10, 32))
-        images += [
-            unit(np.concatenate([windows, own]) + 0.1 * rng.normal(size=(100, 32))) for _ in range(2)
-        ]
+        images += [unit(np.concatenate([windows, own]) + 0.1 * rng.normal(size=(100, 32))) for _ in range(2)]
     words = _word_weights(images, 1024, map_all=one_by_one, rng=np.random.default_rng(0))
     pairs = as_set(_most_similar(words, 1))
     assert sum((2 * place, 2 * place + 1) in pairs for place in range(60)) > 55

@@ -269,5 +269,5 @@ def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F
         focal = float(np.median(K[known, 0, 0])) if len(known) else typical * longest[views[0]]
         rows[views, FOCAL] = focal
         if len(known):
-            rows[np.ix_(views, CENTRE)] = np.median(K[known, :2, 2], axis=0)
+            rows[views[:, None], [*CENTRE]] = np.median(K[known, :2, 2], axis=0)
     return rows
