@@ -164,17 +164,22 @@ def _rows_of_part(tracks: Tracks, views: I64, points: I64) -> I64:
     return np.flatnonzero(np.isin(tracks.view_index, views) & np.isin(tracks.point_index, points))
 
 
+def _tracks_of_part(tracks: Tracks, views: I64) -> Tracks:
+    points = points_of_part(tracks, views)
+    view, point = np.full(tracks.n_views, -1), np.full(tracks.n_points, -1)
+    view[views], point[points] = np.arange(len(views)), np.arange(len(points))
+    k = _rows_of_part(tracks, views, points)
+    return Tracks(
+        view[tracks.view_index[k]], point[tracks.point_index[k]], tracks.xy[k], len(views), len(points)
+    )
+
+
 def input_of_part(
     tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, prior: IntrinsicsPrior, views: I64
 ) -> PartInput:
     """The input of a part; of the pairs only what the projective reconstruction reads."""
-    view, point = np.full(tracks.n_views, -1), np.full(tracks.n_points, -1)
-    points = points_of_part(tracks, views)
-    view[views], point[points] = np.arange(len(views)), np.arange(len(points))
-    k = _rows_of_part(tracks, views, points)
-    own = Tracks(
-        view[tracks.view_index[k]], point[tracks.point_index[k]], tracks.xy[k], len(views), len(points)
-    )
+    view = np.full(tracks.n_views, -1)
+    view[views] = np.arange(len(views))
     none, affine = np.zeros(0, np.int64), np.zeros((0, 2, 2))
     inside = [p for p in pairs if p.accepted and view[p.i] >= 0 and view[p.j] >= 0]
     renumbered = tuple(
@@ -182,7 +187,7 @@ def input_of_part(
         for p in inside
     )
     rows = {name: getattr(prior, name)[views] for name in ("mean", "std", "shared", "kind")}
-    return PartInput(own, renumbered, sizes[views], replace(prior, **rows))
+    return PartInput(_tracks_of_part(tracks, views), renumbered, sizes[views], replace(prior, **rows))
 
 
 def reconstruct_part(
@@ -204,16 +209,16 @@ def reconstruct_part(
         except StageFailure:
             continue
         if metric.trusted:
-            return [_one_observation_each(metric.reconstruction)]
-    return [_no_cameras(given)]
+            return [_without_observations(metric.reconstruction)]
+    return [_without_observations(_no_cameras(given))]
 
 
-def _one_observation_each(model: Reconstruction) -> Reconstruction:
-    """The model with the first inlier of each point: alignment reads no other, and the result is small."""
-    t, inliers = model.tracks, np.flatnonzero(model.inlier)
-    first = inliers[np.unique(t.point_index[inliers], return_index=True)[1]]
-    tracks = replace(t, view_index=t.view_index[first], point_index=t.point_index[first], xy=t.xy[first])
-    return replace(model, tracks=tracks, inlier=np.ones(len(first), dtype=bool))
+def _without_observations(model: Reconstruction) -> Reconstruction:
+    """The model without the observations, which the caller has: the result of a task is small."""
+    none = np.zeros(0, np.int64)
+    return replace(
+        model, tracks=replace(model.tracks, view_index=none, point_index=none, xy=np.zeros((0, 2)))
+    )
 
 
 def _no_cameras(given: PartInput) -> Reconstruction:
@@ -228,8 +233,13 @@ def align_parts(
 ) -> Reconstruction | None:
     """Cameras and points of all parts that can be aligned with the largest one, in its frame, or None.
 
-    ``own`` are the views of each part without the overlap, which take their camera from it.
+    ``own`` are the views of each part without the overlap, which take their camera from it. The observations
+    of the ``models`` are those of ``tracks``.
     """
+    models = [
+        replace(model, tracks=_tracks_of_part(tracks, views))
+        for model, views in zip(models, parts, strict=True)
+    ]
     order = sorted(range(len(parts)), key=lambda p: -int(models[p].registered.sum()))
     if not models[order[0]].registered.any():
         return None
