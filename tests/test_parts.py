@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline import _parts
 from thesisrecon.pipeline._parts import (
     align_parts,
+    cameras_from_parts,
     divide_views,
     input_of_part,
     neighbour_graph,
@@ -22,7 +24,8 @@ from thesisrecon.pipeline._parts import (
     reconstruct_part,
 )
 from thesisrecon.pipeline._second_pass import cameras_on_tracks
-from thesisrecon.records import MetricResult
+from thesisrecon.records import Image, MetricResult
+from thesisrecon.runtime._run import _StageLog, start_run
 
 VIEWS, PART = 72, 45
 
@@ -104,6 +107,23 @@ def test_the_result_of_a_part_is_small(scene, models):
         assert len(model.inlier) <= inside.sum()
         size = 300 * len(views) + 33 * len(model.X) + len(model.inlier)
         assert len(pickle.dumps([model], 5)) < size + 4096
+
+
+def test_the_tasks_of_a_run_give_the_parts_that_are_aligned(scene, models, monkeypatch, tmp_path):
+    monkeypatch.setattr(_parts, "reconstruct_part", lambda _, __, number, ___, ____: [models[number]])
+    config = PipelineConfig(images=ImageOptions(part_views=PART))
+    _, run, _ = start_run(tmp_path, config, 0, None, {"threads": 1})
+    run.logs["tracks"] = run.logs["matches"] = _StageLog()
+    grey = np.zeros(1, np.uint8)
+    images = tuple(Image("", np.broadcast_to(grey, (h, w, 3)), (w, h)) for w, h in scene.sizes)
+    result = SimpleNamespace(tracks=scene.tracks, images=images)
+    prior = prior_from_options(IntrinsicsOptions(), [(1, 1)] * VIEWS, np.full(VIEWS, np.nan), np.ones(VIEWS))
+    state = SimpleNamespace(run=run, config=config, result=result, used_pairs=(), prior=prior)
+    found, (own, parts) = cameras_from_parts(state, 1), parts_of(scene, PART)
+    expected = align_parts(scene.tracks, scene.sizes, own, parts, models)
+    assert expected.registered.all()
+    for name in ("P", "X", "inlier", "valid", "registered"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 def test_a_part_without_cameras_leaves_the_others_whole(scene, models):
