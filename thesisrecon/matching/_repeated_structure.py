@@ -36,13 +36,11 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
     graph = scipy.sparse.coo_array((np.ones(strong.sum()), ends), (n_views, n_views)).tocsr()
     group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     steps = _steps_within(graph + graph.T, np.unique(i[~strong]), MAX_STEPS)
-    near = {(int(a), int(b)) for a, b in steps}
+    weak = ~strong & (group[i] == group[j])
+    apart = set(zip(i[weak].tolist(), j[weak].tolist(), strict=True)) - set(map(tuple, steps.tolist()))
     return [
         replace(pair, accepted=False, reason=_reason(pair))
-        if pair.accepted
-        and pair.inliers < STRONG * min(most[pair.i], most[pair.j])
-        and group[pair.i] == group[pair.j]
-        and (pair.i, pair.j) not in near
+        if pair.accepted and (pair.i, pair.j) in apart
         else pair
         for pair in pairs
     ]

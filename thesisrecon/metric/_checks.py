@@ -17,10 +17,10 @@ from thesisrecon.metric._model import (
     inlier_mask,
     reproject_observations,
     residual_norms,
-    rows_of_views,
 )
 from thesisrecon.metric._uncertainty import USUAL_INFLATION
 from thesisrecon.numerics._noise import MAD_FACTOR, noise_from_distances
+from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.numerics._partial_bundle import refine_pose
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 

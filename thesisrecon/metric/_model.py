@@ -91,12 +91,6 @@ def choose_points(order: I64, start: I64, cell: I64, needed: I64, keep: B8) -> N
                 needed[cell[k]] -= 1
 
 
-def rows_of_views(view: I64, n_views: int) -> list[I64]:
-    """The rows of ``view`` (K,) with each view, in their order."""
-    ends = np.cumsum(np.bincount(view, minlength=n_views))
-    return np.split(np.argsort(view, kind="stable"), ends[:-1])
-
-
 def reproject_observations(model: MetricEstimate, view: I64, point: I64) -> tuple[F64, F64]:
     """Pixels (K, 2), with distortion, and depths (K,) of the points of observations."""
     cameras = model.cameras

@@ -20,8 +20,8 @@ from thesisrecon.metric._model import (
     normalized_observations,
     restrict_points,
     retriangulate_tracks,
-    rows_of_views,
 )
+from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.numerics._partial_bundle import refine_pose
 
 ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)

@@ -20,6 +20,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project_camera
 from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import Reconstruction, Tracks, TwoView
@@ -260,10 +261,11 @@ def align_parts(
         if best is None:
             break
         placed[best[1]] = best[2]
-    return _in_one_frame(tracks, sizes, own, parts, models, placed)
+    return _in_one_frame(tracks, sizes, own, list(zip(parts, points, models, strict=True)), placed)
 
 
 _Part = tuple[I64, I64, Reconstruction]
+"""Views, points and model of a part."""
 
 
 def _align_part(a: _Part, b: _Part) -> tuple[int, Similarity]:
@@ -338,8 +340,7 @@ def _in_one_frame(
     tracks: Tracks,
     sizes: I64,
     own: Sequence[I64],
-    parts: Sequence[I64],
-    models: Sequence[Reconstruction],
+    parts: Sequence[_Part],
     placed: dict[int, Similarity],
 ) -> Reconstruction:
     """Cameras of the part that owns a view, points of the part with most inliers; inliers agree with both."""
@@ -349,7 +350,7 @@ def _in_one_frame(
     distortion = np.zeros((n, 3))
     for inner in (True, False):
         for p, similarity in placed.items():
-            views, model = parts[p], models[p]
+            views, _, model = parts[p]
             free = model.registered & ~registered[views] & (np.isin(views, own[p]) | (not inner))
             here = np.flatnonzero(free)
             R, C = _poses(model, here)
@@ -360,8 +361,8 @@ def _in_one_frame(
             distortion[views[here]] = 0.0 if model.distortion is None else model.distortion[here]
             registered[views[here]] = True
     for p, similarity in placed.items():
-        model, points = models[p], points_of_part(tracks, parts[p])
-        seen[_rows_of_part(tracks, parts[p], points)[model.inlier]] = True
+        views, points, model = parts[p]
+        seen[_rows_of_part(tracks, views, points)[model.inlier]] = True
         count = np.bincount(model.tracks.point_index[model.inlier], minlength=len(points))
         better = model.valid & (count > support[points])
         moved = similarity.apply(model.X[better, :3] / model.X[better, 3:])
@@ -369,7 +370,7 @@ def _in_one_frame(
             np.column_stack([moved, np.ones(len(moved))]),
             count[better],
         )
-    sigma = float(np.median([models[p].sigma_px for p in placed]))
+    sigma = float(np.median([parts[p][2].sigma_px for p in placed]))
     found = (registered, support > 0, seen, tracks, sizes, sigma, ("",) * n, K, distortion)
     merged = Reconstruction("metric", P, X, *found)
     close = _reprojection_px(merged) < MAX_OFFSET_REL * sizes[tracks.view_index].max(axis=1)
@@ -383,9 +384,7 @@ def _reprojection_px(model: Reconstruction) -> F64:
     t, distance = model.tracks, np.full(len(model.tracks.xy), np.inf)
     assert model.K is not None
     assert model.distortion is not None
-    for view, rows in enumerate(
-        np.split(np.argsort(t.view_index, kind="stable"), _ends(t.view_index, t.n_views))
-    ):
+    for view, rows in enumerate(rows_of_views(t.view_index, t.n_views)):
         if model.registered[view]:
             rows = rows[model.X[t.point_index[rows], 3] != 0.0]
             K, X = model.K[view], model.X[t.point_index[rows], :3]
@@ -394,7 +393,3 @@ def _reprojection_px(model: Reconstruction) -> F64:
                 xy = project_camera(K, Rt[:, :3], Rt[:, 3], X, distortion=model.distortion[view])
             distance[rows] = np.nan_to_num(np.linalg.norm(xy - t.xy[rows], axis=1), nan=np.inf)
     return distance
-
-
-def _ends(index: I64, count: int) -> I64:
-    return np.cumsum(np.bincount(index, minlength=count))[:-1]
