@@ -156,7 +156,7 @@ class FakeMetric:
     trusted_from: int = 0
     failed_checks: tuple[str, ...] = ("odd focal",)
 
-    def refine(self, reconstruction, calibration, *, prior, rng):
+    def refine(self, reconstruction, calibration, *, prior, rng, threads):
         attempt = sum(call.startswith("metric") for call in CALLS)
         CALLS.append(f"metric {attempt}")
         views = len(prior.mean)

@@ -10,7 +10,8 @@ from tests.synthetic import TrueScene, make_scene, true_pairs, with_poses
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric import _model, _resection, _shared_camera, refinement
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.numerics._metric_bundle import refine_metric_bundle
+from thesisrecon.numerics import _schur
+from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.projective._track_selection import select_core
 from thesisrecon.projective.incremental import OUTSIDE_CORE, IncrementalProjective
 from thesisrecon.records import Tracks
@@ -143,6 +144,20 @@ def test_fixed_cameras_stay_and_the_others_converge():
     assert np.abs(fit.residual_px).max() < 1e-3
 
 
+def test_threads_do_not_change_the_adjustment():
+    walk = make_walk(150, "street", np.random.default_rng(0), denser=3)
+    assert len(walk.seen.xy) > 3 * _schur.CHUNK
+    cameras, X = walk.start(np.random.default_rng(1))
+    fits = [
+        refine_metric_bundle(
+            cameras, X, walk.seen, free=np.ones(6, bool), options=BundleOptions(max_iterations=4, threads=n)
+        )
+        for n in (1, 3)
+    ]
+    np.testing.assert_array_equal(fits[0].X, fits[1].X)
+    np.testing.assert_array_equal(fits[0].cameras.intrinsics, fits[1].cameras.intrinsics)
+
+
 def test_points_are_chosen_until_every_cell_has_enough():
     rng = np.random.default_rng(3)
     length = rng.integers(2, 9, 400)
@@ -160,6 +175,32 @@ def test_points_are_chosen_until_every_cell_has_enough():
     np.testing.assert_array_equal(needed, left)
     assert 0.2 < keep.mean() < 0.6
     assert left.max() <= 3
+
+
+def test_points_are_chosen_again_by_their_residuals(monkeypatch):
+    scene = street(40)
+    rng, n = np.random.default_rng(2), scene.tracks.n_points
+    noisy = np.arange(n) % 2 == 0
+    shift = rng.normal(0.0, 1.0, scene.tracks.xy.shape) * noisy[scene.tracks.point_index, None]
+    tracks = replace(scene.tracks, xy=scene.tracks.xy + shift)
+    cameras = make_walk(40, "street", np.random.default_rng(1)).cameras
+    model = _model.MetricEstimate(
+        tracks, scene.sizes, cameras, np.ones(40, bool), scene.X, np.ones(n, bool),
+        np.ones(len(tracks.xy), bool), 0.5,
+    )  # fmt: skip
+    assert _model.with_precise_points(model, tracks) is model, "few points are all used"
+    monkeypatch.setattr(_model, "MAX_OBSERVATIONS", len(tracks.xy) // 4)
+    monkeypatch.setattr(_model, "MIN_PER_VIEW", 20)
+    few = _model.with_enough_points(model)
+    chosen = _model.with_precise_points(few, tracks)
+
+    def positions(tracks):
+        return {tuple(row) for row in tracks.xy.tolist()}
+
+    noisy_xy = positions(replace(tracks, xy=tracks.xy[noisy[tracks.point_index]]))
+    by_length, by_residual = (len(positions(m.tracks) & noisy_xy) / len(m.tracks.xy) for m in (few, chosen))
+    assert by_residual < 0.5 * by_length
+    assert np.bincount(chosen.tracks.view_index, minlength=40).min() >= 20
 
 
 def test_shared_intrinsics_of_many_views_are_tested_in_runs(monkeypatch):

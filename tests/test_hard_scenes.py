@@ -52,8 +52,8 @@ class Given:
     def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
         return replace(self.truth, stratum="projective", K=None, distortion=None)
 
-    def refine(self, reconstruction, calibration, *, prior, rng):
-        reported = FakeMetric().refine(reconstruction, calibration, prior=prior, rng=rng)
+    def refine(self, reconstruction, calibration, *, prior, rng, threads):
+        reported = FakeMetric().refine(reconstruction, calibration, prior=prior, rng=rng, threads=threads)
         return replace(reported, reconstruction=self.truth)
 
 

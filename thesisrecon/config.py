@@ -258,8 +258,11 @@ class MetricRefiner(Protocol):
         *,
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
+        threads: int,
     ) -> MetricResult:
         """Refine a projective reconstruction to the metric model; all candidate calibrations are tried.
+
+        The result does not depend on the number of ``threads``.
 
         Returns
         -------

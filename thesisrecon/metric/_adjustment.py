@@ -41,7 +41,7 @@ class BundleAdjustment:
 
     ``lens_std`` is the prior standard deviation of k2 and k3 about 0 (0 fixes them), ``noise_floor_px`` the
     lower bound of the measured noise, ``inflation`` a factor on the noise in the weights, for correlated
-    residuals.
+    residuals. ``threads`` share the work.
     """
 
     prior: IntrinsicsPrior
@@ -49,6 +49,7 @@ class BundleAdjustment:
     noise_floor_px: float
     hierarchical: HierarchicalPrior | None = None
     inflation: float = 1.0
+    threads: int = 1
 
     def options(self, model: MetricEstimate, *, iterations: int) -> BundleOptions:
         """Weights and loss for the noise of a model."""
@@ -56,6 +57,7 @@ class BundleAdjustment:
             sigma_px=self.inflation * model.sigma_px,
             loss_px=model.loss_sigmas * model.sigma_px,
             max_iterations=iterations,
+            threads=self.threads,
             damping=LITTLE_DAMPING if model.registered.sum() > MANY_VIEWS else BundleOptions.damping,
         )
 

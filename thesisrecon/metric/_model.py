@@ -23,6 +23,8 @@ MIN_ANGLE = float(np.radians(0.05))
 """Smallest triangulation angle of a point."""
 MAX_OBSERVATIONS, MIN_PER_VIEW, CELLS = 400_000, 1000, 8
 """Observations above which points are chosen for adjustment, the least of a view, and cells along a side."""
+PRIOR_RESIDUALS = 6
+"""Residuals of a point that its prior noise counts as."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +66,45 @@ def with_enough_points(model: MetricEstimate) -> MetricEstimate:
 
     All points up to ``MAX_OBSERVATIONS``; of more, the rest adds little to the precision of the cameras.
     """
-    t = model.tracks
-    if len(t.xy) <= MAX_OBSERVATIONS:
+    if len(model.tracks.xy) <= MAX_OBSERVATIONS:
         return model
+    length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
+    return _hold_views(model, np.lexsort((-length, ~model.valid)))
+
+
+def with_precise_points(model: MetricEstimate, tracks: Tracks) -> MetricEstimate:
+    """Choose among all ``tracks`` again, if points were chosen: those with the least residuals first.
+
+    Where the surface has relief, a corner is not one point of it: what is seen of a joint or an edge changes
+    with the direction. That is less than the noise, but the same in every view, and bends long rows of views.
+    """
+    if model.tracks.n_points == tracks.n_points:
+        return model
+    model = with_tracks(model, tracks)
+    t, variance = model.tracks, model.sigma_px**2
+    k = np.flatnonzero(model.registered[t.view_index] & model.valid[t.point_index])
+    view, point = t.view_index[k], t.point_index[k]
+    xy, _ = reproject_observations(model, view, point)
+    squared = np.nan_to_num(np.sum((xy - t.xy[k]) ** 2, axis=1), nan=np.inf)
+    squared = np.minimum(squared, (LATE_SIGMAS * model.gate_px) ** 2)
+    total = np.bincount(point, squared, minlength=t.n_points)
+    count = np.bincount(point, minlength=t.n_points)
+    # The mean of the variance under an inverse gamma prior at that of all points, which holds short tracks.
+    noise = (total + PRIOR_RESIDUALS * variance) / np.maximum(2 * count - 3 + PRIOR_RESIDUALS, 1)
+    return _hold_views(model, np.argsort(np.where(model.valid, noise, np.inf), kind="stable"))
+
+
+def _hold_views(model: MetricEstimate, order: I64) -> MetricEstimate:
+    """The model with points, tried in ``order``, until every view has enough of them all over its image."""
+    t = model.tracks
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
     cell = (t.view_index * CELLS + cell[:, 0]) * CELLS + cell[:, 1]
     occupied = np.bincount(np.unique(cell) // CELLS**2, minlength=t.n_views)
     wanted = max(MIN_PER_VIEW, MAX_OBSERVATIONS // t.n_views)
     needed = np.repeat(-(-wanted // np.maximum(occupied, 1)), CELLS**2)
-    length, keep = np.bincount(t.point_index, minlength=t.n_points), np.zeros(t.n_points, dtype=bool)
-    start = np.concatenate([[0], np.cumsum(length)])
-    choose_points(np.lexsort((-length, ~model.valid)), start, cell, needed, keep)
+    start = np.concatenate([[0], np.cumsum(np.bincount(t.point_index, minlength=t.n_points))])
+    keep = np.zeros(t.n_points, dtype=bool)
+    choose_points(order, start, cell, needed, keep)
     return restrict_points(model, np.flatnonzero(keep))
 
 

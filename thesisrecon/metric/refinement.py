@@ -35,6 +35,7 @@ from thesisrecon.metric._model import (
     truncated_cost,
     upgraded_model,
     with_enough_points,
+    with_precise_points,
     with_tracks,
 )
 from thesisrecon.metric._resection import register_missing_cameras
@@ -56,13 +57,15 @@ from thesisrecon.metric._uncertainty import (
 )
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._noise import noise_from_distances
-from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Upgrade
+from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, Upgrade
 
 MIN_CHANGE = 0.002
 """Share of observations that change sides below which the rounds end."""
 START_ROUNDS = 3
 MAX_ROUNDS = 4
 """Final rounds of triangulation and adjustment."""
+PRECISE_ROUNDS = 2
+"""Times that the points of a large set are chosen again; a choice depends on the model before it."""
 LENS_STD = 0.02
 """Prior standard deviation about 0 of k2 and k3 of a camera with several images."""
 NOISE_FLOOR_PX = 0.02
@@ -91,9 +94,10 @@ class MetricRefinement:
         *,
         prior: IntrinsicsPrior,
         rng: np.random.Generator,
+        threads: int = 1,
     ) -> MetricResult:
         """See `thesisrecon.config.MetricRefiner.refine`."""
-        adjustment = BundleAdjustment(prior, LENS_STD, NOISE_FLOOR_PX)
+        adjustment = BundleAdjustment(prior, LENS_STD, NOISE_FLOOR_PX, threads=threads)
         trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:
@@ -105,6 +109,7 @@ class MetricRefinement:
             "" if model.registered[v] else rejected.get(v, reconstruction.reasons[v] or NO_COMMON_POINTS)
             for v in range(len(model.registered))
         )
+        model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         final, sharing, enlarged, difference = settle_camera_model(finish_metric(model, adjustment))
         model, adjustment, own, scatter = final
         shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
@@ -201,6 +206,16 @@ def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> Met
         if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
             break
     return adjustment.run(model, iterations=LAST_ITERATIONS)[0]
+
+
+def _adjust_to_precise_points(
+    model: MetricEstimate, tracks: Tracks, adjustment: BundleAdjustment
+) -> MetricEstimate:
+    """Choose the points again, if they were chosen, by the residuals of the adjusted model."""
+    if model.tracks.n_points < tracks.n_points:
+        for _ in range(PRECISE_ROUNDS):
+            model = with_precise_points(adjustment.run(model, iterations=10)[0], tracks)
+    return model
 
 
 def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:

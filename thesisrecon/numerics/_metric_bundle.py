@@ -52,7 +52,7 @@ _Covariances = tuple[F64, F64 | None, F64 | None]
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """Weighting, end, first damping, wanted covariances, and the least noise assumed for them."""
+    """Weighting, end, first damping, wanted covariances, the least noise assumed for them, and threads."""
 
     sigma_px: float = 1.0
     loss_px: float = 1.0
@@ -61,6 +61,7 @@ class BundleOptions:
     point_covariance: bool = False
     noise_floor_px: float = 0.0
     damping: float = 1e-4
+    threads: int = 1
 
     def __post_init__(self) -> None:
         if not (self.sigma_px > 0.0 and self.loss_px > 0.0):
@@ -236,7 +237,12 @@ def _metric_problem(
     values, start, table = number_unknowns(cameras, used, free, prior)
     columns = assign_columns(values, group, np.flatnonzero(free), moves)
     layout = build_layout(
-        o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border
+        o,
+        columns.block,
+        width=POSE_DOF + len(columns.own),
+        common=columns.border,
+        border=columns.n_border,
+        threads=options.threads,
     )
     weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
     return _MetricProblem(layout, columns, moves, values, weighting, layout.jacobians()), start, table

@@ -7,8 +7,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -35,13 +37,16 @@ CHUNK = 16384
 # Every chunk has its own sums: few chunks if these are large.
 MAX_CHUNKS, CHUNK_BYTES = 16, 128e6
 
+Answer = TypeVar("Answer")
+
 
 @dataclass(frozen=True)
 class BundleLayout:
     """Structure of one problem.
 
     The camera unknowns are ``width`` columns for each view's block, then ``border`` common columns; ``row``
-    and ``column`` (n,) are the views of each block of the reduced matrix, ``chunks`` ranges of points.
+    and ``column`` (n,) are the views of each block of the reduced matrix, ``chunks`` ranges of points, which
+    ``threads`` share; their number does not depend on the threads, so that sums are the same.
     """
 
     observations: SortedObservations
@@ -52,6 +57,7 @@ class BundleLayout:
     column: I64
     chunks: tuple[tuple[int, int], ...]
     solver: BandedCholesky | None
+    threads: int = 1
 
     @property
     def size(self) -> int:
@@ -60,12 +66,22 @@ class BundleLayout:
 
     def sum_over_observations(self, work: Callable[[slice, Observations], float]) -> float:
         """Return the sum of work(rows, observations) over the observations of every range of points."""
-        start, seen, total = self.observations.start, self.observations.seen, 0.0
-        for first, last in self.chunks:
+        start, seen = self.observations.start, self.observations.seen
+
+        def of_chunk(n: int) -> float:
+            first, last = self.chunks[n]
             rows = slice(start[first], start[last])
-            part = Observations(seen.view_index[rows], seen.point_index[rows], seen.xy[rows])
-            total += work(rows, part)
-        return total
+            return work(rows, Observations(seen.view_index[rows], seen.point_index[rows], seen.xy[rows]))
+
+        return sum(self.map_chunks(of_chunk))
+
+    def map_chunks(self, work: Callable[[int], Answer]) -> list[Answer]:
+        """Return work(n) of every chunk n."""
+        chunks: Iterable[int] = range(len(self.chunks))
+        if min(self.threads, len(self.chunks)) == 1:
+            return [work(n) for n in chunks]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(work, chunks))
 
     def jacobians(self) -> Jacobians:
         """Allocate the buffers of one linearisation."""
@@ -79,7 +95,7 @@ class BundleLayout:
 
 
 def build_layout(
-    observations: SortedObservations, block: I64, *, width: int, common: I64, border: int
+    observations: SortedObservations, block: I64, *, width: int, common: I64, border: int, threads: int = 1
 ) -> BundleLayout:
     """Find the pairs of views with common points, divide the points into chunks and choose a solver."""
     seen, start, n = observations.seen, observations.start, int(block.max(initial=-1)) + 1
@@ -95,7 +111,7 @@ def build_layout(
     chunks = tuple(itertools.pairwise([0, *bounds.tolist(), len(start) - 1]))
     index = BlockIndex(start, seen.view_index, block, pair, np.ascontiguousarray(common))
     solver = choose_solver(row, column, n, width, border)
-    return BundleLayout(observations, index, width, border, row, column, chunks, solver)
+    return BundleLayout(observations, index, width, border, row, column, chunks, solver, threads)
 
 
 # Gaussian terms between camera columns: first (L,), second (L,) of the border or -1 for a number instead,
@@ -119,10 +135,16 @@ class BundleSystem:
         """Eliminate the points; return the damped system, sums of the points, and the damping terms (D,)."""
         N, layout = len(self.layout.observations.start) - 1, self.layout
         points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
-        parts = [layout.sums() for _ in layout.chunks]
-        for (first, last), part in zip(layout.chunks, parts, strict=True):
-            eliminate_points(first, last, damping, self.jacobians, layout.index, part, points)
-        total = ReducedSums(*(sum(arrays[1:], arrays[0]) for arrays in zip(*parts, strict=True)))
+
+        def eliminate(n: int) -> ReducedSums:
+            part = layout.sums()
+            eliminate_points(*layout.chunks[n], damping, self.jacobians, layout.index, part, points)
+            return part
+
+        total, *others = layout.map_chunks(eliminate)
+        for part in others:
+            for into, values in zip(total, part, strict=True):
+                into += values
         pair = layout.index.pair
         if self.prior is not None:
             _add_prior(pair, total, self.prior)
@@ -139,7 +161,12 @@ class BundleSystem:
         if cameras is None:
             return None
         moves = np.zeros_like(points.gradient)
-        substitute_points(0, len(moves), cameras, self.jacobians, self.layout.index, points, moves)
+
+        def substitute(n: int) -> None:
+            index = self.layout.index
+            substitute_points(*self.layout.chunks[n], cameras, self.jacobians, index, points, moves)
+
+        self.layout.map_chunks(substitute)
         if not np.isfinite(moves).all():
             return None
         stiff = float(damped @ cameras**2) + damping * float(np.vdot(points.diagonal, moves**2))

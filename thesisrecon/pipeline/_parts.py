@@ -206,7 +206,7 @@ def reconstruct_part(
             )
             calibration = calibrate_with_core(config.selfcalibration, projective, prior=given.prior, rng=rng)
             start = calibrated_part(projective, calibration)
-            metric = config.metric.refine(start, calibration, prior=given.prior, rng=rng)
+            metric = config.metric.refine(start, calibration, prior=given.prior, rng=rng, threads=1)
         except StageFailure:
             continue
         if metric.trusted:

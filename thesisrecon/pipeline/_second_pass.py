@@ -56,14 +56,14 @@ def _registered_more(
 ) -> MetricResult:
     rng, calibration = stream(state.run.seed, "metric", attempt, 1), state.result.calibration
     assert calibration is not None
-    map_all = state.run.workers.map_all
-    tracks = state.config.tracks.build(state.prepared_views(), pairs, map_all=map_all, rng=rng)
+    workers = state.run.workers
+    tracks = state.config.tracks.build(state.prepared_views(), pairs, map_all=workers.map_all, rng=rng)
     start, again = (
         cameras_on_tracks(metric.reconstruction, tracks),
         from_metric(metric.reconstruction, calibration),
     )
     try:
-        found = state.config.metric.refine(start, again, prior=state.prior, rng=rng)
+        found = state.config.metric.refine(start, again, prior=state.prior, rng=rng, threads=workers.threads)
     except StageFailure:
         return metric
     before, after = metric.reconstruction.registered, found.reconstruction.registered

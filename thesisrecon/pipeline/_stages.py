@@ -306,9 +306,10 @@ def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) ->
     start = calibrated_part(state.result.projective, calibration) if aligned is None else aligned
     known = calibration if aligned is None else from_metric(aligned, calibration)
     parts = [] if aligned is None else list(state.run.logs["metric"].keys.values())
+    threads = state.run.workers.threads
     metric: MetricResult = _cached(
         state, "metric", attempt, [state.run.logs["selfcalibration"].keys[f"attempt-{attempt}"], parts],
-        lambda rng: state.config.metric.refine(start, known, prior=prior, rng=rng),
+        lambda rng: state.config.metric.refine(start, known, prior=prior, rng=rng, threads=threads),
     )  # fmt: skip
     state.result = replace(state.result, metric=metric)
     return metric

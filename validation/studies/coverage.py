@@ -83,7 +83,9 @@ def run_trial(cameras: Cameras, number: int) -> tuple[IntervalScores, MetricResu
         calibration = config.selfcalibration.calibrate(
             projective, prior=prior, rng=stream(number, "selfcalibration")
         )
-        result = config.metric.refine(projective, calibration, prior=prior, rng=stream(number, "metric"))
+        result = config.metric.refine(
+            projective, calibration, prior=prior, rng=stream(number, "metric"), threads=1
+        )
     except StageFailure:
         return None
     return one_camera(interval_scores(result, scene.K), cameras), result

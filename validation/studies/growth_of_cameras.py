@@ -62,7 +62,9 @@ def measure_growth(kind: Kind, views: int, core_views: int) -> dict[str, Any]:
         lambda rng: calibrate_with_core(config.selfcalibration, found, prior=prior, rng=rng),
     )
     part = calibrated_part(found, calibration)
-    metric = measured("metric", lambda rng: config.metric.refine(part, calibration, prior=prior, rng=rng))
+    metric = measured(
+        "metric", lambda rng: config.metric.refine(part, calibration, prior=prior, rng=rng, threads=1)
+    )
     K, R, C = (np.array([getattr(pose, name) for pose in set_.poses]) for name in "KRC")
     errors, n = measure_cameras(metric.reconstruction, TrueCameras(K, R, C)), metric.reconstruction.registered
     focal = metric.intrinsics[int(np.flatnonzero(n)[0])]["focal_px"]

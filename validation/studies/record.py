@@ -142,6 +142,7 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
             calibration,
             prior=prior_for(projective, config.intrinsics),
             rng=stream(0, "metric", 0),
+            threads=1,
         )
         r = metric.reconstruction
         digests["metric"] = arrays_of([r.P, r.X, r.K, r.inlier, r.registered])

@@ -155,7 +155,7 @@ def solve(
             )
             found.append(
                 config.metric.refine(
-                    projective, calibration, prior=prior, rng=stream(seed, "metric", attempt)
+                    projective, calibration, prior=prior, rng=stream(seed, "metric", attempt), threads=1
                 )
             )
         except StageFailure as failure:

@@ -132,7 +132,7 @@ class CalibrationOverNoise(Task):
         calibration = config.selfcalibration.calibrate(projective, prior=prior, rng=rng)
         K = calibration.K
         if self.bundle:
-            refined = config.metric.refine(projective, calibration, prior=prior, rng=rng)
+            refined = config.metric.refine(projective, calibration, prior=prior, rng=rng, threads=1)
             assert refined.reconstruction.K is not None
             K = refined.reconstruction.K
         judged = projective.registered
