@@ -188,11 +188,11 @@ def test_points_are_chosen_again_by_their_residuals(monkeypatch):
         tracks, scene.sizes, cameras, np.ones(40, bool), scene.X, np.ones(n, bool),
         np.ones(len(tracks.xy), bool), 0.5,
     )  # fmt: skip
-    assert _model.with_precise_points(model, tracks) is model, "few points are all used"
     monkeypatch.setattr(_model, "MAX_OBSERVATIONS", len(tracks.xy) // 4)
     monkeypatch.setattr(_model, "MIN_PER_VIEW", 20)
     few = _model.with_enough_points(model)
-    chosen = _model.with_precise_points(few, tracks)
+    chosen, points = _model.with_precise_points(few, tracks)
+    assert len(points) == chosen.tracks.n_points
 
     def positions(tracks):
         return {tuple(row) for row in tracks.xy.tolist()}

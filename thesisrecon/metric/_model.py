@@ -69,17 +69,15 @@ def with_enough_points(model: MetricEstimate) -> MetricEstimate:
     if len(model.tracks.xy) <= MAX_OBSERVATIONS:
         return model
     length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
-    return _hold_views(model, np.lexsort((-length, ~model.valid)))
+    return restrict_points(model, _points_that_hold(model, np.lexsort((-length, ~model.valid))))
 
 
-def with_precise_points(model: MetricEstimate, tracks: Tracks) -> MetricEstimate:
-    """Choose among all ``tracks`` again, if points were chosen: those with the least residuals first.
+def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
+    """Choose among the points of all ``tracks`` those of the least residuals first; return their numbers.
 
     Where the surface has relief, a corner is not one point of it: what is seen of a joint or an edge changes
     with the direction. That is less than the noise, but the same in every view, and bends long rows of views.
     """
-    if model.tracks.n_points == tracks.n_points:
-        return model
     model = with_tracks(model, tracks)
     t, variance = model.tracks, model.sigma_px**2
     k = np.flatnonzero(model.registered[t.view_index] & model.valid[t.point_index])
@@ -91,11 +89,12 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> MetricEstimate
     count = np.bincount(point, minlength=t.n_points)
     # The mean of the variance under an inverse gamma prior at that of all points, which holds short tracks.
     noise = (total + PRIOR_RESIDUALS * variance) / np.maximum(2 * count - 3 + PRIOR_RESIDUALS, 1)
-    return _hold_views(model, np.argsort(np.where(model.valid, noise, np.inf), kind="stable"))
+    points = _points_that_hold(model, np.argsort(np.where(model.valid, noise, np.inf), kind="stable"))
+    return restrict_points(model, points), points
 
 
-def _hold_views(model: MetricEstimate, order: I64) -> MetricEstimate:
-    """The model with points, tried in ``order``, until every view has enough of them all over its image."""
+def _points_that_hold(model: MetricEstimate, order: I64) -> I64:
+    """Points, tried in ``order``, until every view has enough of them all over its image."""
     t = model.tracks
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
     cell = (t.view_index * CELLS + cell[:, 0]) * CELLS + cell[:, 1]
@@ -105,7 +104,7 @@ def _hold_views(model: MetricEstimate, order: I64) -> MetricEstimate:
     start = np.concatenate([[0], np.cumsum(np.bincount(t.point_index, minlength=t.n_points))])
     keep = np.zeros(t.n_points, dtype=bool)
     choose_points(order, start, cell, needed, keep)
-    return restrict_points(model, np.flatnonzero(keep))
+    return np.flatnonzero(keep)
 
 
 @kernel

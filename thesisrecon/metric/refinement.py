@@ -64,8 +64,8 @@ MIN_CHANGE = 0.002
 START_ROUNDS = 3
 MAX_ROUNDS = 4
 """Final rounds of triangulation and adjustment."""
-PRECISE_ROUNDS = 2
-"""Times that the points of a large set are chosen again; a choice depends on the model before it."""
+PRECISE_ROUNDS, SAME_POINTS = 5, 0.98
+"""Times that the points of a large set are chosen again, at most, and the share that stays at the end."""
 LENS_STD = 0.02
 """Prior standard deviation about 0 of k2 and k3 of a camera with several images."""
 NOISE_FLOOR_PX = 0.02
@@ -211,10 +211,16 @@ def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> Met
 def _adjust_to_precise_points(
     model: MetricEstimate, tracks: Tracks, adjustment: BundleAdjustment
 ) -> MetricEstimate:
-    """Choose the points again, if they were chosen, by the residuals of the adjusted model."""
-    if model.tracks.n_points < tracks.n_points:
-        for _ in range(PRECISE_ROUNDS):
-            model = with_precise_points(adjustment.run(model, iterations=10)[0], tracks)
+    """Choose the points again, if points were chosen, by the residuals of the model adjusted to them."""
+    if model.tracks.n_points == tracks.n_points:
+        return model
+    before = np.empty(0, dtype=np.int64)
+    for _ in range(PRECISE_ROUNDS):
+        model, points = with_precise_points(model, tracks)
+        model = adjustment.run(model, iterations=LAST_ITERATIONS)[0]
+        if len(np.intersect1d(points, before)) >= SAME_POINTS * len(points):
+            break
+        before = points
     return model
 
 

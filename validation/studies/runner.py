@@ -32,6 +32,7 @@ from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_s
 from validation.stamp import stamp
 
 MODULES = {
+    "adjustment-size": "adjustment_size",
     "benchmark-table": "timing",
     "calibration-coverage": "coverage",
     "calibration-real": "calibration_real",
