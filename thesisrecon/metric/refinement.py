@@ -64,8 +64,9 @@ MIN_CHANGE = 0.002
 START_ROUNDS = 3
 MAX_ROUNDS = 4
 """Final rounds of triangulation and adjustment."""
-PRECISE_ROUNDS, SAME_POINTS = 5, 0.98
-"""Times that the points of a large set are chosen again, at most, and the share that stays at the end."""
+PRECISE_ROUNDS, PRECISE_ITERATIONS, SAME_POINTS = 5, 15, 0.98
+"""Times that the points of a large set are chosen again, at most, iterations of each adjustment to them, and
+the share that stays at the end."""
 LENS_STD = 0.02
 """Prior standard deviation about 0 of k2 and k3 of a camera with several images."""
 NOISE_FLOOR_PX = 0.02
@@ -217,7 +218,7 @@ def _adjust_to_precise_points(
     before = np.empty(0, dtype=np.int64)
     for _ in range(PRECISE_ROUNDS):
         model, points = with_precise_points(model, tracks)
-        model = adjustment.run(model, iterations=LAST_ITERATIONS)[0]
+        model = adjustment.run(model, iterations=PRECISE_ITERATIONS)[0]
         if len(np.intersect1d(points, before)) >= SAME_POINTS * len(points):
             break
         before = points
