@@ -1,9 +1,12 @@
 """The documentation site: pages for every exported name, an example on each, every command and setting."""
 
+import ast
 import importlib
+import inspect
 import re
 import shlex
 import sys
+import typing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +17,7 @@ import thesisrecon
 from thesisrecon.config import KINDS
 
 DOCS = Path(__file__).parent.parent / "docs"
+README = DOCS.parent / "README.md"
 EXPORTED = sorted(set(thesisrecon.__all__) - {"__version__"})
 
 
@@ -100,6 +104,28 @@ def test_every_block_of_python_is_run_by_a_test():
         assert Path(page).name in (Path(__file__).parent / test).read_text("utf-8"), page
 
 
+def test_the_calls_of_the_readme_fit_the_functions():
+    """Its names stand for data of the reader, so it cannot run: arguments and named attributes must exist."""
+    [block] = [text for kind, text in CODE.findall(README.read_text("utf-8")) if kind == "python"]
+    lines, attributes, tree = block.splitlines(), 0, ast.parse(block)
+    whole = {getattr(statement, "value", None) for statement in tree.body}
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    calls = [call for call in calls if ast.unparse(call.func).startswith("thesisrecon.")]
+    for call in calls:
+        function = getattr(thesisrecon, call.func.attr)
+        inspect.signature(function).bind(*call.args, **{keyword.arg: None for keyword in call.keywords})
+        if call not in whole:
+            continue
+        made = function if isinstance(function, type) else typing.get_type_hints(function)["return"]
+        comment = lines[call.end_lineno - 1].partition("  # ")[2]
+        for name in re.findall(r"(?:^|[ ;,])\.(\w+)", comment):
+            fields = getattr(made, "__dataclass_fields__", {})
+            assert name in fields or hasattr(made, name), f"{call.func.attr}: .{name}"
+            attributes += 1
+    assert len(calls) >= 15
+    assert attributes >= 15
+
+
 def test_lines_of_code_fit_the_page():
     made = {DOCS / "development" / "architecture.md", DOCS / "evidence" / "scaling.md"}
     long = [
@@ -131,7 +157,7 @@ def test_commands_of_the_pages_exist(site):
 
     sections = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", site("interface").command_page(), re.M | re.S))
     shipped, tried = {file.stem for file in STUDIES.glob("*.toml")}, 0
-    for path in [*PAGES, DOCS.parent / "README.md"]:
+    for path in [*PAGES, README]:
         for program, *words in commands_of(path.read_text("utf-8")):
             where = f"{path.name}: {' '.join([program, *words])}"
             options = [word.split("=")[0] for word in words if re.match("--?[a-z]", word)]
