@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics import _levenberg_marquardt, _metric_kernels, _schur
+from thesisrecon.numerics import _block_scatter, _levenberg_marquardt, _metric_kernels, _schur
 from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
 from thesisrecon.numerics._block_scatter import _gram_matrix, block_scatter
@@ -20,6 +20,7 @@ from thesisrecon.numerics._noise import huber
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting, sort_observations
 from thesisrecon.numerics._schur import BundleSystem, build_layout
 from thesisrecon.numerics._small_solvers import floored_diagonal
+from validation.scenes.streets import make_walk
 
 
 def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):
@@ -357,6 +358,32 @@ def test_noise_that_neighbours_share_is_seen():
 def test_the_gram_matrix_of_sparse_rows_is_that_of_dense_ones():
     A = scipy.sparse.random_array((300, 40), density=0.2, format="csr", rng=np.random.default_rng(0))
     np.testing.assert_array_equal(_gram_matrix(A), (A.T @ A).toarray())
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_the_scatter_of_a_street_is_that_of_dense_information(monkeypatch, own):
+    rng, views = np.random.default_rng(0), 120
+    walk = make_walk(views, "street", rng)
+    cameras, free = walk.cameras, np.array([True, False, False, False, False, True])
+    if own:
+        cameras = replace(
+            cameras, intrinsics=np.tile(cameras.intrinsics, (views, 1)), group=np.arange(views), shared=None
+        )
+    prior = IntrinsicsPrior.unshared(
+        cameras.intrinsics, np.tile([100.0, 0, 0, 0, 0, 0.1], (len(cameras.intrinsics), 1))
+    )
+    options = BundleOptions(sigma_px=0.5, loss_px=1.0, max_iterations=15)
+    fit = refine_metric_bundle(cameras, walk.X, walk.seen, free=free, prior=prior, options=options)
+    monkeypatch.setattr(_block_scatter, "_MANY", 100)
+    found = []
+    for share in (0.0, 0.5):
+        monkeypatch.setattr(_block_scatter, "_SPARSE", share)
+        found.append(block_scatter(fit.cameras, fit.X, walk.seen, free=free, prior=prior, noise=(0.5, 1.0)))
+    dense, sparse = found
+    np.testing.assert_allclose(sparse.variance, dense.variance, rtol=1e-5)
+    np.testing.assert_allclose(sparse.shared_variance, dense.shared_variance, rtol=1e-5)
+    np.testing.assert_allclose(sparse.ratio, dense.ratio, rtol=1e-4)
+    assert sparse.overdispersion == pytest.approx(dense.overdispersion, rel=1e-4)
 
 
 def test_large_information_is_inverted_like_small(monkeypatch):

@@ -6,6 +6,7 @@ and lenses beyond the model make gradients summed by parts larger than independe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from thesisrecon.arrays import B8, F64, I32, I64
 from thesisrecon.geometry._conditioning import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.kernels import kernel
-from thesisrecon.numerics._covariance import gauge_directions, invert_in_inner_gauge
+from thesisrecon.numerics._covariance import fixed_coordinates, gauge_directions, invert_in_inner_gauge
 from thesisrecon.numerics._intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting
@@ -23,6 +24,11 @@ from thesisrecon.numerics._observations import Jacobians, Observations, Weightin
 # Number of pose unknowns tested besides all intrinsics.
 _MAX_POSES = 30
 _MAX_BLOCKS, _MIN_BLOCK_POINTS = 32, 12
+# Unknowns, and the share of pairs of views with a common point, up to which the information is sparse.
+_MANY, _SPARSE = 1200, 0.2
+
+_Solve = Callable[[F64], F64]
+"""B -> C B for the covariance C, which is dense even if the information is sparse."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +92,8 @@ def block_scatter(
     With S_b the information of block b on the cameras (its points eliminated), g_b its gradient and C the
     covariance, the pull of a block on value a is c_a' g_b; without correlation between blocks sum (c_a'
     g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a, and the ratio of the two is 1. Huber's loss
-    weights as if its weight were its slope; the ratio of their means corrects the covariance. The matrix of
-    all cameras is dense: for a few hundred of them.
+    weights as if its weight were its slope; the ratio of their means corrects the covariance. Where most
+    views have no common point, as in a street, the information stays sparse.
     """
     o, group = observations, cameras.group
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
@@ -99,24 +105,39 @@ def block_scatter(
     frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
     place = np.where(observed, np.cumsum(observed) - 1, -1)
     system = _linearise(frame, scale * (X - origin), o, (values, place), noise)
-    S = _gram_matrix(system.J) - _gram_matrix(system.taken)
-    S[first:, first:] += values.terms.information(values.size)
-    C = _covariance(S, frame, views)
+    S = _information(system, values.terms.information(values.size), o, len(views))
+    solve = _covariance(S, frame, views)
     poses = np.arange(0, first, max(first // _MAX_POSES, 1))
-    tested = np.concatenate([poses, np.arange(first, len(C))])
+    tested = np.concatenate([poses, np.arange(first, S.shape[0])])
+    rows = solve(np.eye(S.shape[0])[:, tested]).T
     block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
-    ratio = curvature * _block_ratio(system, C[tested], C, block)
-    alone = curvature * _point_ratio(system, C[tested])
+    ratio = curvature * _block_ratio(system, rows, solve, block)
+    alone = curvature * _point_ratio(system, rows)
     valid = np.isfinite(ratio) & (alone > 0.0)
     estimated, number = values.number >= 0, values.number
+    variance = np.diag(rows[len(poses) :, first:])
     return BlockScatter(
-        np.where(estimated, np.diag(C)[np.where(estimated, first + number, 0)], 0.0),
-        _shared_variances(S, C, values, frame, views),
+        np.append(variance, 0.0)[np.where(estimated, number, -1)],
+        _shared_variances(S, variance, values, frame, views),
         np.where(estimated, ratio[np.where(estimated, len(poses) + number, 0)], np.nan),
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )
+
+
+def _information(
+    system: _Linearised, prior: F64, o: Observations, n_views: int
+) -> F64 | scipy.sparse.csc_matrix:
+    """Return the information (D, D) of the cameras, sparse if most views have no common point."""
+    D, size = system.J.shape[1], len(prior)
+    seen = scipy.sparse.csr_matrix((np.ones(len(o.xy)), (o.view_index, o.point_index)))
+    if D <= _MANY or (seen @ seen.T).nnz > _SPARSE * n_views**2:
+        S = _gram_matrix(system.J) - _gram_matrix(system.taken)
+        S[D - size :, D - size :] += prior
+        return S
+    both = scipy.sparse.block_diag([scipy.sparse.csc_matrix((D - size, D - size)), prior])
+    return scipy.sparse.csc_matrix(system.J.T @ system.J - system.taken.T @ system.taken + both)
 
 
 def _gram_matrix(A: scipy.sparse.csr_matrix) -> F64:
@@ -180,33 +201,65 @@ def _orthonormal(B: F64, point: I64, n: int) -> F64:
     return np.asarray(B @ (U * root[:, None])[point])
 
 
-def _covariance(S: F64, cameras: MetricCameras, views: I64) -> F64:
+def _covariance(S: F64 | scipy.sparse.csc_matrix, cameras: MetricCameras, views: I64) -> _Solve:
     """Return the inverse of S without the gauge freedoms."""
-    poses = gauge_directions(cameras.R[views], cameras.t[views])
-    N = np.zeros((len(S), poses.shape[1]))
+    R, t = cameras.R[views], cameras.t[views]
+    poses = gauge_directions(R, t)
+    N = np.zeros((S.shape[0], poses.shape[1]))
     N[: len(poses)] = poses
-    return invert_in_inner_gauge(S, N)
+    if isinstance(S, np.ndarray):
+        C = invert_in_inner_gauge(S, N)
+        return lambda B: C @ B
+    fixed, (first, far, line) = scipy.sparse.lil_matrix(S.shape), fixed_coordinates(R, t)
+    fixed[first, first] = np.eye(POSE_DOF)
+    fixed[far, far] = line
+    weight = float(np.median(S.diagonal()))
+    factor = scipy.sparse.linalg.splu(
+        scipy.sparse.csc_matrix(S + weight * fixed),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    # Baarda's S-transformation from the fixed coordinates to the inner gauge.
+    return lambda B: _without(N, factor.solve(_without(N, B)))
 
 
-def _shared_variances(S: F64, C: F64, values: IntrinsicUnknowns, cameras: MetricCameras, views: I64) -> F64:
-    """Return the variances (C,) of the intrinsics if all cameras were one, from S and its inverse C."""
-    first, width = len(S) - values.size, values.number.shape[1]
+def _without(N: F64, B: F64) -> F64:
+    """Return the part of B (D, m) orthogonal to the orthonormal N (D, n)."""
+    return np.asarray(B - N @ (N.T @ B))
+
+
+def _shared_variances(
+    S: F64 | scipy.sparse.csc_matrix,
+    variance: F64,
+    values: IntrinsicUnknowns,
+    cameras: MetricCameras,
+    views: I64,
+) -> F64:
+    """Return the variances (C,) of the intrinsics if all cameras were one, from S and those of each value."""
+    first, width = S.shape[0] - values.size, values.number.shape[1]
     column = values.column[: values.n_table]
     if values.size == len(np.unique(column)):
         variances = np.zeros(width)
-        variances[column] = np.diag(C)[first:]
+        variances[column] = variance
         return variances
-    T = np.zeros((len(S), first + width))
-    T[np.arange(first), np.arange(first)] = 1.0
-    T[first + np.arange(values.n_table), first + column] = 1.0
-    moves = np.concatenate([np.ones(first, dtype=bool), np.isin(np.arange(width), column)])
-    together = _covariance(T[:, moves].T @ S @ T[:, moves], cameras, views)
-    shared = np.zeros(T.shape[1])
-    shared[moves] = np.diag(together)
-    return shared[first:]
+    used = np.unique(column)
+    place = np.searchsorted(used, column)
+    T = scipy.sparse.csc_matrix(
+        (
+            np.ones(first + values.n_table),
+            (np.arange(first + values.n_table), np.concatenate([np.arange(first), first + place])),
+        ),
+        (S.shape[0], first + len(used)),
+    )
+    together = T.T @ S @ T
+    solve = _covariance(together if scipy.sparse.issparse(S) else np.asarray(together), cameras, views)
+    shared = np.zeros(width)
+    shared[used] = np.diag(solve(np.eye(first + len(used))[:, first:])[first:])
+    return shared
 
 
-def _block_ratio(system: _Linearised, rows: F64, C: F64, block: I64) -> F64:
+def _block_ratio(system: _Linearised, rows: F64, solve: _Solve, block: I64) -> F64:
     """Squared pulls of the blocks on ``rows`` of C over sum C (S_b - S_b C S_b) C, their expectation."""
     squares, expected = np.zeros(len(rows)), np.zeros(len(rows))
     of_residual, of_point = block[system.point], np.repeat(block, 3)
@@ -214,7 +267,7 @@ def _block_ratio(system: _Linearised, rows: F64, C: F64, block: I64) -> F64:
         here = np.flatnonzero(of_residual == b)
         J, taken = system.J[here], system.taken[np.flatnonzero(of_point == b)]
         half = (J.T @ (J @ rows.T) - taken.T @ (taken @ rows.T)).T
-        expected += np.sum(half * rows, axis=1) - np.sum((half @ C) * half, axis=1)
+        expected += np.sum(half * rows, axis=1) - np.sum(solve(half.T).T * half, axis=1)
         squares += (rows @ (J.T @ system.residual[here])) ** 2
     return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
 

@@ -151,13 +151,24 @@ def _band_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) 
 def _fix_gauge(reduced: ReducedSystem, R: F64, t: F64) -> None:
     """Add weight to seven coordinates: one pose, and the distance to the farthest camera."""
     sums, C = reduced.sums, reduced.sums.border.shape[1]
+    diagonal = (reduced.row == reduced.column).nonzero()[0]
+    weight = float(np.median(sums.blocks[diagonal][:, np.arange(C), np.arange(C)]))
+    _, moved, line = fixed_coordinates(R, t)
+    sums.blocks[diagonal[0], np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
+    sums.blocks[diagonal[moved.start // POSE_DOF], 3:6, 3:6] += weight * line
+
+
+def fixed_coordinates(R: F64, t: F64) -> tuple[slice, slice, F64]:
+    """Return the columns of the first pose, and of the translation of the farthest, with its direction.
+
+    Seven coordinates without a gauge freedom: a pose, and the distance to another camera, whose direction is
+    given as the outer product (3, 3) of a unit vector.
+    """
     centres = -np.einsum("vba,vb->va", R, t)
     far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
     line = R[far] @ (centres[far] - centres[0])
-    diagonal = (reduced.row == reduced.column).nonzero()[0]
-    weight = float(np.median(sums.blocks[diagonal][:, np.arange(C), np.arange(C)]))
-    sums.blocks[diagonal[0], np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
-    sums.blocks[diagonal[far], 3:6, 3:6] += weight * np.outer(line, line) / max(float(line @ line), 1e-300)
+    direction = np.outer(line, line) / max(float(line @ line), 1e-300)
+    return slice(0, POSE_DOF), slice(POSE_DOF * far + 3, POSE_DOF * far + 6), direction
 
 
 def _gauge_basis(reduced: ReducedSystem, R: F64, t: F64) -> F64:
