@@ -109,7 +109,7 @@ def block_scatter(
     solve = _covariance(S, frame, views)
     poses = np.arange(0, first, max(first // _MAX_POSES, 1))
     tested = np.concatenate([poses, np.arange(first, S.shape[0])])
-    rows = solve(np.eye(S.shape[0])[:, tested]).T
+    rows = solve(_unit_columns(S.shape[0], tested)).T
     block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
     ratio = curvature * _block_ratio(system, rows, solve, block)
@@ -224,6 +224,13 @@ def _covariance(S: F64 | scipy.sparse.csc_matrix, cameras: MetricCameras, views:
     return lambda B: _without(N, factor.solve(_without(N, B)))
 
 
+def _unit_columns(size: int, index: I64) -> F64:
+    """Return the columns ``index`` of the identity, which would itself be dense."""
+    columns = np.zeros((size, len(index)))
+    columns[index, np.arange(len(index))] = 1.0
+    return columns
+
+
 def _without(N: F64, B: F64) -> F64:
     """Return the part of B (D, m) orthogonal to the orthonormal N (D, n)."""
     return np.asarray(B - N @ (N.T @ B))
@@ -255,7 +262,7 @@ def _shared_variances(
     together = T.T @ S @ T
     solve = _covariance(together if scipy.sparse.issparse(S) else np.asarray(together), cameras, views)
     shared = np.zeros(width)
-    shared[used] = np.diag(solve(np.eye(first + len(used))[:, first:])[first:])
+    shared[used] = np.diag(solve(_unit_columns(first + len(used), first + np.arange(len(used))))[first:])
     return shared
 
 

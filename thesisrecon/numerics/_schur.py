@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
@@ -77,7 +77,7 @@ class BundleLayout:
 
     def map_chunks(self, work: Callable[[int], Answer]) -> list[Answer]:
         """Return work(n) of every chunk n."""
-        chunks: Iterable[int] = range(len(self.chunks))
+        chunks = range(len(self.chunks))
         if min(self.threads, len(self.chunks)) == 1:
             return [work(n) for n in chunks]
         with ThreadPoolExecutor(self.threads) as pool:
