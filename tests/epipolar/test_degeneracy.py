@@ -152,8 +152,8 @@ def test_a_pure_rotation_does_not_determine_f(outliers):
 
 
 def test_few_matches_do_not_determine_f():
-    pair = make_pair(8, np.random.default_rng(0))
-    xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.5, outliers=0.0)
+    pair = make_pair(8, np.random.default_rng(1))
+    xy1, xy2, _ = spoil(pair, np.random.default_rng(1), sigma=0.5, outliers=0.0)
     for fit, words in (
         (estimate_fundamental(xy1, xy2), "matches off the dominant plane"),
         (estimate_fundamental(xy1[:7], xy2[:7], method="seven-point"), "7 matches leave none"),

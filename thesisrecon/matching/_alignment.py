@@ -36,7 +36,7 @@ MIN_WINDOW_CORRELATION = 0.3
 # Minimum det / product of the diagonal of the normal matrix: structure in one direction gives no position.
 MIN_CONDITION = 1e-4
 # Squared step in pixels of the scale at which the iteration stops.
-SETTLED = 1e-6
+SETTLED = 1e-4
 ITERATIONS = 12
 # Maximum distance of aligned matches from their corners, in pixels of the corner's scale.
 MAX_SHIFT = 3.0

@@ -43,6 +43,8 @@ DECIDING_SEEDS = 100
 RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
 # Pairs with a wide step have few seeds, whose maps are known to a fifth and positions to a few pixels.
 OBLIQUE_NEIGHBOURS, SEED_AFFINE_STD, GROWN_AFFINE_STD, SEED_SHIFT = 3, 0.2, 0.1, 5.0
+# Share of the corners of image 1 whose matches give maps dense enough not to match again.
+EXPLAINED = 1.0 / 3.0
 # Rounds of least squares of a local map: the first unweighted, the others reweighted.
 ROUNDS = 3
 # Weight of the prior of a local map, relative to the neighbours' weights along one direction.
@@ -301,7 +303,8 @@ class SeedsAndGrowth:
     coarse_first : bool
         Match the corners of the coarser scale first; they give a better F for all.
     rematch : bool
-        Repeat the guided matching with the F and the maps of its own matches.
+        Repeat the guided matching with the F and the maps of its own matches, unless these are a third of the
+        corners.
     align : bool
         Align positions in image 2 by least-squares matching, else keep the corners.
     oblique_pairs : int
@@ -425,18 +428,19 @@ class SeedsAndGrowth:
         estimate: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match the corners of the coarser scale, then all twice, guided by the previous matches."""
-        known, F = start
+        """Match the corners of the coarser scale, then all, guided by the previous matches.
+
+        All are matched again if the first time leaves most unmatched.
+        """
         scale = view1.features.scale
         everything = np.arange(len(scale))
-        rounds = [np.flatnonzero(scale > scale.min())] if self.coarse_first else []
-        rounds += [everything] * (1 + self.rematch)
-        for chosen in rounds[:-1]:
-            grown = self._grow(view1, view2, chosen, known, F)
-            if len(grown.xy1) < 8:
-                continue
-            known, F = _verified(grown, estimate, rng) or (known, F)
-        return self._grow(view1, view2, everything, known, F)
+        if self.coarse_first:
+            grown = self._grow(view1, view2, np.flatnonzero(scale > scale.min()), *start)
+            start = _verified(grown, estimate, rng) or start
+        grown = self._grow(view1, view2, everything, *start)
+        if not self.rematch or len(grown.xy1) >= EXPLAINED * len(scale):
+            return grown
+        return self._grow(view1, view2, everything, *(_verified(grown, estimate, rng) or start))
 
     def _grow(
         self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, F: F64
@@ -465,6 +469,8 @@ def _verified(
     matches: Matches, estimate: EstimateFundamental, rng: np.random.Generator
 ) -> tuple[Matches, F64] | None:
     """The matches that agree with one F, and F; None if no F is found."""
+    if len(matches.xy1) < 8:
+        return None
     try:
         fit = estimate(matches.xy1, matches.xy2, rng)
     except StageFailure:

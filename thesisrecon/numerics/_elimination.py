@@ -2,8 +2,8 @@
 
 A Jacobian has columns A of its view, E that views have in common, and B of its point. The reduced system has
 blocks for pairs of views with a common point, a border between views and common columns, and a corner. With
-V = sum B'B + damping = L L' of one point, B~ = B L^-T and W = B~' A (3 x C), the block of two observations is
-delta_kl A_k' A_l - W_k' W_l.
+V = sum B'B + damping = L L' of one point, B~ = B L^-T, Q_kl = delta_kl I - B~_k B~_l' (2 x 2) and W = B~' A
+(3 x C), the block of two observations is S_kl = A_k' Q_kl A_l = delta_kl A_k' A_k - W_k' W_l.
 """
 
 from __future__ import annotations
@@ -66,6 +66,14 @@ class _Elimination(NamedTuple):
     g: F64
 
 
+class _ByView(NamedTuple):
+    """Observations ``order`` of free views by view; block of the view and end of the point of each (k,)."""
+
+    order: I64
+    block: I64
+    end: I64
+
+
 @kernel
 def eliminate_points(
     first: int,
@@ -126,34 +134,35 @@ def _sum_points(
                 t = left.Bt[k - left.first, i]
                 t[0], t[1], t[2] = t0, t1, t2
                 left.residual[k - left.first, i] = J.residual[k, i] - t0 * g0 - t1 * g1 - t2 * g2
-            _project(left.Bt[k - left.first], J.A[k], left.W[k - left.first])
-
-
-@kernel(inline="always", fastmath={"contract"}, forceinline=True)
-def _project(Bt: F64, A: F64, W: F64) -> None:
-    """Compute W = B~' A (3, C)."""
-    for a in range(3):
-        for c in range(A.shape[1]):
-            W[a, c] = Bt[0, a] * A[0, c] + Bt[1, a] * A[1, c]
+            if J.A.shape[2] == 6:
+                o = k - left.first
+                for i in range(3):
+                    t0, t1 = left.Bt[o, 0, i], left.Bt[o, 1, i]
+                    for c in range(6):
+                        left.W[o, i, c] = t0 * J.A[k, 0, c] + t1 * J.A[k, 1, c]
 
 
 @kernel
-def _sort_by_view(first: int, last: int, index: BlockIndex, order: I64, end: I64) -> int:
-    """Fill the observations of free views by view, and the end of the point of each; return how many."""
-    next_of, base = zeros(len(index.pair) + 1, np.int64), index.start[first]
+def _sort_by_view(first: int, last: int, index: BlockIndex) -> _ByView:
+    """Sort the observations of a range of points; those of one view stay in their order."""
+    base = index.start[first]
+    n = index.start[last] - base
+    order, end, block = empty(n, np.int64), empty(n, np.int64), empty(n, np.int64)
+    next_of = zeros(len(index.pair) + 1, np.int64)
     for j in range(first, last):
         for k in range(index.start[j], index.start[j + 1]):
-            end[k - base] = index.start[j + 1]
-            next_of[index.block[index.view_index[k]] + 1] += 1
+            b = index.block[index.view_index[k]]
+            end[k - base], block[k - base] = index.start[j + 1], b
+            next_of[b + 1] += 1
     next_of[0] = 0
     for b in range(len(index.pair)):
         next_of[b + 1] += next_of[b]
-    for k in range(base, index.start[last]):
-        b = index.block[index.view_index[k]]
+    for k in range(n):
+        b = block[k]
         if b >= 0:
-            order[next_of[b]] = k
+            order[next_of[b]] = base + k
             next_of[b] += 1
-    return next_of[len(index.pair) - 1] if len(index.pair) > 0 else 0
+    return _ByView(order[: next_of[len(index.pair) - 1] if len(index.pair) > 0 else 0], block, end)
 
 
 @kernel(forceinline=True)
@@ -164,14 +173,10 @@ def _add_views(
 
     View by view: the blocks of one stay in the cache.
     """
-    C, n = J.A.shape[2], index.start[last] - left.first
-    order, end, block = empty(n, np.int64), empty(n, np.int64), empty(n, np.int64)
-    total = _sort_by_view(first, last, index, order, end)
-    for i in range(n):
-        block[i] = index.block[index.view_index[left.first + i]]
-    for i in range(total):
-        k, o = order[i], order[i] - left.first
-        v = block[o]
+    C, by_view = J.A.shape[2], _sort_by_view(first, last, index)
+    for k in by_view.order:
+        o = k - left.first
+        v = by_view.block[o]
         r0, r1 = J.residual[k, 0], J.residual[k, 1]
         t0, t1 = left.residual[o, 0], left.residual[o, 1]
         for a in range(C):
@@ -180,38 +185,56 @@ def _add_views(
             sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
             sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
     if C == 6:
-        _add_products_of_six(left.first, total, order, end, block, index.pair, J.A, left.W, sums.blocks)
+        _add_blocks_of_six(left.first, by_view, index.pair, J.A, left.W, sums.blocks)
     else:
-        _add_products(left.first, total, order, end, block, index.pair, J.A, left.W, sums.blocks)
+        _add_blocks(left.first, by_view, index.pair, J.A, left.Bt, sums.blocks)
 
 
-@kernel(fastmath={"contract"})
-def _add_products(
-    first: int, total: int, order: I64, end: I64, block: I64, pair: I64, A: F64, W: F64, blocks: F64
-) -> None:
-    """Add A_k' A_k - W_k' W_m of each observation k and the later ones m of its point to their blocks.
+@kernel(fastmath={"contract"}, forceinline=True)
+def _add_blocks(first: int, by_view: _ByView, pair: I64, A: F64, Bt: F64, blocks: F64) -> None:
+    """Add A_k' Q_km A_m of each observation k and the later ones m of its point to their blocks.
 
     Those of two observations of one view are transposed too.
     """
-    for i in range(total):
+    order, block, end = by_view
+    for i in range(len(order)):
         k = order[i] - first
         v = block[k]
-        _add_gram(blocks[pair[v, v]], A[order[i]])
         for m in range(k, end[k] - first):
             w = block[m]
             if w < 0:
                 continue
-            _subtract_product(blocks[pair[v, w]], W[k], W[m])
-            if m > k and v == w:
-                _subtract_product(blocks[pair[v, w]], W[m], W[k])
+            same = 1.0 if m == k else 0.0
+            q00 = same - Bt[k, 0, 0] * Bt[m, 0, 0] - Bt[k, 0, 1] * Bt[m, 0, 1] - Bt[k, 0, 2] * Bt[m, 0, 2]
+            q01 = -Bt[k, 0, 0] * Bt[m, 1, 0] - Bt[k, 0, 1] * Bt[m, 1, 1] - Bt[k, 0, 2] * Bt[m, 1, 2]
+            q10 = -Bt[k, 1, 0] * Bt[m, 0, 0] - Bt[k, 1, 1] * Bt[m, 0, 1] - Bt[k, 1, 2] * Bt[m, 0, 2]
+            q11 = same - Bt[k, 1, 0] * Bt[m, 1, 0] - Bt[k, 1, 1] * Bt[m, 1, 1] - Bt[k, 1, 2] * Bt[m, 1, 2]
+            n = pair[v, w]
+            _add_block(blocks, n, A, first + k, first + m, (q00, q01, q10, q11))
+            if v == w and m > k:
+                _add_block(blocks, n, A, first + m, first + k, (q00, q10, q01, q11))
 
 
-@kernel(fastmath={"contract"})
-def _add_products_of_six(
-    first: int, total: int, order: I64, end: I64, block: I64, pair: I64, A: F64, W: F64, blocks: F64
-) -> None:
-    """:func:`_add_products` for C = 6, the width of most adjustments: three times as fast."""
-    for i in range(total):
+@kernel(inline="always", fastmath={"contract"}, forceinline=True)
+def _add_block(blocks: F64, n: int, A: F64, k: int, m: int, Q: tuple[float, float, float, float]) -> None:
+    """Add A_k' Q A_m to block n."""
+    q00, q01, q10, q11 = Q
+    for a in range(blocks.shape[1]):
+        p0 = A[k, 0, a] * q00 + A[k, 1, a] * q10
+        p1 = A[k, 0, a] * q01 + A[k, 1, a] * q11
+        for b in range(blocks.shape[2]):
+            blocks[n, a, b] += p0 * A[m, 0, b] + p1 * A[m, 1, b]
+
+
+@kernel(fastmath={"contract"}, forceinline=True)
+def _add_blocks_of_six(first: int, by_view: _ByView, pair: I64, A: F64, W: F64, blocks: F64) -> None:
+    """:func:`_add_blocks` for C = 6, the width of most adjustments, as A_k' A_k - W_k' W_m.
+
+    More products, but three times as fast: rows are read before they are written, so that the compiler makes
+    vectors of them.
+    """
+    order, block, end = by_view
+    for i in range(len(order)):
         k = order[i] - first
         v = block[k]
         _add_gram_of_six(blocks, pair[v, v], A, order[i])
@@ -221,10 +244,7 @@ def _add_products_of_six(
                 continue
             _subtract_product_of_six(blocks, pair[v, w], W, k, m)
             if m > k and v == w:
-                _subtract_product(blocks[pair[v, w]], W[m], W[k])
-
-
-# Rows are read before they are written, so that the compiler makes vectors of them.
+                _subtract_product_of_six(blocks, pair[v, w], W, m, k)
 
 
 @kernel(inline="always", fastmath={"contract"}, forceinline=True)
@@ -257,25 +277,6 @@ def _add_gram_of_six(blocks: F64, n: int, A: F64, k: int) -> None:
         s4, s5 = blocks[n, a, 4] + p * x4 + q * y4, blocks[n, a, 5] + p * x5 + q * y5
         blocks[n, a, 0], blocks[n, a, 1], blocks[n, a, 2] = s0, s1, s2
         blocks[n, a, 3], blocks[n, a, 4], blocks[n, a, 5] = s3, s4, s5
-
-
-@kernel(inline="always", fastmath={"contract"}, forceinline=True)
-def _subtract_product(S: F64, left: F64, right: F64) -> None:
-    """Subtract left' right of left, right (3, C) from S (C, C)."""
-    C = S.shape[0]
-    for a in range(C):
-        p, q, r = left[0, a], left[1, a], left[2, a]
-        for c in range(C):
-            S[a, c] -= p * right[0, c] + q * right[1, c] + r * right[2, c]
-
-
-@kernel(inline="always", fastmath={"contract"}, forceinline=True)
-def _add_gram(S: F64, A: F64) -> None:
-    """Add A'A of A (2, C) to S (C, C)."""
-    C = S.shape[0]
-    for a in range(C):
-        for c in range(C):
-            S[a, c] += A[0, a] * A[0, c] + A[1, a] * A[1, c]
 
 
 @kernel
