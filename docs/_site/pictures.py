@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import ast
 import os
-import runpy
-import shutil
-import tempfile
 from pathlib import Path
 
+from _site import overview
 from _site.code import ROOT
 
 BLUE, RED, GREY = "#2b6cb0", "#c53030", "#555555"
@@ -166,25 +164,6 @@ def save(figure, path: Path) -> None:
     plt.close(figure)
 
 
-def make_overview(path: Path) -> None:
-    """Reconstruct the six images of the courtyard and draw input, cameras with points, and the model."""
-    import numpy as np
-    from PIL import Image
-
-    import thesisrecon
-
-    images = ROOT / "fixtures" / "courtyard" / "images"
-    script = runpy.run_path(str(ROOT / "scripts" / "make_overview"))
-    with tempfile.TemporaryDirectory() as folder:
-        result = thesisrecon.reconstruct(images, folder, max_size=480, until="model")
-        cameras = list(result.cameras.values())
-        middle = cameras[len(cameras) // 2]
-        pinhole = thesisrecon.Camera(middle.K, middle.R, middle.t, middle.size)
-        view = thesisrecon.render(result.mesh, pinhole.scaled(560 / middle.size[0]))
-        rgb = np.where(view.valid[..., None], view.color, 255).astype(np.uint8)
-        script["write_overview"](Path(folder), images, Image.fromarray(rgb), path)
-
-
 DRAWINGS = {
     "axes.png": draw_axes,
     "pixels.png": draw_pixels,
@@ -194,17 +173,17 @@ DRAWINGS = {
 
 
 def make_all(app) -> None:
-    """Make the pictures that do not exist yet; without the tutorial, the overview is that of the README."""
+    """Make the pictures; without the tutorial, the first page shows the input images only."""
     folder = Path(app.srcdir) / "pictures"
     folder.mkdir(exist_ok=True)
     for name, draw in DRAWINGS.items():
         draw(folder / name)
-    overview, made = folder / "overview.jpg", folder / ".overview-of-the-code"
+    whole, made = folder / "overview.jpg", folder / ".overview-of-the-code"
     if os.environ.get("DOCS_GALLERY") == "0":
-        if not overview.is_file():
-            shutil.copy(ROOT / "docs" / "overview.jpg", overview)
+        if not whole.is_file():
+            overview.draw_input().save(whole)
     elif not made.is_file():
-        make_overview(overview)
+        overview.draw_overview(whole)
         made.touch()
 
 

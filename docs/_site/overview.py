@@ -1,26 +1,25 @@
-#!/usr/bin/env python3
-"""Make docs/overview.jpg from a finished run: `scripts/make_overview RUN IMAGES FRAME [-o FILE]`.
-
-Three panels: four of the input images, the cameras with the points, and FRAME, an image of the model that
-`thesisrecon render` made.
-"""
+"""The picture of the first page: input images, cameras with points, and the model of the courtyard."""
 
 from __future__ import annotations
 
-import argparse
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from PIL import Image, ImageDraw
 
+from _site.code import ROOT
+
+IMAGES = ROOT / "fixtures" / "courtyard" / "images"
 HEIGHT, GAP = 420, 12
 WHITE = (255, 255, 255)
 
 
-def input_panel(images: list[Path]) -> Image.Image:
+def draw_input() -> Image.Image:
     """Four images in a 2 x 2 grid."""
+    images = sorted(IMAGES.glob("*.jpg"))
     chosen = [images[round(k * (len(images) - 1) / 3)] for k in range(4)]
     height = (HEIGHT - GAP) // 2
     tiles = [Image.open(path).convert("RGB") for path in chosen]
@@ -76,33 +75,23 @@ def scene_panel(run: Path, width: int) -> Image.Image:
     return panel
 
 
-def main() -> None:
-    """Write the picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("images", type=Path)
-    parser.add_argument("frame", type=Path)
-    parser.add_argument(
-        "-o", "--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs" / "overview.jpg"
-    )
-    options = parser.parse_args()
-    write_overview(options.run, options.images, Image.open(options.frame).convert("RGB"), options.out)
+def draw_overview(path: Path) -> None:
+    """Reconstruct the six images and write the three panels side by side."""
+    import thesisrecon
 
-
-def write_overview(run: Path, images: Path, frame: Image.Image, out: Path) -> None:
-    """Write the three panels side by side."""
-    panels = [
-        input_panel(sorted(images.glob("*.jpg"))),
-        scene_panel(run, 560),
-        frame.resize((round(HEIGHT * frame.width / frame.height), HEIGHT)),
-    ]
+    with tempfile.TemporaryDirectory() as folder:
+        result = thesisrecon.reconstruct(IMAGES, folder, max_size=480, until="model")
+        scene = scene_panel(Path(folder), 560)
+    cameras = list(result.cameras.values())
+    middle = cameras[len(cameras) // 2]
+    pinhole = thesisrecon.Camera(middle.K, middle.R, middle.t, middle.size)
+    view = thesisrecon.render(result.mesh, pinhole.scaled(560 / middle.size[0]))
+    frame = Image.fromarray(np.where(view.valid[..., None], view.color, 255).astype(np.uint8))
+    frame = frame.resize((round(HEIGHT * frame.width / frame.height), HEIGHT))
+    panels = [draw_input(), scene, frame]
     picture = Image.new("RGB", (sum(p.width for p in panels) + GAP * (len(panels) - 1), HEIGHT), WHITE)
     at = 0
     for panel in panels:
         picture.paste(panel, (at, 0))
         at += panel.width + GAP
-    picture.save(out, quality=82)
-
-
-if __name__ == "__main__":
-    main()
+    picture.save(path, quality=82)
