@@ -218,10 +218,11 @@ def _refit(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8
 
 def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
     """Return squared reprojection residuals (B, M), inf on or behind the principal plane."""
-    xh = np.einsum("bij,mj->bmi", P, X)
+    xh = (P.reshape(-1, 4) @ X.T).reshape(len(P), 3, -1)
+    x, y, depths = xh[:, 0], xh[:, 1], xh[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=-1)
-    return np.where((xh[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
+        squared = (x / depths - xy[:, 0]) ** 2 + (y / depths - xy[:, 1]) ** 2
+    return np.where((depths > 0) & np.isfinite(squared), squared, np.inf)
 
 
 def resect_calibrated(
@@ -241,17 +242,8 @@ def resect_calibrated(
     if len(R) == 0:
         return None
     scored = rng.choice(len(X), 500, replace=False) if len(X) > 500 else np.arange(len(X))
-    cost = np.minimum(_squared_of_poses(R, t, X[scored], normalized[scored]) / threshold**2, 1.0).sum(axis=1)
-    best = int(cost.argmin())
-    return (
-        R[best],
-        t[best],
-        _squared_of_poses(R[best : best + 1], t[best : best + 1], X, normalized)[0] < threshold**2,
-    )
-
-
-def _squared_of_poses(R: F64, t: F64, X: F64, xy: F64) -> F64:
-    Y = np.einsum("cij,mj->cmi", R, X) + t[:, None]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        squared = np.sum((Y[..., :2] / Y[..., 2:] - xy) ** 2, axis=-1)
-    return np.where((Y[..., 2] > 0) & np.isfinite(squared), squared, np.inf)
+    poses, Xh = np.concatenate([R, t[:, :, None]], axis=2), homogenize(X)
+    squared = _squared_residuals(poses, Xh[scored], normalized[scored])
+    best = int(np.minimum(squared / threshold**2, 1.0).sum(axis=1).argmin())
+    inlier = _squared_residuals(poses[best : best + 1], Xh, normalized)[0] < threshold**2
+    return R[best], t[best], inlier
