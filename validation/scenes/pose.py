@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
+from thesisrecon.numerics._metric_kernels import MetricCameras
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -54,6 +55,27 @@ def turntable(
     angle = np.sort(rng.uniform(0.0, np.radians(rng.uniform(40.0, widest_deg)), views))
     turn = Rotation.from_rotvec(angle[:, None] * UP).as_matrix()
     return R @ turn.swapaxes(1, 2), turn @ start
+
+
+def off_the_truth(
+    cameras: MetricCameras,
+    X: F64,
+    rng: np.random.Generator,
+    *,
+    turned: float,
+    moved: float,
+    zoomed: float,
+    points_moved: float | None = None,
+) -> tuple[MetricCameras, F64]:
+    """Cameras turned about their centres (rad), moved and zoomed (a factor), and points (N, 3) moved.
+
+    ``turned``, ``moved`` and ``points_moved`` (default: like cameras) are standard deviations.
+    """
+    turn = Rotation.from_rotvec(turned * rng.normal(size=cameras.t.shape)).as_matrix()
+    t = np.einsum("vab,vb->va", turn, cameras.t) + moved * rng.normal(size=cameras.t.shape)
+    rows = cameras.intrinsics * [zoomed, 1.0, 1.0, 1.0, 1.0, 1.0]
+    X = X + (moved if points_moved is None else points_moved) * rng.normal(size=X.shape)
+    return MetricCameras(turn @ cameras.R, t, rows, cameras.group, cameras.shared), X
 
 
 def _unit(a: F64) -> F64:

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics._observations import Observations
+from validation.scenes.pose import off_the_truth
 
 Kind = Literal["street", "loop"]
 SIZE = (1000, 750)
@@ -32,12 +32,7 @@ class Walk:
 
     def start(self, rng: np.random.Generator, *, size: float = 0.02) -> tuple[MetricCameras, F64]:
         """Cameras turned by a few milliradians, moved and zoomed off the truth, points moved."""
-        c = self.cameras
-        turn = Rotation.from_rotvec(rng.normal(size=c.t.shape) * size / 6.0).as_matrix()
-        t = np.einsum("vab,vb->va", turn, c.t) + rng.normal(size=c.t.shape) * size
-        q = c.intrinsics * [1.01, 1.0, 1.0, 1.0, 1.0, 1.0]
-        X = self.X + rng.normal(size=self.X.shape) * size
-        return MetricCameras(turn @ c.R, t, q, c.group, c.shared), X
+        return off_the_truth(self.cameras, self.X, rng, turned=size / 6.0, moved=size, zoomed=1.01)
 
 
 def make_walk(

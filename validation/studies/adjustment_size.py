@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.triangulation import triangulate_observations
@@ -20,11 +19,12 @@ from thesisrecon.numerics._observations import Observations
 from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres import CeresOptions, refine_with_ceres
 from validation.scenes.many_tracks import SIZE, Kind, make_tracks
+from validation.scenes.pose import off_the_truth
 from validation.studies.measuring import call_apart, timed
 from validation.studies.runner import Part, text_table
 
 LOSS_PX, MIN_VIEWS = 0.5, 3
-FOCAL_OFF, MOVED_REL = 1.02, 0.003
+FOCAL_OFF, MOVED = 1.02, 0.003
 METHODS = ("ours", "Ceres")
 
 
@@ -45,11 +45,10 @@ def adjustment_problem(kind: Kind, views: int) -> tuple[MetricCameras, F64, Obse
     number = np.full(len(X), -1)
     number[used] = np.arange(len(used))
     k = np.flatnonzero(good[t.point_index])
-    turn = Rotation.from_rotvec(MOVED_REL * rng.normal(size=C.shape)).as_matrix()
-    moved = poses[:, :, 3] + MOVED_REL * rng.normal(size=C.shape)
-    row = np.array([[FOCAL_OFF * K[0, 0, 0], 1.0, 0.0, K[0, 0, 2], K[0, 1, 2], 0.0]])
-    cameras = MetricCameras(turn @ R, moved, row, np.zeros(views, dtype=np.int64))
-    X = X[used] + 2.0 * MOVED_REL * rng.normal(size=(len(used), 3))
+    row = np.array([[K[0, 0, 0], 1.0, 0.0, K[0, 0, 2], K[0, 1, 2], 0.0]])
+    exact = MetricCameras(R, poses[:, :, 3], row, np.zeros(views, dtype=np.int64))
+    off = {"turned": MOVED, "moved": MOVED, "zoomed": FOCAL_OFF, "points_moved": 2.0 * MOVED}
+    cameras, X = off_the_truth(exact, X[used], rng, **off)
     return cameras, X, Observations(t.view_index[k], number[t.point_index[k]], t.xy[k])
 
 

@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
@@ -19,6 +18,7 @@ from validation.harness.scenes import has_images, load_images
 from validation.harness.stages.cameras import our_model
 from validation.metrics.record import Metric
 from validation.references.ceres import CeresOptions, ceres_covariances, refine_with_ceres
+from validation.scenes.pose import off_the_truth
 from validation.scenes.streets import SIZE, make_walk
 
 CERES = "Ceres"
@@ -186,13 +186,9 @@ def perturbed_model(
 ) -> tuple[MetricCameras, F64, Observations]:
     """Set the focal length 2 % off and move poses and points by 0.3 % of the scene."""
     exact, X, seen = model_as_bundle(model)
-    R, t = exact.R, exact.t
     scale = float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
-    turn = Rotation.from_rotvec(0.003 * rng.normal(size=t.shape)).as_matrix()
-    row = exact.intrinsics * [1.02, 1.0, 1.0, 1.0, 1.0, 1.0]
-    moved = t + 0.003 * scale * rng.normal(size=t.shape)
-    cameras = MetricCameras(turn @ R, moved, row, exact.group)
-    return cameras, X + 0.003 * scale * rng.normal(size=X.shape), seen
+    cameras, X = off_the_truth(exact, X, rng, turned=0.003, moved=0.003 * scale, zoomed=1.02)
+    return cameras, X, seen
 
 
 def _poses(model: Reconstruction) -> tuple[F64, F64]:
