@@ -104,9 +104,14 @@ def test_every_block_of_python_is_run_by_a_test():
         assert Path(page).name in (Path(__file__).parent / test).read_text("utf-8"), page
 
 
+def _python_of_the_readme():
+    first, calls = [text for kind, text in CODE.findall(README.read_text("utf-8")) if kind == "python"]
+    return first, calls
+
+
 def test_the_calls_of_the_readme_fit_the_functions():
     """Its names stand for data of the reader, so it cannot run: arguments and named attributes must exist."""
-    [block] = [text for kind, text in CODE.findall(README.read_text("utf-8")) if kind == "python"]
+    _, block = _python_of_the_readme()
     lines, attributes, tree = block.splitlines(), 0, ast.parse(block)
     whole = {getattr(statement, "value", None) for statement in tree.body}
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
@@ -233,6 +238,16 @@ def test_points_are_undistorted_as_the_page_of_exports_shows(monkeypatch):
     back = camera.project(names["pinhole"].unproject(names["undistorted"], np.ones(2)))
     assert np.allclose(back, names["xy"])
     assert np.abs(names["undistorted"] - names["xy"]).max() > 1.0
+
+
+@pytest.mark.slow
+def test_the_first_lines_of_the_readme_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fixtures").symlink_to(DOCS.parent / "fixtures")
+    names = {}
+    exec(compile(_python_of_the_readme()[0], "README.md", "exec"), names)
+    assert len(names["result"].cameras) == 14
+    assert names["camera"].K[0, 0] == pytest.approx(908.6, rel=2e-3)
 
 
 @pytest.mark.slow

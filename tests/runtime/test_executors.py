@@ -291,7 +291,7 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
         return found(name, *given, **more)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(UsageError, match=r"not installed; install thesisrecon\[distributed\]"):
+    with pytest.raises(UsageError, match="not installed; install the extra distributed"):
         reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor="dask://localhost:8786")
     assert not (tmp_path / "out").exists()
 

@@ -33,7 +33,7 @@ _CONTRAST_FLOOR = 64.0
 """Squared grey levels: the noise of a dark frame is not sharpness."""
 _UPRIGHT = {turn: EXIF_TRANSFORMS[k] for turn, k in ((90, 8), (-90, 6), (180, 3), (-180, 3))}
 """Transform to the upright image by the rotation (degrees, counter-clockwise) that a video states."""
-_INSTALL = 'install the extra video (pip install "thesisrecon[video]"), or give a folder of its frames'
+_INSTALL = 'install the extra video (pip install ".[video]" in the clone), or give a folder of its frames'
 MapAll = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
 Progress = Callable[[str, int, int], None]
 

@@ -111,7 +111,7 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
         import dask
         from distributed import Client
     except ImportError:
-        missing = "needs the package distributed, which is not installed; install thesisrecon[distributed]"
+        missing = "needs the package distributed, which is not installed; install the extra distributed"
         raise UsageError(f"--executor {executor} {missing}") from None
     # Errors are reported by this module; large tasks are intended.
     settings = {"distributed.admin.large-graph-warning-threshold": "1TiB"}
