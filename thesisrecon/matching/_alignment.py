@@ -24,6 +24,7 @@ from thesisrecon.matching._prepared import (
     pyramid_level,
     sample_window,
     select_matches,
+    window_raster,
 )
 from thesisrecon.numerics._small_solvers import solve_damped
 from thesisrecon.records import Matches
@@ -73,7 +74,7 @@ def _align_windows(
     iterations, affine_std, max_shift, largest_std = limits
     xy2, affine = start.copy(), affine_start.copy()
     score = zeros(len(xy1), np.float32)
-    border = empty(WIDE * WIDE, np.float32)
+    wide, raster = (empty(WIDE * WIDE, np.float32), window_raster(WIDE)), window_raster(SIDE)
     template, window = empty(SAMPLES, np.float32), empty(SAMPLES, np.float32)
     gradient = empty((6 if affine_std > 0.0 else 2, SAMPLES), np.float32)
     for n in range(len(xy1)):
@@ -85,7 +86,7 @@ def _align_windows(
         size = max(float(scale1[n]), base2 / m)
         k1, k2 = pyramid_level(size, base1, len(levels1)), pyramid_level(size * m, base2, len(levels2))
         to1, to2 = 1.0 / (base1 * 2.0**k1), 1.0 / (base2 * 2.0**k2)
-        if not _read_template(pixels1, levels1[k1], to1, (xy1[n], size), border, (template, gradient)):
+        if not _read_template(pixels1, levels1[k1], to1, (xy1[n], size), wide, raster, (template, gradient)):
             continue
         normal = _normal_matrix(gradient)
         d = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
@@ -93,7 +94,7 @@ def _align_windows(
             continue
         value = _iterate(
             (pixels2, levels2[k2], to2),
-            (template, gradient, normal, window),
+            (template, gradient, normal, window, raster),
             (xy2[n], affine[n]),
             (iterations, affine_std, max_shift * size * m, size),
         )
@@ -110,19 +111,27 @@ def _align_windows(
 
 @kernel(forceinline=True)
 def _read_template(
-    pixels: F32, level: I64, to_level: float, place: tuple[F64, float], border: F32, out: tuple[F32, F32]
+    pixels: F32,
+    level: I64,
+    to_level: float,
+    place: tuple[F64, float],
+    wide: tuple[F32, F32],
+    inner: F32,
+    out: tuple[F32, F32],
 ) -> bool:
     """Sample the normalised window of image 1 and its derivatives by the unknowns.
 
-    ``place`` = xy, sample spacing in px. Unknowns: shift x, y in samples and, if ``gradient`` has six rows,
-    the change of the map in units of half the window, so that all six have equal size. False if the window
-    leaves the image or is blank.
+    ``place`` = xy, sample spacing in px; ``wide`` = buffer and raster of a wider window, ``inner`` the raster
+    of this one. Unknowns: shift x, y in samples and, if ``gradient`` has six rows, the change of the map in
+    units of half the window, so that all six have equal size. False if the window leaves the image or is
+    blank.
     """
     xy, size = place
     template, gradient = out
+    border, raster = wide
     step = zeros((2, 2))
     step[0, 0] = step[1, 1] = size
-    if not sample_window(pixels, level, to_level, xy, step, WIDE, border):
+    if not sample_window(pixels, level, to_level, xy, step, raster, border):
         return False
     at = 0
     for row in range(1, WIDE - 1):
@@ -136,14 +145,11 @@ def _read_template(
     if norm == 0.0:
         return False
     if len(gradient) == 6:
-        at = 0
-        for row in range(-HALF, HALF + 1):
-            for column in range(-HALF, HALF + 1):
-                gradient[2, at] = gradient[0, at] * column / HALF
-                gradient[3, at] = gradient[0, at] * row / HALF
-                gradient[4, at] = gradient[1, at] * column / HALF
-                gradient[5, at] = gradient[1, at] * row / HALF
-                at += 1
+        half = np.float32(1.0 / HALF)
+        for n in range(SAMPLES):
+            column, row = half * inner[0, n], half * inner[1, n]
+            gradient[2, n], gradient[3, n] = gradient[0, n] * column, gradient[0, n] * row
+            gradient[4, n], gradient[5, n] = gradient[1, n] * column, gradient[1, n] * row
     for g in range(len(gradient)):
         _project_out_gain_and_bias(gradient[g], template, norm)
     return True
@@ -179,25 +185,25 @@ def _normal_matrix(gradient: F32) -> F64:
 @kernel(forceinline=True)
 def _iterate(
     level2: tuple[F32, I64, float],
-    template: tuple[F32, F32, F64, F32],
+    template: tuple[F32, F32, F64, F32, F32],
     found: tuple[F64, F64],
     limits: tuple[int, float, float, float],
 ) -> float:
     """Move ``found`` = xy2, affine in place by Gauss-Newton; return the correlation, 0 if lost.
 
-    ``template`` = window of image 1, derivatives, normal matrix, buffer for the window of image 2; ``limits``
-    = iterations, prior standard deviation of an affine coefficient, maximum shift px, sample spacing of image
-    1 px.
+    ``template`` = window of image 1, derivatives, normal matrix, buffer and raster of the window of image 2;
+    ``limits`` = iterations, prior standard deviation of an affine coefficient, maximum shift px, sample
+    spacing of image 1 px.
     """
     pixels, level, to_level = level2
-    fixed, gradient, normal, window = template
+    fixed, gradient, normal, window, raster = template
     xy, a = found
     iterations, affine_std, reach, size = limits
     x, y = xy[0], xy[1]
     moved = zeros(len(gradient))
     value = 0.0
     for turn in range(iterations + 1):
-        if not sample_window(pixels, level, to_level, xy, a * size, SIDE, window):
+        if not sample_window(pixels, level, to_level, xy, a * size, raster, window):
             return 0.0
         if normalize_window(window) == 0.0:
             return 0.0

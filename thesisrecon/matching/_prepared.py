@@ -14,7 +14,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.geometry._image_filters import halve, resample
-from thesisrecon.kernels import kernel, zeros
+from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
 # Sums may be reordered; assuming no NaN would break the bounds checks.
@@ -31,36 +31,49 @@ def pyramid_level(scale: float, base: float, count: int) -> int:
     return min(max(k, 0), count - 1)
 
 
+@kernel
+def window_raster(side: int) -> F32:
+    """Columns and rows of the samples of a window, counted from its centre, and scratch (4, side^2)."""
+    raster = empty((4, side * side), np.float32)
+    for n in range(side * side):
+        raster[0, n], raster[1, n] = n % side - side // 2, n // side - side // 2
+    return raster
+
+
 @kernel(fastmath=FAST, forceinline=True)
-def sample_window(pixels: F32, level: I64, to_level: float, xy: F64, step: F64, side: int, out: F32) -> bool:
+def sample_window(
+    pixels: F32, level: I64, to_level: float, xy: F64, step: F64, raster: F32, out: F32
+) -> bool:
     """Sample a square window bilinearly to ``out`` (side^2,); False if it leaves the image.
 
-    Sample (column a, row b), counted from the centre, is at ``xy + step @ (a, b)``; ``to_level`` = level
-    pixels per image pixel.
+    The sample at column a and row b of the ``raster`` is at ``xy + step @ (a, b)``; ``to_level`` = level
+    pixels per image pixel. Places are computed first, in vectors, and then the pixels are read.
     """
     offset, height, width = level[0], level[1], level[2]
     x0 = (xy[0] + 0.5) * to_level - 0.5
     y0 = (xy[1] + 0.5) * to_level - 0.5
     a, b = step[0, 0] * to_level, step[0, 1] * to_level
     c, d = step[1, 0] * to_level, step[1, 1] * to_level
-    half = side // 2
+    half = -raster[0, 0]
     reach_x, reach_y = half * (abs(a) + abs(b)), half * (abs(c) + abs(d))
     if not (x0 - reach_x >= 0.0 and x0 + reach_x < width - 1.001):
         return False
     if not (y0 - reach_y >= 0.0 and y0 + reach_y < height - 1.001):
         return False
-    n = 0
-    for row in range(-half, half + 1):
-        u_row, v_row = x0 + b * row, y0 + d * row
-        for column in range(-half, half + 1):
-            u, v = u_row + a * column, v_row + c * column
-            iu, iv = int(u), int(v)
-            p, q = np.float32(u - iu), np.float32(v - iv)
-            at = offset + iv * width + iu
-            top = pixels[at] + p * (pixels[at + 1] - pixels[at])
-            low = pixels[at + width] + p * (pixels[at + width + 1] - pixels[at + width])
-            out[n] = top + q * (low - top)
-            n += 1
+    left, top = int(x0 - reach_x), int(y0 - reach_y)
+    start, wide = offset + top * width + left, np.float32(width)
+    x, y = np.float32(x0 - left), np.float32(y0 - top)
+    ax, bx, ay, by = np.float32(a), np.float32(b), np.float32(c), np.float32(d)
+    column, row, place, weight = raster[0], raster[1], raster[2], raster[3]
+    for n in range(len(out)):
+        u, v = x + ax * column[n] + bx * row[n], y + ay * column[n] + by * row[n]
+        iu, iv = np.float32(np.int32(u)), np.float32(np.int32(v))
+        place[n], weight[n], out[n] = iv * wide + iu, v - iv, u - iu
+    for n in range(len(out)):
+        at, p = start + int(place[n]), out[n]
+        upper = pixels[at] + p * (pixels[at + 1] - pixels[at])
+        lower = pixels[at + width] + p * (pixels[at + width + 1] - pixels[at + width])
+        out[n] = upper + weight[n] * (lower - upper)
     return True
 
 
@@ -102,11 +115,11 @@ def dot(a: F32, b: F32) -> float:
 def _corner_patches(pixels: F32, levels: I64, base: float, xy: F64, scale: F32, side: int = SIDE) -> F32:
     """Normalised upright windows (N, side^2) of the corners at their scale; zero outside the image."""
     out = zeros((len(xy), side * side), np.float32)
-    step = zeros((2, 2))
+    step, raster = zeros((2, 2)), window_raster(side)
     for n in range(len(xy)):
         k = pyramid_level(scale[n], base, len(levels))
         step[0, 0] = step[1, 1] = scale[n]
-        if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy[n], step, side, out[n]):
+        if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy[n], step, raster, out[n]):
             normalize_window(out[n])
         else:
             out[n] = np.float32(0.0)

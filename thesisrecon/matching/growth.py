@@ -26,6 +26,7 @@ from thesisrecon.matching._prepared import (
     pyramid_level,
     sample_window,
     select_matches,
+    window_raster,
 )
 from thesisrecon.matching._seeds import SeedSet, corners_of_seeds, map_support, seed_matches
 from thesisrecon.numerics._nearest import nearest_neighbours
@@ -167,7 +168,7 @@ def _match_guided(
     score = zeros(count, np.float32)
     second_best = full(count, -1.0, np.float32)
     near, seen = empty(len(xy2), np.int64), empty(len(xy2), np.float32)
-    window = empty((2, SAMPLES), np.float32)
+    window, raster = empty((2, SAMPLES), np.float32), window_raster(SIDE)
     ready = zeros(2, np.bool_)
     sizes = full(2, np.inf)
     for c in range(len(scale2)):
@@ -180,7 +181,7 @@ def _match_guided(
         found = _corners_in_band(xy1[n], (position[n], radius[n]), (F, band), xy2, grid2, near)
         if found == 0:
             continue
-        _warp_windows(view1, (xy1[n], scale1[n]), (affine[n], determinant), sizes, (window, ready))
+        _warp_windows(view1, (xy1[n], scale1[n]), (affine[n], determinant), sizes, (window, ready, raster))
         best, top = -1, least
         for t in range(found):
             c = near[t]
@@ -242,7 +243,7 @@ def _warp_windows(
     corner: tuple[F64, float],
     local: tuple[F64, float],
     sizes: F64,
-    out: tuple[F32, B8],
+    out: tuple[F32, B8, F32],
 ) -> None:
     """Sample the window of a corner of image 1 as seen in image 2, for each corner size there.
 
@@ -251,7 +252,7 @@ def _warp_windows(
     pixels, levels, base = view1
     xy, scale = corner
     a, determinant = local
-    window, ready = out
+    window, ready, raster = out
     m = np.sqrt(determinant)
     inverse = empty((2, 2))
     inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
@@ -262,7 +263,7 @@ def _warp_windows(
         if ratio > 0.6 and ratio < 1.7:
             k = pyramid_level(sizes[t] / m, base, len(levels))
             step = inverse * sizes[t]
-            if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy, step, SIDE, window[t]):
+            if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy, step, raster, window[t]):
                 ready[t] = normalize_window(window[t]) > 0.0
 
 
