@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -44,7 +44,7 @@ DECIDING_SEEDS = 100
 RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
 # Pairs with a wide step have few seeds, whose maps are known to a fifth and positions to a few pixels.
 OBLIQUE_NEIGHBOURS, SEED_AFFINE_STD, GROWN_AFFINE_STD, SEED_SHIFT = 3, 0.2, 0.1, 5.0
-# Share of the corners of image 1 whose matches give maps dense enough not to match again.
+# Share of the corners of image 1 whose matches are dense enough not to match these again.
 EXPLAINED = 1.0 / 3.0
 # Rounds of least squares of a local map: the first unweighted, the others reweighted.
 ROUNDS = 3
@@ -304,8 +304,8 @@ class SeedsAndGrowth:
     coarse_first : bool
         Match the corners of the coarser scale first; they give a better F for all.
     rematch : bool
-        Repeat the guided matching with the F and the maps of its own matches, unless these are a third of the
-        corners.
+        Repeat the guided matching with the F and the maps of its own matches; only of the other corners if
+        these are a third.
     align : bool
         Align positions in image 2 by least-squares matching, else keep the corners.
     oblique_pairs : int
@@ -429,9 +429,9 @@ class SeedsAndGrowth:
         estimate: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match the corners of the coarser scale, then all, guided by the previous matches.
+        """Match the corners of the coarser scale, then all twice, guided by the previous matches.
 
-        All are matched again if the first time leaves most unmatched.
+        If the first time matches enough, only the other corners are matched again.
         """
         scale = view1.features.scale
         everything = np.arange(len(scale))
@@ -439,9 +439,12 @@ class SeedsAndGrowth:
             grown = self._grow(view1, view2, np.flatnonzero(scale > scale.min()), *start)
             start = _verified(grown, estimate, rng) or start
         grown = self._grow(view1, view2, everything, *start)
-        if not self.rematch or len(grown.xy1) >= EXPLAINED * len(scale):
+        if not self.rematch:
             return grown
-        return self._grow(view1, view2, everything, *(_verified(grown, estimate, rng) or start))
+        if len(grown.xy1) < EXPLAINED * len(scale):
+            return self._grow(view1, view2, everything, *(_verified(grown, estimate, rng) or start))
+        others = self._grow(view1, view2, np.setdiff1d(everything, grown.index1), grown, start[1])
+        return _joined(grown, others)
 
     def _grow(
         self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, F: F64
@@ -464,6 +467,14 @@ class SeedsAndGrowth:
         rows = one_to_one(index, score)
         one, two, found = chosen[rows], index[rows], view2.features.xy[index[rows]]
         return Matches(known.i, known.j, one, two, xy1[rows], found, score[rows], affine[rows])
+
+
+def _joined(one: Matches, other: Matches) -> Matches:
+    """The matches of both, one-to-one, in the order of their corners of image 1."""
+    arrays = [np.concatenate([getattr(m, f.name) for m in (one, other)]) for f in fields(Matches)[2:]]
+    both = Matches(one.i, one.j, *arrays)
+    rows = one_to_one(both.index2, both.score)
+    return select_matches(both, rows[np.argsort(both.index1[rows], kind="stable")])
 
 
 def _verified(
