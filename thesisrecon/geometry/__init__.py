@@ -1,4 +1,6 @@
-"""Chapter 3: projective geometry as pure functions of arrays, transform or camera first: ``project(P, X)``.
+"""Chapter 3: projective geometry.
+
+Pure functions of arrays, transform or camera first: ``project(P, X)``.
 
 ===================== ============================================================================
 3.2                   ``homogeneous``

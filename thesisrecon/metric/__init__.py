@@ -1,1 +1,1 @@
-"""After chapter 7: postponed cameras, metric refinement, intervals and the self-check."""
+"""After chapter 7: deferred cameras, metric refinement, intervals and the self-check."""
