@@ -65,11 +65,11 @@ LIST = PACKAGE / "kernels.txt"
 _pickled: Callable[[Any], bytes] = dumps
 
 
-def _set_level() -> None:
-    """Compile at level 2, a third faster than numba's default of 3, and make vectors of statements.
+def _set_up_compiler() -> None:
+    """Compile at level 2, a third faster than numba's default of 3, and make vectors of equal statements.
 
-    Unless NUMBA_OPT or NUMBA_SLP_VECTORIZE is set. Numba's compiler resets its settings once any variable
-    NUMBA_* has changed: that is done first.
+    The variables NUMBA_OPT and NUMBA_SLP_VECTORIZE override this. Numba's compiler resets its settings once
+    any variable NUMBA_* has changed: that is done first.
     """
     numba.config.reload_config()
     settings = vars(numba.config)
@@ -252,7 +252,7 @@ class KernelCache(NullCache):
 
         def compile_and_release(signature: Any) -> Any:
             before = set(self._locks)
-            _set_level()
+            _set_up_compiler()
             try:
                 with global_compiler_lock, _without_garbage_collection():
                     arguments = tuple(normalize_signature(signature)[0])

@@ -6,8 +6,8 @@ width of each; a pixel of level k spans ``base * 2^k`` pixels of the image.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -223,6 +223,13 @@ def one_to_one(index: I64, score: F32) -> I64:
     rows = np.flatnonzero(index >= 0)
     rows = rows[np.lexsort((rows, -score[rows]))]
     return np.sort(rows[np.unique(index[rows], return_index=True)[1]])
+
+
+def join_matches(parts: Sequence[Matches]) -> Matches:
+    """The matches of one pair, those of each part after the other."""
+    names = [f.name for f in fields(Matches)[2:]]
+    arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    return Matches(parts[0].i, parts[0].j, *arrays)
 
 
 def select_matches(matches: Matches, rows: I64 | B8) -> Matches:

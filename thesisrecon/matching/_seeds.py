@@ -12,7 +12,7 @@ import scipy
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import strongest_distinct
-from thesisrecon.matching._prepared import empty_matches, select_matches
+from thesisrecon.matching._prepared import empty_matches, join_matches, select_matches
 from thesisrecon.numerics._nearest import nearest_neighbours
 from thesisrecon.records import Features, Matches, Seeds
 
@@ -175,8 +175,7 @@ def seed_matches(
     found = [
         match_seeds(*way, pair, rotated=rotated, ratio=ratio) for rotated in orientations for way in ways
     ]
-    arrays = (np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches)[2:])
-    matches = Matches(*pair, *arrays)
+    matches = join_matches(found)
     yield select_matches(matches, strongest_distinct(matches, REACH_PX)), map_support
 
 

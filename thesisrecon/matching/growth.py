@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from thesisrecon.matching._prepared import (
     affine_determinant,
     dot,
     empty_matches,
+    join_matches,
     normalize_window,
     one_to_one,
     prepare_image,
@@ -34,6 +35,8 @@ from thesisrecon.records import Features, Image, Matches
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
 APART = 3.0
+# Matches that linear methods need for F.
+MIN_FOR_F = 8
 # Minimum strength of match (at most 10) of a seed in the filtered trial, and verified seeds of a pair.
 MIN_SUPPORT, MIN_SEEDS = 2.0, 12
 # The same of seeds whose maps are affine.
@@ -415,7 +418,7 @@ class SeedsAndGrowth:
             view1, view2, places, affine_std=SEED_AFFINE_STD, max_shift=SEED_SHIFT
         )
         aligned = np.flatnonzero(score >= MIN_CORRELATION)
-        if len(aligned) >= 8:
+        if len(aligned) >= MIN_FOR_F:
             known = select_matches(replace(known, xy2=xy2, affine=affine), aligned)
         grown = near._grow_in_rounds(view1, view2, (known, F), estimate, rng)
         verified = _verified(align_matches(view1, view2, grown, affine_std=GROWN_AFFINE_STD), estimate, rng)
@@ -444,7 +447,9 @@ class SeedsAndGrowth:
         if len(grown.xy1) < EXPLAINED * len(scale):
             return self._grow(view1, view2, everything, *(_verified(grown, estimate, rng) or start))
         others = self._grow(view1, view2, np.setdiff1d(everything, grown.index1), grown, start[1])
-        return _joined(grown, others)
+        both = join_matches([grown, others])
+        rows = one_to_one(both.index2, both.score)
+        return select_matches(both, rows[np.argsort(both.index1[rows], kind="stable")])
 
     def _grow(
         self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, F: F64
@@ -469,19 +474,11 @@ class SeedsAndGrowth:
         return Matches(known.i, known.j, one, two, xy1[rows], found, score[rows], affine[rows])
 
 
-def _joined(one: Matches, other: Matches) -> Matches:
-    """The matches of both, one-to-one, in the order of their corners of image 1."""
-    arrays = [np.concatenate([getattr(m, f.name) for m in (one, other)]) for f in fields(Matches)[2:]]
-    both = Matches(one.i, one.j, *arrays)
-    rows = one_to_one(both.index2, both.score)
-    return select_matches(both, rows[np.argsort(both.index1[rows], kind="stable")])
-
-
 def _verified(
     matches: Matches, estimate: EstimateFundamental, rng: np.random.Generator
 ) -> tuple[Matches, F64] | None:
     """The matches that agree with one F, and F; None if no F is found."""
-    if len(matches.xy1) < 8:
+    if len(matches.xy1) < MIN_FOR_F:
         return None
     try:
         fit = estimate(matches.xy1, matches.xy2, rng)

@@ -54,9 +54,9 @@ class PointSums(NamedTuple):
 
 
 class _Elimination(NamedTuple):
-    """B~ (k, 2, 3), W (k, 3, C) and residuals (k, 2) after the points' own steps, from ``first`` on.
+    """B~ (k, 2, 3), W (k, 3, 6) and residuals (k, 2) after the points' own steps, from ``first`` on.
 
-    g = L^-1 h (n, 3).
+    g = L^-1 h (n, 3). W is empty unless a view has six columns.
     """
 
     first: int
@@ -87,7 +87,7 @@ def eliminate_points(
     """Add the eliminated points to the sums; a point whose block is not positive does not move."""
     k = index.start[first]
     n = index.start[last] - k
-    W = empty((n, 3, J.A.shape[2]))
+    W = empty((n if J.A.shape[2] == 6 else 0, 3, 6))
     left = _Elimination(k, empty((n, 2, 3)), W, empty((n, 2)), empty((last - first, 3)))
     _sum_points(first, last, damping, J, index, points, left)
     _add_views(first, last, J, index, sums, left)

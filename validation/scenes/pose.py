@@ -1,4 +1,7 @@
-"""True poses of synthetic cameras; ``look_at`` uses + - * / sqrt only, which IEEE 754 rounds exactly."""
+"""True poses of synthetic cameras, and cameras moved off the truth.
+
+``look_at`` uses + - * / sqrt only, which IEEE 754 rounds exactly.
+"""
 
 from __future__ import annotations
 

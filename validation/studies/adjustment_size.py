@@ -47,8 +47,9 @@ def adjustment_problem(kind: Kind, views: int) -> tuple[MetricCameras, F64, Obse
     k = np.flatnonzero(good[t.point_index])
     row = np.array([[K[0, 0, 0], 1.0, 0.0, K[0, 0, 2], K[0, 1, 2], 0.0]])
     exact = MetricCameras(R, poses[:, :, 3], row, np.zeros(views, dtype=np.int64))
-    off = {"turned": MOVED, "moved": MOVED, "zoomed": FOCAL_OFF, "points_moved": 2.0 * MOVED}
-    cameras, X = off_the_truth(exact, X[used], rng, **off)
+    cameras, X = off_the_truth(
+        exact, X[used], rng, turned=MOVED, moved=MOVED, zoomed=FOCAL_OFF, points_moved=2.0 * MOVED
+    )
     return cameras, X, Observations(t.view_index[k], number[t.point_index[k]], t.xy[k])
 
 
