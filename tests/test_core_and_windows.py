@@ -103,10 +103,11 @@ def test_a_view_of_other_windows_waits_until_the_model_reaches_it(monkeypatch):
     assert centre_error(metric, scene) < 0.01
 
 
-def test_points_that_hold_every_view_are_enough(monkeypatch):
+@pytest.mark.parametrize("limits", [{"MAX_OBSERVATIONS": 3000}, {"MANY_VIEWS": 11, "LONG_PER_VIEW": 250}])
+def test_points_that_hold_every_view_are_enough(monkeypatch, limits):
     scene = make_scene(views=12, points=900, sigma_px=0.4, seed=12)
-    monkeypatch.setattr(_model, "MAX_OBSERVATIONS", 3000)
-    monkeypatch.setattr(_model, "MIN_PER_VIEW", 100)
+    for name, value in limits.items():
+        monkeypatch.setattr(_model, name, value)
     kept = []
     restrict = _model.restrict_points
     monkeypatch.setattr(_model, "restrict_points", lambda m, p: kept.append(len(p)) or restrict(m, p))
@@ -189,7 +190,6 @@ def test_points_are_chosen_again_by_their_residuals(monkeypatch):
         np.ones(len(tracks.xy), bool), 0.5,
     )  # fmt: skip
     monkeypatch.setattr(_model, "MAX_OBSERVATIONS", len(tracks.xy) // 4)
-    monkeypatch.setattr(_model, "MIN_PER_VIEW", 20)
     few = _model.with_enough_points(model)
     chosen, points = _model.with_precise_points(few, tracks)
     assert len(points) == chosen.tracks.n_points

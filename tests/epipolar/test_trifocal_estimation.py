@@ -199,7 +199,7 @@ def test_the_refinement_is_at_a_minimum_and_its_gradient_is_right():
         _ReprojectionProblem(T, points, segments, equations.transforms, 1.0) for T in (linear, best)
     )
     state, h = (np.zeros(18), np.zeros((17, 4))), 1e-7
-    for _ in range(20):
+    for _ in range(60):
         # The gradient is that of the cameras alone if points and lines fit them.
         state = from_linear.retract(state, np.zeros(18))
     gradient = from_linear.linearize(state).gradient

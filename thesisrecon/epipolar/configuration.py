@@ -31,7 +31,8 @@ from thesisrecon.epipolar._planes import (
 from thesisrecon.epipolar._refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.geometry._homography import homography_sampson_residuals
-from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
+from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
 
 # Initial focal lengths in units of the point spread: fields of view of 150 to 10 degrees.
@@ -312,27 +313,50 @@ def _refine_translation(f: F64, points: F64, gate: float) -> None:
         return
     e /= np.linalg.norm(e)
     kept = points[np.asarray(sampson_distances(f, points)) < gate]
-    if len(kept) < 5:
-        return
-    x1, x2 = homogenize(kept[:, :2]), homogenize(kept[:, 2:])
-    normal = np.cross(x1, x2)
+    if len(kept) >= 5:
+        _correct_epipole(e, np.ascontiguousarray(kept))
+        f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()
+
+
+@kernel
+def _correct_epipole(e: F64, points: F64) -> None:
+    """Minimise the Sampson distances of [e]x of matches (K, 4) over the unit vector ``e``, in place."""
+    normal, right, J, n = empty((3, 3)), empty(3), empty(3), empty(3)
+    one, two = empty(3), empty(3)
     for _ in range(CORRECTIONS):
-        # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two rows.
-        l2, l1 = np.cross(e, x1)[:, :2], np.cross(x2, e)[:, :2]
-        g = np.sum(l1**2, axis=1) + np.sum(l2**2, axis=1) + EXACT**2
-        value = normal @ e
-        size = 1.0 / np.sqrt(g)
-        # d g / d e = 2 (l1 . dl1 + l2 . dl2)
-        dg = np.zeros((len(kept), 3))
-        dg[:, 0] = l2[:, 1] * -x1[:, 2] + l1[:, 1] * x2[:, 2]
-        dg[:, 1] = l2[:, 0] * x1[:, 2] - l1[:, 0] * x2[:, 2]
-        dg[:, 2] = -l2[:, 0] * x1[:, 1] + l2[:, 1] * x1[:, 0] + l1[:, 0] * x2[:, 1] - l1[:, 1] * x2[:, 0]
-        J = normal * size[:, None] - (value * size**3)[:, None] * dg
-        basis = np.linalg.svd(e[None])[2][1:].T
-        Jb = J @ basis
-        step = basis @ np.linalg.lstsq(Jb, -(value * size), rcond=None)[0]
-        e = e + step
-        e /= np.linalg.norm(e)
-        if step @ step < 1e-20:
+        normal[:], right[:] = 0.0, 0.0
+        for k in range(len(points)):
+            x1, y1, x2, y2 = points[k]
+            # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two
+            # rows, whose squares are g.
+            n[0], n[1], n[2] = y1 - y2, x2 - x1, x1 * y2 - y1 * x2
+            a0, a1 = e[1] - e[2] * y1, e[2] * x1 - e[0]
+            b0, b1 = y2 * e[2] - e[1], e[0] - x2 * e[2]
+            size = 1.0 / np.sqrt(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + EXACT**2)
+            residual = (n[0] * e[0] + n[1] * e[1] + n[2] * e[2]) * size
+            by_g = residual * size * size
+            J[0] = n[0] * size - by_g * (b1 - a1)
+            J[1] = n[1] * size - by_g * (a0 - b0)
+            J[2] = n[2] * size - by_g * (a1 * x1 - a0 * y1 + b0 * y2 - b1 * x2)
+            for i in range(3):
+                right[i] -= J[i] * residual
+                for j in range(3):
+                    normal[i, j] += J[i] * J[j]
+        # Two directions at right angles to e and to each other.
+        least = int(np.argmin(np.abs(e)))
+        one[:] = -e[least] * e
+        one[least] += 1.0
+        one /= np.sqrt(one @ one)
+        two[0], two[1] = e[1] * one[2] - e[2] * one[1], e[2] * one[0] - e[0] * one[2]
+        two[2] = e[0] * one[1] - e[1] * one[0]
+        along = normal @ one, normal @ two
+        aa, ab, bb = one @ along[0], one @ along[1], two @ along[1]
+        determinant = aa * bb - ab * ab
+        if not determinant > EXACT * aa * bb:
             break
-    f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()
+        u, v = one @ right, two @ right
+        u, v = (bb * u - ab * v) / determinant, (aa * v - ab * u) / determinant
+        e += u * one + v * two
+        e /= np.sqrt(e @ e)
+        if u * u + v * v < 1e-20:
+            break

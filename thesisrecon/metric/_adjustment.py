@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
+from thesisrecon.metric._model import CENTRE, FOCAL, K1, MANY_VIEWS, WIDTH, MetricEstimate, residual_norms
 from thesisrecon.numerics._block_scatter import BlockScatter, block_scatter
 from thesisrecon.numerics._metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics._noise import best_huber_width, noise_from_distances
@@ -20,8 +20,8 @@ MAX_LOSS_SIGMAS = 20.0
 """Huber widths above this many sigmas are least squares."""
 RAYLEIGH_90 = 2.1460
 """90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
-MANY_VIEWS, LITTLE_DAMPING = 40, 1e-8
-"""Long rows of views bend against little resistance: stronger damping would hold them as they are."""
+LITTLE_DAMPING = 1e-8
+"""Long rows of many views bend against little resistance: stronger damping would hold them as they are."""
 MIN_VIEWS_PER_LENS = 3
 """k2 and k3 are estimated only if this many views share them."""
 FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))

@@ -21,8 +21,11 @@ EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0
 """Residual gates of the early and the late rounds in noise sigmas."""
 MIN_ANGLE = float(np.radians(0.05))
 """Smallest triangulation angle of a point."""
-MAX_OBSERVATIONS, MIN_PER_VIEW, CELLS = 400_000, 1000, 8
-"""Observations above which points are chosen for adjustment, the least of a view, and cells along a side."""
+MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
+"""Of more observations, points are chosen for adjustment until each view has its part of this number; of more
+views, until each has the numbers below. A view is divided into ``CELLS`` along each side."""
+LONG_PER_VIEW, PRECISE_PER_VIEW = 1000, 500
+"""Observations of each of many views: of long tracks while the model grows, then of the most precise ones."""
 PRIOR_RESIDUALS = 6
 """Residuals of a point that its prior noise counts as."""
 
@@ -64,12 +67,15 @@ def restrict_points(model: MetricEstimate, points: I64) -> MetricEstimate:
 def with_enough_points(model: MetricEstimate) -> MetricEstimate:
     """The model with points that hold every view all over its image: known points first, then long tracks.
 
-    All points up to ``MAX_OBSERVATIONS``; of more, the rest adds little to the precision of the cameras.
+    All points up to ``MAX_OBSERVATIONS`` of at most ``MANY_VIEWS``; of more, the rest adds little to the
+    precision of the cameras.
     """
-    if len(model.tracks.xy) <= MAX_OBSERVATIONS:
+    if len(model.tracks.xy) <= MAX_OBSERVATIONS and model.tracks.n_views <= MANY_VIEWS:
         return model
     length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
-    return restrict_points(model, _points_that_hold(model, np.lexsort((-length, ~model.valid))))
+    return restrict_points(
+        model, _points_that_hold(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
+    )
 
 
 def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
@@ -89,17 +95,21 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
     count = np.bincount(point, minlength=t.n_points)
     # The mean of the variance under an inverse gamma prior at that of all points, which holds short tracks.
     noise = (total + PRIOR_RESIDUALS * variance) / np.maximum(2 * count - 3 + PRIOR_RESIDUALS, 1)
-    points = _points_that_hold(model, np.argsort(np.where(model.valid, noise, np.inf), kind="stable"))
+    order = np.argsort(np.where(model.valid, noise, np.inf), kind="stable")
+    points = _points_that_hold(model, order, PRECISE_PER_VIEW)
     return restrict_points(model, points), points
 
 
-def _points_that_hold(model: MetricEstimate, order: I64) -> I64:
-    """Points, tried in ``order``, until every view has enough of them all over its image."""
+def _points_that_hold(model: MetricEstimate, order: I64, per_view: int) -> I64:
+    """Points, tried in ``order``, until every view has enough of them all over its image.
+
+    ``per_view`` is the number that each of many views needs.
+    """
     t = model.tracks
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
     cell = (t.view_index * CELLS + cell[:, 0]) * CELLS + cell[:, 1]
     occupied = np.bincount(np.unique(cell) // CELLS**2, minlength=t.n_views)
-    wanted = max(MIN_PER_VIEW, MAX_OBSERVATIONS // t.n_views)
+    wanted = per_view if t.n_views > MANY_VIEWS else MAX_OBSERVATIONS // t.n_views
     needed = np.repeat(-(-wanted // np.maximum(occupied, 1)), CELLS**2)
     start = np.concatenate([[0], np.cumsum(np.bincount(t.point_index, minlength=t.n_points))])
     keep = np.zeros(t.n_points, dtype=bool)

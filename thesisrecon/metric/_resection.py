@@ -9,11 +9,12 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import counted
 from thesisrecon.geometry.robust_resection import resect_calibrated
-from thesisrecon.metric._adjustment import MANY_VIEWS, MIN_OBSERVATIONS, BundleAdjustment
+from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, BundleAdjustment
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
     LATE_SIGMAS,
+    MANY_VIEWS,
     WIDTH,
     MetricEstimate,
     inlier_ratios,

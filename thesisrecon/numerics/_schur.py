@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -33,7 +34,7 @@ from thesisrecon.numerics._reduced_solvers import (
 )
 from thesisrecon.numerics._small_solvers import floored_diagonal
 
-CHUNK = 16384
+CHUNK = 4096
 # Every chunk has its own sums: few chunks if these are large.
 MAX_CHUNKS, CHUNK_BYTES = 16, 128e6
 
@@ -64,6 +65,11 @@ class BundleLayout:
         """Number of camera unknowns D."""
         return len(self.index.pair) * self.width + self.border
 
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        """Threads that live as long as the problem: an iteration may take less time than their start."""
+        return ThreadPoolExecutor(self.threads)
+
     def sum_over_observations(self, work: Callable[[slice, Observations], float]) -> float:
         """Return the sum of work(rows, observations) over the observations of every range of points."""
         start, seen = self.observations.start, self.observations.seen
@@ -80,8 +86,7 @@ class BundleLayout:
         chunks = range(len(self.chunks))
         if min(self.threads, len(self.chunks)) == 1:
             return [work(n) for n in chunks]
-        with ThreadPoolExecutor(self.threads) as pool:
-            return list(pool.map(work, chunks))
+        return list(self._pool.map(work, chunks))
 
     def jacobians(self) -> Jacobians:
         """Allocate the buffers of one linearisation."""

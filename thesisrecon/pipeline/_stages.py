@@ -64,12 +64,13 @@ MAP_BYTES = 2**29
 def find_features(state: PipelineState) -> None:
     """Detect the features of all images (4.2.1); sets ``result.features``."""
     run, images = state.run, state.result.images
-    variant = run.variant_key("features")
+    config = state.config_for_set
+    variant = run.variant_key("features", config.features)
     digests = enumerate(image.digest for image in state.inputs.decoded)
     keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
-        return (([i], (state.config, images[i])) for i in missing)
+        return (([i], (config, images[i])) for i in missing)
 
     finish_features(state, run.map_cached("features", keys, _detect, batches))
 
@@ -166,7 +167,7 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
 
 
 def _prepared_oblique(state: PipelineState) -> PreparedViews:
-    return PreparedViews(partial(prepare_oblique, state.config), state.given())
+    return PreparedViews(partial(prepare_oblique, state.config_for_set), state.given())
 
 
 def _match_all(
