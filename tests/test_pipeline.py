@@ -12,12 +12,10 @@ import trimesh
 from tests import fake_stages as fakes
 from tests.conftest import refuses
 from tests.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
-from tests.synthetic import texture
 from thesisrecon.camera import Camera
 from thesisrecon.cli.runs import summary_text
-from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
@@ -323,16 +321,6 @@ def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path
     run(tmp_path, 4, overwrite=True)
     assert [c for c in CALLS if c.startswith("detect")] == ["detect 03.png"]
     assert sorted(c for c in CALLS if c.startswith("match")) == [f"match ({k}, 3)" for k in range(3)]
-
-
-def test_the_detector_of_a_run_is_that_for_its_number_of_images(tmp_path):
-    detector = MultiScaleCorners(full_corners=60, half_corners=0, seeds_per_level=40, many_images=2)
-    images = [texture(64, 80, seed=k).astype(np.uint8) for k in range(3)]
-    given = {"config": PipelineConfig(features=detector), "until": "features", "threads": 1}
-    few = reconstruct(images[:2], tmp_path / "few", **given).features
-    many = reconstruct(images, tmp_path / "many", **given).features
-    assert [len(f.xy) for f in few] == [60, 60]
-    assert [len(f.xy) for f in many] == [30, 30, 30]
 
 
 def test_the_page_is_called_after_the_photographs(tmp_path):

@@ -49,20 +49,6 @@ def test_corners_are_sorted_inside_and_the_same_each_time(variant):
     assert np.array_equal(features.xy, again.xy)
 
 
-def test_each_of_many_images_gets_fewer_corners_and_seeds():
-    detector = MultiScaleCorners(seeds_per_level=901, many_images=5)
-    assert detector.for_images(5) is detector
-    few = detector.for_images(6)
-    assert (few.full_corners, few.half_corners, few.seeds_per_level) == (1500, 750, 451)
-    assert few.for_images(5) is few
-    image = photograph(texture(300, 400))
-    many, fewer = detector.detect(image), few.detect(image)
-    assert len(fewer.xy) < 0.6 * len(many.xy)
-    assert len(fewer.seeds.xy) < 0.6 * len(many.seeds.xy)
-    with pytest.raises(ValueError, match="many_share must be above 0"):
-        MultiScaleCorners(many_share=0.0)
-
-
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (9, 9), (20, 20), (5, 400), (64, 48)])
 @pytest.mark.parametrize("kind", ["blank", "noise"])

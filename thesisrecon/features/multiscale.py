@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
@@ -59,10 +58,6 @@ class MultiScaleCorners:
         Long side below which the image is doubled; 0 for never.
     oblique_tilts : tuple of float
         Compressions of the simulated views that give seeds for pairs with a wide step; () for none.
-    many_images : int
-        Number of images above which each needs fewer corners, because more images show each place.
-    many_share : float
-        Share of the corners and seeds that each of so many images gets.
     measure : CornerMeasure
         Response and its parameters at every size.
     """
@@ -74,8 +69,6 @@ class MultiScaleCorners:
     levels: int = 5
     upsample_below_px: int = 1000
     oblique_tilts: tuple[float, ...] = (1.414, 2.828)
-    many_images: int = 40
-    many_share: float = 0.5
     measure: CornerMeasure = field(default_factory=CornerMeasure)
 
     def __post_init__(self) -> None:
@@ -90,16 +83,6 @@ class MultiScaleCorners:
             raise ValueError(f"seeds_per_level must be at least 0; got {self.seeds_per_level}")
         if not all(tilt > 1.0 for tilt in self.oblique_tilts):
             raise ValueError(f"oblique_tilts must be above 1; got {self.oblique_tilts}")
-        if not 0.0 < self.many_share <= 1.0:
-            raise ValueError(f"many_share must be above 0 and at most 1; got {self.many_share}")
-
-    def for_images(self, count: int) -> MultiScaleCorners:
-        """The detector for a set of ``count`` images: itself, or with fewer corners and seeds of each."""
-        if count <= self.many_images:
-            return self
-        numbers = {name: getattr(self, name) for name in ("full_corners", "half_corners", "seeds_per_level")}
-        fewer = {name: math.ceil(self.many_share * number) for name, number in numbers.items()}
-        return replace(self, **fewer)
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""

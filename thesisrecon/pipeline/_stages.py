@@ -17,6 +17,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.matching._repeated_structure import reject_repeated_structure
+from thesisrecon.matching.growth import ENOUGH, SeedsAndGrowth, strongest_share
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
@@ -64,13 +65,12 @@ MAP_BYTES = 2**29
 def find_features(state: PipelineState) -> None:
     """Detect the features of all images (4.2.1); sets ``result.features``."""
     run, images = state.run, state.result.images
-    config = state.config_for_set
-    variant = run.variant_key("features", config.features)
+    variant = run.variant_key("features")
     digests = enumerate(image.digest for image in state.inputs.decoded)
     keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
-        return (([i], (config, images[i])) for i in missing)
+        return (([i], (state.config, images[i])) for i in missing)
 
     finish_features(state, run.map_cached("features", keys, _detect, batches))
 
@@ -110,13 +110,29 @@ def match_pairs(state: PipelineState) -> None:
     """Match the pairs and estimate their epipolar geometry (4.2.2, chapter 5); sets ``result.pairs``."""
     assert state.result.pair_choice is not None
     pairs = [(int(i), int(j)) for i, j in state.result.pair_choice.pairs]
-    found = _matched(state, pairs, "", lambda: state.prepared_views())
+    found = _matched_in_turn(state, pairs)
     again = pairs_to_connect(state.result.features, found, oblique_pairs(state.config))
     if again:
         second = _matched(state, [pairs[n] for n in again], "-oblique", lambda: _prepared_oblique(state))
         for n, pair in zip(again, second, strict=True):
             found[n] = pair if pair.accepted else found[n]
     finish_matches(state, reject_repeated_structure(found, len(state.result.images)))
+
+
+def _matched_in_turn(state: PipelineState, pairs: Sequence[tuple[int, int]]) -> list[TwoView]:
+    """Match pairs; those of many images by a share of their corners, and by all if these are too few."""
+    features, matching = state.result.features, state.config.matching
+    if not isinstance(matching, SeedsAndGrowth) or len(features) <= matching.many_images:
+        return _matched(state, pairs, "", lambda: state.prepared_views())
+    fewer, rows = zip(*(strongest_share(f, matching.many_share) for f in features), strict=True)
+    given = dict(enumerate(zip(state.result.images, fewer, strict=True)))
+    found = _matched(state, pairs, "-fewer", lambda: PreparedViews(matching.prepare, given))
+    found = [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in found]
+    weak = [n for n, pair in enumerate(found) if not pair.accepted or pair.inliers < ENOUGH]
+    second = _matched(state, [pairs[n] for n in weak], "", lambda: state.prepared_views())
+    for n, pair in zip(weak, second, strict=True):
+        found[n] = pair
+    return found
 
 
 def _matched(
@@ -167,7 +183,7 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
 
 
 def _prepared_oblique(state: PipelineState) -> PreparedViews:
-    return PreparedViews(partial(prepare_oblique, state.config_for_set), state.given())
+    return PreparedViews(partial(prepare_oblique, state.config), state.given())
 
 
 def _match_all(

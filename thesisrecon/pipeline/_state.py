@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from thesisrecon.arrays import B8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
 from thesisrecon.numerics._observations import cached_pair_order
@@ -130,14 +129,6 @@ class PipelineState:
     def config(self) -> PipelineConfig:
         """The run's settings."""
         return self.run.config
-
-    @property
-    def config_for_set(self) -> PipelineConfig:
-        """The run's settings, with the detector for a set of this number of images."""
-        features = self.config.features
-        if not isinstance(features, MultiScaleCorners):
-            return self.config
-        return replace(self.config, features=features.for_images(len(self.result.images)))
 
     @property
     def names(self) -> list[str]:

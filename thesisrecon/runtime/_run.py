@@ -136,12 +136,9 @@ class Run:
         finally:
             log.seconds += time.perf_counter() - start
 
-    def variant_key(self, stage: str, variant: Any = None) -> list[Any]:
-        """The part of a key that identifies the method of a stage: class, parameters and code.
-
-        ``variant`` is the method, by default that of the settings.
-        """
-        variant = variant or getattr(self.config, stage)
+    def variant_key(self, stage: str) -> list[Any]:
+        """The part of a key that identifies the method of a stage: class, parameters and code."""
+        variant = getattr(self.config, stage)
         module = type(variant).__module__
         return [module, type(variant).__qualname__, table_from_dataclass(variant), code_digest(variant)]
 

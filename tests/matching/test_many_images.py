@@ -1,0 +1,50 @@
+"""Pairs of many images: first a share of the corners and seeds, all of them only where these are too few."""
+
+import numpy as np
+import pytest
+
+from tests.synthetic import photograph, texture
+from thesisrecon import PipelineConfig, reconstruct
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.io._images import demo_images
+from thesisrecon.matching.growth import SeedsAndGrowth, strongest_share
+from thesisrecon.pipeline import _stages
+
+
+def test_the_strongest_corners_of_each_scale_and_seeds_of_each_level_are_kept():
+    features = MultiScaleCorners().detect(photograph(texture(200, 260)))
+    fewer, rows = strongest_share(features, 0.5)
+    assert np.array_equal(fewer.xy, features.xy[rows])
+    assert (np.diff(rows) > 0).all()
+    for scale in np.unique(features.scale):
+        every, kept = (f.response[f.scale == scale] for f in (features, fewer))
+        assert len(kept) == (len(every) + 1) // 2
+        assert kept.min() >= np.sort(every)[-len(kept)]
+    levels, kept = (
+        np.unique(np.where(s.angle == 0.0, s.scale, -s.scale), return_counts=True)[1]
+        for s in (features.seeds, fewer.seeds)
+    )
+    assert np.array_equal(kept, (levels + 1) // 2)
+    assert len(fewer.seeds.patches) == len(fewer.seeds.xy) == kept.sum()
+    with pytest.raises(ValueError, match="many_share must be above 0"):
+        SeedsAndGrowth(many_share=0.0)
+
+
+def test_pairs_of_many_images_have_fewer_matches_unless_these_are_too_few(tmp_path, monkeypatch):
+    def pairs(name, many_images):
+        config = PipelineConfig(matching=SeedsAndGrowth(many_images=many_images))
+        return reconstruct(
+            demo_images()[:3], tmp_path / name, config=config, max_size=480, until="matches", threads=2
+        )
+
+    every, fewer = pairs("all", 3), pairs("fewer", 2)
+    for whole, part in zip(every.pairs, fewer.pairs, strict=True):
+        assert part.accepted
+        assert 240 <= part.inliers < 0.65 * whole.inliers
+        # The numbers are those of all corners.
+        assert np.array_equal(part.xy1, every.features[part.i].xy[part.index1])
+        assert np.abs(part.xy2 - every.features[part.j].xy[part.index2]).max() < 10.0
+    monkeypatch.setattr(_stages, "ENOUGH", 10**6)
+    for whole, again in zip(every.pairs, pairs("again", 2).pairs, strict=True):
+        assert np.array_equal(whole.index1, again.index1)
+        assert np.array_equal(whole.xy2, again.xy2)
