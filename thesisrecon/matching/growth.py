@@ -487,7 +487,7 @@ class SeedsAndGrowth:
 
 
 def strongest_share(features: Features, share: float) -> tuple[Features, I64]:
-    """Select the strongest corners and seeds, of which two images keep the same ones.
+    """Select the strongest corners and seeds: two images keep the same ones.
 
     Parameters
     ----------

@@ -111,8 +111,12 @@ class EpipolarPencil:
         enter = np.where(parallel, np.where(inside, -np.inf, np.inf), np.minimum(one, two)).max(axis=1)
         leave = np.where(parallel, np.where(inside, np.inf, -np.inf), np.maximum(one, two)).min(axis=1)
         if lines.epipole[2] < 0.0:
-            return lines, enter, np.minimum(leave, lines.start)
-        return lines, np.maximum(enter, lines.start), leave
+            leave = np.minimum(leave, lines.start)
+        else:
+            enter = np.maximum(enter, lines.start)
+        # A line beside the image that is parallel to its border would enter at infinity.
+        met = leave >= enter
+        return lines, np.where(met, enter, 0.0), np.where(met, leave, -1.0)
 
     def sweep_rate(self, side: int, phi: F64, z: F64) -> F64:
         """Motion (N,) of epipolar lines across their points z (N, 2) per radian, normalised."""
