@@ -12,7 +12,13 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.stereo import _planar as planar
 from thesisrecon.stereo import rectification
-from thesisrecon.stereo._epipolar_pair import MAX_GROWTH, MAX_SHRINK, pair_of_cameras, pair_of_fundamental
+from thesisrecon.stereo._epipolar_pair import (
+    MAX_GROWTH,
+    MAX_SHRINK,
+    EpipolarPencil,
+    pair_of_cameras,
+    pair_of_fundamental,
+)
 from thesisrecon.stereo._polar import PolarRectification, polar
 from thesisrecon.stereo._rectification_quality import jacobians, matches_in_frame, measure_quality
 from thesisrecon.stereo._resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
@@ -324,3 +330,16 @@ def test_small_frames():
     one = warp_image(image, lambda rows: np.full((len(rows), 1, 2), 3.0), (1, 1))
     assert one[0, 0] == pytest.approx(image[3, 3], abs=1e-4)
     assert np.isnan(planar_frame(np.eye(3), (12, 8)).warp(image, 0)[:, 9:]).all()
+
+
+def test_lines_beside_an_image_parallel_to_its_border_have_finite_ends():
+    rows = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # l = (0, a, b): y = -b / a
+    pencil = EpipolarPencil(
+        np.stack([rows, rows]), np.full((2, 2), [49.5, 39.5]), np.full(2, 50.0), ((100, 80),) * 2
+    )
+    phi = pencil.angles(0, np.array([[20.0, 10.0], [20.0, 200.0], [20.0, -90.0], [5.0, 79.0]]))
+    lines, enter, leave = pencil.chords(0, phi)
+    assert (lines.direction[:, 1] == 0.0).all()
+    assert (leave >= enter).tolist() == [True, False, False, True]
+    assert np.isfinite([enter, leave]).all()
+    assert leave[0] - enter[0] == pytest.approx(99 / 50)
