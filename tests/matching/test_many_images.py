@@ -7,13 +7,14 @@ from tests.synthetic import photograph, texture
 from thesisrecon import PipelineConfig, reconstruct
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.io._images import demo_images
-from thesisrecon.matching.growth import SeedsAndGrowth, strongest_share
+from thesisrecon.matching._prepared import strongest_corners, strongest_share
+from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.pipeline import _stages
 
 
 def test_the_strongest_corners_of_each_scale_and_seeds_of_each_level_are_kept():
     features = MultiScaleCorners().detect(photograph(texture(200, 260)))
-    fewer, rows = strongest_share(features, 0.5)
+    fewer, rows = strongest_share(features, 0.5), strongest_corners(features, 0.5)
     assert np.array_equal(fewer.xy, features.xy[rows])
     assert (np.diff(rows) > 0).all()
     for scale in np.unique(features.scale):

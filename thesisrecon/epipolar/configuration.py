@@ -34,6 +34,7 @@ from thesisrecon.geometry._homography import homography_sampson_residuals
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
+from thesisrecon.numerics._small_solvers import solve_damped
 
 # Initial focal lengths in units of the point spread: fields of view of 150 to 10 degrees.
 FOCALS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -321,10 +322,9 @@ def _refine_translation(f: F64, points: F64, gate: float) -> None:
 @kernel
 def _correct_epipole(e: F64, points: F64) -> None:
     """Minimise the Sampson distances of [e]x of matches (K, 4) over the unit vector ``e``, in place."""
-    normal, right, J, n = empty((3, 3)), empty(3), empty(3), empty(3)
-    one, two = empty(3), empty(3)
+    normal, gradient, J, n, step = empty((3, 3)), empty(3), empty(3), empty(3), empty(3)
     for _ in range(CORRECTIONS):
-        normal[:], right[:] = 0.0, 0.0
+        normal[:], gradient[:] = 0.0, 0.0
         for k in range(len(points)):
             x1, y1, x2, y2 = points[k]
             # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two
@@ -339,24 +339,17 @@ def _correct_epipole(e: F64, points: F64) -> None:
             J[1] = n[1] * size - by_g * (a0 - b0)
             J[2] = n[2] * size - by_g * (a1 * x1 - a0 * y1 + b0 * y2 - b1 * x2)
             for i in range(3):
-                right[i] -= J[i] * residual
+                gradient[i] += J[i] * residual
                 for j in range(3):
                     normal[i, j] += J[i] * J[j]
-        # Two directions at right angles to e and to each other.
-        least = int(np.argmin(np.abs(e)))
-        one[:] = -e[least] * e
-        one[least] += 1.0
-        one /= np.sqrt(one @ one)
-        two[0], two[1] = e[1] * one[2] - e[2] * one[1], e[2] * one[0] - e[0] * one[2]
-        two[2] = e[0] * one[1] - e[1] * one[0]
-        along = normal @ one, normal @ two
-        aa, ab, bb = one @ along[0], one @ along[1], two @ along[1]
-        determinant = aa * bb - ab * ab
-        if not determinant > EXACT * aa * bb:
+        # The length of e has no effect on the distances: e e' holds it.
+        held = normal[0, 0] + normal[1, 1] + normal[2, 2]
+        for i in range(3):
+            for j in range(3):
+                normal[i, j] += held * e[i] * e[j]
+        if not solve_damped(normal, gradient, 0.0, step):
             break
-        u, v = one @ right, two @ right
-        u, v = (bb * u - ab * v) / determinant, (aa * v - ab * u) / determinant
-        e += u * one + v * two
+        e += step
         e /= np.sqrt(e @ e)
-        if u * u + v * v < 1e-20:
+        if step @ step < 1e-20:
             break

@@ -6,22 +6,25 @@ width of each; a pixel of level k spans ``base * 2^k`` pixels of the image.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.geometry._image_filters import halve, resample
 from thesisrecon.kernels import empty, kernel, zeros
-from thesisrecon.records import Features, FundamentalFit, Image, Matches
+from thesisrecon.records import Features, FundamentalFit, Image, Matches, Seeds
 
 # Sums may be reordered; assuming no NaN would break the bounds checks.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 SIDE = 15
 SAMPLES = SIDE * SIDE
 PYRAMID_LEVELS = 4
+Found = TypeVar("Found", Features, Seeds)
 
 
 @kernel
@@ -237,3 +240,30 @@ def select_matches(matches: Matches, rows: I64 | B8) -> Matches:
     return Matches(
         m.i, m.j, m.index1[rows], m.index2[rows], m.xy1[rows], m.xy2[rows], m.score[rows], m.affine[rows]
     )
+
+
+def select_found(found: Found, rows: I64 | B8) -> Found:
+    """Some of the corners of features, or some of the seeds."""
+    columns = {field.name: getattr(found, field.name) for field in fields(found)}
+    chosen: dict[str, Any] = {name: a[rows] for name, a in columns.items() if isinstance(a, np.ndarray)}
+    return replace(found, **chosen)
+
+
+def strongest_corners(features: Features, share: float) -> I64:
+    """Rows, sorted, of the strongest corners, a share of each scale: two images keep the same ones."""
+    return _first_of_each(features.scale, share)
+
+
+def strongest_share(features: Features, share: float) -> Features:
+    """The features with their strongest corners, and with as large a share of the seeds of each level."""
+    fewer, seeds = select_found(features, strongest_corners(features, share)), features.seeds
+    if seeds is None:
+        return fewer
+    level = np.where(seeds.angle == 0.0, seeds.scale, -seeds.scale)
+    return replace(fewer, seeds=select_found(seeds, _first_of_each(level, share)))
+
+
+def _first_of_each(label: F32, share: float) -> I64:
+    """Rows, sorted, of the first ``share`` of the rows of each label."""
+    groups = (np.flatnonzero(label == one) for one in np.unique(label))
+    return np.sort(np.concatenate([rows[: math.ceil(share * len(rows))] for rows in groups]))

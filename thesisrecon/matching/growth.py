@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -48,8 +47,6 @@ DECIDING_SEEDS = 100
 RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
 # Pairs with a wide step have few seeds, whose maps are known to a fifth and positions to a few pixels.
 OBLIQUE_NEIGHBOURS, SEED_AFFINE_STD, GROWN_AFFINE_STD, SEED_SHIFT = 3, 0.2, 0.1, 5.0
-# Verified matches of a pair, from a share of its corners, that need no more.
-ENOUGH = 240
 # Share of the corners of image 1 whose matches are dense enough not to match these again.
 EXPLAINED = 1.0 / 3.0
 # Rounds of least squares of a local map: the first unweighted, the others reweighted.
@@ -316,7 +313,7 @@ class SeedsAndGrowth:
         Align positions in image 2 by least-squares matching, else keep the corners.
     many_images : int
         Number of images above which pairs are first matched with fewer corners and seeds, since more images
-        show each place, and with all only if these give few matches (:func:`strongest_share`).
+        show each place, and with all only if these give few matches.
     many_share : float
         Share of the corners and seeds that are matched first.
     oblique_pairs : int
@@ -484,41 +481,6 @@ class SeedsAndGrowth:
         rows = one_to_one(index, score)
         one, two, found = chosen[rows], index[rows], view2.features.xy[index[rows]]
         return Matches(known.i, known.j, one, two, xy1[rows], found, score[rows], affine[rows])
-
-
-def strongest_share(features: Features, share: float) -> tuple[Features, I64]:
-    """Select the strongest corners and seeds: two images keep the same ones.
-
-    Parameters
-    ----------
-    features : Features
-        Corners and seeds of one image.
-    share : float
-        Share of the corners of each scale, and of the seeds of each level, to keep.
-
-    Returns
-    -------
-    Features
-        The selected corners and seeds.
-    ndarray (M,) of int
-        Numbers of these corners in ``features``, sorted.
-    """
-    rows = _first_of_each(features.scale, share)
-    corners = replace(
-        features, xy=features.xy[rows], scale=features.scale[rows], response=features.response[rows]
-    )
-    if (seeds := features.seeds) is None:
-        return corners, rows
-    upright = seeds.angle == 0.0
-    kept = _first_of_each(np.where(upright, seeds.scale, -seeds.scale), share)
-    columns = {name: a[kept] for name, a in vars(seeds).items() if a is not None}
-    return replace(corners, seeds=replace(seeds, **columns)), rows
-
-
-def _first_of_each(label: F32, share: float) -> I64:
-    """Rows, sorted, of the first ``share`` of the rows of each label."""
-    groups = (np.flatnonzero(label == one) for one in np.unique(label))
-    return np.sort(np.concatenate([rows[: math.ceil(share * len(rows))] for rows in groups]))
 
 
 def _verified(

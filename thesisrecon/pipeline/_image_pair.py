@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import scipy
@@ -15,7 +15,7 @@ from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._images import read_image
-from thesisrecon.matching._prepared import select_matches
+from thesisrecon.matching._prepared import Found, select_found, select_matches
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 from thesisrecon.runtime._run import stream
 
@@ -24,7 +24,6 @@ ImageInput = str | Path | np.ndarray | Image
 """A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
 MASK_REACH = 4.0
 """Half width, in pixels of its scale, of the window that determines the position of a corner."""
-Found = TypeVar("Found", Features, Seeds)
 
 
 def match_pair(
@@ -114,9 +113,7 @@ def _distance_to_mask(image: Image) -> Any:
 def _unmasked(found: Found, clear: Any) -> Found:
     if clear is None:
         return found
-    keep = values_at(clear, found.xy) > MASK_REACH * found.scale
-    arrays = {field.name: getattr(found, field.name) for field in fields(found)}
-    return replace(found, **{name: a[keep] for name, a in arrays.items() if isinstance(a, np.ndarray)})
+    return select_found(found, values_at(clear, found.xy) > MASK_REACH * found.scale)
 
 
 def values_at(pixels: Any, xy: Any) -> Any:

@@ -16,8 +16,9 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.matching._prepared import strongest_corners, strongest_share
 from thesisrecon.matching._repeated_structure import reject_repeated_structure
-from thesisrecon.matching.growth import ENOUGH, SeedsAndGrowth, strongest_share
+from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
@@ -52,6 +53,8 @@ from thesisrecon.views._image_similarity import covered_pixels, match_exposure, 
 from thesisrecon.views.render import render
 
 MIN_CORNERS = 16
+ENOUGH = 240
+"""Verified matches of a pair, from a share of its corners, that need no more."""
 ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""
 MIN_GROUP = 3
@@ -124,15 +127,19 @@ def _matched_in_turn(state: PipelineState, pairs: Sequence[tuple[int, int]]) -> 
     features, matching = state.result.features, state.config.matching
     if not isinstance(matching, SeedsAndGrowth) or len(features) <= matching.many_images:
         return _matched(state, pairs, "", lambda: state.prepared_views())
-    fewer, rows = zip(*(strongest_share(f, matching.many_share) for f in features), strict=True)
-    given = dict(enumerate(zip(state.result.images, fewer, strict=True)))
-    found = _matched(state, pairs, "-fewer", lambda: PreparedViews(matching.prepare, given))
+    prepare = partial(_prepare_share, matching)
+    found = _matched(state, pairs, "-fewer", lambda: PreparedViews(prepare, state.given()))
+    rows = [strongest_corners(f, matching.many_share) for f in features]
     found = [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in found]
     weak = [n for n, pair in enumerate(found) if not pair.accepted or pair.inliers < ENOUGH]
     second = _matched(state, [pairs[n] for n in weak], "", lambda: state.prepared_views())
     for n, pair in zip(weak, second, strict=True):
         found[n] = pair
     return found
+
+
+def _prepare_share(matching: SeedsAndGrowth, image: Image, features: Features) -> Any:
+    return matching.prepare(image, strongest_share(features, matching.many_share))
 
 
 def _matched(
