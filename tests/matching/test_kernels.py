@@ -7,7 +7,7 @@ from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching._alignment import _align_windows
 from thesisrecon.matching._prepared import _corner_patches, prepare_image
-from thesisrecon.matching._seeds import _scan_correlations, _update_column_best
+from thesisrecon.matching._seeds import _scan_correlations, _update_largest_of_columns
 from thesisrecon.matching.growth import _fit_local_affines, _match_guided
 from thesisrecon.matching.strength import (
     _displacement_weight,
@@ -41,13 +41,13 @@ def test_scan_equals_its_numpy_twin():
     assert np.allclose(second_best, np.where(elsewhere, correlation, -1.0).max(axis=1))
 
 
-def test_column_best_over_blocks_equals_the_best_of_all_rows():
-    correlation = RNG.uniform(-1, 1, (50, 30)).astype(np.float32)
-    value, index = np.full(30, -2.0, np.float32), np.zeros(30, np.int64)
-    for first in range(0, 50, 16):
-        _update_column_best(correlation[first : first + 16], first, value, index)
-    assert np.array_equal(index, correlation.argmax(axis=0))
-    assert np.array_equal(value, correlation.max(axis=0))
+@pytest.mark.parametrize("rows", [1, 4, 50])
+def test_largest_of_columns_over_blocks_equals_that_of_all_rows(rows):
+    correlation = RNG.uniform(-1, 1, (rows, 30)).astype(np.float32)
+    largest = np.full(30, -2.0, np.float32)
+    for first in range(0, rows, 17):
+        _update_largest_of_columns(correlation[first : first + 17], largest)
+    assert np.array_equal(largest, correlation.max(axis=0))
 
 
 def affine_twin(xy, near, xy1, xy2, prior):

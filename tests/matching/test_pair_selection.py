@@ -318,17 +318,21 @@ def _parts(n, pairs):
 
 
 def mutual_best_numpy(correlation, xy2, apart2):
-    best, back = correlation.argmax(axis=1), correlation.argmax(axis=0)
-    mutual = back[best] == np.arange(len(best))
+    best = correlation.argmax(axis=1)
+    mutual = correlation.max(axis=1) == correlation.max(axis=0)[best]
+    first = {column: row for row, column in reversed(list(enumerate(best))) if mutual[row]}
+    mutual = np.array([first.get(column) == row for row, column in enumerate(best)])
     apart = ((xy2[None] - xy2[best][:, None]) ** 2).sum(axis=2) > apart2[best][:, None]
     second_best = np.where(apart, correlation, -1.0).max(axis=1)
     return np.where(mutual, best, -1), np.where(mutual, second_best, -1.0)
 
 
-@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
-def test_mutual_best_is_its_numpy_twin(rows, columns, seed):
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31), st.booleans())
+def test_mutual_best_is_its_numpy_twin(rows, columns, seed, equal):
     rng = np.random.default_rng(seed)
     correlation = rng.uniform(-1.0, 1.0, (rows, columns)).astype(np.float32)
+    if equal:
+        correlation = np.round(correlation)
     xy2 = rng.uniform(0.0, 10.0, (columns, 2)).astype(np.float32)
     apart2 = rng.uniform(0.0, 40.0, columns).astype(np.float32)
     index, _, second_best = mutual_best([correlation[:3], correlation[3:]], xy2, apart2)

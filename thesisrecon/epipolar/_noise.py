@@ -68,12 +68,33 @@ def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, 
     return likelihood / n
 
 
+@kernel
+def _equally_likely(sigma: float, spread: float, core: float, tail: float, wrong: float) -> float:
+    """Residual between ``sigma`` and ``spread`` at which noise and wrong matches are equally likely."""
+    low, high = sigma, spread
+    for _ in range(_BISECTIONS):
+        middle = np.sqrt(low * high)
+        noise = core * np.exp(-0.5 * (middle / sigma) ** 2)
+        noise += tail / TAIL * np.exp(-0.5 * (middle / (TAIL * sigma)) ** 2)
+        if noise > sigma * (wrong / spread * np.exp(-0.5 * (middle / spread) ** 2)):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _middle(ordered: F64) -> float:
+    """Median of ascending values."""
+    n = len(ordered)
+    return float(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
+
+
 def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
     """1.4826 (1 + 5 / (n - p)) median |r|, for less than half wrong residuals (Rousseeuw and Leroy 1987)."""
-    n = len(residuals)
-    if n <= parameters or not np.isfinite(residuals).all():
+    n, ordered = len(residuals), np.sort(np.abs(residuals))
+    if n <= parameters or not np.isfinite(ordered[-1]):
         raise ValueError(f"noise_scale needs more than {parameters} finite residuals; got {n}")
-    return float(MAD_FACTOR * (1.0 + 5.0 / (n - parameters)) * np.median(np.abs(residuals)))
+    return float(MAD_FACTOR * (1.0 + 5.0 / (n - parameters)) * _middle(ordered))
 
 
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
@@ -87,8 +108,7 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
         n = int(np.searchsorted(ordered, width))
         if n <= parameters:
             return threshold
-        median = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
-        if median <= _MEDIAN_RATIO * width * np.sqrt(1.0 - parameters / n):
+        if _middle(ordered[:n]) <= _MEDIAN_RATIO * width * np.sqrt(1.0 - parameters / n):
             return width
         width *= 1.5
     return threshold
@@ -134,14 +154,7 @@ class NoiseMixture:
     @property
     def limit(self) -> float:
         """Residual at which noise, with its tail, and wrong matches are equally likely."""
-        low, high = self.sigma, self.spread
-        for _ in range(_BISECTIONS):
-            middle = float(np.sqrt(low * high))
-            core = self.core * np.exp(-0.5 * (middle / self.sigma) ** 2)
-            tail = self.tail / TAIL * np.exp(-0.5 * (middle / (TAIL * self.sigma)) ** 2)
-            wrong = self.wrong / self.spread * np.exp(-0.5 * (middle / self.spread) ** 2)
-            low, high = (middle, high) if core + tail > self.sigma * wrong else (low, middle)
-        return low
+        return float(_equally_likely(self.sigma, self.spread, self.core, self.tail, self.wrong))
 
     @property
     def core_limit(self) -> float:

@@ -86,15 +86,20 @@ def _largest_by_lane(row: F32, largest: F32) -> None:
         largest[n % LANES] = max(largest[n % LANES], row[n])
 
 
-@kernel
-def _update_column_best(correlation: F32, first_row: int, value: F32, index: I64) -> None:
-    """Update the best row ``index`` (N,) of each column and its ``value`` (N,)."""
-    for b in range(correlation.shape[0]):
-        row = correlation[b]
-        for n in range(len(value)):
-            if row[n] > value[n]:
-                value[n] = row[n]
-                index[n] = first_row + b
+@kernel(fastmath={"nnan", "nsz"})
+def _update_largest_of_columns(correlation: F32, largest: F32) -> None:
+    """Update the largest value (N,) of each column, four rows at a time."""
+    rows, columns = correlation.shape
+    for b in range(0, rows - 3, 4):
+        one, two, three, four = correlation[b], correlation[b + 1], correlation[b + 2], correlation[b + 3]
+        for n in range(columns):
+            p = one[n] if one[n] > two[n] else two[n]
+            q = three[n] if three[n] > four[n] else four[n]
+            p = p if p > q else q
+            largest[n] = p if p > largest[n] else largest[n]
+    for b in range(rows - rows % 4, rows):
+        for n in range(columns):
+            largest[n] = max(largest[n], correlation[b, n])
 
 
 def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
@@ -102,17 +107,19 @@ def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32,
 
     ``blocks`` (B, N) are rows of the matrix; columns within the squared distance ``apart2`` (N,) of the best,
     at ``xy2`` (N, 2), are the same position. Returns the column of each row (-1 if the best is not mutual;
-    the first of equal values counts), its correlation and the second best elsewhere (-1: none, or not
-    mutual).
+    of equal columns or rows the first counts), its correlation and the second best elsewhere (-1: none, or
+    not mutual).
     """
-    column_value, back = np.full(len(xy2), -2.0, np.float32), np.zeros(len(xy2), np.int64)
-    parts, first = [], 0
+    largest, parts = np.full(len(xy2), -2.0, np.float32), []
     for correlation in blocks:
         parts.append(_scan_correlations(correlation, xy2, apart2))
-        _update_column_best(correlation, first, column_value, back)
-        first += len(correlation)
+        _update_largest_of_columns(correlation, largest)
     index, value, second_best = (np.concatenate(column) for column in zip(*parts, strict=True))
-    mutual = back[index] == np.arange(first)
+    rows = np.flatnonzero(value == largest[index])
+    # Written from the last to the first, so that the first of equal rows stays.
+    back = np.full(len(xy2), -1)
+    back[index[rows[::-1]]] = rows[::-1]
+    mutual = back[index] == np.arange(len(index))
     return np.where(mutual, index, -1), value, np.where(mutual, second_best, np.float32(-1.0))
 
 

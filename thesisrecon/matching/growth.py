@@ -455,7 +455,9 @@ class SeedsAndGrowth:
             return grown
         if len(grown.xy1) < EXPLAINED * len(scale):
             return self._grow(view1, view2, everything, *(_verified(grown, estimate, rng) or start))
-        others = self._grow(view1, view2, np.setdiff1d(everything, grown.index1), grown, start[1])
+        left = np.ones(len(scale), np.bool_)
+        left[grown.index1] = False
+        others = self._grow(view1, view2, np.flatnonzero(left), grown, start[1])
         both = join_matches([grown, others])
         rows = one_to_one(both.index2, both.score)
         return select_matches(both, rows[np.argsort(both.index1[rows], kind="stable")])

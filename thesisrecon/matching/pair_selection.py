@@ -299,9 +299,11 @@ def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> 
             x, y = xy1[m, 0] - xy1[h, 0], xy1[m, 1] - xy1[h, 1]
             dx = xy2[h, 0] + c * x - s * y - xy2[m, 0]
             dy = xy2[h, 1] + s * x + c * y - xy2[m, 1]
+            # Few matches are near, so that few need a logarithm and a cosine.
+            if m == h or not dx * dx + dy * dy <= radius2:
+                continue
             turn = np.cos(angle[m] - angle[h])
-            similarity = abs(np.log(scale[m] / scale[h])) <= limits[1] and turn >= np.cos(limits[2])
-            if m != h and similarity and dx * dx + dy * dy <= radius2:
+            if abs(np.log(scale[m] / scale[h])) <= limits[1] and turn >= np.cos(limits[2]):
                 count += 1
         most = max(most, count)
     return most
