@@ -393,7 +393,8 @@ def _word_weights(
     everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
     if not len(everything):
         return scipy.sparse.csr_array((len(patches), 1))
-    vocabulary = _vocabulary(everything, min(words, len(everything) // SAMPLES_PER_WORD), rng)
+    words = min(words, len(everything) // SAMPLES_PER_WORD)
+    vocabulary = _vocabulary(everything, words, map_all=map_all, rng=rng)
     found = map_all(lambda given: np.unique(_words_of(given, vocabulary), return_counts=True), patches)
     image = np.repeat(np.arange(len(patches)), [len(word) for word, _ in found])
     word, count = (np.concatenate([part[k] for part in found]) for k in (0, 1))
@@ -407,17 +408,18 @@ _Vocabulary = tuple[F32, F32]
 """Unit centres (B, D) of branches, and of the words (B, B, D) of each."""
 
 
-def _vocabulary(patches: F32, words: int, rng: np.random.Generator) -> _Vocabulary:
+def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Generator) -> _Vocabulary:
     """A tree of two levels with about so many words (D. Nister and H. Stewenius, CVPR 2006)."""
     branches = max(int(np.sqrt(words)), 1)
     sample = patches[rng.permutation(len(patches))[: SAMPLES_PER_WORD * branches**2]]
     top = _centres(sample, branches)
     branch = np.argmax(sample @ top.T, axis=1)
     leaves = np.repeat(top[:, None], branches, axis=1)
-    for b in range(branches):
-        inside = sample[branch == b]
-        if len(inside):
-            leaves[b, : min(branches, len(inside))] = _centres(inside, branches)
+    inside = [sample[branch == b] for b in range(branches)]
+    used = [b for b in range(branches) if len(inside[b])]
+    found = map_all(lambda b: _centres(inside[b], branches), used)
+    for b, centres in zip(used, found, strict=True):
+        leaves[b, : len(centres)] = centres
     return top, leaves
 
 
