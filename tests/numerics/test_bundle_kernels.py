@@ -176,7 +176,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     gradient[[6, 40]] = [3.0, -3.0]
     prior = np.array([6, 40, 38]), np.array([40, -1, 42]), np.array([2e4, 5e3, 3e4]), gradient
     system = BundleSystem(cost, layout, J, prior)
-    (camera_step, point_step), gain = system.solve(1e-3)
+    (camera_step, point_step), gain, of_cameras = system.solve(1e-3)
 
     full, r, D = _full_jacobian(J, layout), J.residual.ravel(), layout.size
     H, g = full.T @ full, full.T @ r
@@ -191,6 +191,9 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     np.testing.assert_allclose(camera_step, expected[:D], rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(point_step.ravel(), expected[D:], rtol=1e-5, atol=1e-8)
     assert gain == pytest.approx(-g @ expected - 0.5 * expected @ H @ expected, rel=1e-5)
+    # What the points alone would gain is missing in the gain of the cameras.
+    of_points = g[D:] @ np.linalg.solve(damped[D:, D:], g[D:])
+    assert of_cameras == pytest.approx(0.5 * (-g @ expected - of_points), rel=1e-4)
 
 
 def test_chunks_give_the_sums_of_the_whole(monkeypatch):

@@ -50,6 +50,27 @@ def test_every_solver_leads_to_the_same_optimum(monkeypatch, groups):
     np.testing.assert_allclose(other.cameras.intrinsics[:, 0], dense.cameras.intrinsics[:, 0], rtol=1e-3)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_adjustment_ends_when_the_cameras_are_settled(monkeypatch, seed):
+    block = make_block(points=600)
+    cameras, X = perturbed(block)
+    rng = np.random.default_rng(seed)
+    xy = block.xy + 0.3 * rng.normal(size=block.xy.shape)
+    wrong = block.point % 10 == 0
+    xy[wrong] += 4.0 * rng.normal(size=(wrong.sum(), 2))
+    solved, solve = [], _schur.BundleSystem.solve
+    monkeypatch.setattr(_schur.BundleSystem, "solve", lambda *given: solved.append(0) or solve(*given))
+    options = {"sigma_px": 0.3, "loss_px": 0.3, "max_iterations": 200, "covariance": True}
+    exact = _refine(cameras, X, _seen(block, xy), free=FOCAL, **options)
+    many = len(solved)
+    early = _refine(cameras, X, _seen(block, xy), free=FOCAL, settled=1e-3, **options)
+    assert len(solved) - many < 0.6 * many
+    std = np.sqrt(exact.intrinsics_covariance[0, 0, 0])
+    assert abs(early.cameras.intrinsics[0, 0] - exact.cameras.intrinsics[0, 0]) < 0.05 * std
+    # The contradictory points have not arrived.
+    assert exact.cost < early.cost < exact.cost * 1.001
+
+
 def test_cost_does_not_depend_on_the_frame():
     block = make_block()
     cameras, X = perturbed(block)

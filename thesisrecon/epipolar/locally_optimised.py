@@ -285,7 +285,7 @@ def _coincide(f: F64, other: F64, points: F64, gate: float) -> bool:
             if mine < gate:
                 near[side] += 1.0
                 squares[side] += min(theirs, FAR * gate) ** 2
-    return squares[0] <= near[0] * gate**2 and squares[1] <= near[1] * gate**2
+    return bool(squares[0] <= near[0] * gate**2 and squares[1] <= near[1] * gate**2)
 
 
 def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float) -> tuple[F64, list[F64]]:

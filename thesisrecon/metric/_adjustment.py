@@ -22,6 +22,9 @@ RAYLEIGH_90 = 2.1460
 """90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
 LITTLE_DAMPING = 1e-8
 """Long rows of many views bend against little resistance: stronger damping would hold them as they are."""
+SETTLED, ROUND_SETTLED = 1e-5, 1e-3
+"""Predicted gain of the cameras, half a squared distance in standard deviations, at which an adjustment ends;
+larger if the observations are chosen again after it."""
 MIN_VIEWS_PER_LENS = 3
 """k2 and k3 are estimated only if this many views share them."""
 FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
@@ -51,12 +54,13 @@ class BundleAdjustment:
     inflation: float = 1.0
     threads: int = 1
 
-    def options(self, model: MetricEstimate, *, iterations: int) -> BundleOptions:
+    def options(self, model: MetricEstimate, *, iterations: int, settled: float = SETTLED) -> BundleOptions:
         """Weights and loss for the noise of a model."""
         return BundleOptions(
             sigma_px=self.inflation * model.sigma_px,
             loss_px=model.loss_sigmas * model.sigma_px,
             max_iterations=iterations,
+            settled=settled,
             threads=self.threads,
             damping=LITTLE_DAMPING if model.registered.sum() > MANY_VIEWS else BundleOptions.damping,
         )
@@ -86,7 +90,13 @@ class BundleAdjustment:
         return np.asarray((self.row_prior(model).std > 0.0).any(axis=0))
 
     def run(
-        self, model: MetricEstimate, *, free: B8 | None = None, fixed: B8 | None = None, iterations: int
+        self,
+        model: MetricEstimate,
+        *,
+        free: B8 | None = None,
+        fixed: B8 | None = None,
+        iterations: int,
+        settled: float = ROUND_SETTLED,
     ) -> tuple[MetricEstimate, MetricBundleResult]:
         """Adjust the model to its inliers, by default all that the prior leaves ``free``; measure noise.
 
@@ -99,7 +109,7 @@ class BundleAdjustment:
             _inlier_observations(model),
             free=moves if free is None else moves & free,
             prior=prior,
-            options=self.options(model, iterations=iterations),
+            options=self.options(model, iterations=iterations, settled=settled),
             fixed=fixed,
         )
         norms = np.linalg.norm(result.residual_px, axis=1)

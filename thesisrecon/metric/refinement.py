@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric._adjustment import FOCAL_AND_CENTRE, BundleAdjustment, with_initial_gate
+from thesisrecon.metric._adjustment import FOCAL_AND_CENTRE, SETTLED, BundleAdjustment, with_initial_gate
 from thesisrecon.metric._camera_model import (
     MAX_REMAINING,
     camera_differences,
@@ -206,7 +206,7 @@ def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> Met
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
         if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
             break
-    return adjustment.run(model, iterations=LAST_ITERATIONS)[0]
+    return adjustment.run(model, iterations=LAST_ITERATIONS, settled=SETTLED)[0]
 
 
 def _adjust_to_precise_points(

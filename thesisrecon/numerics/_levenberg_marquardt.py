@@ -22,12 +22,16 @@ _MANY = 1200
 
 
 class _LinearSystem(Protocol[StepOut]):
-    """Normal equations at one state; ``solve`` gives the damped step and its predicted gain, or None."""
+    """Normal equations at one state.
+
+    ``solve`` gives the damped step, its predicted gain, and the part of it that decides about the end, or
+    None.
+    """
 
     @property
     def cost(self) -> float: ...
 
-    def solve(self, damping: float) -> tuple[StepOut, float] | None: ...
+    def solve(self, damping: float) -> tuple[StepOut, float, float] | None: ...
 
 
 class _Problem(Protocol[State, Step]):
@@ -46,22 +50,24 @@ def run_levenberg_marquardt(
     *,
     max_iterations: int,
     tolerance: float = 1e-7,
+    enough: float = 0.0,
     initial_damping: float = 1e-4,
 ) -> tuple[State, float, int]:
     """Minimise a problem by Levenberg-Marquardt; return the final state, its cost, linear solves (6.7).
 
     The cost never rises and singular systems raise nothing. The damping multiplies the diagonal (Marquardt
     1963), so that units do not matter and gauge freedoms need no other treatment; it follows Nielsen
-    (IMM-REP-1999-05). ``tolerance`` is the relative gain of cost, predicted or actual, at convergence.
+    (IMM-REP-1999-05). At convergence the gain of cost, predicted or actual, is at most ``tolerance`` relative
+    to the cost, or the predicted gain of the unknowns that decide is at most ``enough``.
     """
     system = problem.linearize(state)
     cost = system.cost
     damping, growth = initial_damping, 2.0
     for iteration in range(1, max_iterations + 1):
         solved = system.solve(damping)
-        gain, promised, candidate = -1.0, 1.0, state
+        gain, promised, deciding, candidate = -1.0, 1.0, np.inf, state
         if solved is not None:
-            promised = solved[1]
+            _, promised, deciding = solved
             if promised <= tolerance * 1e-3 * cost:
                 return state, cost, iteration
             candidate = problem.retract(state, solved[0])
@@ -70,7 +76,7 @@ def run_levenberg_marquardt(
             state, previous = candidate, cost
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / promised - 1.0) ** 3), _MIN_DAMPING)
             growth = 2.0
-            if gain <= tolerance * previous:
+            if gain <= tolerance * previous or deciding <= enough:
                 return state, cost - gain, iteration
             cost -= gain
             if iteration < max_iterations:
@@ -91,13 +97,14 @@ class DenseSystem:
     hessian: F64
     gradient: F64
 
-    def solve(self, damping: float) -> tuple[F64, float] | None:
-        """The damped step and its predicted gain by Cholesky, or None; unknowns without effect stay."""
+    def solve(self, damping: float) -> tuple[F64, float, float] | None:
+        """The step and its predicted gain (twice) by Cholesky, or None; unknowns without effect stay."""
         diagonal = damping * floored_diagonal(np.diag(self.hessian))
         step = solve_positive(self.hessian + np.diag(diagonal), -self.gradient)
         if step is None:
             return None
-        return step, 0.5 * float(step @ (diagonal * step - self.gradient))
+        gain = 0.5 * float(step @ (diagonal * step - self.gradient))
+        return step, gain, gain
 
 
 def invert_information(information: F64) -> F64:

@@ -52,11 +52,16 @@ _Covariances = tuple[F64, F64 | None, F64 | None]
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """Weighting, end, first damping, wanted covariances, the least noise assumed for them, and threads."""
+    """Weighting, end, first damping, wanted covariances, the least noise assumed for them, and threads.
+
+    The adjustment also ends when the predicted gain of the cameras is at most ``settled``: half the squared
+    distance of all cameras from the minimum, in standard deviations.
+    """
 
     sigma_px: float = 1.0
     loss_px: float = 1.0
     max_iterations: int = 20
+    settled: float = 0.0
     covariance: bool = False
     point_covariance: bool = False
     noise_floor_px: float = 0.0
@@ -209,14 +214,19 @@ def refine_metric_bundle(
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> tuple[_State, float]:
     """Return the minimum and its cost: by reweighting first, nearly Newton's steps where the loss bends."""
-    most, damping = options.max_iterations, options.damping
+    most, damping, enough = options.max_iterations, options.damping, options.settled
     state, cost, iterations = run_levenberg_marquardt(
-        problem, state, max_iterations=most, tolerance=_NEWTON_GAIN, initial_damping=damping
+        problem,
+        state,
+        max_iterations=most,
+        tolerance=_NEWTON_GAIN,
+        enough=enough,
+        initial_damping=damping,
     )
     if iterations < most:
         near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
         state, cost, _ = run_levenberg_marquardt(
-            near, state, max_iterations=most - iterations, initial_damping=damping
+            near, state, max_iterations=most - iterations, enough=enough, initial_damping=damping
         )
     return state, cost
 

@@ -77,13 +77,15 @@ def refine_projective_bundle(
     *,
     loss_px: float = 1.0,
     max_iterations: int = 10,
+    settled: float = 0.0,
     fixed_views: B8 | None = None,
 ) -> ProjectiveBundleResult:
     """Minimise sum rho(|x - P X|^2) over all points and cameras but ``fixed_views`` with Huber's loss (6.7).
 
     Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the
     damping handles the 15 gauge freedoms (methods 6.7). The cost never rises; views and points without
-    observations do not change.
+    observations do not change. The search also ends when the predicted gain of the cameras is at most
+    ``settled`` times the square of ``loss_px``.
     """
     o = sort_observations(Observations(view_index, point_index, xy), len(P), len(X))
     observed = np.bincount(o.seen.view_index, minlength=len(P)) > 0
@@ -100,7 +102,9 @@ def refine_projective_bundle(
     cameras, P_norms = _unit_rows((T @ P @ np.linalg.inv(M)).reshape(-1, 12), observed)
     points, X_norms = _unit_rows(X @ M.T, seen_points)
     start = UnitState.at(cameras, points)
-    end, cost, _ = run_levenberg_marquardt(problem, start, max_iterations=max_iterations)
+    end, cost, _ = run_levenberg_marquardt(
+        problem, start, max_iterations=max_iterations, enough=settled * (loss_px * scale) ** 2
+    )
 
     P_back = np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4) @ M
     X_back = (end.X * X_norms[:, None]) @ np.linalg.inv(M).T

@@ -158,8 +158,12 @@ class BundleSystem:
         add_diagonal(total.blocks, pair, total.corner, np.where(total.diagonal == 0.0, 1.0, damped))
         return ReducedSystem(layout.row, layout.column, total), points, damped
 
-    def solve(self, damping: float) -> tuple[BundleStep, float] | None:
-        """Return the damped step and its predicted gain of cost; None if the system is not positive."""
+    def solve(self, damping: float) -> tuple[BundleStep, float, float] | None:
+        """Return the damped step, its predicted gain of cost, and that of the cameras; None if not positive.
+
+        The gain of the cameras, half their squared distance in standard deviations, decides about the end:
+        points whose observations contradict each other move on for long, without an effect on any camera.
+        """
         reduced, points, damped = self.reduce(damping)
         solver = self.layout.solver
         cameras = solve_dense(reduced) if solver is None else solver.solve(reduced)
@@ -176,7 +180,8 @@ class BundleSystem:
             return None
         stiff = float(damped @ cameras**2) + damping * float(np.vdot(points.diagonal, moves**2))
         slope = float(reduced.sums.gradient @ cameras) + float(np.vdot(points.gradient, moves))
-        return (cameras, moves), 0.5 * (stiff - slope)
+        gain = 0.5 * (stiff - slope)
+        return (cameras, moves), gain, 0.5 * float(reduced.sums.rhs @ cameras) if len(cameras) else gain
 
 
 def _add_prior(pair: I64, total: ReducedSums, prior: CameraPrior) -> None:

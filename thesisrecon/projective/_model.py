@@ -18,6 +18,8 @@ from thesisrecon.records import Reconstruction, Tracks
 
 # Residual beyond which the loss of bundle adjustment is linear, in noise sigmas.
 LOSS_SIGMAS = 2.0
+# Predicted gain of the cameras, relative to the square of that residual, at which an adjustment ends.
+SETTLED = 1e-4
 # View pairs tried for a point with a wrong observation: all of them up to five observations.
 _HYPOTHESES = 10
 _POINT_ITERATIONS = 4
@@ -175,7 +177,7 @@ def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
         return
     result = refine_projective_bundle(
         model.P, model.X, t.view_index[used], t.point_index[used], t.xy[used],
-        loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations,
+        loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations, settled=SETTLED,
     )  # fmt: skip
     model.P, model.X = _whitened(result.P, result.X, model)
     norm = np.asarray(np.linalg.norm(result.residual_px, axis=1))
@@ -200,7 +202,8 @@ def adjust_locally(
         return
     result = refine_projective_bundle(
         model.P, model.X, t.view_index[chosen], t.point_index[chosen], t.xy[chosen],
-        loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations, fixed_views=~free,
+        loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations, settled=SETTLED,
+        fixed_views=~free,
     )  # fmt: skip
     model.P, model.X = result.P, result.X
     retriangulate_points(model, sigmas, points=local)
