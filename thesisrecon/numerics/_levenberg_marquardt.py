@@ -17,6 +17,9 @@ Step = TypeVar("Step")
 StepOut = TypeVar("StepOut", covariant=True)
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
+# Curvature, relative to the diagonal, of the weakest combination of unknowns that must arrive. Stronger damping
+# hides up to the ratio of the two of its gain.
+_WEAKEST = 1e-8
 # Unknowns above which information is inverted by Cholesky.
 _MANY = 1200
 
@@ -58,7 +61,7 @@ def run_levenberg_marquardt(
     The cost never rises and singular systems raise nothing. The damping multiplies the diagonal (Marquardt
     1963), so that units do not matter and gauge freedoms need no other treatment; it follows Nielsen
     (IMM-REP-1999-05). At convergence the gain of cost, predicted or actual, is at most ``tolerance`` relative
-    to the cost, or the predicted gain of the unknowns that decide is at most ``enough``.
+    to the cost, or the predicted gain of the unknowns that decide is below ``enough``.
     """
     system = problem.linearize(state)
     cost = system.cost
@@ -68,6 +71,7 @@ def run_levenberg_marquardt(
         gain, promised, deciding, candidate = -1.0, 1.0, np.inf, state
         if solved is not None:
             _, promised, deciding = solved
+            deciding *= max(1.0, damping / _WEAKEST)
             if promised <= tolerance * 1e-3 * cost:
                 return state, cost, iteration
             candidate = problem.retract(state, solved[0])
@@ -76,7 +80,7 @@ def run_levenberg_marquardt(
             state, previous = candidate, cost
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / promised - 1.0) ** 3), _MIN_DAMPING)
             growth = 2.0
-            if gain <= tolerance * previous or deciding <= enough:
+            if gain <= tolerance * previous or deciding < enough:
                 return state, cost - gain, iteration
             cost -= gain
             if iteration < max_iterations:

@@ -54,7 +54,7 @@ _Covariances = tuple[F64, F64 | None, F64 | None]
 class BundleOptions:
     """Weighting, end, first damping, wanted covariances, the least noise assumed for them, and threads.
 
-    The adjustment also ends when the predicted gain of the cameras is at most ``settled``: half the squared
+    The adjustment also ends when the predicted gain of the cameras is below ``settled``: half the squared
     distance of all cameras from the minimum, in standard deviations.
     """
 

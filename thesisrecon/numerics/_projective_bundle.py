@@ -84,7 +84,7 @@ def refine_projective_bundle(
 
     Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the
     damping handles the 15 gauge freedoms (methods 6.7). The cost never rises; views and points without
-    observations do not change. The search also ends when the predicted gain of the cameras is at most
+    observations do not change. The search also ends when the predicted gain of the cameras is below
     ``settled`` times the square of ``loss_px``.
     """
     o = sort_observations(Observations(view_index, point_index, xy), len(P), len(X))

@@ -19,7 +19,7 @@ from thesisrecon.records import Reconstruction, Tracks
 # Residual beyond which the loss of bundle adjustment is linear, in noise sigmas.
 LOSS_SIGMAS = 2.0
 # Predicted gain of the cameras, relative to the square of that residual, at which an adjustment ends.
-SETTLED = 1e-4
+SETTLED = 1e-3
 # View pairs tried for a point with a wrong observation: all of them up to five observations.
 _HYPOTHESES = 10
 _POINT_ITERATIONS = 4
