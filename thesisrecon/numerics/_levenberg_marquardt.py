@@ -17,8 +17,8 @@ Step = TypeVar("Step")
 StepOut = TypeVar("StepOut", covariant=True)
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
-# Curvature, relative to the diagonal, of the weakest combination of unknowns that must arrive. Stronger damping
-# hides up to the ratio of the two of its gain.
+# Curvature, relative to the diagonal, of the weakest combination of unknowns that must arrive. Stronger
+# damping hides up to the ratio of the two of its gain.
 _WEAKEST = 1e-8
 # Unknowns above which information is inverted by Cholesky.
 _MANY = 1200
