@@ -196,6 +196,17 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     assert of_cameras == pytest.approx(0.5 * (-g @ expected - of_points), rel=1e-4)
 
 
+def test_image_points_are_those_of_the_residuals_with_their_depths():
+    block = make_block(k1=0.03, lens=(-0.04, 0.05), points=50)
+    c = block.cameras
+    model = _metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen = Observations(block.view, block.point, block.xy)
+    xy, depth = _metric_kernels.image_points(model, block.view, block.point)
+    np.testing.assert_allclose(xy - block.xy, _metric_kernels.project_metric(model, seen), atol=1e-9)
+    wanted = np.einsum("kb,kb->k", c.R[block.view, 2], block.X[block.point]) + c.t[block.view, 2]
+    np.testing.assert_allclose(depth, wanted)
+
+
 def test_chunks_give_the_sums_of_the_whole(monkeypatch):
     block = make_block(views=6, points=200, groups=1)
     cameras, X = perturbed(block)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.camera_matrix import distort, undistort
+from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.kernels import kernel
-from thesisrecon.numerics._metric_kernels import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras, MetricModel, image_points
 from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.records import Reconstruction, Tracks, Upgrade
 
@@ -132,15 +132,9 @@ def choose_points(order: I64, start: I64, cell: I64, needed: I64, keep: B8) -> N
 
 def reproject_observations(model: MetricEstimate, view: I64, point: I64) -> tuple[F64, F64]:
     """Pixels (K, 2), with distortion, and depths (K,) of the points of observations."""
-    cameras = model.cameras
-    Y = np.einsum("kab,kb->ka", cameras.R[view], model.X[point]) + cameras.t[view]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        xy = Y[:, :2] / Y[:, 2:]
-        rows = cameras.intrinsics[cameras.group[view]]
-        xy = distort(xy, rows[:, K1:])
-        f, aspect, skew, cx, cy = rows[:, :K1].T
-        xy = np.column_stack([f * xy[:, 0] + skew * xy[:, 1] + cx, aspect * f * xy[:, 1] + cy])
-    return xy, Y[:, 2]
+    c = model.cameras
+    rows = (np.ascontiguousarray(a) for a in (c.R, c.t, c.intrinsics, c.group, model.X))
+    return image_points(MetricModel(*rows), view, point)
 
 
 def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:

@@ -110,6 +110,18 @@ def project_metric(model: MetricModel, obs: Observations) -> F64:
 
 
 @kernel
+def image_points(model: MetricModel, view: I64, point: I64) -> tuple[F64, F64]:
+    """Return pixels (K, 2), with distortion, and depths (K,) of points in views."""
+    xy, depth = empty((len(view), 2)), empty(len(view))
+    for k in range(len(view)):
+        v = view[k]
+        x0, x1, depth[k] = _in_camera(model.R[v], model.t[v], model.X[point[k]])
+        q = model.intrinsics[model.group[v]]
+        xy[k, 0], xy[k, 1] = _image_of(q, x0, x1, away_from_zero(depth[k]))
+    return xy, depth
+
+
+@kernel
 def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> float:
     """Return 1/2 sum rho of the residuals."""
     cost = 0.0
