@@ -133,8 +133,9 @@ def choose_points(order: I64, start: I64, cell: I64, needed: I64, keep: B8) -> N
 def reproject_observations(model: MetricEstimate, view: I64, point: I64) -> tuple[F64, F64]:
     """Pixels (K, 2), with distortion, and depths (K,) of the points of observations."""
     c = model.cameras
-    rows = (np.ascontiguousarray(a) for a in (c.R, c.t, c.intrinsics, c.group, model.X))
-    return image_points(MetricModel(*rows), view, point)
+    R, t, intrinsics, X = (np.ascontiguousarray(a) for a in (c.R, c.t, c.intrinsics, model.X))
+    pixels: tuple[F64, F64] = image_points(MetricModel(R, t, intrinsics, c.group, X), view, point)
+    return pixels
 
 
 def normalized_observations(cameras: MetricCameras, view: I64, xy: F64) -> F64:
