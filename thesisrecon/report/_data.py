@@ -13,6 +13,7 @@ from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import distort, project
 from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.records import (
     HeldOut,
     Image,
@@ -242,13 +243,12 @@ def point_colors(reconstruction: Reconstruction, images: tuple[Image, ...]) -> N
     used = used_observations(reconstruction)
     tracks = reconstruction.tracks
     view, point = tracks.view_index[used], tracks.point_index[used]
-    xy = np.rint(tracks.xy[used]).astype(np.int64)
-    total = np.zeros((len(reconstruction.X), 3))
-    for i, image in enumerate(images):
-        here = view == i
-        column = np.clip(xy[here, 0], 0, image.size[0] - 1)
-        row = np.clip(xy[here, 1], 0, image.size[1] - 1)
-        np.add.at(total, point[here], image.rgb[row, column].astype(np.float64))
+    xy, colors = np.rint(tracks.xy[used]).astype(np.int64), np.zeros((len(view), 3))
+    for image, rows in zip(images, rows_of_views(view, len(images)), strict=True):
+        column, row = (np.clip(xy[rows, k], 0, image.size[k] - 1) for k in (0, 1))
+        colors[rows] = image.rgb[row, column]
+    n = len(reconstruction.X)
+    total = np.stack([np.bincount(point, channel, minlength=n) for channel in colors.T], axis=1)
     count = np.bincount(point, minlength=len(total))
     total[count == 0] = 128.0
     return np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
