@@ -18,6 +18,7 @@ from thesisrecon.pipeline._parts import (
     align_parts,
     cameras_from_parts,
     divide_views,
+    has_narrow_cut,
     input_of_part,
     neighbour_graph,
     overlapping_parts,
@@ -28,6 +29,7 @@ from thesisrecon.records import Image, MetricResult
 from thesisrecon.runtime._run import _StageLog, start_run
 
 VIEWS, PART = 72, 45
+OBSERVED = ("view_index", "point_index", "xy")
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +78,15 @@ def test_a_street_is_cut_into_stretches_that_overlap(scene):
 
 
 def test_one_place_is_not_cut():
-    scene = make_scene(views=24, points=300, sigma_px=0.4, seed=5)
-    assert [len(views) for views in divide_views(neighbour_graph(scene.tracks), 8)] == [24]
+    place = make_scene(views=24, points=300, sigma_px=0.4, seed=5)
+    assert [len(views) for views in divide_views(neighbour_graph(place.tracks), 8)] == [24]
+    assert not has_narrow_cut(place.tracks)
+
+
+def test_a_street_has_a_narrow_cut(scene):
+    assert has_narrow_cut(scene.tracks)
+    nothing = replace(scene.tracks, **{name: getattr(scene.tracks, name)[:0] for name in OBSERVED})
+    assert not has_narrow_cut(nothing)
 
 
 def test_repeated_windows_make_no_neighbours(scene):

@@ -1,4 +1,4 @@
-"""Pairs of many images: first a share of the corners and seeds, all of them only where these are too few."""
+"""Pairs of many images: first a share of the corners and seeds, all if these are too few, and in streets."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_the_strongest_corners_of_each_scale_and_seeds_of_each_level_are_kept():
         SeedsAndGrowth(many_share=0.0)
 
 
-def test_pairs_of_many_images_have_fewer_matches_unless_these_are_too_few(tmp_path, monkeypatch):
+def test_pairs_of_many_images_have_fewer_matches_unless_all_are_needed(tmp_path, monkeypatch):
     def pairs(name, many_images):
         config = PipelineConfig(matching=SeedsAndGrowth(many_images=many_images))
         return reconstruct(
@@ -45,7 +45,10 @@ def test_pairs_of_many_images_have_fewer_matches_unless_these_are_too_few(tmp_pa
         # The numbers are those of all corners.
         assert np.array_equal(part.xy1, every.features[part.i].xy[part.index1])
         assert np.abs(part.xy2 - every.features[part.j].xy[part.index2]).max() < 10.0
-    monkeypatch.setattr(_stages, "ENOUGH", 10**6)
-    for whole, again in zip(every.pairs, pairs("again", 2).pairs, strict=True):
-        assert np.array_equal(whole.index1, again.index1)
-        assert np.array_equal(whole.xy2, again.xy2)
+    for name, value in (("ENOUGH", 10**6), ("has_narrow_cut", lambda _: True)):
+        with monkeypatch.context() as patch:
+            patch.setattr(_stages, name, value)
+            again = pairs(name, 2).pairs
+        for whole, pair in zip(every.pairs, again, strict=True):
+            assert np.array_equal(whole.index1, pair.index1)
+            assert np.array_equal(whole.xy2, pair.xy2)

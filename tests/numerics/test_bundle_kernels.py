@@ -191,7 +191,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     np.testing.assert_allclose(camera_step, expected[:D], rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(point_step.ravel(), expected[D:], rtol=1e-5, atol=1e-8)
     assert gain == pytest.approx(-g @ expected - 0.5 * expected @ H @ expected, rel=1e-5)
-    # What the points alone would gain is missing in the gain of the cameras.
+    # The gain of the cameras is without that of the points alone.
     of_points = g[D:] @ np.linalg.solve(damped[D:, D:], g[D:])
     assert of_cameras == pytest.approx(0.5 * (-g @ expected - of_points), rel=1e-4)
 

@@ -313,7 +313,7 @@ class SeedsAndGrowth:
         Align positions in image 2 by least-squares matching, else keep the corners.
     many_images : int
         Number of images above which pairs are first matched with fewer corners and seeds, since more images
-        show each place, and with all only if these give few matches.
+        show each place, and with all only if these give few matches or the images form a long row.
     many_share : float
         Share of the corners and seeds that are matched first.
     oblique_pairs : int

@@ -17,7 +17,7 @@ from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_c
 from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.matching.pair_selection import MapAll
 from thesisrecon.numerics._observations import cached_pair_order
-from thesisrecon.records import Matches, Tracks, TwoView
+from thesisrecon.records import Features, Matches, Tracks, TwoView
 
 MERGE_PX = 1.0
 """Default distance of positions that are one corner: the noise of positions that differ from pair to pair."""
@@ -266,6 +266,12 @@ class AlignedTracks:
 
         map_all(align, _batches(_groups(chains.view[middle], chains.view, len(prepared))))
         return _tracks(chains, xy, kept, len(prepared))
+
+
+def tracks_of_corners(features: Sequence[Features], pairs: Sequence[TwoView]) -> Tracks:
+    """Tracks of accepted pairs that match corners, each at its corner."""
+    chains = _link_matches([found.xy for found in features], _best_first(pairs))
+    return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(features))
 
 
 def _numbered(pairs: Sequence[TwoView]) -> bool:

@@ -92,6 +92,14 @@ def neighbour_graph(tracks: Tracks) -> scipy.sparse.csr_array:
     return scipy.sparse.coo_array((count[strong], (row[strong], column[strong])), common.shape).tocsr()
 
 
+def has_narrow_cut(tracks: Tracks) -> bool:
+    """Whether few common points hold the largest connected group of views together, as in a street."""
+    graph = neighbour_graph(tracks)
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    views = np.flatnonzero(label == np.argmax(np.bincount(label)))
+    return len(views) > 2 and _best_cut(graph, views) is not None
+
+
 def divide_views(graph: scipy.sparse.csr_array, part_views: int) -> list[I64]:
     """Divide the views until a part has at most ``part_views``, or every cut severs too many common points.
 

@@ -20,6 +20,7 @@ from thesisrecon.matching._prepared import strongest_corners, strongest_share
 from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
+from thesisrecon.matching.tracks import tracks_of_corners
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._image_pair import (
@@ -28,7 +29,7 @@ from thesisrecon.pipeline._image_pair import (
     oblique_pairs,
     prepare_oblique,
 )
-from thesisrecon.pipeline._parts import cameras_from_parts
+from thesisrecon.pipeline._parts import cameras_from_parts, has_narrow_cut
 from thesisrecon.pipeline._second_pass import from_metric, register_more
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs, name_images
 from thesisrecon.records import (
@@ -123,18 +124,25 @@ def match_pairs(state: PipelineState) -> None:
 
 
 def _matched_in_turn(state: PipelineState, pairs: Sequence[tuple[int, int]]) -> list[TwoView]:
-    """Match pairs; those of many images by a share of their corners, and by all if these are too few."""
+    """Match pairs; those of many images by a share of their corners, and by all where these are too few.
+
+    They are too few for weak pairs, and for all pairs of a long row of images, where errors add up.
+    """
     features, matching = state.result.features, state.config.matching
-    if not isinstance(matching, SeedsAndGrowth) or len(features) <= matching.many_images:
+    if not isinstance(matching, SeedsAndGrowth) or matching.many_share == 1.0:
+        return _matched(state, pairs, "", lambda: state.prepared_views())
+    if len(features) <= matching.many_images:
         return _matched(state, pairs, "", lambda: state.prepared_views())
     prepare = partial(_prepare_share, matching)
     found = _matched(state, pairs, "-fewer", lambda: PreparedViews(prepare, state.given()))
     rows = [strongest_corners(f, matching.many_share) for f in features]
     found = [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in found]
-    weak = [n for n, pair in enumerate(found) if not pair.accepted or pair.inliers < ENOUGH]
-    second = _matched(state, [pairs[n] for n in weak], "", lambda: state.prepared_views())
-    for n, pair in zip(weak, second, strict=True):
-        found[n] = pair
+    kept = reject_repeated_structure(found, len(features))
+    long = has_narrow_cut(tracks_of_corners(features, kept))
+    again = [n for n, pair in enumerate(found) if long or not pair.accepted or pair.inliers < ENOUGH]
+    second = _matched(state, [pairs[n] for n in again], "", lambda: state.prepared_views())
+    for n, pair in zip(again, second, strict=True):
+        found[n] = pair if pair.accepted or not found[n].accepted else found[n]
     return found
 
 
