@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,21 +67,6 @@ def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, 
         mixture[3] = (n1 + _TAIL_COUNT) / total
         mixture[4] = (n2 + _WRONG_COUNT) / total
     return likelihood / n
-
-
-@kernel
-def _equally_likely(sigma: float, spread: float, core: float, tail: float, wrong: float) -> float:
-    """Residual between ``sigma`` and ``spread`` at which noise and wrong matches are equally likely."""
-    low, high = sigma, spread
-    for _ in range(_BISECTIONS):
-        middle = np.sqrt(low * high)
-        noise = core * np.exp(-0.5 * (middle / sigma) ** 2)
-        noise += tail / TAIL * np.exp(-0.5 * (middle / (TAIL * sigma)) ** 2)
-        if noise > sigma * (wrong / spread * np.exp(-0.5 * (middle / spread) ** 2)):
-            low = middle
-        else:
-            high = middle
-    return low
 
 
 def _middle(ordered: F64) -> float:
@@ -154,7 +140,15 @@ class NoiseMixture:
     @property
     def limit(self) -> float:
         """Residual at which noise, with its tail, and wrong matches are equally likely."""
-        return float(_equally_likely(self.sigma, self.spread, self.core, self.tail, self.wrong))
+        low, high = self.sigma, self.spread
+        for _ in range(_BISECTIONS):
+            # Functions of single numbers: those of NumPy take ten times as long.
+            middle = math.sqrt(low * high)
+            noise = self.core * math.exp(-0.5 * (middle / self.sigma) ** 2)
+            noise += self.tail / TAIL * math.exp(-0.5 * (middle / (TAIL * self.sigma)) ** 2)
+            wrong = self.wrong / self.spread * math.exp(-0.5 * (middle / self.spread) ** 2)
+            low, high = (middle, high) if noise > self.sigma * wrong else (low, middle)
+        return low
 
     @property
     def core_limit(self) -> float:

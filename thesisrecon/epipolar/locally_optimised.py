@@ -13,7 +13,6 @@ from thesisrecon.epipolar._noise import NoiseMixture, noise_scale, noise_width
 from thesisrecon.epipolar._refinement import SAMPSON, fundamental_covariance, refine
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.errors import StageFailure
-from thesisrecon.kernels import kernel, zeros
 from thesisrecon.numerics._noise import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit
 
@@ -275,17 +274,14 @@ def _search_among_inliers(f: F64, points: F64, columns: F64, gate: float, rng: G
             return
 
 
-@kernel
 def _coincide(f: F64, other: F64, points: F64, gate: float) -> bool:
     """Whether the inliers of either F are near the other: their RMS distance is below the gate."""
-    one, two = sampson_distances(f, points), sampson_distances(other, points)
-    near, squares = zeros(2), zeros(2)
-    for k in range(len(points)):
-        for side, mine, theirs in ((0, one[k], two[k]), (1, two[k], one[k])):
-            if mine < gate:
-                near[side] += 1.0
-                squares[side] += min(theirs, FAR * gate) ** 2
-    return bool(squares[0] <= near[0] * gate**2 and squares[1] <= near[1] * gate**2)
+    distances = np.asarray(sampson_distances(f, points)), np.asarray(sampson_distances(other, points))
+    for mine, theirs in (distances, distances[::-1]):
+        far = np.minimum(theirs[mine < gate], FAR * gate)
+        if far @ far > gate**2 * len(far):
+            return False
+    return True
 
 
 def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float) -> tuple[F64, list[F64]]:
