@@ -269,7 +269,18 @@ class AlignedTracks:
 
 
 def tracks_of_corners(features: Sequence[Features], pairs: Sequence[TwoView]) -> Tracks:
-    """Tracks of accepted pairs that match corners, each at its corner."""
+    """Return the tracks of accepted pairs that match corners, each observation at its corner.
+
+    Parameters
+    ----------
+    features, pairs : sequence of Features, sequence of TwoView
+        Corners of every image, and matched pairs; only accepted ones are used.
+
+    Returns
+    -------
+    Tracks
+        Observations that are not aligned.
+    """
     chains = _link_matches([found.xy for found in features], _best_first(pairs))
     return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(features))
 
