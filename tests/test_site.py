@@ -127,7 +127,7 @@ def test_the_calls_of_the_readme_fit_the_functions():
             fields = getattr(made, "__dataclass_fields__", {})
             assert name in fields or hasattr(made, name), f"{call.func.attr}: .{name}"
             attributes += 1
-    assert len(calls) >= 10
+    assert len(calls) >= 15
     assert attributes >= 15
 
 
