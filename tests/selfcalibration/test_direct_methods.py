@@ -13,6 +13,7 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
@@ -51,7 +52,9 @@ def calibrate(method, scene, prior, *, seed=0):
 def adjusted(scene, seed):
     """The projective bundle adjustment of the scene's observations, in a random frame."""
     rec, t = projective_reconstruction(scene, seed=seed), scene.tracks
-    fitted = refine_projective_bundle(rec.P, rec.X, t.view_index, t.point_index, t.xy, max_iterations=30)
+    fitted = refine_projective_bundle(
+        rec.P, rec.X, Observations(t.view_index, t.point_index, t.xy), max_iterations=30
+    )
     return replace(rec, P=fitted.P, X=fitted.X)
 
 

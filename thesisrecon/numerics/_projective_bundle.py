@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_transform
 from thesisrecon.numerics._elimination import revert_crossing_points
 from thesisrecon.numerics._levenberg_marquardt import run_levenberg_marquardt
@@ -71,9 +71,7 @@ class _ProjectiveProblem:
 def refine_projective_bundle(
     P: F64,
     X: F64,
-    view_index: I64,
-    point_index: I64,
-    xy: F64,
+    observations: Observations,
     *,
     loss_px: float = 1.0,
     max_iterations: int = 10,
@@ -87,7 +85,7 @@ def refine_projective_bundle(
     observations do not change. The search also ends when the predicted gain of the cameras is below
     ``settled`` times the square of ``loss_px``.
     """
-    o = sort_observations(Observations(view_index, point_index, xy), len(P), len(X))
+    o = sort_observations(observations, len(P), len(X))
     observed = np.bincount(o.seen.view_index, minlength=len(P)) > 0
     seen_points = np.diff(o.start) > 0
     free = observed & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))

@@ -11,6 +11,7 @@ from thesisrecon.geometry._conditioning import whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.numerics._noise import noise_from_distances
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.projective._track_selection import observation_cells
@@ -176,7 +177,7 @@ def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
     if used.sum() < 2 * 8:
         return
     result = refine_projective_bundle(
-        model.P, model.X, t.view_index[used], t.point_index[used], t.xy[used],
+        model.P, model.X, Observations(t.view_index[used], t.point_index[used], t.xy[used]),
         loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations, settled=SETTLED,
     )  # fmt: skip
     model.P, model.X = _whitened(result.P, result.X, model)
@@ -201,7 +202,7 @@ def adjust_locally(
     if chosen.sum() < 2 * 8:
         return
     result = refine_projective_bundle(
-        model.P, model.X, t.view_index[chosen], t.point_index[chosen], t.xy[chosen],
+        model.P, model.X, Observations(t.view_index[chosen], t.point_index[chosen], t.xy[chosen]),
         loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations, settled=SETTLED,
         fixed_views=~free,
     )  # fmt: skip

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.pose import UP, look_at, turntable
@@ -190,7 +191,7 @@ def projective_estimate(scene: Sequence, rng: np.random.Generator) -> Reconstruc
     P = scene.P @ np.linalg.inv(G)
     P /= np.linalg.norm(P, axis=(1, 2))[:, None, None]
     t = scene.tracks
-    fit = refine_projective_bundle(P, Xh, t.view_index, t.point_index, t.xy, max_iterations=20)
+    fit = refine_projective_bundle(P, Xh, Observations(t.view_index, t.point_index, t.xy), max_iterations=20)
     n = len(P)
     return Reconstruction(
         "projective", fit.P, fit.X, np.ones(n, dtype=bool), seen, np.ones(len(t.xy), dtype=bool), t,

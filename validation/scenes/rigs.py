@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.cube import SIZE, make_cube
@@ -104,7 +105,11 @@ def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) ->
     P = P @ np.linalg.inv(G) * (rng.uniform(0.5, 2.0, n) * rng.choice([-1.0, 1.0], n))[:, None, None]
     X = X @ G.T * rng.choice([-1.0, 1.0], len(X))[:, None]
     fitted = refine_projective_bundle(
-        P, X, tracks.view_index[use], tracks.point_index[use], tracks.xy[use], loss_px=10.0, max_iterations=30
+        P,
+        X,
+        Observations(tracks.view_index[use], tracks.point_index[use], tracks.xy[use]),
+        loss_px=10.0,
+        max_iterations=30,
     )
     valid = np.bincount(tracks.point_index[use], minlength=len(X)) >= 2
     sigma = float(np.sqrt(np.mean(fitted.residual_px**2)))

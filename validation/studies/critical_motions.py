@@ -22,6 +22,7 @@ from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.projective._track_selection import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
@@ -141,7 +142,7 @@ def published_reconstruction(dinosaur: Dinosaur) -> Reconstruction:
     keep = seen[t.point_index]
     view, point, xy = t.view_index[keep], t.point_index[keep], t.xy[keep]
     X = triangulate_observations(dinosaur.P, view, point, xy, t.n_points)
-    fit = refine_projective_bundle(dinosaur.P, X, view, point, xy, max_iterations=30)
+    fit = refine_projective_bundle(dinosaur.P, X, Observations(view, point, xy), max_iterations=30)
     inlier = np.zeros(len(t.xy), dtype=bool)
     inlier[np.flatnonzero(keep)] = np.linalg.norm(fit.residual_px, axis=1) < 2.0
     n = len(dinosaur.P)

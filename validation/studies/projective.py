@@ -21,6 +21,7 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.config import ProjectiveReconstructor
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.triangulation import triangulate_observations
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.pipeline.reconstruction import reconstruct
@@ -160,7 +161,7 @@ def adjusted_rms_px(start: Start, xy: F64, rng: np.random.Generator) -> float:
     signs = np.sign(np.einsum("vb,nb->vn", start.P[:, 2], start.X))
     X = start.X * np.where(signs.sum(axis=0) < 0.0, -1.0, 1.0)[:, None]
     result = refine_projective_bundle(
-        start.P @ np.linalg.inv(G), X @ G.T, t.view_index, t.point_index, t.xy,
+        start.P @ np.linalg.inv(G), X @ G.T, Observations(t.view_index, t.point_index, t.xy),
         loss_px=10.0, max_iterations=BUNDLE_STEPS,
     )  # fmt: skip
     return float(np.sqrt(np.mean(np.sum(result.residual_px**2, axis=1))))
@@ -254,7 +255,7 @@ def judge_adjusted(P: F64, registered: B8, tracks: Tracks) -> tuple[Residuals, R
     X, before = judge_cameras(P, registered, tracks)
     k = np.isfinite(before.px)
     result = refine_projective_bundle(
-        P, X, tracks.view_index[k], tracks.point_index[k], tracks.xy[k],
+        P, X, Observations(tracks.view_index[k], tracks.point_index[k], tracks.xy[k]),
         loss_px=LOSS_PX, max_iterations=ADJUSTMENT_STEPS,
     )  # fmt: skip
     return before, judge_cameras(result.P, registered, tracks)[1]

@@ -15,6 +15,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.triangulation import triangulate
+from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
 from validation.harness.rows import each, plot, read_arrays, row, scatter
@@ -102,7 +103,9 @@ def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
     view, point = np.tile(np.arange(views), points), np.repeat(np.arange(points), views)
     seen = problem.xy[view, point]
     start = triangulate(P, problem.xy, method="linear")
-    fit = refine_projective_bundle(P, start, view, point, seen, loss_px=1e3, max_iterations=DESCENT)
+    fit = refine_projective_bundle(
+        P, start, Observations(view, point, seen), loss_px=1e3, max_iterations=DESCENT
+    )
     return fit.P, fit.X
 
 
