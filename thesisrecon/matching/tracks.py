@@ -17,7 +17,7 @@ from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_c
 from thesisrecon.matching._prepared import PreparedImage
 from thesisrecon.matching.pair_selection import MapAll
 from thesisrecon.numerics._observations import cached_pair_order
-from thesisrecon.records import Features, Matches, Tracks, TwoView
+from thesisrecon.records import Matches, Tracks, TwoView
 
 MERGE_PX = 1.0
 """Default distance of positions that are one corner: the noise of positions that differ from pair to pair."""
@@ -222,8 +222,7 @@ class PlainTracks:
         corners = [found.xy for found in features if found is not None]
         if len(corners) < len(prepared):
             corners, accepted = corners_from_matches(accepted, len(prepared), self.merge_px)
-        chains = _link_matches(corners, accepted)
-        return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(prepared))
+        return tracks_of_corners(corners, accepted)
 
 
 @dataclass(frozen=True)
@@ -268,12 +267,12 @@ class AlignedTracks:
         return _tracks(chains, xy, kept, len(prepared))
 
 
-def tracks_of_corners(features: Sequence[Features], pairs: Sequence[TwoView]) -> Tracks:
+def tracks_of_corners(corners: Sequence[F64], pairs: Sequence[TwoView]) -> Tracks:
     """Return the tracks of accepted pairs that match corners, each observation at its corner.
 
     Parameters
     ----------
-    features, pairs : sequence of Features, sequence of TwoView
+    corners, pairs : sequence of ndarray (N, 2), sequence of TwoView
         Corners of every image, and matched pairs; only accepted ones are used.
 
     Returns
@@ -281,8 +280,8 @@ def tracks_of_corners(features: Sequence[Features], pairs: Sequence[TwoView]) ->
     Tracks
         Observations that are not aligned.
     """
-    chains = _link_matches([found.xy for found in features], _best_first(pairs))
-    return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(features))
+    chains = _link_matches(corners, _best_first(pairs))
+    return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(corners))
 
 
 def _numbered(pairs: Sequence[TwoView]) -> bool:

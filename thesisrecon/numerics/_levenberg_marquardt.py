@@ -70,11 +70,11 @@ def run_levenberg_marquardt(
         solved = system.solve(damping)
         gain, promised, deciding, candidate = -1.0, 1.0, np.inf, state
         if solved is not None:
-            _, promised, deciding = solved
+            step, promised, deciding = solved
             deciding *= max(1.0, damping / _WEAKEST)
             if promised <= tolerance * 1e-3 * cost:
                 return state, cost, iteration
-            candidate = problem.retract(state, solved[0])
+            candidate = problem.retract(state, step)
             gain = cost - problem.cost(candidate)
         if gain > 0.0 and np.isfinite(gain):
             state, previous = candidate, cost

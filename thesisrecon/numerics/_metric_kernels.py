@@ -97,19 +97,6 @@ def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
 
 
 @kernel
-def project_metric(model: MetricModel, obs: Observations) -> F64:
-    """Return residuals (K, 2), projection minus observation, px."""
-    residual = empty((len(obs.xy), 2))
-    for k in range(len(obs.xy)):
-        v, x = obs.view_index[k], model.X[obs.point_index[k]]
-        x0, x1, x2 = _in_camera(model.R[v], model.t[v], x)
-        px, py = _image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
-        residual[k, 0] = px - obs.xy[k, 0]
-        residual[k, 1] = py - obs.xy[k, 1]
-    return residual
-
-
-@kernel
 def image_points(model: MetricModel, view: I64, point: I64) -> tuple[F64, F64]:
     """Return pixels (K, 2), with distortion, and depths (K,) of points in views."""
     xy, depth = empty((len(view), 2)), empty(len(view))
@@ -119,6 +106,12 @@ def image_points(model: MetricModel, view: I64, point: I64) -> tuple[F64, F64]:
         q = model.intrinsics[model.group[v]]
         xy[k, 0], xy[k, 1] = _image_of(q, x0, x1, away_from_zero(depth[k]))
     return xy, depth
+
+
+@kernel
+def project_metric(model: MetricModel, obs: Observations) -> F64:
+    """Return residuals (K, 2), projection minus observation, px."""
+    return image_points(model, obs.view_index, obs.point_index)[0] - obs.xy
 
 
 @kernel

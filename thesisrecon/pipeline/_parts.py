@@ -95,9 +95,13 @@ def neighbour_graph(tracks: Tracks) -> scipy.sparse.csr_array:
 def has_narrow_cut(tracks: Tracks) -> bool:
     """Whether few common points hold the largest connected group of views together, as in a street."""
     graph = neighbour_graph(tracks)
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    views = np.flatnonzero(label == np.argmax(np.bincount(label)))
+    views = max(_connected_views(graph), key=len)
     return len(views) > 2 and _best_cut(graph, views) is not None
+
+
+def _connected_views(graph: scipy.sparse.csr_array) -> list[I64]:
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    return [np.flatnonzero(label == k) for k in range(label.max() + 1)]
 
 
 def divide_views(graph: scipy.sparse.csr_array, part_views: int) -> list[I64]:
@@ -106,8 +110,7 @@ def divide_views(graph: scipy.sparse.csr_array, part_views: int) -> list[I64]:
     The views of a part are numbered such that neighbours are close (reverse Cuthill-McKee); the cut between
     consecutive numbers with the smallest fraction of severed points divides it.
     """
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    left, parts = [np.flatnonzero(label == k) for k in range(label.max() + 1)], list[I64]()
+    left, parts = _connected_views(graph), list[I64]()
     while left:
         views = left.pop()
         halves = _best_cut(graph, views) if len(views) > part_views else None

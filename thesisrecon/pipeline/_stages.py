@@ -129,18 +129,20 @@ def _matched_in_turn(state: PipelineState, pairs: Sequence[tuple[int, int]]) -> 
     They are too few for weak pairs, and for all pairs of a long row of images, where errors add up.
     """
     features, matching = state.result.features, state.config.matching
-    if not isinstance(matching, SeedsAndGrowth) or matching.many_share == 1.0:
-        return _matched(state, pairs, "", lambda: state.prepared_views())
-    if len(features) <= matching.many_images:
-        return _matched(state, pairs, "", lambda: state.prepared_views())
+    if (
+        not isinstance(matching, SeedsAndGrowth)
+        or matching.many_share == 1.0
+        or len(features) <= matching.many_images
+    ):
+        return _matched(state, pairs, "", state.prepared_views)
     prepare = partial(_prepare_share, matching)
     found = _matched(state, pairs, "-fewer", lambda: PreparedViews(prepare, state.given()))
     rows = [strongest_corners(f, matching.many_share) for f in features]
     found = [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in found]
     kept = reject_repeated_structure(found, len(features))
-    long = has_narrow_cut(tracks_of_corners(features, kept))
+    long = has_narrow_cut(tracks_of_corners([found.xy for found in features], kept))
     again = [n for n, pair in enumerate(found) if long or not pair.accepted or pair.inliers < ENOUGH]
-    second = _matched(state, [pairs[n] for n in again], "", lambda: state.prepared_views())
+    second = _matched(state, [pairs[n] for n in again], "", state.prepared_views)
     for n, pair in zip(again, second, strict=True):
         found[n] = pair if pair.accepted or not found[n].accepted else found[n]
     return found
