@@ -3,11 +3,11 @@ r"""
 =================================
 
 With calibrated cameras a disparity becomes a depth, and each image gets a :term:`depth map` (section 2.6):
-for every pixel :math:`x` the depth :math:`Z` along the optical axis, so that :math:`X = C + Z R^\top K^{-1} x` lies
-on the surface. Several neighbours are matched, their depths are combined, each pixel is refined with a small
-plane through its surface point, and depths that no other view confirms are removed. The cameras here are the
-true ones of the courtyard, so that errors of depth are not mixed with those of the cameras;
-``thesisrecon.load(out).cameras`` gives estimated ones.
+for every pixel :math:`x` the depth :math:`Z` along the optical axis, so that
+:math:`X = C + Z R^\top K^{-1} x` lies on the surface. Several neighbours are matched, their depths are
+combined, each pixel is refined with a small plane through its surface point, and depths that no other view
+confirms are removed. The cameras here are the true ones of the courtyard, so that errors of depth are not
+mixed with those of the cameras; ``thesisrecon.load(out).cameras`` gives estimated ones.
 """
 
 from pathlib import Path

@@ -126,6 +126,8 @@ class FakeTracks:
 
 @dataclass(frozen=True)
 class FakeProjective:
+    """Fails in the first attempts; the noise is one more than the number of the attempt."""
+
     fail_below: int = 0
 
     def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
@@ -134,7 +136,8 @@ class FakeProjective:
         if attempt < self.fail_below:
             raise StageFailure("the initial pair is bad", f"attempt {attempt}")
         P = np.stack([scene_camera(i) for i in range(tracks.n_views)])
-        return reconstruction_of(P, sizes, X=scene_points(), tracks=tracks, stratum="projective")
+        found = reconstruction_of(P, sizes, X=scene_points(), tracks=tracks, stratum="projective")
+        return replace(found, sigma_px=1.0 + attempt)
 
 
 @dataclass(frozen=True)

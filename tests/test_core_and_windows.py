@@ -120,6 +120,19 @@ def test_points_that_hold_every_view_are_enough(monkeypatch, limits):
     assert centre_error(metric, scene) < 2e-3
 
 
+def test_images_of_other_groups_do_not_make_a_set_large():
+    scene = make_scene(views=12, points=100)
+    t = scene.tracks
+    wide = replace(t, view_index=t.view_index + 30, n_views=45)
+    assert _model.seen_views(t) == _model.seen_views(wide) == 12
+    n = len(t.xy)
+    model = _model.MetricEstimate(
+        wide, np.tile(scene.sizes[:1], (45, 1)), None, np.ones(45, bool), scene.X,
+        np.ones(100, bool), np.ones(n, bool), 0.5,
+    )  # fmt: skip
+    assert _model.with_enough_points(model) is model
+
+
 def test_a_core_has_ties_with_parallax_and_doubles():
     pairs = true_pairs(make_scene(views=12, points=60))
     core = select_core(pairs, 12, 5)

@@ -258,3 +258,11 @@ def test_an_image_of_another_scene_does_not_join():
     keypoints[4] = rng.uniform(0, SIZE, keypoints[4].shape)
     result = reconstruct_from_matches(keypoints, with_few_matches(4), SCENE.sizes)
     assert list(result.metric.reconstruction.registered) == [True] * 4 + [False]
+
+
+def test_corrected_sizes_are_used_by_a_repeated_run(tmp_path):
+    given = {"out": tmp_path, "until": "projective"}
+    doubled = [(2 * width, 2 * height) for width, height in SCENE.sizes]
+    for sizes in (SCENE.sizes, doubled):
+        result = reconstruct_from_matches(SCENE.keypoints, SCENE.matches, sizes, **given, overwrite=True)
+        assert result.projective.sizes.tolist() == [list(size) for size in sizes]

@@ -6,13 +6,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy
 
+from tests.matching.test_repeated_structure import pair
+from tests.matching.test_repeated_structure import street as street_pairs
 from tests.metric.test_metric_refinement import centre_error
 from tests.synthetic import make_scene, true_pairs
 from tests.test_core_and_windows import street, with_repeated_windows
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
+from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.pipeline import _parts
 from thesisrecon.pipeline._parts import (
     align_parts,
@@ -24,7 +28,7 @@ from thesisrecon.pipeline._parts import (
     overlapping_parts,
     reconstruct_part,
 )
-from thesisrecon.pipeline._second_pass import cameras_on_tracks
+from thesisrecon.pipeline._second_pass import cameras_on_tracks, pairs_of_missing
 from thesisrecon.records import Image, MetricResult
 from thesisrecon.runtime._run import _StageLog, start_run
 
@@ -175,3 +179,20 @@ def test_similarities_of_common_cameras_need_no_centres_off_a_line():
 def test_the_number_of_views_of_a_part_is_checked():
     with pytest.raises(ValueError, match="part_views must be at least 0; got -1"):
         ImageOptions(part_views=-1)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_cut_does_not_depend_on_the_direction_of_the_numbers(order):
+    ties = np.where(np.arange(23) == 22, 9.0, 1.0)[::order]
+    graph = scipy.sparse.diags_array([ties, ties], offsets=[1, -1], shape=(24, 24)).tocsr()
+    sizes = [len(views) for views in divide_views(graph, 23)]
+    assert sizes == [16, 8][::order]
+
+
+def test_pairs_of_repeated_structure_do_not_come_back_for_missing_images():
+    pairs, missing = reject_repeated_structure([*street_pairs(60), pair(5, 50, 80)], 60), np.arange(60) == 50
+    pairs = [replace(p, configuration="general") for p in pairs]
+    few = replace(pair(49, 50, 40, accepted=False), configuration="general")
+    found = pairs_of_missing([*pairs, few], missing)
+    assert (5, 50) not in {(p.i, p.j) for p in found}
+    assert len(found) == len(pairs)

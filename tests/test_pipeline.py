@@ -415,6 +415,27 @@ def test_a_failed_attempt_is_followed_by_another(tmp_path):
     assert result.warnings == ("3 initial pairs were tried; the best result is used",)
 
 
+@pytest.mark.parametrize(("first", "chosen"), [(0, 0), (1, 1)])
+def test_stages_report_the_chosen_attempt(tmp_path, first, chosen):
+    config = fake_config(
+        projective=fakes.FakeProjective(fail_below=first), metric=fakes.FakeMetric(trusted_from=9)
+    )
+    for result in (run(tmp_path, config=config), run(tmp_path, config=config)):
+        (report,) = [report for report in result.reports if report.stage == "projective"]
+        assert report.metrics["sigma_px"] == 1.0 + chosen
+
+
+@pytest.mark.parametrize("failed", [0, 1, 2])
+def test_a_large_set_is_divided_once_whichever_attempt_is_the_first_to_be_calibrated(
+    tmp_path, monkeypatch, failed
+):
+    divided = []
+    monkeypatch.setattr(_stages, "cameras_from_parts", lambda *_: divided.append(len(CALLS)))
+    untrusted = fakes.FakeMetric(trusted_from=9)
+    run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=failed), metric=untrusted))
+    assert len(divided) == 1
+
+
 def test_a_pair_that_fails_is_a_refused_pair(tmp_path):
     result = run(tmp_path, config=fake_config(matching=fakes.FakeMatcher(fail_pair=(0, 2))))
     refused = [pair for pair in result.pairs if not pair.accepted]

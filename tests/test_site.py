@@ -187,6 +187,24 @@ def test_commands_of_the_pages_exist(site):
     assert named - {*MODULES, "all"} == set()
 
 
+def test_all_studies_run_with_the_options_of_the_pages():
+    """`study all` makes the tables of the chapters and of the evidence."""
+    pytest.importorskip("validation.studies.runner")
+    from validation.studies.runner import MODULES, OF_PAGES, load_study, study_parser
+
+    def options(name, words):
+        return vars(study_parser(name, load_study(name)).parse_args([*words, "-o", "OUT"]))
+
+    pages = [p for p in PAGES if p.parent.name in ("theory", "evidence") and p.stem != "index"]
+    shown = [words for page in pages for words in commands_of(page.read_text("utf-8"))]
+    shown = [words[2:] for words in shown if words[1:2] == ["study"] and words[2:3] and words[2] in MODULES]
+    assert len(shown) > 15
+    for name, *words in shown:
+        given = words[: words.index("-o")] if "-o" in words else words
+        run = [options(name, all_options) for all_options in OF_PAGES.get(name, [[]])]
+        assert options(name, given) in run, (name, words)
+
+
 def sections_with_tables(text):
     """The sections of a page that have a table, and the number of the tables."""
     for section in re.split(r"^(?=##? )", text, flags=re.M):

@@ -1,15 +1,20 @@
 """Pairs of many images: first a share of the corners and seeds, all if these are too few, and in streets."""
 
+from dataclasses import replace
+
 import numpy as np
+import PIL.Image
 import pytest
 
 from tests.synthetic import photograph, texture
 from thesisrecon import PipelineConfig, reconstruct
+from thesisrecon.errors import StageFailure
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.io._images import demo_images
 from thesisrecon.matching._prepared import strongest_corners, strongest_share
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.pipeline import _stages
+from thesisrecon.records import Features
 
 
 def test_the_strongest_corners_of_each_scale_and_seeds_of_each_level_are_kept():
@@ -52,3 +57,25 @@ def test_pairs_of_many_images_have_fewer_matches_unless_all_are_needed(tmp_path,
         for whole, pair in zip(every.pairs, again, strict=True):
             assert np.array_equal(whole.index1, pair.index1)
             assert np.array_equal(whole.xy2, pair.xy2)
+
+
+def test_an_image_without_corners_among_many_has_none_of_the_strongest():
+    none = np.zeros(0, np.float32)
+    empty = Features(np.zeros((0, 2)), none, none)
+    assert len(strongest_corners(empty, 0.5)) == 0
+    assert len(strongest_share(empty, 0.5).xy) == 0
+
+
+def test_images_of_nothing_in_common_are_a_failure_for_any_number(tmp_path):
+    """More images than `many_images`, one of them without corners, and no accepted pair."""
+    rng = np.random.default_rng(0)
+    images = [photograph(texture(96, 128, seed=k)) for k in range(3)]
+    smooth = np.linspace(60.0, 190.0, 128)[None, :, None] + rng.normal(0.0, 0.0, (96, 1, 3))
+    images.append(replace(images[0], name="smooth.png", rgb=smooth.astype(np.uint8)))
+    paths = []
+    for k, image in enumerate(images):
+        paths.append(tmp_path / f"{k}.png")
+        PIL.Image.fromarray(image.rgb).save(paths[-1])
+    config = PipelineConfig(matching=SeedsAndGrowth(many_images=2))
+    with pytest.raises(StageFailure, match="no two images could be matched"):
+        reconstruct(paths, tmp_path / "out", config=config, until="metric", threads=2)

@@ -112,3 +112,7 @@ def test_each_model_is_tried_once_and_known_intrinsics_stay_known():
     assert list(richer_models(focal, free)) == [(FOCAL,), (FOCAL, *CENTRE)]
     assert list(richer_models(focal, known)) == [(FOCAL,)]
     assert list(richer_models(np.zeros(8, bool), free)) == []
+    # Known in some images only: the others may have been zoomed.
+    some = replace(free, std=np.where((np.arange(8) < 4)[:, None] & (np.arange(6) == FOCAL), 0.0, free.std))
+    assert list(richer_models(focal, some)) == [(FOCAL,), (FOCAL, *CENTRE)]
+    assert list(richer_models(focal, setting(focal="known", focal_px=1500.0)[1])) == []

@@ -7,10 +7,12 @@ import pytest
 
 from tests.metric.test_population import refine
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
 from thesisrecon.geometry.robust_resection import resect_calibrated
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.metric import refinement
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 
@@ -201,3 +203,33 @@ def test_a_camera_made_wrong_is_sought_again():
 def _poses(reconstruction):
     pose = np.linalg.solve(reconstruction.K, reconstruction.P)
     return pose[:, :, :3], pose[:, :, 3]
+
+
+def test_a_candidate_without_inliers_leaves_the_others_whole(monkeypatch):
+    scene = make_scene(sigma_px=0.3, points=300, seed=4)
+    start = projective_reconstruction(scene)
+    prior = prior_for(start, IntrinsicsOptions())
+    calibration = HypothesesAndRefinement().calibrate(start, prior=prior, rng=np.random.default_rng(0))
+    best = calibration.candidates[0]
+    upgraded = refinement.upgraded_model
+
+    def broken(reconstruction, upgrade, *given):
+        model = upgraded(reconstruction, upgrade, *given)
+        return replace(model, X=np.zeros_like(model.X)) if upgrade.method == "broken" else model
+
+    monkeypatch.setattr(refinement, "upgraded_model", broken)
+    both = replace(calibration, candidates=(replace(best, method="broken"), best))
+    found = MetricRefinement().refine(start, both, prior=prior, rng=np.random.default_rng(0))
+    assert found.trusted
+    assert centre_error(found, scene) < 0.01
+    only = replace(calibration, candidates=both.candidates[:1])
+    with pytest.raises(StageFailure, match="no candidate calibration gives a metric model"):
+        MetricRefinement().refine(start, only, prior=prior, rng=np.random.default_rng(0))
+    for known, advice in (
+        (IntrinsicsOptions(focal="known", focal_px=1500.0), "Leave it out."),
+        (IntrinsicsOptions(focal_px=1500.0, focal_std_rel=0.05), "larger focal_std_rel"),
+    ):
+        prior = prior_for(start, known)
+        with pytest.raises(StageFailure, match="contradict the given focal length") as failed:
+            MetricRefinement().refine(start, only, prior=prior, rng=np.random.default_rng(0))
+        assert advice.lower() in f"{failed.value}.".lower()

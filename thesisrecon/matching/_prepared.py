@@ -265,5 +265,6 @@ def strongest_share(features: Features, share: float) -> Features:
 
 def _first_of_each(label: F32, share: float) -> I64:
     """Rows, sorted, of the first ``share`` of the rows of each label."""
-    groups = (np.flatnonzero(label == one) for one in np.unique(label))
-    return np.sort(np.concatenate([rows[: math.ceil(share * len(rows))] for rows in groups]))
+    groups = [np.flatnonzero(label == one) for one in np.unique(label)]
+    first = [rows[: math.ceil(share * len(rows))] for rows in groups]
+    return np.sort(np.concatenate([np.zeros(0, np.int64), *first]))

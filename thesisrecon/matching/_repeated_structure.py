@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.records import TwoView
 
 MANY_VIEWS = 40
 """Fewer views have few pairs, none of which is redundant."""
 STRONG = 0.1
-"""A pair is strong if it has this fraction of the matches of the best pair of one of its views."""
+"""A pair is strong if it has this fraction of the matches, or common points, of the best pair of one of its
+views."""
 MAX_STEPS = 5
 """Strong pairs that connect the views of a weak one at most, if both show one place."""
 
@@ -29,9 +31,7 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
     if n_views <= MANY_VIEWS or not accepted:
         return list(pairs)
     i, j, count = np.array([(pair.i, pair.j, pair.inliers) for pair in accepted]).T
-    most = np.zeros(n_views, np.int64)
-    np.maximum.at(most, np.concatenate([i, j]), np.tile(count, 2))
-    strong = count >= STRONG * np.minimum(most[i], most[j])
+    strong = strong_pairs(i, j, count, n_views)
     ends = i[strong], j[strong]
     graph = scipy.sparse.coo_array((np.ones(strong.sum()), ends), (n_views, n_views)).tocsr()
     group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
@@ -44,6 +44,13 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
         else pair
         for pair in pairs
     ]
+
+
+def strong_pairs(i: I64, j: I64, count: I64 | F64, n_views: int) -> B8:
+    """Whether pairs (i, j) have ``STRONG`` of the ``count`` of the best pair of one of their views."""
+    most = np.zeros(n_views, count.dtype)
+    np.maximum.at(most, np.concatenate([i, j]), np.tile(count, 2))
+    return np.asarray(count >= STRONG * np.minimum(most[i], most[j]))
 
 
 def _steps_within(graph: scipy.sparse.csr_array, start: np.ndarray, steps: int) -> np.ndarray:

@@ -300,15 +300,15 @@ class SeedsAndGrowth:
         Seeds by upright patches, by patches rotated to their gradient, or the latter too if the upright ones
         do not relate the pair well.
     support : {"auto", "always", "never"}
-        Estimate F from seeds whose neighbours move alike, from all seeds, or from the latter too, with the
-        better result, if few or fewer than half of the former agree.
+        "always": estimate F from the seeds whose neighbours move alike; "never": from all seeds; "auto": from
+        the former, and also from all if few of them or fewer than half agree; the F with more inliers counts.
     growth : bool
         Match all corners by guided search, else only corners at seeds.
     coarse_first : bool
         Match the corners of the coarser scale first; they give a better F for all.
     rematch : bool
-        Repeat the guided matching with the F and the maps of its own matches; only of the other corners if
-        these are a third.
+        Repeat the guided matching with the F and the maps of its own matches. If these cover a third of the
+        corners of image 1, only the other corners are matched again.
     align : bool
         Align positions in image 2 by least-squares matching, else keep the corners.
     many_images : int

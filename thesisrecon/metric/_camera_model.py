@@ -33,13 +33,14 @@ RICHER: tuple[tuple[int, ...], ...] = (CENTRE, (FOCAL,), (FOCAL, *CENTRE))
 
 
 def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[int, ...]]:
-    """Columns to free: every model that has all ``contradicted`` (8,) columns; known ones stay known."""
+    """Columns to free: every model that frees all ``contradicted`` (8,) columns; known values stay known."""
     if not contradicted.any():
         return
-    unknown = np.flatnonzero((prior.std > 0.0).all(axis=0))
-    enough = (columns for columns in RICHER if np.isin(np.flatnonzero(contradicted), columns).all())
+    unknown = np.flatnonzero((prior.std > 0.0).any(axis=0))
     # Without known columns two models may be the same.
-    yield from dict.fromkeys(tuple(c for c in columns if c in unknown) for columns in enough)
+    for columns in dict.fromkeys(tuple(c for c in columns if c in unknown) for columns in RICHER):
+        if np.isin(np.flatnonzero(contradicted), columns).all():
+            yield columns
 
 
 def with_own_values(

@@ -64,17 +64,23 @@ def restrict_points(model: MetricEstimate, points: I64) -> MetricEstimate:
     return replace(model, tracks=tracks, X=model.X[points], valid=model.valid[points], inlier=model.inlier[k])
 
 
+def seen_views(tracks: Tracks) -> int:
+    """Number of views with observations: the images of other groups have none."""
+    return int(np.count_nonzero(np.bincount(tracks.view_index)))
+
+
 def with_enough_points(model: MetricEstimate) -> MetricEstimate:
-    """The model with points that hold every view all over its image: known points first, then long tracks.
+    """The model with points that constrain every view, spread over its image: known ones first, then long
+    tracks.
 
     All points up to ``MAX_OBSERVATIONS`` of at most ``MANY_VIEWS``; of more, the rest adds little to the
     precision of the cameras.
     """
-    if len(model.tracks.xy) <= MAX_OBSERVATIONS and model.tracks.n_views <= MANY_VIEWS:
+    if len(model.tracks.xy) <= MAX_OBSERVATIONS and seen_views(model.tracks) <= MANY_VIEWS:
         return model
     length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
     return restrict_points(
-        model, _points_that_hold(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
+        model, _select_spread_points(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
     )
 
 
@@ -96,12 +102,12 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
     # The mean of the variance under an inverse gamma prior at that of all points, which holds short tracks.
     noise = (total + PRIOR_RESIDUALS * variance) / np.maximum(2 * count - 3 + PRIOR_RESIDUALS, 1)
     order = np.argsort(np.where(model.valid, noise, np.inf), kind="stable")
-    points = _points_that_hold(model, order, PRECISE_PER_VIEW)
+    points = _select_spread_points(model, order, PRECISE_PER_VIEW)
     return restrict_points(model, points), points
 
 
-def _points_that_hold(model: MetricEstimate, order: I64, per_view: int) -> I64:
-    """Points, tried in ``order``, until every view has enough of them all over its image.
+def _select_spread_points(model: MetricEstimate, order: I64, per_view: int) -> I64:
+    """Points, tried in ``order``, until every view has enough of them, spread over its image.
 
     ``per_view`` is the number that each of many views needs.
     """
@@ -109,7 +115,8 @@ def _points_that_hold(model: MetricEstimate, order: I64, per_view: int) -> I64:
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
     cell = (t.view_index * CELLS + cell[:, 0]) * CELLS + cell[:, 1]
     occupied = np.bincount(np.unique(cell) // CELLS**2, minlength=t.n_views)
-    wanted = per_view if t.n_views > MANY_VIEWS else MAX_OBSERVATIONS // t.n_views
+    views = seen_views(t)
+    wanted = per_view if views > MANY_VIEWS else MAX_OBSERVATIONS // max(views, 1)
     needed = np.repeat(-(-wanted // np.maximum(occupied, 1)), CELLS**2)
     start = np.concatenate([[0], np.cumsum(np.bincount(t.point_index, minlength=t.n_points))])
     keep = np.zeros(t.n_points, dtype=bool)

@@ -21,6 +21,7 @@ from thesisrecon.metric._model import (
     normalized_observations,
     restrict_points,
     retriangulate_tracks,
+    seen_views,
 )
 from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.numerics._partial_bundle import refine_pose
@@ -134,7 +135,7 @@ def _register_missing(
     missing = allowed & ~model.registered
     reached = missing & (counts >= MIN_SHARE * np.array([len(k) for k in rows]))
     rejected: dict[int, str] = {}
-    for views in (reached, missing & ~reached) if t.n_views > MANY_VIEWS else (missing,):
+    for views in (reached, missing & ~reached) if seen_views(t) > MANY_VIEWS else (missing,):
         for view in sorted(np.flatnonzero(views).tolist(), key=lambda v: -counts[v]):
             if counts[view] < MIN_POINTS:
                 rejected[view] = (

@@ -21,7 +21,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.metric._adjustment import BundleAdjustment, HierarchicalPrior
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.numerics._block_scatter import BlockScatter
-from thesisrecon.numerics._noise import student_factor
+from thesisrecon.numerics._noise import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
 
 USUAL_INFLATION = 4.0
@@ -120,7 +120,7 @@ def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> Hierarc
 def find_outliers(value: F64, std: F64) -> B8:
     """Values more than ``OUTLIER_SIGMAS`` of their noise and the scatter of all (MAD) from the median."""
     off = np.abs(value - np.median(value))
-    scatter = 1.4826 * float(np.median(off))
+    scatter = MAD_FACTOR * float(np.median(off))
     return np.asarray(off > OUTLIER_SIGMAS * np.hypot(scatter, std))
 
 

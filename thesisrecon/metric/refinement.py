@@ -13,7 +13,13 @@ import numpy as np
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric._adjustment import FOCAL_AND_CENTRE, SETTLED, BundleAdjustment, with_initial_gate
+from thesisrecon.metric._adjustment import (
+    FOCAL_AND_CENTRE,
+    MIN_OBSERVATIONS,
+    SETTLED,
+    BundleAdjustment,
+    with_initial_gate,
+)
 from thesisrecon.metric._camera_model import (
     MAX_REMAINING,
     camera_differences,
@@ -144,6 +150,8 @@ def _start(
         if model.valid.sum() < 20:
             return None
         model = select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
+        if model.inlier.sum() < MIN_OBSERVATIONS:
+            return None
         model = gentle.run(model, free=FOCAL_AND_CENTRE, iterations=15)[0]
     return select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
 
@@ -236,7 +244,7 @@ def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:
     return StageFailure(
         "the images contradict the given focal length",
         f"none of {tried} calibrations near it (+- {wide:.1%}) fits them",
-        "leave it out, or set a larger focal_std_rel",
+        "leave it out, or set a larger focal_std_rel" if wide > 0.0 else "leave it out",
     )
 
 

@@ -9,6 +9,7 @@ from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.numerics._elimination import BlockIndex
 from thesisrecon.numerics._levenberg_marquardt import invert_information
 from thesisrecon.numerics._metric_kernels import FOCAL, POSE_DOF
+from thesisrecon.numerics._noise import MAD_FACTOR
 from thesisrecon.numerics._observations import Jacobians
 from thesisrecon.numerics._reduced_solvers import ReducedSystem, order_views
 
@@ -19,7 +20,6 @@ MAX_DENSE = 1200
 BAND = 5
 # Pairs of observations at a time.
 PAIRS = 16384
-MAD_TO_SIGMA = 1.4826
 # Trimming point and variance of a standard normal variable trimmed there.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
 # Least fraction of the variance that a coordinate must keep to contribute.
@@ -35,7 +35,7 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     if not informative.any():
         return 0.0
     size = np.abs(residual[informative]) / np.sqrt(kept[informative])
-    sigma = MAD_TO_SIGMA * float(np.median(size))
+    sigma = MAD_FACTOR * float(np.median(size))
     for _ in range(5):
         within = size[size <= TRIM * sigma]
         if len(within):

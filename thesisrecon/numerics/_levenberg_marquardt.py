@@ -17,8 +17,8 @@ Step = TypeVar("Step")
 StepOut = TypeVar("StepOut", covariant=True)
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
-# Curvature, relative to the diagonal, of the weakest combination of unknowns that must arrive. Stronger
-# damping hides up to the ratio of the two of its gain.
+# Curvature, relative to the diagonal, of the weakest combination of unknowns that must converge. Stronger
+# damping divides the predicted gain of such a combination by up to damping / _WEAKEST.
 _WEAKEST = 1e-8
 # Unknowns above which information is inverted by Cholesky.
 _MANY = 1200
@@ -27,8 +27,8 @@ _MANY = 1200
 class _LinearSystem(Protocol[StepOut]):
     """Normal equations at one state.
 
-    ``solve`` gives the damped step, its predicted gain, and the part of it that decides about the end, or
-    None.
+    ``solve`` gives the damped step, its predicted gain of cost, and the part of that which only the cameras
+    gain (small problems: all of it), or None.
     """
 
     @property
@@ -53,7 +53,7 @@ def run_levenberg_marquardt(
     *,
     max_iterations: int,
     tolerance: float = 1e-7,
-    enough: float = 0.0,
+    min_camera_gain: float = 0.0,
     initial_damping: float = 1e-4,
 ) -> tuple[State, float, int]:
     """Minimise a problem by Levenberg-Marquardt; return the final state, its cost, linear solves (6.7).
@@ -61,26 +61,26 @@ def run_levenberg_marquardt(
     The cost never rises and singular systems raise nothing. The damping multiplies the diagonal (Marquardt
     1963), so that units do not matter and gauge freedoms need no other treatment; it follows Nielsen
     (IMM-REP-1999-05). At convergence the gain of cost, predicted or actual, is at most ``tolerance`` relative
-    to the cost, or the predicted gain of the unknowns that decide is below ``enough``.
+    to the cost, or that of the cameras, predicted, is below ``min_camera_gain``.
     """
     system = problem.linearize(state)
     cost = system.cost
     damping, growth = initial_damping, 2.0
     for iteration in range(1, max_iterations + 1):
         solved = system.solve(damping)
-        gain, promised, deciding, candidate = -1.0, 1.0, np.inf, state
+        gain, predicted, camera_gain, candidate = -1.0, 1.0, np.inf, state
         if solved is not None:
-            step, promised, deciding = solved
-            deciding *= max(1.0, damping / _WEAKEST)
-            if promised <= tolerance * 1e-3 * cost:
+            step, predicted, camera_gain = solved
+            camera_gain *= max(1.0, damping / _WEAKEST)
+            if predicted <= tolerance * 1e-3 * cost:
                 return state, cost, iteration
             candidate = problem.retract(state, step)
             gain = cost - problem.cost(candidate)
         if gain > 0.0 and np.isfinite(gain):
             state, previous = candidate, cost
-            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / promised - 1.0) ** 3), _MIN_DAMPING)
+            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / predicted - 1.0) ** 3), _MIN_DAMPING)
             growth = 2.0
-            if gain <= tolerance * previous or deciding < enough:
+            if gain <= tolerance * previous or camera_gain < min_camera_gain:
                 return state, cost - gain, iteration
             cost -= gain
             if iteration < max_iterations:
@@ -102,7 +102,10 @@ class DenseSystem:
     gradient: F64
 
     def solve(self, damping: float) -> tuple[F64, float, float] | None:
-        """The step and its predicted gain (twice) by Cholesky, or None; unknowns without effect stay."""
+        """The step by Cholesky and its predicted gain, which also is the gain of the cameras; or None.
+
+        Unknowns without effect do not move.
+        """
         diagonal = damping * floored_diagonal(np.diag(self.hessian))
         step = solve_positive(self.hessian + np.diag(diagonal), -self.gradient)
         if step is None:

@@ -214,19 +214,19 @@ def refine_metric_bundle(
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> tuple[_State, float]:
     """Return the minimum and its cost: by reweighting first, nearly Newton's steps where the loss bends."""
-    most, damping, enough = options.max_iterations, options.damping, options.settled
+    most, damping, settled = options.max_iterations, options.damping, options.settled
     state, cost, iterations = run_levenberg_marquardt(
         problem,
         state,
         max_iterations=most,
         tolerance=_NEWTON_GAIN,
-        enough=enough,
+        min_camera_gain=settled,
         initial_damping=damping,
     )
     if iterations < most:
         near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
         state, cost, _ = run_levenberg_marquardt(
-            near, state, max_iterations=most - iterations, enough=enough, initial_damping=damping
+            near, state, max_iterations=most - iterations, min_camera_gain=settled, initial_damping=damping
         )
     return state, cost
 

@@ -101,7 +101,7 @@ def refine_projective_bundle(
     points, X_norms = _unit_rows(X @ M.T, seen_points)
     start = UnitState.at(cameras, points)
     end, cost, _ = run_levenberg_marquardt(
-        problem, start, max_iterations=max_iterations, enough=settled * (loss_px * scale) ** 2
+        problem, start, max_iterations=max_iterations, min_camera_gain=settled * (loss_px * scale) ** 2
     )
 
     P_back = np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4) @ M

@@ -13,22 +13,19 @@ import numpy as np
 import scipy
 
 from thesisrecon._code_digest import code_digest
-from thesisrecon._settings import tables_from_config
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project_camera
 from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.matching._repeated_structure import strong_pairs
 from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 from thesisrecon.runtime._run import Batch, stream
 
-WEAK = 0.1
-"""Two views are neighbours if they share this fraction of the points that one of them shares with its closest
-view; fewer may be repeated structure."""
 MAX_CUT = 0.1
 """Largest fraction of the common points of a part that a cut may sever; one place has no such cut."""
 MIN_SIDE = 0.3
@@ -60,17 +57,16 @@ def cameras_from_parts(state: PipelineState, attempts: int) -> Reconstruction | 
     parts = overlapping_parts(graph, own)
     sizes = np.array([image.size for image in state.result.images], dtype=np.int64)
     variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
-    code, upstream = code_digest(reconstruct_part), run.logs["tracks"].keys
+    code, upstream, prior = code_digest(reconstruct_part), run.logs["tracks"].keys, state.prior
+    inputs = [sizes, prior.mean, prior.std, prior.shared, prior.kind]
     keys = {
-        f"part-{n}": run.key(
-            "metric", variants, code, upstream, tables_from_config(config)["intrinsics"], views, run.seed
-        )
+        f"part-{n}": run.key("metric", variants, code, upstream, *inputs, views, run.seed)
         for n, views in enumerate(parts)
     }
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         for n in missing:
-            given = input_of_part(tracks, state.used_pairs, sizes, state.prior, parts[n])
+            given = input_of_part(tracks, state.used_pairs, sizes, prior, parts[n])
             yield [n], (config, given, n, run.seed, attempts)
 
     models: Sequence[Reconstruction] = run.map_cached("metric", keys, reconstruct_part, batches)
@@ -78,7 +74,7 @@ def cameras_from_parts(state: PipelineState, attempts: int) -> Reconstruction | 
 
 
 def neighbour_graph(tracks: Tracks) -> scipy.sparse.csr_array:
-    """Numbers of common points of neighbouring views (V, V), without the weakly connected ones."""
+    """Numbers of common points of neighbouring views (V, V), without those of weak pairs."""
     ones = np.ones(len(tracks.xy))
     seen = scipy.sparse.coo_array(
         (ones, (tracks.view_index, tracks.point_index)), (tracks.n_views, tracks.n_points)
@@ -86,9 +82,7 @@ def neighbour_graph(tracks: Tracks) -> scipy.sparse.csr_array:
     common = (seen.tocsr() @ seen.tocsr().T).tocoo()
     apart = common.row != common.col
     row, column, count = common.row[apart], common.col[apart], common.data[apart]
-    most = np.zeros(tracks.n_views)
-    np.maximum.at(most, row, count)
-    strong = count >= WEAK * np.minimum(most[row], most[column])
+    strong = strong_pairs(row, column, count, tracks.n_views)
     return scipy.sparse.coo_array((count[strong], (row[strong], column[strong])), common.shape).tocsr()
 
 
@@ -131,8 +125,8 @@ def _best_cut(graph: scipy.sparse.csr_array, views: I64) -> list[I64] | None:
     # Each tie stands twice in the symmetric matrix; it is severed by the cuts behind first ... last - 1.
     change = np.bincount(first, ties.data, len(views)) - np.bincount(last, ties.data, len(views))
     severed = np.cumsum(change)[:-1]
-    volume = np.cumsum(np.asarray(inside.sum(axis=1)).ravel()[order])[:-1]
-    ratio = severed / np.maximum(np.minimum(volume, volume[-1] - volume), 1.0)
+    *volume, total = np.cumsum(np.asarray(inside.sum(axis=1)).ravel()[order])
+    ratio = severed / np.maximum(np.minimum(volume, total - volume), 1.0)
     sides = np.arange(1, len(views))
     ratio[np.minimum(sides, len(views) - sides) < MIN_SIDE * len(views)] = np.inf
     at = int(np.argmin(ratio))
@@ -354,11 +348,24 @@ def _in_one_frame(
     parts: Sequence[_Part],
     placed: dict[int, Similarity],
 ) -> Reconstruction:
-    """Cameras of the part that owns a view, points of the part with most inliers; inliers agree with both."""
-    n, m = tracks.n_views, tracks.n_points
-    P, K, registered = np.zeros((n, 3, 4)), np.zeros((n, 3, 3)), np.zeros(n, dtype=bool)
-    X, support, seen = np.zeros((m, 4)), np.zeros(m, np.int64), np.zeros(len(tracks.xy), dtype=bool)
-    distortion = np.zeros((n, 3))
+    """Cameras and points of the placed parts; inliers agree with their part and with the whole."""
+    registered, P, K, distortion = _cameras_in_one_frame(tracks.n_views, own, parts, placed)
+    X, support, seen = _points_in_one_frame(tracks, parts, placed)
+    sigma = float(np.median([parts[p][2].sigma_px for p in placed]))
+    found = (registered, support > 0, seen, tracks, sizes, sigma, ("",) * tracks.n_views, K, distortion)
+    merged = Reconstruction("metric", P, X, *found)
+    close = _reprojection_px(merged) < MAX_OFFSET_REL * sizes[tracks.view_index].max(axis=1)
+    inlier = seen & registered[tracks.view_index] & close
+    valid = (support > 0) & (np.bincount(tracks.point_index[inlier], minlength=tracks.n_points) >= 2)
+    return replace(merged, inlier=inlier & valid[tracks.point_index], valid=valid)
+
+
+def _cameras_in_one_frame(
+    n_views: int, own: Sequence[I64], parts: Sequence[_Part], placed: dict[int, Similarity]
+) -> tuple[B8, F64, F64, F64]:
+    """Which views have a camera (V,), and P, K and distortion, of the part that owns the view if it can."""
+    registered, distortion = np.zeros(n_views, dtype=bool), np.zeros((n_views, 3))
+    P, K = np.zeros((n_views, 3, 4)), np.zeros((n_views, 3, 3))
     for inner in (True, False):
         for p, similarity in placed.items():
             views, _, model = parts[p]
@@ -371,23 +378,24 @@ def _in_one_frame(
             P[views[here]] = model.K[here] @ np.concatenate([R, -(R @ C[:, :, None])], axis=2)
             distortion[views[here]] = 0.0 if model.distortion is None else model.distortion[here]
             registered[views[here]] = True
+    return registered, P, K, distortion
+
+
+def _points_in_one_frame(
+    tracks: Tracks, parts: Sequence[_Part], placed: dict[int, Similarity]
+) -> tuple[F64, I64, B8]:
+    """Points (M, 4) of the part with most inliers, their numbers of inliers, and inliers (K,) of any part."""
+    m = tracks.n_points
+    X, support, seen = np.zeros((m, 4)), np.zeros(m, np.int64), np.zeros(len(tracks.xy), dtype=bool)
     for p, similarity in placed.items():
         views, points, model = parts[p]
         seen[_rows_of_part(tracks, views, points)[model.inlier]] = True
         count = np.bincount(model.tracks.point_index[model.inlier], minlength=len(points))
         better = model.valid & (count > support[points])
         moved = similarity.apply(model.X[better, :3] / model.X[better, 3:])
-        X[points[better]], support[points[better]] = (
-            np.column_stack([moved, np.ones(len(moved))]),
-            count[better],
-        )
-    sigma = float(np.median([parts[p][2].sigma_px for p in placed]))
-    found = (registered, support > 0, seen, tracks, sizes, sigma, ("",) * n, K, distortion)
-    merged = Reconstruction("metric", P, X, *found)
-    close = _reprojection_px(merged) < MAX_OFFSET_REL * sizes[tracks.view_index].max(axis=1)
-    inlier = seen & registered[tracks.view_index] & close
-    valid = (support > 0) & (np.bincount(tracks.point_index[inlier], minlength=m) >= 2)
-    return replace(merged, inlier=inlier & valid[tracks.point_index], valid=valid)
+        X[points[better]] = np.column_stack([moved, np.ones(len(moved))])
+        support[points[better]] = count[better]
+    return X, support, seen
 
 
 def _reprojection_px(model: Reconstruction) -> F64:

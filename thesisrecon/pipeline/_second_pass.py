@@ -15,6 +15,7 @@ import numpy as np
 from thesisrecon.arrays import B8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
+from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, TwoView, Upgrade
 from thesisrecon.runtime._run import stream
@@ -24,22 +25,26 @@ MIN_AGREEMENT = 0.5
 
 
 def pairs_of_missing(pairs: Sequence[TwoView], missing: B8) -> list[TwoView]:
-    """The accepted pairs, and the rejected ones of missing images whose matches mostly agree with one F."""
+    """The accepted pairs, and the rejected ones of missing images whose matches mostly agree with one F.
+
+    Pairs that were rejected as repeated structure stay rejected.
+    """
 
     def of_use(pair: TwoView) -> bool:
         agree = pair.inliers >= MIN_AGREEMENT * pair.candidates
         return bool(pair.configuration) and agree and bool(missing[pair.i] or missing[pair.j])
 
-    return [
+    more = [
         p if p.accepted else replace(p, accepted=True, reason="") for p in pairs if p.accepted or of_use(p)
     ]
+    return [pair for pair in reject_repeated_structure(more, len(missing)) if pair.accepted]
 
 
 def register_more(state: PipelineState, attempt: int, metric: MetricResult) -> MetricResult:
     """Register images that the metric model lacks; the model as it was if none joins, or trust is lost."""
     missing = ~metric.reconstruction.registered
     pairs = pairs_of_missing(state.used_pairs, missing)
-    if len(pairs) == sum(pair.accepted for pair in state.used_pairs):
+    if len(pairs) <= sum(pair.accepted for pair in state.used_pairs):
         return metric
     run, item = state.run, f"attempt-{attempt}-more"
     key = run.key(

@@ -234,7 +234,9 @@ def take_group(whole: PipelineState, views: Sequence[int], state: PipelineState)
     for n in inside:
         pair = whole.result.pairs[n]
         pair = replace(pair, i=number[pair.i], j=number[pair.j])
-        key = run.key("matches", keys[n], pair.i, pair.j)
+        # Which matches count, and whether they do, depends on all images and not only on the two.
+        content = [pair.index1, pair.index2, pair.xy1, pair.xy2, pair.affine, pair.accepted, pair.reason]
+        key = run.key("matches", keys[n], pair.i, pair.j, content)
         pairs.append(run.cached("matches", f"{pair.i:05d}-{pair.j:05d}", key, partial(replace, pair)))
     finish_matches(state, pairs)
 
@@ -289,7 +291,9 @@ def _sizes_of(reconstruction: Reconstruction) -> dict[str, int]:
 
 
 def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
-    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair.
+    """Reconstruct up to a projective transform (chapter 6); sets ``result.projective``.
+
+    ``attempt`` is the rank of the initial pair.
 
     Of many views only a core (``projective.core_views``): the metric stage registers the others, calibrated.
     """
@@ -302,11 +306,22 @@ def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
     )
     method = state.config.projective
     projective: Reconstruction = _cached(
-        state, "projective", attempt, run.logs["tracks"].keys,
+        state, "projective", attempt, [run.logs["tracks"].keys, sizes],
         lambda rng: method.reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt),
     )  # fmt: skip
     state.result = replace(result, projective=projective)
-    run.finish("projective", counts=_sizes_of(projective), metrics={"sigma_px": projective.sigma_px})
+
+
+def finish_projective(state: PipelineState) -> None:
+    """Report the projective reconstruction, and its self-calibration if there is one."""
+    projective, calibration = state.result.projective, state.result.calibration
+    if projective is not None:
+        sigma = {"sigma_px": projective.sigma_px}
+        state.run.finish("projective", counts=_sizes_of(projective), metrics=sigma)
+    if calibration is not None:
+        counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
+        warnings = [name_images(text, state.names) for text in _critical(calibration)]
+        state.run.finish("selfcalibration", counts=counts, warnings=warnings)
 
 
 def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
@@ -320,9 +335,6 @@ def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
         lambda rng: calibrate_with_core(with_images(method, pixels), projective, prior=prior, rng=rng),
     )  # fmt: skip
     state.result = replace(state.result, calibration=calibration)
-    counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
-    warnings = [name_images(text, state.names) for text in _critical(calibration)]
-    run.finish("selfcalibration", counts=counts, warnings=warnings)
     return calibration
 
 
@@ -333,10 +345,13 @@ def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
     return ("; ".join(found.sentences),) if found is not None and resolved else ()
 
 
-def _refine(state: PipelineState, attempt: int, calibration: SelfCalibration) -> MetricResult:
+def _refine(
+    state: PipelineState, attempt: int, calibration: SelfCalibration, *, in_parts: bool
+) -> MetricResult:
+    """The metric reconstruction of one attempt; ``in_parts``: large sets are divided if they can be."""
     prior = state.prior
     assert state.result.projective is not None
-    aligned = None if attempt else cameras_from_parts(state, ATTEMPTS)
+    aligned = cameras_from_parts(state, ATTEMPTS) if in_parts else None
     start = calibrated_part(state.result.projective, calibration) if aligned is None else aligned
     known = calibration if aligned is None else from_metric(aligned, calibration)
     parts = [] if aligned is None else list(state.run.logs["metric"].keys.values())
@@ -358,13 +373,16 @@ def reconstruct_metric(state: PipelineState) -> None:
         state.result, trusted = start, False
         try:
             reconstruct_projective(state, attempt)
-            trusted = _refine(state, attempt, _calibrate(state, attempt)).trusted
+            calibration = _calibrate(state, attempt)
+            first = all(result.calibration is None for result in tried)
+            trusted = _refine(state, attempt, calibration, in_parts=first).trusted
         except StageFailure as failure:
             failures.append(failure)
         tried.append(state.result)
         if trusted:
             break
     state.result = best = best_result(tried)
+    finish_projective(state)
     if best.metric is None:
         raise failures[0]
     attempt = next(k for k, result in enumerate(tried) if result is best)

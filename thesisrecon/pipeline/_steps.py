@@ -18,6 +18,7 @@ from thesisrecon.pipeline._stages import (
     build_tracks,
     estimate_depth_maps,
     find_features,
+    finish_projective,
     match_pairs,
     reconstruct_metric,
     reconstruct_projective,
@@ -37,8 +38,9 @@ STEPS: dict[str, tuple[Step, ...]] = {
     "features": (find_features,),
     "matches": (find_features, select_pairs, match_pairs),
 }
-STEPS["projective"] = (*STEPS["matches"], split_groups, build_tracks, reconstruct_projective)
-STEPS["metric"] = (*STEPS["matches"], split_groups, build_tracks, reconstruct_metric)
+_TO_TRACKS: tuple[Step, ...] = (*STEPS["matches"], split_groups, build_tracks)
+STEPS["projective"] = (*_TO_TRACKS, reconstruct_projective, finish_projective)
+STEPS["metric"] = (*_TO_TRACKS, reconstruct_metric)
 """Algorithm 1: the steps up to each last stage."""
 SURFACE_STEPS = (estimate_depth_maps, build_model)
 STEPS["dense"] = (*STEPS["metric"], *SURFACE_STEPS[:1])

@@ -14,6 +14,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.numerics._noise import MAD_FACTOR
 from thesisrecon.records import Image
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, ReferenceFrame
@@ -182,7 +183,7 @@ def _refine_plane(
         plane, v = _fit_plane(frame, segments.subset(kept), direction[kept], (plane, v), noise)
         residuals = _plane_residuals(frame, segments, np.maximum(direction, 0), plane[None], v[None])
         distances = np.abs(residuals[0])
-        noise = max(1.4826 * float(np.median(distances[direction >= 0])), _MIN_NOISE_PX)
+        noise = max(MAD_FACTOR * float(np.median(distances[direction >= 0])), _MIN_NOISE_PX)
         trimmed = (direction >= 0) & (distances <= 2.5 * noise)
         if np.bincount(direction[trimmed], minlength=len(v)).min() < _MIN_SEGMENTS:
             break

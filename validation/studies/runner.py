@@ -66,10 +66,18 @@ MODULES = {
 }
 """Name of a study -> the module of this folder that holds its function."""
 OF_PAGES = {
+    "cluster-efficiency": [
+        ["--sizes", "48", "100"],
+        ["--sizes", "12", "--until", "dense"],
+        ["--scene", "street", "--sizes", "72", "--set", "images.part_views=30"],
+    ],
+    "critical-motions": [["--trials", "200"]],
     "epipolar": [["--trials", "2000"]],
+    "epipolar-methods": [["--trials", "500"]],
+    "growth-of-cameras": [[], ["--core-views", "0", "--kinds", "place", "--sizes", "100", "300"]],
     "growth-of-cost": [
-        ["--colmap"],
-        ["--scene", "street", "--sizes", "100", "300", "--colmap"],
+        ["--colmap", "--sizes", "100", "300"],
+        ["--scene", "street", "--sizes", "100", "1000"],
         ["--until", "model", "--sizes", "12", "48", "100"],
     ],
     "package": [["--steps", "build", "install", "imports", "typed", "quiet", "demo"]],
