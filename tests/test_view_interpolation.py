@@ -1,6 +1,7 @@
 """Views between photographs: the front door, what is refused, and the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from thesisrecon import view_interpolation as between
 from thesisrecon.cli import view_files as sequences
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import interpolate_images
-from thesisrecon.config import PipelineConfig
+from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
@@ -121,6 +122,24 @@ def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
         between.prepare_pair(photograph(0), photograph(1), config=config)
     monkeypatch.setattr(MultiViewStereo, "failure", StageFailure("no parallax"))
     refuses(StageFailure, "no parallax", between.prepare_pair, photograph(0), photograph(1), config=config)
+
+
+def test_records_are_matched_at_their_own_size_and_without_masked_pixels():
+    """``max_size_px`` is for files and arrays."""
+    images = [photograph_of_courtyard(k) for k in (6, 7)]
+    large, small = (
+        between.prepare_pair(*images, config=PipelineConfig(images=ImageOptions(max_size_px=side)))
+        for side in (320, 128)
+    )
+    np.testing.assert_array_equal(small.view(0.5), large.view(0.5))
+    nothing = np.zeros((240, 320), dtype=bool)
+    masked = [replace(image, mask=nothing) for image in images]
+    refuses(StageFailure, "do not match", between.prepare_pair, *masked)
+
+
+def photograph_of_courtyard(k):
+    with PIL.Image.open(COURTYARD / f"000{k}.jpg") as picture:
+        return Image(f"{k}.jpg", np.asarray(picture.resize((320, 240))), (320, 240))
 
 
 @pytest.fixture

@@ -180,7 +180,7 @@ def prepare_pair(
         for one in (image1, image2)
     )
     require_comparable_images((first, second))
-    pair = match_pair(first.rgb, second.rgb, config=config, seed=seed)
+    pair = match_pair(first, second, config=config, seed=seed)
     _require_sideways_motion(pair, (first, second))
     try:
         dense = config.dense.match_two_views(first, second, pair.F, pair.xy1, pair.xy2, planar=True)
