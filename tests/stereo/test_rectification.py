@@ -22,7 +22,13 @@ from thesisrecon.stereo._epipolar_pair import (
 from thesisrecon.stereo._polar import PolarRectification, polar
 from thesisrecon.stereo._rectification_quality import jacobians, matches_in_frame, measure_quality
 from thesisrecon.stereo._resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
-from thesisrecon.stereo.rectification import disparity_range, rectify, rectify_cameras, rectify_pair
+from thesisrecon.stereo.rectification import (
+    RectifiedImages,
+    disparity_range,
+    rectify,
+    rectify_cameras,
+    rectify_pair,
+)
 
 PLANAR_METHODS = (planar.hartley, planar.loop_zhang, planar.minimum_distortion, planar.common_orientation)
 CASES = [(method, motion) for method in PLANAR_METHODS for motion in PLANAR]
@@ -323,6 +329,32 @@ def test_whole_pixels_are_kept_and_quadratics_are_reproduced():
     inner = (u > 2) & (u < 47) & (v > 2) & (v < 37)
     expected = 0.05 * u**2 - 0.03 * u * v + 0.02 * v**2 + u
     np.testing.assert_allclose(found[inner], expected[inner], atol=1e-3)
+
+
+@pytest.mark.parametrize("limits", [(-41, 30), (-30, -5), (0, 12), (5, 40)], ids=str)
+def test_every_match_of_the_range_is_in_the_moved_images(limits):
+    columns = np.broadcast_to(np.arange(80, dtype=np.uint8)[:, None], (10, 80, 3))
+    pair = RectifiedImages.of(planar_frame(np.eye(3), (80, 10)), (columns, columns), limits)
+    assert pair.max_disparity_px == limits[1] - limits[0]
+    x, d = (a.ravel() for a in np.meshgrid(np.arange(80), np.arange(limits[0], limits[1] + 1)))
+    x, d = (a[(x - d >= 0) & (x - d < 80)] for a in (x, d))
+    ends = [np.column_stack([a, np.full(len(a), 4)]).astype(float) for a in (x, x - d)]
+    moved = [pair.rectified_from_original(side, xy) for side, xy in enumerate(ends)]
+    np.testing.assert_array_equal(moved[0][:, 0] - moved[1][:, 0], d - limits[0])
+    for side, image in enumerate((pair.left, pair.right)):
+        at = moved[side].astype(int)
+        np.testing.assert_array_equal(image[at[:, 1], at[:, 0], 0], ends[side][:, 0])
+        np.testing.assert_array_equal(pair.original_from_rectified(side, moved[side]), ends[side])
+
+
+def test_levels_of_rectified_images_are_those_of_images():
+    """Cubic convolution alone overshoots beside an edge."""
+    edge = np.zeros((20, 30, 3), np.uint8)
+    edge[:, 15:] = 255
+    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    pair = RectifiedImages.of(planar_frame(half, (30, 20)), (edge, edge), (0, 5))
+    assert np.isnan(pair.left[:, 0]).all()
+    assert (pair.left[:, 1:].min(), pair.left[:, 1:].max()) == (0.0, 255.0)
 
 
 def test_small_frames():

@@ -47,7 +47,8 @@ class RectifiedImages:
     max_disparity_px : float
         Largest disparity of the matches, with a margin.
     frame, shift : Rectification, int
-        Maps between the images and the rectified frame, and the columns by which the right image was moved.
+        Maps between the images and the rectified frame, and the columns by which the right image was moved
+        to the right or, if negative, the left one.
     """
 
     left: F32
@@ -58,7 +59,7 @@ class RectifiedImages:
 
     @classmethod
     def of(cls, frame: Rectification, images: tuple[U8, U8], disparities: tuple[int, int]) -> RectifiedImages:
-        """Resample two images; the right one moves by whole columns so that disparities begin at 0.
+        """Resample two images; one moves to the right by whole columns so that disparities begin at 0.
 
         Parameters
         ----------
@@ -69,11 +70,15 @@ class RectifiedImages:
         -------
         RectifiedImages
         """
-        left, right = (frame.warp(image.astype(np.float32), side) for side, image in enumerate(images))
-        shift, width = disparities[0], right.shape[1]
-        right = np.roll(right, shift, axis=1)
-        right[:, : max(shift, 0)] = right[:, max(min(width + shift, width), 0) :] = np.nan
-        return cls(left, right, float(disparities[1] - shift), frame, shift)
+        shift, (width, height) = disparities[0], frame.size
+        moved = np.full((2, height, width + max(-shift, 0), 3), np.nan, dtype=np.float32)
+        for side, image in enumerate(images):
+            # Columns of the right image that are cut off correspond to none of the left one.
+            place = moved[side, :, _moved_by(side, shift) :]
+            # Cubic convolution exceeds the range of the levels.
+            levels = np.clip(frame.warp(image.astype(np.float32), side), 0.0, 255.0)
+            place[:, :width] = levels[:, : place.shape[1]]
+        return cls(moved[0], moved[1], float(disparities[1] - shift), frame, shift)
 
     def rectified_from_original(self, side: int, xy: F64) -> F64:
         """Map pixels of an image (side 0 or 1) to the rectified one.
@@ -89,7 +94,7 @@ class RectifiedImages:
             NaN beyond the line that is sent to infinity.
         """
         moved = self.frame.rectified_from_original(side, xy, within=False)
-        return np.asarray(moved + np.array([side * self.shift, 0]))
+        return np.asarray(moved + np.array([_moved_by(side, self.shift), 0]))
 
     def original_from_rectified(self, side: int, xy: F64) -> F64:
         """Map pixels of a rectified image (side 0 or 1) to the original one.
@@ -104,8 +109,13 @@ class RectifiedImages:
         ndarray (N, 2)
             NaN beyond the epipole.
         """
-        places = np.asarray(xy - np.array([side * self.shift, 0]))
+        places = np.asarray(xy - np.array([_moved_by(side, self.shift), 0]))
         return self.frame.original_from_rectified(side, places, within=False)
+
+
+def _moved_by(side: int, shift: int) -> int:
+    """Columns by which an image is moved: the right one by ``shift``, or the left one if it is negative."""
+    return max(shift if side else -shift, 0)
 
 
 def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:
