@@ -65,6 +65,11 @@ def test_arrays_of_cameras_and_reconstructions_give_the_same_maps(tmp_path):
         np.testing.assert_allclose(same[1].P, one[1].P, rtol=0, atol=1e-9)
         # The last digits of the cameras change depths within their noise.
         assert np.nanmedian(np.abs(same[1].depth - one[1].depth)) < 0.01
+    # Points that no image observes give neither range nor neighbours.
+    lidar = Reconstruction.from_cameras(*arrays, sizes=SIZE, X=scene.reconstruction.X[:, :3])
+    alike = [depth_maps(images, given, max_size=120) for given in (lidar, model)]
+    np.testing.assert_array_equal(alike[0][1].depth, alike[1][1].depth)
+    assert np.isfinite(alike[0][1].depth).any()
     # Of a folder, images without a camera (not registered) are left out.
     for n, image in enumerate(images):
         PIL.Image.fromarray(image).save(tmp_path / f"{n}.png")

@@ -43,8 +43,8 @@ def depth_maps(
     images : path or sequence of paths or ndarray (H, W) or (H, W, 3) uint8
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
-        Their cameras in pixels of the images (arrays with ``sizes``); of a reconstruction with points these
-        give the depth range and the neighbours.
+        Their cameras in pixels of the images (arrays with ``sizes``); of a reconstruction with points and
+        their observations these give the depth range and the neighbours.
     sizes : array_like (V, 2) or (2,), optional
         Image width and height, for plain arrays.
     depth_range : array_like (2,) or (V, 2), optional
@@ -243,7 +243,7 @@ def _scene(
             raise ValueError(f"{what}; give cameras in pixels of the images, or Camera.scaled(...)")
     scaled = [_scaled(view, image.scale, image.size) for view, image in zip(views, read, strict=True)]
     model = _model(scaled)
-    if isinstance(cameras, Reconstruction) and cameras.valid.any():
+    if isinstance(cameras, Reconstruction) and cameras.inlier.any():
         kept = cameras.registered[cameras.tracks.view_index]
         t, number = cameras.tracks, np.cumsum(cameras.registered) - 1
         tracks = Tracks(number[t.view_index[kept]], t.point_index[kept], t.xy[kept], len(read), t.n_points)

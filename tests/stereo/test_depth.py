@@ -7,6 +7,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from tests.conftest import refuses
 from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
 from thesisrecon.dense_model import confirmed_depth_maps
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
@@ -60,6 +61,18 @@ def test_the_same_bytes_with_any_number_of_threads(walled):
         one = stereo.confirm(scene, raw, i)
         for field in ("depth", "std", "views", "P"):
             assert getattr(one, field).tobytes() == getattr(together[i], field).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "rule"),
+    [
+        ({"sequence_links": -1}, "not be negative"), ({"max_neighbours": 0}, "at least 1; got 0"),
+        ({"max_side": 0}, "at least 64 px; got 0 and 640"), ({"match_side": 1}, "at least 64 px; got 1024"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_settings_without_depth_are_refused(wrong, rule):
+    refuses(ValueError, rule, MultiViewStereo, **wrong)
 
 
 def test_idle_threads_take_part_in_a_depth_map(walled):

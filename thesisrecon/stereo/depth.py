@@ -27,6 +27,8 @@ BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
 """Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones."""
 MIN_ANGLE_DEG, MIN_POINTS = 1.0, 12
 """A neighbour has at least so many common points of at least this angle."""
+MIN_SIDE = 64
+"""Least longest side of depth maps and of images for stereo matching, in pixels."""
 VIEW_BYTES = 2**29
 """Undistorted views of one size in memory; more are made again when they are used."""
 
@@ -270,6 +272,11 @@ class MultiViewStereo:
     def __post_init__(self) -> None:
         if self.sequence_links < 0:
             raise ValueError(f"sequence_links must not be negative; got {self.sequence_links}")
+        if self.max_neighbours < 1:
+            raise ValueError(f"max_neighbours must be at least 1; got {self.max_neighbours}")
+        if min(self.max_side, self.match_side) < MIN_SIDE:
+            sides = f"{self.max_side} and {self.match_side}"
+            raise ValueError(f"max_side and match_side must be at least {MIN_SIDE} px; got {sides}")
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
         """See `thesisrecon.config.DepthEstimator.match_rectified`."""
@@ -307,7 +314,7 @@ class MultiViewStereo:
         side = min(self.match_side, self.max_side)
         longest = max((max(frame.seen.shape) for frame in frames.values()), default=0)
         matched = undistorted(side) if longest > side else views
-        if depth_range is None and reconstruction.valid.any():
+        if depth_range is None and reconstruction.inlier.any():
             points = _sparse_points(reconstruction)
         else:
             points = SparsePoints(*frustum_samples(frames, len(images), depth_range), sampled=True)
