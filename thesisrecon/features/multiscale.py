@@ -53,7 +53,7 @@ class MultiScaleCorners:
     seeds_per_level : int
         Number of seeds at the finest level; each further level has 1/sqrt(2) as many.
     levels : int
-        Number of levels.
+        Number of levels; with fewer than 3 there is no half size.
     upsample_below_px : int
         Long side below which the image is doubled; 0 for never.
     oblique_tilts : tuple of float
@@ -78,6 +78,11 @@ class MultiScaleCorners:
             raise ValueError(
                 "full_corners and half_corners must be at least 0, and one of them above; "
                 f"got {self.full_corners} and {self.half_corners}"
+            )
+        if self.half_corners and self.levels < 3:
+            raise ValueError(
+                "half_corners must be 0 with fewer than 3 levels, because the third level has half the size; "
+                f"got {self.half_corners} with levels = {self.levels}"
             )
         if self.seeds_per_level < 0:
             raise ValueError(f"seeds_per_level must be at least 0; got {self.seeds_per_level}")
