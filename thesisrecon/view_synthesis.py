@@ -17,7 +17,12 @@ from thesisrecon.io._images import read_image
 from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
-from thesisrecon.views.trilinear import VirtualCamera, default_intrinsics, pair_from_fundamental
+from thesisrecon.views.trilinear import (
+    VirtualCamera,
+    default_intrinsics,
+    pair_from_fundamental,
+    require_intrinsics,
+)
 from thesisrecon.views.trilinear_synthesis import TensorSynthesis, prepare_synthesis
 
 
@@ -154,13 +159,16 @@ def synthesize_view(
 
 
 def _given_intrinsics(K: ArrayLike | None) -> F64 | None:
-    """Return K as (2, 3, 3), None if not given."""
+    """Return K as (2, 3, 3), None if not given; ``ValueError`` if it is not that of a camera."""
     if K is None:
         return None
     given = np.asarray(K, dtype=np.float64)
     if given.shape not in ((3, 3), (2, 3, 3)):
         raise ValueError(f"K must be (3, 3) for both images or (2, 3, 3); got {given.shape}")
-    return np.broadcast_to(given, (2, 3, 3))
+    both = np.broadcast_to(given, (2, 3, 3))
+    for one in both:
+        require_intrinsics(one)
+    return both
 
 
 def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfig) -> tuple[F64, F64]:

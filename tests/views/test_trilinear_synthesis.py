@@ -79,6 +79,13 @@ def test_off_the_baseline_too(synthesis, translation):
     assert _psnr(picture[inner], _truth(camera)[inner]) > 30.0
 
 
+def test_pixels_that_see_nothing_in_any_direction_are_black(synthesis):
+    wide = calibration_matrix(40.0, 40.0, 140.0, 100.0)
+    picture = synthesis.render(VirtualCamera(*STILL, wide, SIZE))
+    assert 0.02 < (picture == 0).all(axis=2).mean() < 0.1
+    assert picture[90:110, 130:150].min() > 0
+
+
 def test_the_picture_does_not_depend_on_the_threads(synthesis):
     camera = camera_at(PAIR, 0.4, sizes=(SIZE, SIZE))
     np.testing.assert_array_equal(synthesis.render(camera, threads=3), synthesis.render(camera))

@@ -44,8 +44,14 @@ def _require_motion(R: F64, t: F64) -> None:
         raise ValueError(f"a translation is three finite numbers; got {t}")
 
 
-def _require_intrinsics(K: F64) -> None:
-    """Check that K is upper triangular with positive focal lengths and K33 = 1."""
+def require_intrinsics(K: F64) -> None:
+    """Raise ``ValueError`` unless K is upper triangular with positive focal lengths and K33 = 1.
+
+    Parameters
+    ----------
+    K : ndarray (3, 3)
+        Intrinsics.
+    """
     K = np.asarray(K, dtype=np.float64)
     if K.shape != (3, 3) or not np.isfinite(K).all():
         raise ValueError(f"intrinsics are a finite matrix (3, 3); got shape {K.shape}")
@@ -70,8 +76,8 @@ class CalibratedPair:
     t: F64
 
     def __post_init__(self) -> None:
-        _require_intrinsics(self.K1)
-        _require_intrinsics(self.K2)
+        require_intrinsics(self.K1)
+        require_intrinsics(self.K2)
         _require_motion(self.R, self.t)
         if not np.linalg.norm(self.t) > 0.0:
             raise ValueError("CalibratedPair needs a translation other than 0")
@@ -143,8 +149,8 @@ def pair_from_fundamental(
         For an F of other matches, no parallax, or points behind the cameras.
     """
     require_finite("pair_from_fundamental", F, xy1, xy2)
-    _require_intrinsics(K1)
-    _require_intrinsics(K2)
+    require_intrinsics(K1)
+    require_intrinsics(K2)
     distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
     extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
     if not np.median(distance) <= MAX_RESIDUAL * extent:
@@ -251,7 +257,7 @@ class VirtualCamera:
 
     def __post_init__(self) -> None:
         _require_motion(self.rotation, self.translation)
-        _require_intrinsics(self.K)
+        require_intrinsics(self.K)
         if min(self.size) < 1:
             raise ValueError(f"an image is at least 1 x 1 px; got {self.size}")
 

@@ -213,7 +213,7 @@ class TensorSynthesis:
             )
         rgb, inverse_depth = self._mixed(layers, self._share_of_second(moved[0]), step)
         filled = fill_holes(rgb, inverse_depth, step=step)
-        return np.asarray(np.clip(np.rint(filled), 0.0, 255.0), dtype=np.uint8)
+        return np.clip(np.rint(np.nan_to_num(filled)), 0.0, 255.0).astype(np.uint8)
 
     def _share_of_second(self, virtual: VirtualTensor) -> np.float32:
         """Position of the camera along the baseline, clipped to 0 (first image) and 1 (second image)."""
