@@ -187,7 +187,8 @@ def texture(
     Parameters
     ----------
     mesh : TexturedMesh
-        Vertices and faces; faces anticlockwise seen from the cameras.
+        Vertices and faces; faces anticlockwise seen from the cameras. Faces that no image shows completely
+        take the colours of their surroundings, so large ones must be subdivided.
     images, cameras, sizes, max_size, config, threads
         As for :func:`depth_maps`; ``config.model`` is the method.
 
@@ -199,7 +200,7 @@ def texture(
     Raises
     ------
     ValueError, StageFailure
-        If a camera is missing or is not of its image's size; if no view sees the surface.
+        If a camera is missing or is not of its image's size; if no view shows a face completely.
 
     Examples
     --------

@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._zbuffer import rasterize
 from thesisrecon.io._meshes import write_mesh
+from thesisrecon.records import TexturedMesh
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import _texture_kernels as kernels
 from thesisrecon.surface import texture_atlas
@@ -133,8 +135,19 @@ def test_unseen_faces_take_the_colour_of_their_surroundings(sphere):
 def test_a_surface_outside_all_views_is_rejected(sphere):
     away = photograph(ring_of()[0])
     away = replace(away, seen=np.zeros_like(away.seen))
-    with pytest.raises(StageFailure, match="no texture"):
-        TextureAtlas().texture(sphere, [away])
+    refuses(StageFailure, "no texture; no image shows any part", TextureAtlas().texture, sphere, [away])
+
+
+def test_faces_larger_than_the_images_are_rejected_with_advice():
+    square = np.array(
+        [[-100.0, -100.0, 4.0], [100.0, -100.0, 4.0], [100.0, 100.0, 4.0], [-100.0, 100.0, 4.0]]
+    )
+    view = photograph(ring_of()[0])
+    camera = blending.view_camera(view)
+    wall = TexturedMesh(square @ camera.R + camera.centre, np.array([[0, 2, 1], [0, 3, 2]]))
+    refuses(StageFailure, "completely; subdivide the mesh", TextureAtlas().texture, wall, [view])
+    inside_out = replace(wall, faces=wall.faces[:, ::-1])
+    refuses(StageFailure, "no image shows any part", TextureAtlas().texture, inside_out, [view])
 
 
 def test_gains_are_found(sphere):

@@ -90,6 +90,19 @@ def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequ
     return quality
 
 
+def shows_part(mesh: TexturedMesh, views: Sequence[PinholeView]) -> bool:
+    """Whether any view shows a part of the outside of a face."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    for view in views:
+        camera = view_camera(view)
+        drawn = rasterize(mesh.vertices, mesh.faces, camera).face[view.seen]
+        drawn = drawn[drawn >= 0]
+        if np.any(np.sum(normal[drawn] * (camera.centre - a[drawn]), axis=1) > 0.0):
+            return True
+    return False
+
+
 def choose_views(
     mesh: TexturedMesh,
     views: Sequence[PinholeView],

@@ -25,6 +25,7 @@ from thesisrecon.surface._texture_blending import (
     paint_texture,
     prepare_views,
     project_to_view,
+    shows_part,
 )
 
 CHART_MARGIN = 2
@@ -73,13 +74,17 @@ class TextureAtlas:
         Raises
         ------
         StageFailure
-            If no face is visible, or the atlas is too large even with images reduced to ``MIN_SCALE``.
+            If no view shows a face completely, or the atlas is too large even with images reduced to
+            ``MIN_SCALE``.
         """
         neighbours = face_neighbours(mesh.faces)
         frames = [(view.P, (view.rgb.shape[1], view.rgb.shape[0])) for view in views]
         buffers = depth_buffers(mesh, views)
         label = choose_views(mesh, views, buffers, neighbours, threads=threads)
         if not (label >= 0).any():
+            if shows_part(mesh, views):
+                evidence = "images show parts of faces, but none shows a face completely"
+                raise StageFailure("the surface has no texture", evidence, "subdivide the mesh")
             raise StageFailure("the surface has no texture", "no image shows any part of it")
         chart = label_charts(label, neighbours)
         scale = 1.0
