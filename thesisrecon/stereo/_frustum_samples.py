@@ -51,7 +51,7 @@ def frustum_samples(
         seen = np.zeros((n_views, len(X)), dtype=bool)
         for j in views:
             if j != i:
-                seen[j] = _inside(views[j], X)
+                seen[j] = project_inside(views[j], X)[1]
                 if depth_range is None:
                     seen[j] &= _angle_within_limits(X - centres[i], X - centres[j])
         kept = seen.any(axis=0)
@@ -71,13 +71,13 @@ def _on_rays(view: PinholeView, centre: F64, depth: F64) -> F64:
     return np.asarray((centre + depth[:, None, None] * rays).reshape(-1, 3))
 
 
-def _inside(view: PinholeView, X: F64) -> B8:
+def project_inside(view: PinholeView, X: F64) -> tuple[F64, B8]:
+    """Pixels (N, 2) of points in a view, and whether they are in front of it and inside the image."""
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = project(view.P, X)
     size = np.array(view.seen.shape[::-1])
-    return np.asarray(
-        (X @ view.P[2, :3] + view.P[2, 3] > 0.0) & np.all((xy >= 0.0) & (xy <= size - 1.0), axis=1)
-    )
+    inside = np.all((xy >= 0.0) & (xy <= size - 1.0), axis=1)
+    return xy, np.asarray((X @ view.P[2, :3] + view.P[2, 3] > 0.0) & inside)
 
 
 def _angle_within_limits(a: F64, b: F64) -> B8:

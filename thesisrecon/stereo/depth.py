@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import camera_centre, project
+from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.numerics._on_demand import MappingOnDemand
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link_sequence, pixel_transfer
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
-from thesisrecon.stereo._frustum_samples import frustum_samples
+from thesisrecon.stereo._frustum_samples import frustum_samples, project_inside
 from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
 from thesisrecon.stereo._resampling import pinhole_frame, pinhole_view
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
@@ -57,15 +57,9 @@ def _shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) ->
     """Pixels (N, 2) in two views of the points that at least one of them observes, if inside both images."""
     seen = points.seen[a.view], points.seen[b.view]
     X = points.X[seen[0] & seen[1] if points.sampled else seen[0] | seen[1]]
-    keep = np.ones(len(X), dtype=bool)
-    places = []
-    for view in (a, b):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            xy = project(view.P, X)
-        size = np.array(view.seen.shape[::-1])
-        keep &= (X @ view.P[2, :3] + view.P[2, 3] > 0.0) & np.all((xy >= 0.0) & (xy <= size - 1.0), axis=1)
-        places.append(xy)
-    return places[0][keep], places[1][keep]
+    (xy_a, inside_a), (xy_b, inside_b) = (project_inside(view, X) for view in (a, b))
+    keep = inside_a & inside_b
+    return xy_a[keep], xy_b[keep]
 
 
 def _select_neighbours(
