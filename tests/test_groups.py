@@ -6,7 +6,7 @@ import pytest
 
 from tests import fake_stages as fakes
 from tests.conftest import refuses
-from tests.fake_stages import CALLS, fake_config, kept_bytes, photographs, read
+from tests.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon import load
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
@@ -104,6 +104,14 @@ def test_groups_can_be_turned_off(tmp_path):
     assert len(result.cameras) == 9
     assert "groups" not in result.summary
     assert not (tmp_path / "group-2" / "summary.json").exists()
+
+
+def test_a_replaced_run_leaves_no_result_of_its_groups(tmp_path):
+    run(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, seed=1, overwrite=True, threads=1, progress=interrupt_at("features", 9))
+    assert not list(tmp_path.rglob("summary.json"))
+    assert (tmp_path / "group-2" / "06-metric").is_dir()
 
 
 def test_a_group_that_fails_leaves_the_others_whole(tmp_path):

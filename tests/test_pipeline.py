@@ -12,6 +12,7 @@ import trimesh
 from tests import fake_stages as fakes
 from tests.conftest import refuses
 from tests.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
+from thesisrecon import load
 from thesisrecon.camera import Camera
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
@@ -361,6 +362,23 @@ def test_a_failure_leaves_no_model_of_the_run_before(tmp_path):
     assert "the initial pair is bad" in summary["failure"]
     assert summary["pairs"]["accepted"] == 6
     assert "the initial pair is bad" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("images", [3, 4])
+def test_a_replaced_run_is_not_read_back_with_the_new_one(tmp_path, images):
+    """Records of the old one stay for reuse, with their manifests."""
+    run(tmp_path, until="model")
+    run(tmp_path, images, until="matches", seed=1, overwrite=True)
+    loaded = load(tmp_path)
+    assert [report.stage for report in loaded.reports] == ["features", "pairs", "matches"]
+    assert len(loaded.images) == len(loaded.features) == images
+    assert loaded.tracks is loaded.best_reconstruction is loaded.calibration is loaded.mesh is None
+    failing = fake_config(projective=fakes.FakeProjective(fail_below=9))
+    refuses(StageFailure, "the initial pair is bad", run, tmp_path, images, config=failing, overwrite=True)
+    loaded = load(tmp_path)
+    assert loaded.tracks.n_views == images
+    assert loaded.best_reconstruction is loaded.calibration is None
+    assert "the initial pair is bad" in loaded.failure
 
 
 def test_a_replaced_run_leaves_no_result_even_if_the_new_one_is_interrupted(tmp_path):

@@ -65,8 +65,11 @@ def load(out: str | Path) -> RunResult:
 
 
 def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
-    stages = {stage: _records(folder / name) for stage, name in FOLDERS.items() if stage != "dense"}
-    reports = [StageFolder(folder / name).finished(_keys(folder / name)) for name in FOLDERS.values()]
+    # The folders of later stages may hold those of a run that this one replaced.
+    finished = {stage: folder / name for stage, name in FOLDERS.items() if stage in summary["seconds"]}
+    reports = [StageFolder(path).finished(_keys(path)) for path in finished.values()]
+    stages: dict[str, dict[str, Any]] = {stage: {} for stage in FOLDERS}
+    stages |= {stage: _records(path) for stage, path in finished.items() if stage != "dense"}
     views, projective = summary["cameras"], list(stages["projective"].values())
     sizes = projective[0].sizes if projective else [_working_size(view) for view in views]
     names = [view["name"] for view in views]
@@ -106,7 +109,7 @@ def _keys(folder: Path) -> dict[str, str]:
 
 
 def _records(folder: Path) -> dict[str, Any]:
-    """Item -> record of a stage, in order of the items; empty if the stage did not run."""
+    """Item -> record of a stage, in order of the items."""
     stage = StageFolder(folder)
     found = {item: stage.load(item, key) for item, key in sorted(_keys(folder).items())}
     return {item: record for item, record in found.items() if record is not None}

@@ -40,6 +40,8 @@ COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "fra
 SURFACE_FILES = ("model.glb", "model-full.glb", *TILE_FILES)
 MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
+REPLACED_FILES = (*RESULT_FILES, *(f"group-*/{name}" for name in RESULT_FILES))
+"""What a run removes of another one in its folder."""
 MAX_AFFINE = 1e3
 """Largest affine coordinate written to affine.ply, in standard deviations of the points."""
 

@@ -34,7 +34,7 @@ from thesisrecon.pipeline._given import (
     verify_pairs,
     views_of,
 )
-from thesisrecon.pipeline._outputs import RESULT_FILES
+from thesisrecon.pipeline._outputs import REPLACED_FILES
 from thesisrecon.pipeline._stages import build_tracks, split_groups
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
@@ -287,7 +287,7 @@ def _reconstruct(
             result = empty_result(run, inputs)
             state = PipelineState(run, inputs, result, until)
             identity = identity_of(run, inputs, source)
-            run.directory.adopt(identity, overwrite=overwrite, results=RESULT_FILES)
+            run.directory.adopt(identity, overwrite=overwrite, results=REPLACED_FILES)
             found = run_steps(state, _steps(given, until), surface_required=requested)
         return found if out is not None else replace(found, out=None)
 

@@ -15,7 +15,7 @@ from thesisrecon.io._frames import FrameSource
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
 from thesisrecon.io._masks import add_masks, check_masks_folder
 from thesisrecon.matching.pair_selection import ListedPairs
-from thesisrecon.pipeline._outputs import RESULT_FILES
+from thesisrecon.pipeline._outputs import REPLACED_FILES
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
 from thesisrecon.results import RunResult
@@ -128,7 +128,7 @@ def reconstruct(
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
             listed.check([image.name for image in inputs.images], inputs.refused)
         state = PipelineState(run, inputs, empty_result(run, inputs), until)
-        run.directory.adopt(identity_of(run, inputs, source), overwrite=overwrite, results=RESULT_FILES)
+        run.directory.adopt(identity_of(run, inputs, source), overwrite=overwrite, results=REPLACED_FILES)
         return run_steps(state, STEPS[until], surface_required=surface_required)
 
 
