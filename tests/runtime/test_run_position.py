@@ -7,6 +7,8 @@ import time
 import numpy as np
 import pytest
 
+from tests.fake_stages import fake_config, interrupt_at, photographs
+from thesisrecon import reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._files import write_json
 from thesisrecon.records import PairChoice, StageReport
@@ -54,8 +56,25 @@ def test_a_killed_run_tells_how_to_go_on(folder):
 
 def test_resumed_items_do_not_count_for_the_rate(folder):
     os.utime(folder / "run.json")
+    directory = RunDirectory(folder)
+    for stage, count in (("01-features", IMAGES), ("02-matches", 5)):
+        for n in range(count):
+            directory.mark(directory.stage(stage), f"{n:05d}")
     with RunDirectory(folder).claim({}, overwrite=True):
         assert run_position(folder) == "running: matches, 5 of 45 done"
+
+
+def test_records_of_a_replaced_run_are_not_counted(tmp_path):
+    def run(images, **options):
+        return reconstruct(photographs(images), tmp_path, config=fake_config(), threads=1, **options)
+
+    run(4)
+    with pytest.raises(KeyboardInterrupt):
+        run(5, seed=1, overwrite=True, progress=interrupt_at("matches", 2))
+    assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"
+    with pytest.raises(KeyboardInterrupt):
+        run(5, seed=1, progress=interrupt_at("matches", 3))
+    assert run_position(tmp_path) == "interrupted: matches, 3 of 10 done; repeat the command to resume"
 
 
 def test_a_folder_without_a_run_has_no_position(tmp_path):

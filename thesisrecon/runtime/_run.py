@@ -163,6 +163,8 @@ class Run:
             except ChangedRecord:
                 record = None
                 changed.append(f"{FOLDERS[stage]}/{item}.npz")
+            if record is not None:
+                self.directory.mark(folder, item)
             yield record
         if changed:
             more, were = (f" and {len(changed) - 1} more", "were") if len(changed) > 1 else ("", "was")

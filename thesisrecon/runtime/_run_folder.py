@@ -14,7 +14,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -221,6 +221,12 @@ class RunDirectory:
     def stage(self, folder: str) -> StageFolder:
         """The folder of a stage, such as ``01-features``."""
         return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
+
+    def mark(self, stage: StageFolder, item: str) -> None:
+        """Give a reused record the time of the run, so that only those of replaced runs are older."""
+        with suppress(OSError):
+            start = (self.path / RUN_FILE).stat().st_mtime_ns
+            os.utime(stage.path / f"{item}.npz", ns=(start, start))
 
     @contextmanager
     def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:

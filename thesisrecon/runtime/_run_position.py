@@ -41,10 +41,12 @@ def run_position(folder: Path) -> str:
 
 def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
     """The last stage that was written to, the times of its items, and when the one before it ended."""
-    ended = (folder / RUN_FILE).stat().st_mtime
+    started = ended = (folder / RUN_FILE).stat().st_mtime
     found = ("images", list[float](), ended)
     for stage, name in FOLDERS.items():
-        times = sorted(path.stat().st_mtime for path in (folder / name).glob("*.npz"))
+        every = [path.stat().st_mtime for path in (folder / name).glob("*.npz")]
+        # Older records are those of a run that this one replaces; reused ones have the time of the run file.
+        times = sorted(when for when in every if when >= started)
         if times:
             found = (stage, times, ended)
             manifest = folder / name / MANIFEST_FILE
