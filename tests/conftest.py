@@ -7,6 +7,7 @@ import os
 import pytest
 
 from thesisrecon.cli.main import run_command
+from thesisrecon.runtime._run_folder import bytes_from_record
 
 LOCAL = {
     "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": ":0", "worker_dashboard_address": None,
@@ -40,6 +41,11 @@ def refuses(error, words, call, *arguments, **options):
     """Require that a call raises the error with these words."""
     with pytest.raises(error, match=words):
         call(*arguments, **options)
+
+
+def same_pairs(one, other):
+    """Whether the matched pairs of two results are equal in all fields."""
+    return [bytes_from_record(p, "") for p in one.pairs] == [bytes_from_record(p, "") for p in other.pairs]
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from tests import fake_stages as fakes
-from tests.conftest import refuses
+from tests.conftest import refuses, same_pairs
 from tests.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon import load
 from thesisrecon.camera import Camera
@@ -21,7 +21,7 @@ from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline import _outputs, _stages, _tiles
-from thesisrecon.pipeline._state import name_images
+from thesisrecon.pipeline._state import PreparedViews, name_images
 from thesisrecon.pipeline.reconstruction import _exif_warnings, reconstruct
 from thesisrecon.records import Image
 from thesisrecon.runtime._executors import Workers
@@ -550,6 +550,27 @@ def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path):
     matched = ["match (0, 2)", "match (0, 3)", "match (1, 3)"]
     assert sorted(c for c in CALLS if c.startswith("match")) == matched
     assert "pairs" not in more.summary["resumed"]
+
+
+def test_the_final_pairs_are_read_back(tmp_path, monkeypatch):
+    """One is matched again from oblique views, and one is rejected because of the others."""
+
+    def oblique(state):
+        return PreparedViews(lambda _, features: replace(features, xy=features.xy + 1.0), state.given())
+
+    def reject(pairs, _):
+        return [*pairs[:-1], replace(pairs[-1], accepted=False, reason="repeated structure")]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_stages, "pairs_to_connect", lambda *_: [1])
+        patch.setattr(_stages, "_prepared_oblique", oblique)
+        patch.setattr(_stages, "reject_repeated_structure", reject)
+        result = run(tmp_path, until="matches", threads=1)
+    np.testing.assert_allclose(result.pairs[1].xy2, result.features[2].xy + 1.0)
+    assert [pair.accepted for pair in result.pairs] == [True] * 5 + [False]
+    assert same_pairs(load(tmp_path), result)
+    assert same_pairs(run(tmp_path, until="matches"), load(tmp_path))
+    assert all(pair.accepted for pair in load(tmp_path).pairs)
 
 
 def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import thesisrecon
+from tests.conftest import same_pairs
 from tests.given_scene import SIZE, given_scene
 from thesisrecon.errors import UsageError
 from thesisrecon.io._models import read_cameras
@@ -59,8 +60,18 @@ def test_a_finished_folder_is_read_back(run):
     assert list(loaded.cameras) == list(result.cameras)
     assert np.array_equal(loaded.points, result.points)
     assert np.array_equal(loaded.cameras[1].K, result.cameras[1].K)
-    assert len(loaded.pairs) == len(result.pairs)
+    assert same_pairs(loaded, result)
     assert loaded.tracks.n_points == result.tracks.n_points
+
+
+def test_pairs_that_were_given_the_other_way_round_are_read_back(run, tmp_path):
+    scene = run[0]
+    matches = {(j, i): rows[:, ::-1] for (i, j), rows in scene.matches.items()}
+    result = thesisrecon.reconstruct_from_matches(
+        scene.keypoints, matches, scene.sizes, tmp_path, until="matches"
+    )
+    assert [(p.i, p.j) for p in result.pairs][:3] == [(0, 1), (0, 2), (1, 2)]
+    assert same_pairs(thesisrecon.load(tmp_path), result)
 
 
 def test_a_loaded_result_is_saved_as_the_run_wrote_it(run, tmp_path):

@@ -6,8 +6,9 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from tests.conftest import same_pairs
 from tests.synthetic import photograph, texture
-from thesisrecon import PipelineConfig, reconstruct
+from thesisrecon import PipelineConfig, load, reconstruct
 from thesisrecon.errors import StageFailure
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.io._images import demo_images
@@ -39,9 +40,11 @@ def test_the_strongest_corners_of_each_scale_and_seeds_of_each_level_are_kept():
 def test_pairs_of_many_images_have_fewer_matches_unless_all_are_needed(tmp_path, monkeypatch):
     def pairs(name, many_images):
         config = PipelineConfig(matching=SeedsAndGrowth(many_images=many_images))
-        return reconstruct(
+        result = reconstruct(
             demo_images()[:3], tmp_path / name, config=config, max_size=480, until="matches", threads=2
         )
+        assert same_pairs(load(tmp_path / name), result)
+        return result
 
     every, fewer = pairs("all", 3), pairs("fewer", 2)
     for whole, part in zip(every.pairs, fewer.pairs, strict=True):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,8 @@ from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import render
 
+FEWER, FINAL = "-fewer", "final"
+"""End of the names of pairs matched by a share of the corners, and name of the record of the final pairs."""
 MIN_CORNERS = 16
 ENOUGH = 240
 """Verified matches of a pair, from a share of its corners, that need no more."""
@@ -114,19 +117,25 @@ def match_pairs(state: PipelineState) -> None:
     """Match the pairs and estimate their epipolar geometry (4.2.2, chapter 5); sets ``result.pairs``."""
     assert state.result.pair_choice is not None
     pairs = [(int(i), int(j)) for i, j in state.result.pair_choice.pairs]
-    found = _matched_in_turn(state, pairs)
+    found, kinds = _matched_in_turn(state, pairs)
     again = pairs_to_connect(state.result.features, found, oblique_pairs(state.config))
     if again:
         second = _matched(state, [pairs[n] for n in again], "-oblique", lambda: _prepared_oblique(state))
         for n, pair in zip(again, second, strict=True):
-            found[n] = pair if pair.accepted else found[n]
-    finish_matches(state, reject_repeated_structure(found, len(state.result.images)))
+            if pair.accepted:
+                found[n], kinds[n] = pair, "-oblique"
+    final = reject_repeated_structure(found, len(state.result.images))
+    rejected = {n: pair.reason for n, pair in enumerate(final) if pair is not found[n]}
+    finish_matches(state, final, kinds, rejected)
 
 
-def _matched_in_turn(state: PipelineState, pairs: Sequence[tuple[int, int]]) -> list[TwoView]:
+def _matched_in_turn(
+    state: PipelineState, pairs: Sequence[tuple[int, int]]
+) -> tuple[list[TwoView], list[str]]:
     """Match pairs; those of many images by a share of their corners, and by all where these are too few.
 
-    They are too few for weak pairs, and for all pairs of a long row of images, where errors add up.
+    They are too few for weak pairs, and for all pairs of a long row of images, where errors add up. Returns
+    the pairs, and the kind of record of each.
     """
     features, matching = state.result.features, state.config.matching
     if (
@@ -134,18 +143,24 @@ def _matched_in_turn(state: PipelineState, pairs: Sequence[tuple[int, int]]) -> 
         or matching.many_share == 1.0
         or len(features) <= matching.many_images
     ):
-        return _matched(state, pairs, "", state.prepared_views)
+        return _matched(state, pairs, "", state.prepared_views), [""] * len(pairs)
     prepare = partial(_prepare_share, matching)
-    found = _matched(state, pairs, "-fewer", lambda: PreparedViews(prepare, state.given()))
-    rows = [strongest_corners(f, matching.many_share) for f in features]
-    found = [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in found]
+    found = _matched(state, pairs, FEWER, lambda: PreparedViews(prepare, state.given()))
+    found, kinds = of_all_corners(found, features, matching.many_share), [FEWER] * len(pairs)
     kept = reject_repeated_structure(found, len(features))
     long = has_narrow_cut(tracks_of_corners([found.xy for found in features], kept))
     again = [n for n, pair in enumerate(found) if long or not pair.accepted or pair.inliers < ENOUGH]
     second = _matched(state, [pairs[n] for n in again], "", state.prepared_views)
     for n, pair in zip(again, second, strict=True):
-        found[n] = pair if pair.accepted or not found[n].accepted else found[n]
-    return found
+        if pair.accepted or not found[n].accepted:
+            found[n], kinds[n] = pair, ""
+    return found, kinds
+
+
+def of_all_corners(pairs: Sequence[TwoView], features: Sequence[Features], share: float) -> list[TwoView]:
+    """Pairs matched by a share of the corners, with the numbers of all corners."""
+    rows = [strongest_corners(f, share) for f in features]
+    return [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in pairs]
 
 
 def _prepare_share(matching: SeedsAndGrowth, image: Image, features: Features) -> Any:
@@ -160,7 +175,7 @@ def _matched(
     variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
     features = list(run.logs["features"].keys.values())
     inputs = {(i, j): (features[i], features[j], run.seed, i, j, *([kind] if kind else [])) for i, j in pairs}
-    keys = {f"{i:05d}-{j:05d}{kind}": run.key("matches", variants, *inputs[i, j]) for i, j in pairs}
+    keys = {_item(i, j, kind): run.key("matches", variants, *inputs[i, j]) for i, j in pairs}
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         views, shared = prepared(), run.workers.in_process
@@ -174,9 +189,23 @@ def _matched(
     return list(run.map_cached("matches", keys, _match_all, batches))
 
 
-def finish_matches(state: PipelineState, two_views: Sequence[TwoView]) -> None:
-    """Report the matched pairs; sets ``result.pairs``."""
+def finish_matches(
+    state: PipelineState,
+    two_views: Sequence[TwoView],
+    kinds: Sequence[str] | None = None,
+    rejected: Mapping[int, str] | None = None,
+) -> None:
+    """Report the matched pairs; sets ``result.pairs``.
+
+    If these are not all records as they are stored, another record lists those that count, of ``kinds``, and
+    the reasons of those ``rejected`` (by number) because of other pairs.
+    """
+    run, rejected = state.run, rejected or {}
     state.result = replace(state.result, pairs=tuple(two_views))
+    items = [_item(p.i, p.j, kind) for p, kind in zip(two_views, kinds or repeat(""), strict=False)]
+    if rejected or any(kinds or ()) or items != sorted(run.logs["matches"].keys):
+        final = {"items": items, "rejected": {items[n]: reason for n, reason in rejected.items()}}
+        run.cached("matches", FINAL, run.key("matches", FINAL, final), lambda: final)
     accepted = [pair for pair in two_views if pair.accepted]
     counts = {
         "pairs": len(two_views),
@@ -185,7 +214,11 @@ def finish_matches(state: PipelineState, two_views: Sequence[TwoView]) -> None:
         "undetermined": sum(pair.undetermined for pair in accepted),
     }
     metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
-    state.run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
+    run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
+
+
+def _item(i: int, j: int, kind: str) -> str:
+    return f"{i:05d}-{j:05d}{kind}"
 
 
 def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
@@ -237,7 +270,7 @@ def take_group(whole: PipelineState, views: Sequence[int], state: PipelineState)
         # Which matches count, and whether they do, depends on all images and not only on the two.
         content = [pair.index1, pair.index2, pair.xy1, pair.xy2, pair.affine, pair.accepted, pair.reason]
         key = run.key("matches", keys[n], pair.i, pair.j, content)
-        pairs.append(run.cached("matches", f"{pair.i:05d}-{pair.j:05d}", key, partial(replace, pair)))
+        pairs.append(run.cached("matches", _item(pair.i, pair.j, ""), key, partial(replace, pair)))
     finish_matches(state, pairs)
 
 
