@@ -1,5 +1,7 @@
 """What a run returns: cameras, points and observations in original pixels, saved and read back."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,25 @@ def test_a_result_without_a_folder_is_saved(run, tmp_path):
     saved = read_cameras(tmp_path / "saved" / "cameras.json")
     assert np.allclose(saved["image-2"].K, kept.cameras[2].K)
     assert (tmp_path / "saved" / "points.ply").read_bytes() == (kept.out / "points.ply").read_bytes()
+
+
+def test_results_of_one_folder_stay_apart_and_outlive_it(run, tmp_path):
+    scene, kept = run
+    out = tmp_path / "out"
+
+    def again(**options):
+        given = (scene.keypoints, scene.matches, scene.sizes, out)
+        return thesisrecon.reconstruct_from_matches(*given, overwrite=True, **options)
+
+    first, second = again(), again(set={"intrinsics.focal_px": 1000.0, "intrinsics.focal": "known"})
+    assert abs(second.cameras[0].K[0, 0] / first.cameras[0].K[0, 0] - 1.1) < 0.05
+    for _ in ("replaced", "removed"):
+        assert thesisrecon.compare_models(first, second).summary["focal_error_rel"]["max"] > 1e-6
+        assert thesisrecon.compare_models(first, kept).summary["focal_error_rel"]["max"] == 0.0
+        first.save(tmp_path / "copy")
+        for name in ("cameras.json", "points.ply", "sparse/0/images.bin", "sparse/0/points3D.bin"):
+            assert (tmp_path / "copy" / name).read_bytes() == (kept.out / name).read_bytes()
+        shutil.rmtree(out, ignore_errors=True)
 
 
 def test_a_folder_without_a_finished_run_is_refused(tmp_path):

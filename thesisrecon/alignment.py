@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,7 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import UsageError, counted, unknown_word
 from thesisrecon.geometry.similarity import Similarity, estimate_similarity
 from thesisrecon.io._models import read_model
-from thesisrecon.results import RunResult
+from thesisrecon.results import RunResult, folder_with
 from thesisrecon.sparse_model import SparseModel
 
 _MAX_TRIPLES = 1000
@@ -79,10 +79,11 @@ def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
         return model
     if not isinstance(model, RunResult):
         return read_model(model)
-    if model.out is not None:
-        return read_model(model.out)
+    out = model.out if model.metric is None else folder_with(model)
+    if out is not None:
+        return read_model(out)
     with TemporaryDirectory() as folder:
-        model.save(folder)
+        replace(model, mesh=None).save(folder)
         return read_model(folder)
 
 

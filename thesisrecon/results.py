@@ -11,6 +11,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.camera import Camera
+from thesisrecon.io._files import as_read, read_json
 from thesisrecon.records import (
     DepthMap,
     Features,
@@ -27,6 +28,8 @@ from thesisrecon.records import (
     Tracks,
     TwoView,
 )
+
+SUMMARY = "summary.json"
 
 
 class SeenPoints(NamedTuple):
@@ -52,6 +55,22 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
         return interval
     shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0
     return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)
+
+
+def folder_with(result: RunResult) -> Path | None:
+    """Return the output folder of a result if it still holds it.
+
+    Parameters
+    ----------
+    result : RunResult
+        Its summary, with times, tells it from every other result, of an equal run too.
+
+    Returns
+    -------
+    Path or None
+    """
+    out = result.out
+    return out if out is not None and read_json(out / SUMMARY) == as_read(result.summary) else None
 
 
 def _number_of(image: str | int, images: tuple[Image, ...]) -> int:

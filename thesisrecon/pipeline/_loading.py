@@ -13,10 +13,10 @@ from thesisrecon.arrays import I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import image_without_pixels
-from thesisrecon.pipeline._outputs import SUMMARY, with_image_names
+from thesisrecon.pipeline._outputs import with_image_names
 from thesisrecon.pipeline._stages import FEWER, FINAL, best_result, of_all_corners
 from thesisrecon.records import Features, Image, TwoView
-from thesisrecon.results import RunResult
+from thesisrecon.results import SUMMARY, RunResult
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, ChangedRecord, StageFolder
 

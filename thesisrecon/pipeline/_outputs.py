@@ -25,7 +25,7 @@ from thesisrecon.pipeline._tiles import TILE_FILES, TILES, write_tiles
 from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
-from thesisrecon.results import RunResult
+from thesisrecon.results import SUMMARY, RunResult, folder_with
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
@@ -35,7 +35,7 @@ from thesisrecon.surface.texture_atlas import TextureAtlas
 
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
-SUMMARY, PAGE = "summary.json", "report.html"
+PAGE = "report.html"
 COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
 SURFACE_FILES = ("model.glb", "model-full.glb", *TILE_FILES)
 MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
@@ -152,11 +152,11 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
 
 
 def save_result(result: RunResult, folder: Path) -> None:
-    """Copy the result files of a run, or write those of a run that had no folder (without its page)."""
-    if result.out is not None and (result.out / SUMMARY).is_file():
-        for path in (path for name in RESULT_FILES for path in sorted(result.out.glob(name))):
+    """Copy the result files of a run, or write those that no folder holds (without the page)."""
+    if (out := folder_with(result)) is not None:
+        for path in (path for name in RESULT_FILES for path in sorted(out.glob(name))):
             if path.is_file():
-                write_atomically(folder / path.relative_to(result.out), path.read_bytes())
+                write_atomically(folder / path.relative_to(out), path.read_bytes())
         return
     folder.mkdir(parents=True, exist_ok=True)
     _write_results(RunDirectory(folder), result)
