@@ -10,9 +10,11 @@ import pytest
 
 import thesisrecon
 from tests.conftest import refuses
+from tests.fake_stages import FakeDense
 from tests.given_scene import SIZE, given_scene
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.cli.main import run_command
+from thesisrecon.pipeline import _stages
 
 SCENE = given_scene()
 ORIENTATIONS = "CREATE TABLE {} (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
@@ -76,6 +78,16 @@ def test_images_give_colours_and_other_sizes_of_work(from_rows):
     )
     assert result.images[0].size == (320, 240)
     assert focal_is_right(result) == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-4)
+
+
+def test_a_run_without_a_folder_holds_all_depth_maps(monkeypatch):
+    monkeypatch.setattr(_stages, "MAP_BYTES", 1)
+    images = np.random.default_rng(0).integers(0, 256, (5, 480, 640, 3), np.uint8)
+    config = thesisrecon.PipelineConfig(dense=FakeDense())
+    result = reconstruct_from_matches(
+        SCENE.keypoints, SCENE.matches, SCENE.sizes, images=list(images), config=config, until="dense"
+    )
+    assert [m.depth.shape for m in result.depth_maps] == [(480, 640)] * 5
 
 
 def test_a_run_in_a_folder_is_resumed_and_other_matches_are_another_run(tmp_path):

@@ -289,7 +289,8 @@ def _reconstruct(
             identity = identity_of(run, inputs, source)
             run.directory.adopt(identity, overwrite=overwrite, results=REPLACED_FILES)
             found = run_steps(state, _steps(given, until), surface_required=requested)
-        return found if out is not None else replace(found, out=None)
+        # All depth maps are read: the folder is removed.
+        return found if out is not None else replace(found, out=None, depth_maps=found.depth_maps[:])
 
 
 def _steps(given: Given, until: str) -> list[Any]:
