@@ -20,7 +20,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
-from thesisrecon.pipeline import _outputs, _stages, _tiles
+from thesisrecon.pipeline import _matching_stages, _outputs, _stages, _tiles
 from thesisrecon.pipeline._state import PreparedViews, name_images
 from thesisrecon.pipeline.reconstruction import _exif_warnings, reconstruct
 from thesisrecon.records import Image
@@ -562,9 +562,9 @@ def test_the_final_pairs_are_read_back(tmp_path, monkeypatch):
         return [*pairs[:-1], replace(pairs[-1], accepted=False, reason="repeated structure")]
 
     with monkeypatch.context() as patch:
-        patch.setattr(_stages, "pairs_to_connect", lambda *_: [1])
-        patch.setattr(_stages, "_prepared_oblique", oblique)
-        patch.setattr(_stages, "reject_repeated_structure", reject)
+        patch.setattr(_matching_stages, "pairs_to_connect", lambda *_: [1])
+        patch.setattr(_matching_stages, "_prepared_oblique", oblique)
+        patch.setattr(_matching_stages, "reject_repeated_structure", reject)
         result = run(tmp_path, until="matches", threads=1)
     np.testing.assert_allclose(result.pairs[1].xy2, result.features[2].xy + 1.0)
     assert [pair.accepted for pair in result.pairs] == [True] * 5 + [False]

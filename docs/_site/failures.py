@@ -23,7 +23,7 @@ SOURCES = {
         "io/_masks.py": ("find_masks",),
         "io/_frames.py": ("_decoded",),
         "pipeline/reconstruction.py": ("_read_inputs", "_exif_warnings"),
-        "pipeline/_stages.py": ("finish_features",),
+        "pipeline/_matching_stages.py": ("finish_features",),
     },
     "Images that are not registered": {
         "projective/incremental.py": (
@@ -36,7 +36,7 @@ SOURCES = {
     },
     "Pairs of images": {
         "epipolar/verification.py": ("_objection", "_assess_pair"),
-        "pipeline/_stages.py": ("_degenerate_pairs",),
+        "pipeline/_matching_stages.py": ("_degenerate_pairs",),
         "pipeline/_steps.py": ("_run_groups",),
     },
     "Calibration": {

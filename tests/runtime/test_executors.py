@@ -21,7 +21,7 @@ from tests.fake_stages import fake_config, photographs
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io._files import read_json
-from thesisrecon.pipeline import _stages
+from thesisrecon.pipeline import _matching_stages, _stages
 from thesisrecon.pipeline import _state as preparing
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
@@ -264,7 +264,7 @@ def test_results_of_real_tasks_are_as_small_as_stated(tmp_path, monkeypatch):
     images = sorted(COURTYARD.iterdir())[4:8]
     result = reconstruct(images, tmp_path, config=config, until="dense", threads=1, executor=recorder)
     corners = [len(features.xy) for features in result.features]
-    batches = recorder.found[_stages._match_all]
+    batches = recorder.found[_matching_stages._match_all]
     assert 1 < len(batches) < 6
     for (_, _, pairs, _), answer in batches:
         matches = sum(min(corners[i], corners[j]) for i, j in pairs)
@@ -272,7 +272,7 @@ def test_results_of_real_tasks_are_as_small_as_stated(tmp_path, monkeypatch):
         assert len(answer) <= bound <= largest
     for (_, answer), image in zip(recorder.found[_stages._depths], result.images, strict=True):
         assert len(answer) <= 9 * image.rgb[..., 0].size + 4096
-    assert set(recorder.found) == {_stages._detect, _stages._match_all, _stages._depths}
+    assert set(recorder.found) == {_matching_stages._detect, _matching_stages._match_all, _stages._depths}
 
 
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])

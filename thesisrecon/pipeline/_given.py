@@ -19,7 +19,8 @@ from thesisrecon.matching._prepared import select_matches
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.numerics._observations import Observations, sort_observations
 from thesisrecon.pipeline._image_pair import values_at, verify_matches
-from thesisrecon.pipeline._stages import finish_matches, finish_tracks, require_accepted_pair
+from thesisrecon.pipeline._matching_stages import finish_matches
+from thesisrecon.pipeline._stages import finish_tracks, require_accepted_pair
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView
 from thesisrecon.runtime._run import Batch, Run, stream

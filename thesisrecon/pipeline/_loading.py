@@ -13,8 +13,9 @@ from thesisrecon.arrays import I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import image_without_pixels
+from thesisrecon.pipeline._matching_stages import FEWER, FINAL, of_all_corners
 from thesisrecon.pipeline._outputs import with_image_names
-from thesisrecon.pipeline._stages import FEWER, FINAL, best_result, of_all_corners
+from thesisrecon.pipeline._stages import best_result
 from thesisrecon.records import Features, Image, TwoView
 from thesisrecon.results import SUMMARY, RunResult
 from thesisrecon.runtime._run import FOLDERS

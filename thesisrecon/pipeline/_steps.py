@@ -12,19 +12,21 @@ from thesisrecon._settings import tables_from_config
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import camera_numbers
 from thesisrecon.io._images import ImageSet
+from thesisrecon.pipeline._matching_stages import (
+    find_features,
+    match_pairs,
+    select_pairs,
+    split_groups,
+    take_group,
+)
 from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
 from thesisrecon.pipeline._stages import (
     build_model,
     build_tracks,
     estimate_depth_maps,
-    find_features,
     finish_projective,
-    match_pairs,
     reconstruct_metric,
     reconstruct_projective,
-    select_pairs,
-    split_groups,
-    take_group,
 )
 from thesisrecon.pipeline._state import PipelineState, name_images
 from thesisrecon.records import Reconstruction

@@ -34,8 +34,9 @@ from thesisrecon.pipeline._given import (
     verify_pairs,
     views_of,
 )
+from thesisrecon.pipeline._matching_stages import split_groups
 from thesisrecon.pipeline._outputs import REPLACED_FILES
-from thesisrecon.pipeline._stages import build_tracks, split_groups
+from thesisrecon.pipeline._stages import build_tracks
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
 from thesisrecon.records import Tracks

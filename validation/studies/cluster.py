@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from thesisrecon.pipeline import _parts, _stages
+from thesisrecon.pipeline import _matching_stages, _parts, _stages
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime._executors import AHEAD
@@ -32,7 +32,7 @@ from validation.studies.measuring import call_apart
 from validation.studies.runner import Part, text_table
 
 STAGES: Mapping[Callable[..., Any], str] = {
-    _stages._detect: "features",
+    _matching_stages._detect: "features",
     _parts.reconstruct_part: "parts",
     _stages._depths: "depth maps",
 }
@@ -78,7 +78,7 @@ class Matching:
                     self.views[view] = Task(used, len(pickle.dumps(views.subset([view]), 5)), 0)
                     self.corners[view] = len(views._given[view][1].xy)
             start = time.process_time()
-            one = _stages._match_all(config, views, [pair], seed)
+            one = _matching_stages._match_all(config, views, [pair], seed)
             self.pairs[pair] = Task(time.process_time() - start, 0, len(pickle.dumps(one, 5)))
             found += one
         return found
@@ -109,7 +109,7 @@ class TaskMeter(Executor):
         """Run ``fn(key, pickled task)``, as :class:`thesisrecon.runtime._executors.Workers` submits it."""
         start, answer = time.process_time(), Future[Any]()
         function, given = pickle.loads(args[1])
-        if function is _stages._match_all:
+        if function is _matching_stages._match_all:
             prepare = given[1]._prepare
             stage = PREPARATIONS[getattr(prepare, "func", prepare).__name__]
             answer.set_result(pickle.dumps(self.matching.setdefault(stage, Matching()).run(*given), 5))
