@@ -57,8 +57,20 @@ def _distance_from_rotations(F, plane):
     return float(np.linalg.norm(s - s.mean()))
 
 
+FAR = np.array([[1.0, 0, 0, -4e5], [0, 1, 0, -5e6], [0, 0, 1, -300.0], [0, 0, 0, 1]])
+
+
+def test_cameras_of_a_georeferenced_frame_have_their_fundamental_matrix():
+    for seed in range(10):
+        pair = make_pair(8, np.random.default_rng(seed))
+        F = two_view.fundamental_from_cameras(pair.P1 @ FAR, pair.P2 @ FAR)
+        assert angle_between(F, two_view.fundamental_from_cameras(pair.P1, pair.P2)) < 1e-4
+
+
 def test_cameras_with_one_centre_have_no_fundamental_matrix():
     pair = make_pair(8, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="different centres"):
+        two_view.fundamental_from_cameras(pair.P1 @ FAR, np.diag([1.0, 2.0, 1.0]) @ pair.P1 @ FAR)
     with pytest.raises(ValueError, match="different centres"):
         two_view.fundamental_from_cameras(pair.P1, np.diag([1.0, 2.0, 1.0]) @ pair.P1)
     with pytest.raises(ValueError, match="scale"):
