@@ -10,13 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import require_finite, require_shapes
+from thesisrecon.geometry._conditioning import require_calibration, require_finite, require_shapes
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, project_camera, undistort
 
 _ORTHOGONAL = 2e-4
 """Largest deviation of R'R from the identity; four printed digits leave at most 2 sqrt(3) 5e-5."""
-_TRIANGULAR = 1e-9
-"""Largest deviation of K from upper triangular with K33 = 1, by rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +70,7 @@ class Camera:
             fields["distortion"] = np.asarray(self.distortion, dtype=np.float64)
             require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
         require_finite("Camera", *fields.values())
-        low = np.append(K[[1, 2, 2], [0, 0, 1]], K[2, 2] - 1.0)
-        if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= _TRIANGULAR):
-            needed = "K upper triangular with positive focal lengths and K33 = 1"
-            raise ValueError(f"Camera needs {needed}; got {K.round(6).tolist()}")
+        require_calibration("Camera", K)
         apart = np.abs(R.T @ R - np.eye(3)).max()
         if not apart <= _ORTHOGONAL:
             raise ValueError(f"Camera needs a rotation R; R'R deviates from the identity by {apart:.2g}")

@@ -11,18 +11,14 @@ from numpy.typing import ArrayLike
 from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F64, U8
 from thesisrecon.config import PipelineConfig
+from thesisrecon.geometry._conditioning import require_calibration
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.intrinsics import prior_from_options
 from thesisrecon.io._images import read_image
 from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.correspondence import RectifiedPair
-from thesisrecon.views.trilinear import (
-    VirtualCamera,
-    default_intrinsics,
-    pair_from_fundamental,
-    require_intrinsics,
-)
+from thesisrecon.views.trilinear import VirtualCamera, default_intrinsics, pair_from_fundamental
 from thesisrecon.views.trilinear_synthesis import TensorSynthesis, prepare_synthesis
 
 
@@ -167,7 +163,7 @@ def _given_intrinsics(K: ArrayLike | None) -> F64 | None:
         raise ValueError(f"K must be (3, 3) for both images or (2, 3, 3); got {given.shape}")
     both = np.broadcast_to(given, (2, 3, 3))
     for one in both:
-        require_intrinsics(one)
+        require_calibration("view synthesis", one)
     return both
 
 

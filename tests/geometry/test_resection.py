@@ -81,3 +81,17 @@ def test_points_that_cannot_work_are_named():
     refuses(StageFailure, "no camera explains the points", thesisrecon.resect, X, wrong, K)
     refuses(ValueError, r"needs X \(N, 3\), xy \(N, 2\)", thesisrecon.resect, xy, X)
     refuses(ValueError, "threshold_px must be positive", thesisrecon.resect, X, xy, threshold_px=-1.0)
+
+
+@pytest.mark.parametrize("wrong", [2.0 * K, np.diag([900.0, 0.0, 1.0]), np.diag([-1.0, -1.0, 1.0]) @ K, K.T])
+def test_a_matrix_that_is_no_calibration_is_refused(wrong):
+    X, xy = points(20, np.random.default_rng(0))
+    refuses(ValueError, "resect needs K upper triangular with positive", thesisrecon.resect, X, xy, wrong)
+
+
+@pytest.mark.parametrize("threshold_px", [1.0, None])
+def test_points_without_a_pose_are_no_camera(threshold_px):
+    X = np.outer([0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 0.5]) + 1e-5 * np.random.default_rng(0).normal(size=(4, 3))
+    xy = np.array([[100.0, 100.0], [700.0, 150.0], [120.0, 500.0], [650.0, 520.0]])
+    found = (thesisrecon.resect, X, xy, K)
+    refuses(StageFailure, "no camera explains the points; 0 of 4", *found, threshold_px=threshold_px)

@@ -232,8 +232,8 @@ def test_a_half_turn_is_not_a_small_rotation():
         (np.eye(3) + 0.01, np.zeros(3), None, "off by"),
         (np.full((3, 3), np.nan), np.zeros(3), None, "finite"),
         (np.eye(3), np.zeros(2), None, "three finite numbers"),
-        (np.eye(3), np.zeros(3), np.diag([-1.0, 1.0, 1.0]), "positive focals"),
-        (np.eye(3), np.zeros(3), np.eye(4), "got shape"),
+        (np.eye(3), np.zeros(3), np.diag([-1.0, 1.0, 1.0]), "positive focal lengths"),
+        (np.eye(3), np.zeros(3), np.eye(4), r"needs K \(3, 3\); got \(4, 4\)"),
     ],
 )
 def test_invalid_motions_are_value_errors(rotation, translation, K, sentence):

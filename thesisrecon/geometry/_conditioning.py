@@ -7,6 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon.arrays import F64
 
+_TRIANGULAR = 1e-9
+"""Largest deviation of K from upper triangular with K33 = 1, by rounding."""
+
 
 def checked_inverse(G: F64, caller: str) -> F64:
     """Invert a matrix; a singular one is a ``ValueError`` in the name of the caller."""
@@ -47,6 +50,17 @@ def require_finite(caller: str, *arrays: F64) -> None:
     """Raise ``ValueError`` if an entry is NaN or infinite."""
     if not all(np.isfinite(array).all() for array in arrays):
         raise ValueError(f"{caller} needs finite numbers; some are NaN or infinite")
+
+
+def require_calibration(caller: str, K: F64) -> None:
+    """Raise ``ValueError`` if K is not upper triangular with positive focal lengths and K33 = 1."""
+    require_shapes(caller, K=(K, (3, 3)))
+    require_finite(caller, K)
+    K = np.asarray(K, dtype=np.float64)
+    low = np.append(K[[1, 2, 2], [0, 0, 1]], K[2, 2] - 1.0)
+    if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= _TRIANGULAR):
+        needed = "K upper triangular with positive focal lengths and K33 = 1"
+        raise ValueError(f"{caller} needs {needed}; got {K.round(6).tolist()}")
 
 
 def normalizing_transform(xy: F64) -> F64:

@@ -9,7 +9,12 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry._conditioning import require_finite, require_shapes, whitening_transform
+from thesisrecon.geometry._conditioning import (
+    require_calibration,
+    require_finite,
+    require_shapes,
+    whitening_transform,
+)
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, depth, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
@@ -81,7 +86,8 @@ def resect(
     Raises
     ------
     ValueError
-        If the shapes are wrong or numbers are not finite.
+        If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
+        lengths and K33 = 1.
     StageFailure
         If there are too few points or inliers, or all points lie in one plane and K is not given.
 
@@ -100,8 +106,7 @@ def resect(
     require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
     if K is not None:
         K = np.asarray(K, dtype=np.float64)
-        require_shapes("resect", K=(K, (3, 3)))
-        require_finite("resect", K)
+        require_calibration("resect", K)
     require_finite("resect", X, xy)
     if threshold_px is not None and not threshold_px > 0.0:
         raise ValueError(f"threshold_px must be positive, or None for no search; got {threshold_px}")
@@ -115,14 +120,14 @@ def resect(
             "",
             "add points off it" + (", or give the calibration matrix K" if K is None else ""),
         )
-    fit = _search(X, xy, K, threshold_px or _ANY_PX, np.random.default_rng(seed))
-    inliers = np.ones(len(X), dtype=bool) if threshold_px is None else fit.inliers
     limit = threshold_px or _ANY_PX
+    fit = _search(X, xy, K, limit, np.random.default_rng(seed))
+    inliers = np.ones(len(X), dtype=bool) if fit.inliers.any() and threshold_px is None else fit.inliers
     for _ in range(_ROUNDS):
         if inliers.sum() < needed:
             raise StageFailure(
                 "no camera explains the points",
-                f"{inliers.sum()} of {len(X)} are within {threshold_px:g} px, {needed} are needed",
+                f"{inliers.sum()} of {len(X)} are within {limit:g} px, {needed} are needed",
                 "check that points and pixels correspond",
             )
         fit = _refine(fit, X, xy, inliers, calibrated=K is not None)

@@ -18,7 +18,7 @@ import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import require_finite
+from thesisrecon.geometry._conditioning import require_calibration, require_finite
 from thesisrecon.geometry._homography import require_parallax_of_matches
 from thesisrecon.geometry.camera_matrix import calibration_matrix, rq
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
@@ -44,22 +44,6 @@ def _require_motion(R: F64, t: F64) -> None:
         raise ValueError(f"a translation is three finite numbers; got {t}")
 
 
-def require_intrinsics(K: F64) -> None:
-    """Raise ``ValueError`` unless K is upper triangular with positive focal lengths and K33 = 1.
-
-    Parameters
-    ----------
-    K : ndarray (3, 3)
-        Intrinsics.
-    """
-    K = np.asarray(K, dtype=np.float64)
-    if K.shape != (3, 3) or not np.isfinite(K).all():
-        raise ValueError(f"intrinsics are a finite matrix (3, 3); got shape {K.shape}")
-    lower = float(np.abs(np.tril(K, -1)).max())
-    if not (min(K[0, 0], K[1, 1]) > 0.0 and K[2, 2] == 1.0 and lower == 0.0):
-        raise ValueError("intrinsics are [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]] with positive focals")
-
-
 @dataclass(frozen=True)
 class CalibratedPair:
     """Two calibrated cameras, X_2 = R X_1 + t. For two images |t| = 1 is the unit of length.
@@ -76,8 +60,8 @@ class CalibratedPair:
     t: F64
 
     def __post_init__(self) -> None:
-        require_intrinsics(self.K1)
-        require_intrinsics(self.K2)
+        require_calibration("view synthesis", self.K1)
+        require_calibration("view synthesis", self.K2)
         _require_motion(self.R, self.t)
         if not np.linalg.norm(self.t) > 0.0:
             raise ValueError("CalibratedPair needs a translation other than 0")
@@ -149,8 +133,8 @@ def pair_from_fundamental(
         For an F of other matches, no parallax, or points behind the cameras.
     """
     require_finite("pair_from_fundamental", F, xy1, xy2)
-    require_intrinsics(K1)
-    require_intrinsics(K2)
+    require_calibration("view synthesis", K1)
+    require_calibration("view synthesis", K2)
     distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
     extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
     if not np.median(distance) <= MAX_RESIDUAL * extent:
@@ -257,7 +241,7 @@ class VirtualCamera:
 
     def __post_init__(self) -> None:
         _require_motion(self.rotation, self.translation)
-        require_intrinsics(self.K)
+        require_calibration("view synthesis", self.K)
         if min(self.size) < 1:
             raise ValueError(f"an image is at least 1 x 1 px; got {self.size}")
 
