@@ -81,6 +81,21 @@ def test_cameras_are_shared_by_size_or_number_or_not_at_all():
     assert held.cameras[0].std["focal_px"] == pytest.approx(900.0 * 1e-6, rel=0.01)
 
 
+def test_the_prior_of_a_shared_value_is_about_the_mean_of_the_given_cameras():
+    focals = (800.0, 840.0) * 3
+    cameras, X, xy = _scene(focals=(820.0,) * 6)
+    found = []
+    for given in (focals, focals[::-1]):
+        start = [
+            Camera(c.K * np.array([[f / 820.0], [f / 820.0], [1.0]]), c.R, c.t, c.size)
+            for c, f in zip(cameras, given, strict=True)
+        ]
+        prior = {"focal": 1e-5}
+        found.append(bundle_adjust(start, X, xy, free=("focal", "k1"), shared=True, prior=prior).cameras[0])
+    assert found[0].K[0, 0] == pytest.approx(np.sqrt(800.0 * 840.0), rel=1e-4)
+    assert found[1].K[0, 0] == pytest.approx(found[0].K[0, 0], rel=1e-6)
+
+
 def test_wrong_matches_hardly_move_a_robust_adjustment():
     cameras, X, xy = _scene()
     xy[2, 5:20] += 90.0

@@ -152,12 +152,19 @@ class _Parts:
 def _number_column(
     c: int, value: I64, rows: tuple[F64, B8], prior: IntrinsicsPrior, parts: _Parts
 ) -> tuple[F64, I64]:
-    """Return start and unknown of each row for one intrinsic; rows of equal ``value`` (G,) share it."""
+    """Return start and unknown of each row for one intrinsic; rows of equal ``value`` (G,) share it.
+
+    The prior of a shared value is the narrowest of its rows, with the average mean of equally narrow ones.
+    """
     at, used = rows
     std = prior.std[:, c]
     tightest = np.lexsort((std, value))
     tightest = tightest[np.unique(value[tightest], return_index=True)[1]]
-    width, mean = std[tightest], _log_focal(prior.mean)[tightest, c]
+    width, means = std[tightest], _log_focal(prior.mean)[:, c]
+    # The mean of the tightest rows, as a mean of differences: equal rows keep their bytes.
+    mean, tight = means[tightest], np.isfinite(std) & (std == width[value])
+    off = np.bincount(value[tight], (means - mean[value])[tight], minlength=len(width))
+    mean = mean + off / np.maximum(np.bincount(value[tight], minlength=len(width)), 1)
     unobserved = np.bincount(value[used], minlength=len(width)) == 0
     counted = used | unobserved[value]
     average = np.bincount(value[counted], at[counted]) / np.bincount(value[counted])
