@@ -6,9 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refuses
 from tests.epipolar.pairs import angle_between, make_pair
+from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import two_view
-from thesisrecon.geometry._homography import homography_linear, homography_residuals
+from thesisrecon.geometry._homography import (
+    homography_linear,
+    homography_residuals,
+    require_parallax_of_matches,
+)
 from thesisrecon.geometry.homogeneous import cross_matrix
 
 seeds = st.integers(0, 2**31)
@@ -124,6 +130,12 @@ def test_homography_residual_is_infinite_where_the_point_goes_to_infinity():
     residual = homography_residuals(H, np.array([[0.0, 1.0], [1.0, 1.0]]), np.ones((2, 2)))
     assert np.isinf(residual[0])
     assert residual[1] == pytest.approx(0.0)
+
+
+def test_four_matches_show_no_parallax():
+    pair = make_pair(4, np.random.default_rng(2))
+    matches = pair.F, pair.xy1, pair.xy2
+    refuses(StageFailure, "explains 90 % of 4 matches", require_parallax_of_matches, *matches)
 
 
 @pytest.mark.parametrize("shape", [(3, 2), (5, 3), (5,)])

@@ -83,10 +83,13 @@ def require_parallax_of_matches(
 
 
 def _homography_residuals(xy1: F64, xy2: F64) -> F64:
-    """Residuals of the homography of most matches: least squares, repeated twice without the worst tenth."""
+    """Residuals of the homography of most matches: least squares, repeated twice without the worst tenth.
+
+    Four matches always remain.
+    """
     inliers, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
     for _ in range(3):
         H = homography_linear(xy1[inliers], xy2[inliers])
         residuals = homography_residuals(H, xy1, xy2)
-        inliers = residuals <= np.quantile(residuals, 0.9)
+        inliers = residuals <= np.fmax(np.quantile(residuals, 0.9), np.partition(residuals, 3)[3])
     return residuals
