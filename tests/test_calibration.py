@@ -136,6 +136,20 @@ def test_vanishing_points_give_the_plane_at_infinity(views):
     )  # fmt: skip
 
 
+def test_vanishing_points_without_a_baseline_are_refused():
+    scene = make_scene(views=3, seed=3)
+    v = np.einsum("vij,dj->vdi", scene.P[:, :, :3], np.eye(3))
+    C = -np.einsum("vji,vj->vi", scene.R, scene.t)
+    along = np.einsum("vij,dj->vdi", scene.P[:2, :, :3], [[1.0, 0, 0], [0, 1, 0], C[1] - C[0]])
+    turned = scene.K @ np.concatenate([scene.R, np.zeros((3, 3, 1))], axis=2)
+    locate, sizes = thesisrecon.plane_at_infinity, scene.sizes
+    two = scene.P[:2] @ G, sizes[:2]
+    refuses(StageFailure, "2 have .* not parallel", locate, *two, vanishing_points=along)
+    for P in (turned, turned @ G):
+        refuses(StageFailure, "take images from different positions", locate, P, sizes, vanishing_points=v)
+    refuses(StageFailure, "different positions", locate, scene.P[:1] @ G, sizes[:1], vanishing_points=v[:1])
+
+
 def test_a_reconstruction_of_arrays_has_their_cameras_and_points():
     scene = make_scene(seed=4)
     xy = pixels(scene)

@@ -103,11 +103,24 @@ def test_two_directions_are_refused_with_their_number():
         ParallelLines(one_view).locate(found, np.random.default_rng(0))
 
 
+def test_a_direction_along_the_baseline_is_no_direction():
+    scene = make_scene(seed=3)
+    found, plane = scenes.setup(scene, seed=3)
+    centres = -np.einsum("vji,vj->vi", scene.R, scene.t)
+    along = np.array([*TURN[:2], centres[1] - centres[0]])
+    with pytest.raises(StageFailure, match=r"2 have vanishing points .*not parallel to the baseline"):
+        ParallelLines(vanishing_points(scene, along, [0, 1])).locate(found, np.random.default_rng(0))
+    given = vanishing_points(scene, np.vstack([along, TURN[2]]), [0, 1])
+    located = ParallelLines(given).locate(found, np.random.default_rng(0))
+    np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
+
+
 def test_triangulated_points_are_seen_where_they_were():
     scene = make_scene(seed=4)
     v = np.einsum("vij,dj->dvi", scene.K @ scene.R, TURN)
     v /= np.linalg.norm(v, axis=2, keepdims=True)
-    X = _triangulate_directions(np.tile(scene.P / 1500.0, (3, 1, 1, 1)), v)
+    X, determined = _triangulate_directions(np.tile(scene.P / 1500.0, (3, 1, 1, 1)), v)
+    assert determined.all()
     np.testing.assert_allclose(np.abs(np.sum(X[:, :3] * TURN, axis=1)), 1.0, atol=1e-9)
     np.testing.assert_allclose(X[:, 3], 0.0, atol=1e-8)
 

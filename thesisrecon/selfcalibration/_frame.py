@@ -73,7 +73,7 @@ def build_frame(
     views = np.flatnonzero(reconstruction.registered)
     unit = pixel_from_unit(reconstruction.sizes) if unit is None else unit
     P = np.linalg.inv(unit[views]) @ reconstruction.P[views]
-    _require_cameras_of_full_rank(P)
+    require_cameras_of_full_rank(P)
     seen = reconstruction.tracks.view_index[reconstruction.inlier]
     place = int(np.bincount(seen, minlength=len(unit))[views].argmax())
     U, S, Vt = np.linalg.svd(P[place])
@@ -103,7 +103,7 @@ def _focal_prior(prior: IntrinsicsPrior, group: I64, views: I64, unit: F64) -> t
     return mean, std
 
 
-def _require_cameras_of_full_rank(P: F64) -> None:
+def require_cameras_of_full_rank(P: F64) -> None:
     """Raise ``StageFailure`` if a camera (R, 3, 4) has rank below 3 or all centres coincide."""
     size = np.linalg.norm(P, axis=(1, 2))
     if bad := int((~np.isfinite(P).all(axis=(1, 2)) | (size == 0.0)).sum()):

@@ -17,7 +17,12 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.numerics._noise import MAD_FACTOR
 from thesisrecon.records import Image
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion
-from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, ReferenceFrame
+from thesisrecon.selfcalibration._frame import (
+    PlaneCandidates,
+    ProjectiveScene,
+    ReferenceFrame,
+    require_cameras_of_full_rank,
+)
 from thesisrecon.selfcalibration._line_segments import LineSegments
 from thesisrecon.selfcalibration._refinement import minimize_batch
 
@@ -99,11 +104,14 @@ def _propose_vanishing_points(
     return np.array(found).reshape(-1, 3)
 
 
-def _triangulate_directions(P: F64, v: F64) -> F64:
-    """Space points (B, 4) of unit norm by v x P X = 0 for v (B, n, 3) in P (B, n, 3, 4)."""
+def _triangulate_directions(P: F64, v: F64) -> tuple[F64, B8]:
+    """Unit space points (B, 4) by v x P X = 0 for v (B, n, 3) in P (B, n, 3, 4), and whether determined (B,).
+
+    If all v are epipoles, all points of the baseline satisfy the equations.
+    """
     rows = np.cross(v[..., None], P, axisa=-2, axisb=-2, axisc=-2)
-    normal = np.einsum("bnri,bnrj->bij", rows, rows)
-    return np.asarray(np.linalg.eigh(normal)[1][:, :, 0])
+    values, vectors = np.linalg.eigh(np.einsum("bnri,bnrj->bij", rows, rows))
+    return np.asarray(vectors[:, :, 0]), np.asarray(values[:, 1] > _MIN_SPREAD**2 * values[:, 3])
 
 
 def _find_parallel_directions(
@@ -146,7 +154,7 @@ def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
     v = np.concatenate(proposals)[pair]
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
     cameras = P[view[pair]]
-    X = _triangulate_directions(cameras, v)
+    X, _ = _triangulate_directions(cameras, v)
     seen = np.einsum("bnij,bj->bni", cameras, X)
     sine = np.linalg.norm(np.cross(seen, v), axis=-1) / np.maximum(np.linalg.norm(seen, axis=-1), 1e-300)
     return np.asarray(X[sine.max(axis=1) < 0.1])
@@ -337,18 +345,19 @@ class ParallelLines:
 
 
 def _points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
-    """Return triangulated points (D, 4) in the reference frame, one per given direction."""
+    """Return triangulated points (D, 4) in the reference frame of the given directions that determine one."""
     place = {int(view): k for k, view in enumerate(frame.views)}
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
     unit = np.linalg.inv(frame.pixel_from_unit)
-    found = []
+    found: list[F64] = []
     for d in np.unique(given.direction):
         mine = [m for m in np.flatnonzero(given.direction == d) if int(given.view[m]) in place]
         if len(mine) < 2:
             continue
         v = np.array([unit[given.view[m]] @ given.xyh[m] for m in mine])
         v /= np.linalg.norm(v, axis=1, keepdims=True)
-        found.append(_triangulate_directions(P[[place[int(given.view[m])] for m in mine]][None], v[None])[0])
+        X, determined = _triangulate_directions(P[[place[int(given.view[m])] for m in mine]][None], v[None])
+        found += list(X[determined])
     if len(found) < 3:
         raise _too_few_directions(len(found))
     return np.array(found)
@@ -368,6 +377,7 @@ def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
     -------
     ndarray (4,)
     """
+    require_cameras_of_full_rank(P)
     cameras = np.linalg.inv(unit) @ P
     cameras = cameras / np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
     # In this frame of space the rows of the cameras are orthonormal.
@@ -376,9 +386,10 @@ def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
     v = v / np.linalg.norm(v, axis=2, keepdims=True)
     seen = np.isfinite(v).all(axis=2)
     used = np.flatnonzero(seen.sum(axis=0) >= 2)
-    if len(used) < 3:
-        raise _too_few_directions(len(used))
-    X = [_triangulate_directions(cameras[None, seen[:, d]], v[None, seen[:, d], d])[0] for d in used]
+    found = [_triangulate_directions(cameras[None, seen[:, d]], v[None, seen[:, d], d]) for d in used]
+    X = [point for points, determined in found for point in points[determined]]
+    if len(X) < 3:
+        raise _too_few_directions(len(X))
     plane = M.T @ _null_plane(np.stack(X))
     return np.asarray(plane / np.linalg.norm(plane))
 
@@ -386,8 +397,8 @@ def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
 def _too_few_directions(found: int) -> StageFailure:
     return StageFailure(
         "the plane at infinity needs three directions of parallel lines",
-        f"{found} have vanishing points in two registered images",
-        "give the vanishing points of a third direction",
+        f"{found} have vanishing points in two registered images that are not both epipoles",
+        "give the vanishing points of another direction, not parallel to the baseline",
     )
 
 
