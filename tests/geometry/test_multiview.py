@@ -78,6 +78,8 @@ def test_cameras_with_one_centre_have_no_fundamental_matrix():
     with pytest.raises(ValueError, match="different centres"):
         two_view.fundamental_from_cameras(pair.P1 @ FAR, np.diag([1.0, 2.0, 1.0]) @ pair.P1 @ FAR)
     with pytest.raises(ValueError, match="different centres"):
+        two_view.fundamental_from_cameras(pair.P1, np.column_stack([pair.P2[:, :3], [1e-14, 0.0, 1e-15]]))
+    with pytest.raises(ValueError, match="different centres"):
         two_view.fundamental_from_cameras(pair.P1, np.diag([1.0, 2.0, 1.0]) @ pair.P1)
     with pytest.raises(ValueError, match="scale"):
         two_view.canonical_cameras(pair.F, scale=0.0)

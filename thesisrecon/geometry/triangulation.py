@@ -1,7 +1,8 @@
 """Section 6.3: triangulation of space points by five methods with one entry point, :func:`triangulate`.
 
-Points with fewer than two observations are zeros, all others have unit norm (mid-points X4 = 1). Near an
-epipole "optimal" may end in a higher minimum than "polynomial". docs/theory/projective.md compares them.
+Points with fewer than two observations, or with observations from one centre only, are zeros, all others have
+unit norm (mid-points X4 = 1). Near an epipole "optimal" may end in a higher minimum than "polynomial".
+docs/theory/projective.md compares them.
 
 References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 """
@@ -15,6 +16,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry._conditioning import require_finite, require_shapes
+from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.kernels import copy_to, empty, kernel, zeros
@@ -25,6 +27,8 @@ _PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
 _AT_REST = 1e-6
 """Relative change of all depths at which the iterated linear method has converged."""
+_ONE_CENTRE = 1e-12
+"""Distance of two centres, over 1 plus that from the origin, below which they are equal to rounding."""
 _PARALLEL = 1e-14
 """Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
 
@@ -106,6 +110,22 @@ def _least_algebraic(
 
 
 @kernel
+def _from_one_centre(P: F64, centre: F64, first: int, last: int, view: I64) -> bool:
+    """Whether all cameras that observe a point have the centre of the first; centres (V, 4) are unit."""
+    c = centre[view[first]]
+    for k in range(first + 1, last):
+        p = P[view[k]]
+        apart = size = 0.0
+        for i in range(3):
+            epipole = p[i, 0] * c[0] + p[i, 1] * c[1] + p[i, 2] * c[2] + p[i, 3] * c[3]
+            apart += epipole * epipole
+            size += p[i, 0] * p[i, 0] + p[i, 1] * p[i, 1] + p[i, 2] * p[i, 2]
+        if apart > _ONE_CENTRE * _ONE_CENTRE * size:
+            return False
+    return True
+
+
+@kernel
 def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
     """Return the sum of squared reprojection errors of one point, infinite or NaN in a focal plane."""
     cost = 0.0
@@ -120,21 +140,22 @@ def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64
 
 @kernel
 def _triangulate_each_linear(
-    P: F64, scale: F64, start: I64, view: I64, xy: F64, passes: int, tolerance: float, X: F64
+    P: F64, scale: F64, centre: F64, listed: tuple[I64, I64, F64], passes: int, tolerance: float, X: F64
 ) -> None:
     """Fill X (N, 4) by the linear method, the rows of a view times its ``scale`` (V,).
 
-    ``start`` (N + 1,) is the first observation of each point. ``passes`` > 0: repeat with each row over the
+    Points observed from one ``centre`` (V, 4) stay 0. ``passes`` > 0: repeat with each row over the
     depth p3'X of the last pass until no depth changes by more than ``tolerance``, relative. Without
     convergence the better reprojection of the last and the linear answer is kept.
     """
+    start, view, xy = listed
     R, row, x, y = zeros((4, 4)), empty(4), empty(4), empty(4)
     weight = empty(len(xy))
     obs = (view, xy, weight)
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
         X[j] = 0.0
-        if last - first < 2:
+        if last - first < 2 or _from_one_centre(P, centre, first, last, view):
             continue
         for k in range(first, last):
             weight[k] = scale[view[k]]
@@ -182,7 +203,7 @@ def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
     Returns
     -------
     ndarray (N, 4)
-        Homogeneous points; zeros if a point is observed in fewer than two views or not determined.
+        Homogeneous points; zeros if a point is observed in fewer than two views or from one centre only.
 
     Raises
     ------
@@ -221,7 +242,7 @@ def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: i
     Returns
     -------
     ndarray (n_points, 4)
-        Points of unit norm; zeros for fewer than two observations.
+        Points of unit norm; zeros for fewer than two observations, or observations from one centre only.
     """
     if not (point[1:] >= point[:-1]).all():
         order = np.argsort(point, kind="stable")
@@ -290,8 +311,11 @@ def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
     middle = np.stack([np.bincount(view, xy[:, i], minlength=len(P)) / counts for i in range(2)], axis=1)
     # The fourth column would depend on the origin of space.
     size = np.linalg.norm(P[:, :2, :3] - middle[:, :, None] * P[:, 2:, :3], axis=(1, 2))
+    scale = 1.0 / np.where(size > 0.0, size, 1.0)
+    centre = camera_centre(P)
+    centre /= np.maximum(np.linalg.norm(centre, axis=1, keepdims=True), 1e-300)
     X = np.empty((len(start) - 1, 4))
-    _triangulate_each_linear(P, 1.0 / np.where(size > 0.0, size, 1.0), start, view, xy, passes, _AT_REST, X)
+    _triangulate_each_linear(P, scale, centre, listed, passes, _AT_REST, X)
     return X
 
 
@@ -305,12 +329,13 @@ def _midpoint(P: F64, listed: _SortedPixels) -> F64:
     centres = -np.linalg.solve(M, P[:, :, 3:])[:, :, 0]
     origin = centres.mean(axis=0)
     r = (centres - origin)[view]
+    apart = np.linalg.norm(r - r[start[point]], axis=1) > _ONE_CENTRE * (1.0 + np.abs(centres).max())
     d = np.einsum("kab,kb->ka", np.linalg.inv(M)[view], homogenize(xy))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     A, b = np.zeros((len(start) - 1, 3, 3)), np.zeros((len(start) - 1, 3, 1))
     np.add.at(A, point, np.eye(3) - d[:, :, None] * d[:, None])
     np.add.at(b, point, (r - np.sum(d * r, axis=1, keepdims=True) * d)[:, :, None])
-    good = (np.diff(start) >= 2) & (np.linalg.det(A) > _PARALLEL)
+    good = (np.bincount(point[apart], minlength=len(A)) > 0) & (np.linalg.det(A) > _PARALLEL)
     X = np.zeros((len(start) - 1, 4))
     X[good] = homogenize(np.linalg.solve(A[good], b[good])[:, :, 0] + origin)
     return X

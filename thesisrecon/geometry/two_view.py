@@ -61,8 +61,8 @@ def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
     P1, P2 = checked_unit(P1, "fundamental_from_cameras"), checked_unit(P2, "fundamental_from_cameras")
     C1 = checked_unit(camera_centre(P1), "fundamental_from_cameras, for the centre of its first camera,")
     e2 = P2 @ C1
-    # e2 is small against 1, but not against its terms, if the origin is far from the cameras.
-    if not np.linalg.norm(e2) > 1e-12 * np.linalg.norm(np.abs(P2) @ np.abs(C1)):
+    # M2 is small against P2 if the origin is far from the cameras; e2 = M2 (C1 - C2) C1_4.
+    if not np.linalg.norm(e2) > 1e-12 * np.linalg.norm(P2[:, :3]):
         raise ValueError("fundamental_from_cameras needs cameras with different centres")
     return unit_norm(cross_matrix(e2) @ P2 @ np.linalg.pinv(P1))
 
