@@ -144,6 +144,20 @@ def test_epipoles_and_fundamental_matrices_from_the_tensor(rng):
     assert symmetric_residuals(F31, xy[0], xy[2]).max() < 1e-3
 
 
+@pytest.mark.parametrize("t2", [(0.3, 1.0, 0.4), (0.0, 1.0, 0.0), (-2.0, 0.0, 0.0)])
+@pytest.mark.parametrize("K", [np.eye(3), np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])])
+def test_views_that_are_rectified_to_the_first_have_their_epipoles_and_cameras(K, t2):
+    P = K @ np.stack([np.column_stack([np.eye(3), t]) for t in (np.zeros(3), t2, (1.0, 0.0, 0.0))])
+    X = np.random.default_rng(0).uniform([-1.0, -1.0, 4.0], [1.0, 1.0, 6.0], (10, 3))
+    for second, third in ((1, 2), (2, 1)):
+        order = [0, second, third]
+        T, xy = three_view.tensor_from_cameras(*P[order]), np.stack([project(P[k], X) for k in order])
+        for found, k in zip(three_view.tensor_epipoles(T), order[1:], strict=True):
+            assert gap(found, P[k][:, 3]) < 1e-12
+        assert gap(three_view.tensor_from_cameras(*three_view.cameras_from_tensor(T)), T) < 1e-10
+        np.testing.assert_allclose(three_view.transfer_points(T, xy[0], xy[1]), xy[2], atol=1e-8)
+
+
 @holds_for_every()
 def test_cameras_from_the_tensor_have_the_tensor(rng):
     T = three_view.tensor_from_cameras(*three_cameras(rng))

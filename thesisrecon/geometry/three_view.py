@@ -14,6 +14,10 @@ from thesisrecon.geometry._conditioning import checked_unit, require_finite, uni
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 
+_SKEW = cross_matrix(np.array([0.31, 0.17, 0.53]))
+_TURN = np.linalg.solve(np.eye(3) - _SKEW, np.eye(3) + _SKEW)
+"""A rotation without symmetry, whose rows are no epipoles of common camera positions."""
+
 
 def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
     """Return T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3] (HZ 17), i from 0.
@@ -133,7 +137,8 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
     """Return the unit epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
 
     e2 is orthogonal to the left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones; least
-    squares for a noisy T.
+    squares for a noisy T. The T_i are those of turned coordinates of view 1: T_i has rank 1, and a plane of
+    null vectors, if the i-th unit point of view 1 is an epipole, as in images rectified to each other.
 
     Parameters
     ----------
@@ -145,7 +150,8 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
     e2, e3 : ndarray (3,)
     """
     require_finite("tensor_epipoles", T)
-    U, _, Vt = np.linalg.svd(T)
+    sizes = np.linalg.norm(T, axis=(1, 2), keepdims=True)
+    U, _, Vt = np.linalg.svd(np.einsum("ai,ijk->ajk", _TURN, T / np.maximum(sizes, 1e-300)))
     return np.linalg.svd(U[:, :, 2])[2][2], np.linalg.svd(Vt[:, 2])[2][2]
 
 
