@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.epipolar.pairs import angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.epipolar.linear import estimate_eight_point
@@ -62,3 +63,11 @@ def test_same_minimum_as_the_orthonormal_representation(criterion, parameters):
         start = estimate_eight_point(xy1, xy2)
         found = refine_fundamental(start, xy1, xy2, criterion, parameters=parameters)
         assert angle_between(found, refine_fundamental(start, xy1, xy2, criterion)) < 1e-6
+
+
+def test_unknown_words_are_named():
+    pair = make_pair(20, np.random.default_rng(0))
+    xy1, xy2 = pair.xy1, pair.xy2
+    start = estimate_eight_point(xy1, xy2)
+    refuses(ValueError, "unknown criterion .*mean sampson", refine_fundamental, start, xy1, xy2, "samson")
+    refuses(ValueError, "mean row", refine_fundamental, start, xy1, xy2, parameters="rows")

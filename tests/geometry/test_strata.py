@@ -97,6 +97,11 @@ def test_3_4_a_reflection_is_affine_only_and_wrong_matrices_are_refused():
         refuses(ValueError, "group_of", strata.group_of, wrong)
 
 
+def test_an_unknown_kind_of_entity_is_named():
+    one = strata.transform, np.eye(4), np.ones(4), "point"
+    refuses(ValueError, "unknown kind of entity .*point.*mean points", *one)
+
+
 def _tangent_vectors(group, rng):
     """Small moves away from the identity within a group, without its scale."""
     moves = []

@@ -7,7 +7,7 @@ the epipolar lines (5.6) and the reprojection error.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from thesisrecon.epipolar._refinement import (
     refine,
     residuals_and_derivatives,
 )
+from thesisrecon.errors import unknown_word
 from thesisrecon.geometry._conditioning import unit_norm
 from thesisrecon.geometry.two_view import epipoles
 from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
@@ -61,7 +62,7 @@ def refine_fundamental(
     Raises
     ------
     ValueError
-        If F is not finite and of rank 2 or 3, or the matches are not finite (N, 2) arrays.
+        If F is not finite and of rank 2 or 3, the matches are not finite (N, 2) arrays, or a word is unknown.
     StageFailure
         If there are too few matches or the points of an image are collinear.
 
@@ -78,6 +79,10 @@ def refine_fundamental(
     >>> float(np.round(np.abs(F[0, 2] / F[1, 2]), 6))
     0.5
     """
+    if criterion not in _CRITERIA:
+        raise ValueError(unknown_word("criterion", criterion, _CRITERIA))
+    if parameters not in get_args(Parameters):
+        raise ValueError(unknown_word("value of parameters", parameters, get_args(Parameters)))
     xy1, xy2 = check_matches(xy1, xy2, needed=7)
     frame = PairFrame.of(xy1, xy2)
     f, points = check_start(F, frame), frame.points(xy1, xy2)

@@ -10,11 +10,12 @@ lengths; Euclidean - lengths.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.errors import unknown_word
 from thesisrecon.geometry._conditioning import checked_inverse
 
 Group = Literal["projective", "affine", "metric", "euclidean"]
@@ -35,7 +36,7 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
     Parameters
     ----------
     G : ndarray (4, 4) or (3, 3)
-        Transform of space, or homography; singular ones are a ``ValueError`` where the inverse is needed.
+        Transform of space, or homography.
     entity : ndarray
         (..., d) points, planes or image lines, (..., 3, 4) cameras, (..., d, d) conics or quadrics.
     kind : {"points", "planes", "cameras", "conics", "dual conics"}
@@ -45,11 +46,18 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
     -------
     ndarray
 
+    Raises
+    ------
+    ValueError
+        For an unknown kind, or a singular G where its inverse is needed.
+
     Examples
     --------
     >>> transform(np.diag([2.0, 2.0, 2.0, 1.0]), np.eye(3, 4), "cameras").tolist()
     [[0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]]
     """
+    if kind not in get_args(Entity):
+        raise ValueError(unknown_word("kind of entity", kind, get_args(Entity)))
     if kind == "points":
         return np.asarray(entity @ G.T)
     if kind == "dual conics":
