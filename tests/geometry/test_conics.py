@@ -10,11 +10,12 @@ from thesisrecon.geometry.conics import (
     ABSOLUTE_DUAL_QUADRIC,
     bilinear_form,
     calibration_from_image,
+    curvature_sign,
     dual,
     image_of_absolute_conic,
     intersect_line,
 )
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.strata import PLANE_AT_INFINITY, transform
 from validation.scenes.transforms import random_transform
 
@@ -144,3 +145,30 @@ def test_3_4_2_intersection_and_tangency_of_surfaces_are_kept_by_projective_tran
 def test_the_dual_is_the_adjugate_with_its_sign():
     for C in (np.diag([1.0, 2.0, -3.0]), np.diag([-1.0, -2.0, -3.0]), np.diag([1.0, 2.0, 3.0, -4.0])):
         np.testing.assert_allclose(dual(C), np.linalg.det(C) * np.linalg.inv(C), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("centre", "radius"), [(100.0, 1.0), (-1e4, 2.0), (5e6, 1e3), (0.0, 1e5), (0.0, 1e-3)]
+)
+def test_the_sign_of_the_curvature_depends_neither_on_the_place_nor_on_the_unit(centre, radius):
+    away = np.eye(4)
+    away[:3, 3] = -centre * np.array([1.0, -0.3, 0.2])
+    square = radius**2
+    forms = {1: [1, 1, 1, -square], -1: [1, 1, -1, -square], 0: [1, 1, -1, 0]}
+    for sign, form in forms.items():
+        assert curvature_sign(away.T @ np.diag(form) @ away) == sign
+    assert curvature_sign(away.T @ np.diag([1.0, 1.0, 0.0, -square]) @ away) == 0
+
+
+@pytest.mark.parametrize("radius", [0.5, 10.0, 300.0])
+def test_secants_tangents_and_misses_of_a_circle_far_from_the_origin(radius):
+    away = np.array([[1.0, 0, -1e4], [0, 1, -1e4], [0, 0, 1]])
+    C = away.T @ np.diag([1.0, 1.0, -(radius**2)]) @ away
+    for height, expected in ((0.0, 2), (0.99, 2), (1.0, 1), (1.01, 0), (3.0, 0)):
+        y = 1e4 + height * radius
+        for start, end in ((0.0, 2e4), (1e4 - 0.3 * radius, 1e4 + 2.0 * radius)):
+            found = intersect_line(C, np.array([start, y, 1.0]), np.array([end, y, 1.0]))
+            assert len(found) == expected
+            half = radius * np.sqrt(max(1.0 - height**2, 0.0))
+            for x in dehomogenize(found):
+                np.testing.assert_allclose([abs(x[0] - 1e4), x[1]], [half, y], atol=1e-6 * radius)

@@ -10,6 +10,8 @@ that plane to M x (3.11), so that the image of Omega depends on K alone (3.11-3.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from thesisrecon.arrays import F64
@@ -59,6 +61,15 @@ def dual(C: F64) -> F64:
     return np.asarray(sign * (Vt.T * others) @ U.T)
 
 
+def _length_scale(C: F64) -> float:
+    """Size of the coordinates of a conic or quadric [A b; b' c] about the origin, at least 1.
+
+    In this unit of length its parts are of one size, although it may be far from the origin.
+    """
+    a, b, c = (float(np.linalg.norm(part)) for part in (C[:-1, :-1], C[:-1, -1], C[-1, -1]))
+    return max(1.0, b / a, math.sqrt(c / a)) if a > 1e-15 * max(b, c) else 1.0
+
+
 def intersect_line(C: F64, x: F64, y: F64) -> F64:
     """Intersect a conic or quadric with the line of two points (3.5).
 
@@ -77,7 +88,9 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     ndarray (0, d), (1, d) or (2, d)
         Real points; one for a tangent, none for a line that lies on the quadric.
     """
-    x, y, C = (checked_unit(array, "intersect_line") for array in (x, y, C))
+    require_finite("intersect_line", C)
+    units = np.append(np.full(len(C) - 1, _length_scale(C)), 1.0)
+    x, y, C = (checked_unit(a, "intersect_line") for a in (x / units, y / units, units[:, None] * C * units))
     sxx, sxy, syy = (float(bilinear_form(C, a, b)) for a, b in ((x, x), (x, y), (y, y)))
     size = max(abs(sxx), abs(sxy), abs(syy))
     # The forms of unit vectors have rounding errors of about 1e-15.
@@ -87,9 +100,9 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     touches = discriminant <= rounding
     q = -(sxy + np.copysign(0.0 if touches else np.sqrt(discriminant), sxy))
     if abs(q) <= 1e-7 * size:
-        return (x if abs(sxx) < abs(syy) else y)[None]
+        return units * (x if abs(sxx) < abs(syy) else y)[None]
     first, second = q * x + sxx * y, syy * x + q * y
-    return first[None] if touches else np.stack([first, second])
+    return units * (first[None] if touches else np.stack([first, second]))
 
 
 def curvature_sign(Q: F64) -> int:
@@ -108,7 +121,9 @@ def curvature_sign(Q: F64) -> int:
         1 for ellipsoids, elliptic paraboloids and hyperboloids of two sheets, -1 for saddles, 0 for cones,
         cylinders and planes.
     """
-    det = float(np.linalg.det(checked_unit(Q, "curvature_sign")))
+    require_finite("curvature_sign", Q)
+    units = np.append(np.full(3, _length_scale(Q)), 1.0)
+    det = float(np.linalg.det(checked_unit(units[:, None] * Q * units, "curvature_sign")))
     return 0 if abs(det) < 1e-14 else -int(np.sign(det))
 
 
