@@ -97,6 +97,16 @@ def test_3_4_a_reflection_is_affine_only_and_wrong_matrices_are_refused():
         refuses(ValueError, "group_of", strata.group_of, wrong)
 
 
+def test_3_4_groups_do_not_depend_on_the_unit_of_length():
+    G = np.eye(4)
+    G[0, 3], G[3, 0] = 1e6, 1e-4
+    unit = np.diag([1e3, 1e3, 1e3, 1.0])
+    for one in (G, unit @ G @ np.linalg.inv(unit), np.linalg.inv(G)):
+        assert strata.group_of(one) == "projective"
+    G[0, 3], G[3, 0] = 1e9, 0.0
+    assert strata.group_of(G) == "euclidean"
+
+
 def test_an_unknown_kind_of_entity_is_named():
     one = strata.transform, np.eye(4), np.ones(4), "point"
     refuses(ValueError, "unknown kind of entity .*point.*mean points", *one)

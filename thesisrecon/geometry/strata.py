@@ -70,7 +70,8 @@ def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
     """Return the smallest group that a transform belongs to (figure 3.1).
 
     Affine: the last row is a multiple of (0, 0, 0, 1). Metric: A'A is a multiple of I too, det A > 0 for
-    W = 1. Euclidean: the multiple is 1.
+    W = 1. Euclidean: the multiple is 1. Tested in the unit of length of G, or of its translation |t|/|A| if
+    that is larger.
 
     Parameters
     ----------
@@ -81,6 +82,10 @@ def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
     -------
     {"projective", "affine", "metric", "euclidean"}
     """
+    if G.shape == (4, 4) and np.isfinite(G).all() and G[:3, :3].any():
+        length = max(1.0, float(np.linalg.norm(G[:3, 3]) / np.linalg.norm(G[:3, :3])))
+        units = np.array([length, length, length, 1.0])
+        G = G / units[:, None] * units
     if G.shape != (4, 4) or not np.isfinite(G).all() or not np.linalg.cond(G) < 1e14:
         raise ValueError(f"group_of needs a finite invertible (4, 4) matrix; got shape {G.shape}")
     if np.linalg.norm(G[3, :3]) > tolerance * np.linalg.norm(G):
