@@ -100,9 +100,9 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     touches = discriminant <= rounding
     q = -(sxy + np.copysign(0.0 if touches else np.sqrt(discriminant), sxy))
     if abs(q) <= 1e-7 * size:
-        return units * (x if abs(sxx) < abs(syy) else y)[None]
+        return np.asarray(units * (x if abs(sxx) < abs(syy) else y)[None])
     first, second = q * x + sxx * y, syy * x + q * y
-    return units * (first[None] if touches else np.stack([first, second]))
+    return np.asarray(units * (first[None] if touches else np.stack([first, second])))
 
 
 def curvature_sign(Q: F64) -> int:
