@@ -70,7 +70,7 @@ def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3), K=np.eye(4))
     unknown = np.where(np.eye(3) > 0.0, 1.0, np.nan)
     for wrong in (unknown, 2.0 * np.eye(3), [np.eye(3), unknown]):
-        with pytest.raises(ValueError, match="intrinsics are"):
+        with pytest.raises(ValueError, match=r"view synthesis needs (finite numbers|K upper triangular)"):
             thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3), K=wrong)
     with pytest.raises(UsageError, match=r"there is no image file no\.jpg"):
         thesisrecon.synthesize_view("no.jpg", "file.jpg", np.eye(3), np.zeros(3))
