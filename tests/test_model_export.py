@@ -433,9 +433,31 @@ def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
             export(bad, tmp_path / "out", to=to, images=source)
     with pytest.raises(UsageError, match="holds a run"):
         export(model, tmp_path / "run", to="opencv")
-    images.rename(tmp_path / "images")
-    with pytest.raises(UsageError, match="would replace the originals"):
-        export(model, tmp_path, to="nerfstudio", images=tmp_path / "images")
+
+
+def test_an_export_does_not_replace_its_input(tmp_path, images):
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path, to="colmap")
+    (tmp_path / "masks").mkdir()
+    PIL.Image.fromarray(np.full(SIZE[::-1], 255, np.uint8)).save(tmp_path / "masks" / "c.png.png")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    def refused(source, to, **given):
+        with pytest.raises(UsageError, match="would replace the originals"):
+            export(source, tmp_path, to=to, **given)
+
+    refused(model, "nerfstudio", images=images, masks=tmp_path / "masks")
+    for source in ("", "sparse", "sparse/0"):
+        refused(tmp_path / source, "colmap")
+        refused(tmp_path / source, "colmap-undistorted", images=images)
+    command = ["export", str(tmp_path / "sparse" / "0"), "-o", str(tmp_path), "--to", "colmap"]
+    assert run_command([*command, "--scale", *NAMES[:2], "2"]) == 2
+    (tmp_path / "images").symlink_to(images)
+    refused(model, "nerfstudio", images=images)
+    (tmp_path / "images").unlink()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    # Next to the model is no problem for formats without a sparse folder.
+    export(tmp_path / "sparse" / "0", tmp_path, to="nerfstudio", images=images)
 
 
 def test_an_image_ends_where_the_lens_model_folds_back(tmp_path, images):

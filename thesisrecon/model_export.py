@@ -21,6 +21,7 @@ from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import find_images, read_image
 from thesisrecon.io._masks import find_masks, read_mask
+from thesisrecon.io._models import model_places
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._executors import available_threads
 from thesisrecon.sparse_model import SparseModel, SparseView
@@ -121,6 +122,8 @@ def export(
     images, lost = images or recorded_images(model), list[str]()
     if masks is None:
         masks, lost = recorded_masks(model, to)
+    source = model.out if isinstance(model, RunResult) else None if isinstance(model, SparseModel) else model
+    require_separate(folder, to, model=source, images=images, masks=masks)
     model = as_sparse_model(model)
     _require_cameras(model, to)
     if (folder / "run.json").exists():
@@ -135,6 +138,27 @@ def export(
     files = None if masks is None else _mask_files(Path(masks), model, undistorted, to)
     _write_images(folder, model, undistorted, images, files, threads)
     return ExportReport(_PINHOLE[to](folder, undistorted, files is not None), tuple(notes))
+
+
+def require_separate(
+    folder: Path,
+    to: str,
+    *,
+    model: str | Path | None = None,
+    images: str | Path | None = None,
+    masks: str | Path | None = None,
+) -> None:
+    """Refuse an export whose files would replace those that it is made from."""
+    written = [folder / "images", folder / "masks"] if to in _PINHOLE else []
+    written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
+    given = [] if model is None else model_places(Path(model))
+    given += [Path(path) for path in (images, masks) if path is not None]
+    replaced = {path.resolve() for path in written}
+    lost = next((path for path in given if path.resolve() in replaced), None)
+    if lost is not None:
+        raise UsageError(
+            f"the export to {folder} would replace the originals in {lost}; export to another folder"
+        )
 
 
 def _require_cameras(model: SparseModel, to: str) -> None:
@@ -297,12 +321,7 @@ def _write_images(
         raise UsageError(
             "the model does not record the folder of its images; give it with --images (images=)"
         )
-    originals = Path(images)
-    paths = find_images(originals, model.names)
-    if (folder / "images").resolve() == originals.resolve():
-        raise UsageError(
-            f"the undistorted images would replace the originals in {originals}; export elsewhere"
-        )
+    paths = find_images(Path(images), model.names)
 
     def write(i: int) -> None:
         (K, size), distortion = calibration(model.views[i]), coefficients(model.views[i])

@@ -58,10 +58,12 @@ def export(
     from thesisrecon.alignment import align_to_positions, scaled
     from thesisrecon.io._models import read_model
     from thesisrecon.model_export import export as write_export
-    from thesisrecon.model_export import recorded_images, recorded_masks
+    from thesisrecon.model_export import recorded_images, recorded_masks, require_separate
 
     if folder.resolve() == model.resolve():
         raise UsageError(f"the folder {folder} holds the model; export to another folder")
+    # The export itself is given the model in memory.
+    require_separate(folder, to, model=model)
     found = read_model(model)
     if scale is not None:
         found = scaled(found, *scale)

@@ -49,9 +49,13 @@ _KNOWN = (
 )
 
 
+def model_places(folder: Path) -> list[Path]:
+    """Where a COLMAP model is looked for."""
+    return [folder, folder / "sparse" / "0", folder / "sparse", folder / "0"]
+
+
 def _read_folder(folder: Path) -> SparseModel:
-    places = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
-    colmap = next((place for place in places if is_colmap_model(place)), None)
+    colmap = next((place for place in model_places(folder) if is_colmap_model(place)), None)
     if (folder / "cameras.json").is_file():
         views = _read_views(folder / "cameras.json")
         return SparseModel(views) if colmap is None else _with_views(read_colmap_model(colmap), views)
