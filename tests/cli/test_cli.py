@@ -1,5 +1,6 @@
 """The command line on the project's own photographs: one whole run, killed once, and what it prints."""
 
+import json
 import os
 import re
 import shutil
@@ -13,7 +14,7 @@ import pytest
 
 from tests.fake_stages import kept_bytes, read
 from thesisrecon._settings import build_config
-from thesisrecon.cli import common
+from thesisrecon.cli import common, runs
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.runs import _duration, _intrinsic_lines
 from thesisrecon.io import _images
@@ -252,6 +253,20 @@ def test_help_and_version(capsys):
 def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_path, refused):
     monkeypatch.setattr(_images, "files", lambda _: tmp_path / "thesisrecon")
     assert str(tmp_path / "thesisrecon" / "courtyard") in refused(["demo", "-o", tmp_path / "out"])
+
+
+def test_the_demo_replaces_only_its_own_run(monkeypatch, tmp_path, refused):
+    """A demo of another version has the same images, but perhaps other settings."""
+    replaced = []
+    monkeypatch.setattr(runs, "_run", lambda *given: replaced.append(given[-1]["overwrite"]))
+    found = _images.read_images(_images.demo_images(), max_size_px=1600).decoded
+    own = {decoded.image.name: decoded.digest for decoded in found}
+    for images in ({"mine.jpg": "0"}, dict.fromkeys(own, "0"), None, own):
+        (tmp_path / "run.json").write_text(json.dumps({"settings": {}, "images": images}))
+        if images != own:
+            assert "holds a run of other images" in refused(["demo", "-o", tmp_path])
+    assert run_command(["demo", "-o", str(tmp_path)]) == 0
+    assert replaced == [True]
 
 
 def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, capsys, refused):

@@ -129,11 +129,19 @@ def reconstruct(
 def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0) -> None:
     """Reconstruct the courtyard images that come with the package."""
     cap_threads(threads)
-    from thesisrecon.io._images import demo_images
+    from thesisrecon.config import ImageOptions
+    from thesisrecon.io._images import demo_images, read_images
+    from thesisrecon.runtime._run_folder import RUN_FILE
 
+    images, there = demo_images(), read_json(out / RUN_FILE)
+    if there is not None:
+        found = read_images(images, max_size_px=ImageOptions().max_size_px).decoded
+        own = {one.image.name: one.digest for one in found}
+        if not isinstance(there, dict) or there.get("images") != own:
+            raise UsageError(f"the folder {out} holds a run of other images; choose another one for the demo")
     # The folder may hold a demo of an older version with other settings.
     options = {"threads": threads or None, "overwrite": True}
-    _run(demo_images(), out, 0, {"set": _DEMO_SETTINGS} | options)
+    _run(images, out, 0, {"set": _DEMO_SETTINGS} | options)
 
 
 def _run(images: Path | list[Path], out: Path, seed: int, options: Mapping[str, Any]) -> None:
