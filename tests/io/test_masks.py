@@ -87,16 +87,19 @@ def test_masks_of_any_size_are_resized_like_the_image(folders, size):
         assert apart.mean() < 0.05 if size == (37, 25) else apart.mean() < 0.02
 
 
-def test_exif_rotation_is_that_of_the_image(folders):
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_exif_rotation_is_that_of_the_image(folders, suffix):
     """A mask is upright, or has an EXIF rotation of its own."""
     images, masks = folders
     files.picture(0, SIZE).save(images / "a.jpg", exif=exif_of(ROTATED))
     upright = half_white((SIZE[1], SIZE[0]))
-    save(masks / "a.png", upright)
+    path = masks / f"a.{suffix}"
+    save(path, upright)
     np.testing.assert_array_equal(masks_of(folders)[0]["a.jpg"], upright > 0)
-    save(masks / "a.png", np.rot90(upright), exif=exif_of(ROTATED))
-    np.testing.assert_array_equal(masks_of(folders)[0]["a.jpg"], upright > 0)
-    save(masks / "a.png", np.rot90(upright))
+    for orientation, turned in ((ROTATED, np.rot90(upright)), (3, np.rot90(upright, 2))):
+        save(path, turned, exif=exif_of(orientation))
+        np.testing.assert_array_equal(masks_of(folders)[0]["a.jpg"], upright > 0)
+    save(path, np.rot90(upright))
     refuses(UsageError, r"has 180 x 120 pixels and its image 120 x 180 \(after EXIF", masks_of, folders)
 
 

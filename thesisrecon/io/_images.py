@@ -302,9 +302,7 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
 def _decoded_image(name: str, max_size_px: int, file: PIL.Image.Image) -> DecodedImage:
     # Cameras store a preview as a second frame of a JPEG (MPO).
     several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
-    focal_35mm, transform = read_exif(file)
-    file.load()
-    stored = StoredImage(file, transform)
+    stored, focal_35mm = load_upright(file)
     known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
     focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
     image = Image(name, resized_to(stored, max_size_px), stored.size)
@@ -329,15 +327,19 @@ def _formats() -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in PIL.Image.OPEN)
 
 
-def read_exif(file: PIL.Image.Image) -> tuple[float, PIL.Image.Transpose | None]:
-    """Return the 35 mm focal length (0 = unknown) and the transform to the upright image."""
+def load_upright(file: PIL.Image.Image) -> tuple[StoredImage, float]:
+    """Decode an opened file; return the upright image and the 35 mm focal length (0 = unknown)."""
+    # Before the EXIF data are read: Pillow turns a TIFF image as it loads it, and removes the orientation.
+    file.load()
     try:
         exif = file.getexif()
         orientation, focal = exif.get(_ORIENTATION), float(exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
     except Exception:
         # The pixels may be good even if the header is damaged.
-        return 0.0, None
-    return focal, EXIF_TRANSFORMS.get(orientation) if isinstance(orientation, int) else None
+        return StoredImage(file), 0.0
+    return StoredImage(
+        file, EXIF_TRANSFORMS.get(orientation) if isinstance(orientation, int) else None
+    ), focal
 
 
 def read_pixels(side: Any) -> U8:

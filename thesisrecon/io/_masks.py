@@ -12,8 +12,8 @@ import numpy as np
 from thesisrecon.arrays import B8
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import printable
-from thesisrecon.io._images import DecodedImage, ImageSet, decode_file, list_images, read_exif, with_digest
-from thesisrecon.io._pixels import StoredImage, UnusableImage
+from thesisrecon.io._images import DecodedImage, ImageSet, decode_file, list_images, load_upright, with_digest
+from thesisrecon.io._pixels import UnusableImage
 from thesisrecon.records import Image
 
 _NAMES = "the mask of IMG.jpg is IMG.jpg.png, or IMG with any suffix"
@@ -74,7 +74,7 @@ def add_masks(
 def read_mask(path: Path, image: Image) -> B8 | None:
     """Pixels to use of an image at working size, by nearest neighbour; None: all."""
     try:
-        full = decode_file(path, lambda file: StoredImage(file, read_exif(file)[1]).nonblack())
+        full = decode_file(path, lambda file: load_upright(file)[0].nonblack())
     except UnusableImage as refusal:
         raise UsageError(f"the mask {path} {refusal}; replace or remove it") from None
     size, (width, height) = full.shape[::-1], image.original_size
