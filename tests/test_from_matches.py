@@ -14,6 +14,7 @@ from tests.fake_stages import FakeDense
 from tests.given_scene import SIZE, given_scene
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.cli.main import run_command
+from thesisrecon.io._models import read_model
 from thesisrecon.pipeline import _stages
 
 SCENE = given_scene()
@@ -233,6 +234,33 @@ def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, ca
     assert run_command(["reconstruct", "--from", sparse, "-o", str(tmp_path / "second")]) == 0
     one, two = (thesisrecon.load(tmp_path / name).cameras["7.jpg"].K[0, 0] for name in ("first", "second"))
     assert two == pytest.approx(one, rel=5e-3)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_images_of_colmap_are_used_as_stored(tmp_path, from_rows, orientation):
+    """COLMAP ignores the EXIF rotation; a run from its matches does so too, and says it to the export."""
+    database, exif = write_database(tmp_path / "database.db", verified=True), PIL.Image.Exif()
+    exif[0x0112] = orientation
+    pixels = np.zeros((480, 640, 3), np.uint8)
+    pixels[:240, :, 0], pixels[240:, :, 1] = 200, 200
+    (tmp_path / "images").mkdir()
+    for i in range(5, 10):
+        pixels[:8] = i
+        PIL.Image.fromarray(pixels).save(tmp_path / "images" / f"{i}.jpg", exif=exif, quality=95)
+    from_rows.save(tmp_path / "own")
+    result = reconstruct_from_colmap(database, tmp_path / "out", images=tmp_path / "images", until="metric")
+    assert (result.images[0].rgb[100].argmax(axis=1) == 0).all()
+    reports = {
+        name: read_model(tmp_path / name).as_stored for name in ("own", "own/sparse/0", "out", "out/sparse/0")
+    }
+    assert reports == {"own": False, "own/sparse/0": False, "out": True, "out/sparse/0": True}
+    again = {"images": tmp_path / "images", "until": "metric"}
+    assert (reconstruct_from_colmap(tmp_path / "out", **again).images[0].rgb[100].argmax(axis=1) == 0).all()
+    exported = (
+        thesisrecon.export(result, tmp_path / "export", to="nerfstudio").file.parent / "images" / "7.jpg"
+    )
+    with PIL.Image.open(exported) as image:
+        assert np.asarray(image)[100, 320].argmax() == 0
 
 
 def test_the_command_takes_one_source_of_images(tmp_path, refused):

@@ -379,6 +379,31 @@ def test_a_colmap_model_is_an_input_and_equal_cameras_are_shared(tmp_path, image
     np.testing.assert_array_equal(body["rgb"], model.colors)
 
 
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_images_of_a_colmap_model_are_used_as_stored(tmp_path, images, orientation):
+    """COLMAP ignores the EXIF rotation of images and masks."""
+    mask, exif = np.full(SIZE[::-1], 255, np.uint8), PIL.Image.Exif()
+    mask[MASKED], exif[0x0112] = 0, orientation
+    for folder, options in (("plain", {}), ("rotated", {"exif": exif})):
+        for name in NAMES:
+            path = tmp_path / folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            PIL.Image.fromarray(pixels_of(images / name).astype(np.uint8)).save(path, **options)
+        (tmp_path / f"{folder}-masks").mkdir()
+        PIL.Image.fromarray(mask).save(tmp_path / f"{folder}-masks" / "c.png.png", **options)
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path / "colmap", to="colmap")
+    for source, folder in ((model, "plain"), (tmp_path / "colmap", "rotated")):
+        given = {"images": tmp_path / folder, "masks": tmp_path / f"{folder}-masks"}
+        export(source, tmp_path / f"{folder}-out", to="nerfstudio", **given)
+    for path in (tmp_path / "plain-out").rglob("*.png"):
+        found = pixels_of(tmp_path / "rotated-out" / path.relative_to(tmp_path / "plain-out"))
+        np.testing.assert_array_equal(found, pixels_of(path))
+    if orientation == 6:
+        with pytest.raises(UsageError, match=r"has \(120, 160\) pixels after EXIF rotation"):
+            export(model, tmp_path / "other", to="nerfstudio", images=tmp_path / "rotated")
+
+
 @pytest.mark.references
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_result_is_exported_with_or_without_its_folder(tmp_path, kept):
@@ -424,7 +449,7 @@ def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
         (other, "kalibr", None, "lens model of image a b.png is unknown"),
         (lost, "colmap", None, "no intrinsics"),
         (twice, "bundler", images, "two images of the model would be written as a_b.png"),
-        (small, "bundler", images, r"has \(160, 120\) pixels, but \(150, 120\)"),
+        (small, "bundler", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
         (wild, "openmvs", images, "the camera is not plausible"),
         (replace(model, views=[]), "opencv", None, "no camera"),
     ]

@@ -19,7 +19,7 @@ from thesisrecon.io._colmap_writing import has_skew, write_sparse_model
 from thesisrecon.io._export_formats import calibration, coefficients
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
-from thesisrecon.io._images import find_images, read_image
+from thesisrecon.io._images import find_images, read_image, rotation_words
 from thesisrecon.io._masks import find_masks, read_mask
 from thesisrecon.io._models import model_places
 from thesisrecon.results import RunResult
@@ -87,7 +87,8 @@ def export(
         ``"colmap-undistorted"``, ``"nerfstudio"``, ``"openmvs"`` and ``"bundler"`` write undistorted images
         of pinhole cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
     images : path, optional
-        Folder of the original images; None: the folder that the run was made from.
+        Folder of the original images; None: the folder that the run was made from. Those of a COLMAP model
+        are used as stored, without EXIF rotation.
     masks : path, optional
         Folder of the masks of the original images; None: that of the run, if it had masks.
     threads : int
@@ -326,12 +327,13 @@ def _write_images(
     def write(i: int) -> None:
         (K, size), distortion = calibration(model.views[i]), coefficients(model.views[i])
         pinhole_K, pinhole_size = calibration(pinholes.views[i])
-        image = read_image(paths[i], max_size_px=np.iinfo(np.int32).max).images[0]
+        (image,) = read_image(paths[i], max_size_px=np.iinfo(np.int32).max, as_stored=model.as_stored).images
         if image.size != size:
-            sizes = f"{image.size} pixels, but {size} (width, height) in the model"
+            rule = rotation_words(model.as_stored)
+            sizes = f"{image.size} pixels {rule}, but {size} (width, height) in the model"
             raise UsageError(f"{paths[i]} has {sizes}; give the images of the model")
         file, name = (None, "") if masks is None else masks[i]
-        mask = None if file is None else read_mask(file, image)
+        mask = None if file is None else read_mask(file, image, as_stored=model.as_stored)
         rgb, used = image.rgb, mask
         if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
             frames = K, distortion, pinhole_K, pinhole_size

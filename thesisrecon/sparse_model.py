@@ -45,6 +45,8 @@ class SparseModel:
         Points and their colours.
     view_index, point_index, xy : ndarray (M,), ndarray (M,), ndarray (M, 2)
         Observations of the points, in pixels of the original images.
+    as_stored : bool
+        Whether these are pixels of the files as stored, as in COLMAP, and not after EXIF rotation.
     """
 
     views: Sequence[SparseView]
@@ -53,6 +55,7 @@ class SparseModel:
     view_index: I64 = field(default_factory=lambda: _empty(0).astype(np.int64))
     point_index: I64 = field(default_factory=lambda: _empty(0).astype(np.int64))
     xy: F64 = field(default_factory=lambda: _empty(0, 2))
+    as_stored: bool = False
 
     @property
     def names(self) -> list[str]:

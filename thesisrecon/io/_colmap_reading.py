@@ -84,7 +84,8 @@ def read_colmap_model(folder: Path) -> SparseModel:
     if not (np.isfinite(X).all() and np.isfinite(xy).all()):
         raise UsageError(f"the COLMAP model in {folder} has coordinates that are not finite; export it again")
     colors = np.frombuffer(b"".join(point.rgb for point in points), np.uint8).reshape(-1, 3)
-    return SparseModel([_view(image, known) for image in images], X, colors, view, point, xy)
+    views = [_view(image, known) for image in images]
+    return SparseModel(views, X, colors, view, point, xy, as_stored=True)
 
 
 def _parsed(file: Path, parse: Callable[[bytes], Iterator[Any]]) -> list[Any]:

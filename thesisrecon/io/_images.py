@@ -27,6 +27,7 @@ from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import SPECIAL_FILE, printable
 from thesisrecon.io._pixels import (
+    EXIF_INVERSE,
     EXIF_TRANSFORMS,
     MemoryBudget,
     StoredImage,
@@ -153,11 +154,11 @@ def scene_name(folder: Path) -> str:
     return printable(folder.parent.name if folder.name.lower() in _GENERIC_FOLDERS else folder.name)
 
 
-def read_image(source: Any, *, max_size_px: int) -> ImageSet:
+def read_image(source: Any, *, max_size_px: int, as_stored: bool = False) -> ImageSet:
     """Read one image; UsageError if the file does not exist, StageFailure if it is unusable."""
     if isinstance(source, str | Path) and not Path(source).is_file():
         raise UsageError(f"there is no image file {source}")
-    found = read_images([source], max_size_px=max_size_px)
+    found = read_images([source], max_size_px=max_size_px, as_stored=as_stored)
     for name, reason in found.refused.items():
         raise StageFailure(f"{name} {reason}")
     return found
@@ -167,19 +168,21 @@ def read_images(
     source: ImageSource,
     *,
     max_size_px: int,
+    as_stored: bool = False,
     map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
 ) -> ImageSet:
     """Read all images of a folder or a list, at most ``max_size_px`` long; the rest is refused with a reason.
 
     ``source`` is a folder, or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and Image records;
-    ``map_all`` an ordered map: that of a thread pool reads several images at one time. Names are printable;
-    equal names are numbered. Duplicates, blank and small images are refused too.
+    ``map_all`` an ordered map: that of a thread pool reads several images at one time. Files are turned
+    upright unless they are read ``as_stored``. Names are printable; equal names are numbered. Duplicates,
+    blank and small images are refused too.
     """
     items = _named_items(source)
 
     def read(item: tuple[str, Any]) -> DecodedImage | str:
         try:
-            return _read(*item, max_size_px)
+            return _read(*item, max_size_px, as_stored)
         except UnusableImage as refusal:
             return str(refusal)
 
@@ -224,10 +227,10 @@ def _names(names: Iterable[str]) -> list[str]:
     return list(taken)
 
 
-def _read(name: str, item: Any, max_size_px: int) -> DecodedImage:
+def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedImage:
     """Read an image, refuse small and blank ones, and hash the content."""
     if isinstance(item, Path):
-        decoded = decode_file(item, partial(_decoded_image, name, max_size_px))
+        decoded = decode_file(item, partial(_decoded_image, name, max_size_px, as_stored))
     elif isinstance(item, Image):
         decoded = DecodedImage(item, "")
     else:
@@ -299,10 +302,10 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
         ) from None
 
 
-def _decoded_image(name: str, max_size_px: int, file: PIL.Image.Image) -> DecodedImage:
+def _decoded_image(name: str, max_size_px: int, as_stored: bool, file: PIL.Image.Image) -> DecodedImage:
     # Cameras store a preview as a second frame of a JPEG (MPO).
     several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
-    stored, focal_35mm = load_upright(file)
+    stored, focal_35mm = load_pixels(file, as_stored=as_stored)
     known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
     focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
     image = Image(name, resized_to(stored, max_size_px), stored.size)
@@ -327,19 +330,33 @@ def _formats() -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in PIL.Image.OPEN)
 
 
-def load_upright(file: PIL.Image.Image) -> tuple[StoredImage, float]:
-    """Decode an opened file; return the upright image and the 35 mm focal length (0 = unknown)."""
-    # Before the EXIF data are read: Pillow turns a TIFF image as it loads it, and removes the orientation.
+def load_pixels(file: PIL.Image.Image, *, as_stored: bool) -> tuple[StoredImage, float]:
+    """Decode an opened file; return the image, upright or as stored, and the 35 mm focal length or 0.
+
+    Pillow turns TIFF images itself when it loads them, and then removes their orientation.
+    """
+    stated = _exif(file)[0]
     file.load()
+    orientation, focal = _exif(file)
+    if not as_stored:
+        return StoredImage(file, EXIF_TRANSFORMS.get(orientation)), focal
+    return StoredImage(file, None if orientation == stated else EXIF_INVERSE.get(stated)), focal
+
+
+def rotation_words(as_stored: bool) -> str:
+    """State which pixels of a file are meant."""
+    return "without EXIF rotation, as in COLMAP" if as_stored else "after EXIF rotation"
+
+
+def _exif(file: PIL.Image.Image) -> tuple[int, float]:
+    """Orientation and 35 mm focal length of an opened file, 0 if unknown."""
     try:
         exif = file.getexif()
         orientation, focal = exif.get(_ORIENTATION), float(exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
     except Exception:
         # The pixels may be good even if the header is damaged.
-        return StoredImage(file), 0.0
-    return StoredImage(
-        file, EXIF_TRANSFORMS.get(orientation) if isinstance(orientation, int) else None
-    ), focal
+        return 0, 0.0
+    return orientation if isinstance(orientation, int) else 0, focal
 
 
 def read_pixels(side: Any) -> U8:

@@ -12,7 +12,15 @@ import numpy as np
 from thesisrecon.arrays import B8
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import printable
-from thesisrecon.io._images import DecodedImage, ImageSet, decode_file, list_images, load_upright, with_digest
+from thesisrecon.io._images import (
+    DecodedImage,
+    ImageSet,
+    decode_file,
+    list_images,
+    load_pixels,
+    rotation_words,
+    with_digest,
+)
 from thesisrecon.io._pixels import UnusableImage
 from thesisrecon.records import Image
 
@@ -55,9 +63,13 @@ def add_masks(
     inputs: ImageSet,
     folder: Path,
     *,
+    as_stored: bool = False,
     map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
 ) -> tuple[ImageSet, list[str]]:
-    """Set the masks of images named like files in a folder; return also warnings of the other files."""
+    """Set the masks of images named like files in a folder; return also warnings of the other files.
+
+    Masks are upright, or ``as_stored`` like the images.
+    """
     names = [*(decoded.image.name for decoded in inputs.decoded), *inputs.refused]
     mask_of, unused = find_masks(folder, names)
 
@@ -65,24 +77,25 @@ def add_masks(
         image = decoded.image
         if image.name not in mask_of:
             return decoded
-        image = replace(image, mask=read_mask(mask_of[image.name], image))
+        image = replace(image, mask=read_mask(mask_of[image.name], image, as_stored=as_stored))
         return with_digest(replace(decoded, image=image))
 
     return replace(inputs, decoded=tuple(map_all(masked, list(inputs.decoded)))), unused
 
 
-def read_mask(path: Path, image: Image) -> B8 | None:
+def read_mask(path: Path, image: Image, *, as_stored: bool = False) -> B8 | None:
     """Pixels to use of an image at working size, by nearest neighbour; None: all."""
     try:
-        full = decode_file(path, lambda file: load_upright(file)[0].nonblack())
+        full = decode_file(path, lambda file: load_pixels(file, as_stored=as_stored)[0].nonblack())
     except UnusableImage as refusal:
         raise UsageError(f"the mask {path} {refusal}; replace or remove it") from None
     size, (width, height) = full.shape[::-1], image.original_size
     # Each side of a mask of another size may be rounded.
     if abs(size[0] * height - size[1] * width) > max(width, height):
         raise UsageError(
-            f"the mask {path} has {size[0]} x {size[1]} pixels and its image {width} x {height} (after EXIF "
-            "rotation); a mask may have another size, but not another ratio of width to height"
+            f"the mask {path} has {size[0]} x {size[1]} pixels and its image {width} x {height} "
+            f"({rotation_words(as_stored)}); a mask may have another size, but not another ratio of width to "
+            "height"
         )
     steps = size[0] / width / image.scale, size[1] / height / image.scale
     x, y = (_nearest(image.size[k], steps[k], size[k]) for k in (0, 1))

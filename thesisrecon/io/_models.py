@@ -58,10 +58,20 @@ def _read_folder(folder: Path) -> SparseModel:
     colmap = next((place for place in model_places(folder) if is_colmap_model(place)), None)
     if (folder / "cameras.json").is_file():
         views = _read_views(folder / "cameras.json")
-        return SparseModel(views) if colmap is None else _with_views(read_colmap_model(colmap), views)
+        model = SparseModel(views) if colmap is None else _with_views(read_colmap_model(colmap), views)
+        return replace(model, as_stored=_from_colmap(folder))
     if colmap is None:
         raise UsageError(f"{folder} holds no model; give {_KNOWN}")
-    return read_colmap_model(colmap)
+    # The sparse/0 of a run has the pixels of the run.
+    run = colmap.resolve().parents[1]
+    own = (run / "cameras.json").is_file()
+    return replace(read_colmap_model(colmap), as_stored=not own or _from_colmap(run))
+
+
+def _from_colmap(run: Path) -> bool:
+    """Whether a run was made from COLMAP's matches or tracks."""
+    summary = read_json(run / "summary.json")
+    return isinstance(summary, dict) and summary.get("as_stored") is True
 
 
 def _with_views(model: SparseModel, views: list[SparseView]) -> SparseModel:

@@ -71,6 +71,8 @@ EXIF_TRANSFORMS = {
     8: Transpose.ROTATE_90,
 }
 """Transform to the upright image by EXIF orientation; with any other value the image is used as stored."""
+EXIF_INVERSE = EXIF_TRANSFORMS | {6: Transpose.ROTATE_90, 8: Transpose.ROTATE_270}
+"""Transform back to the stored image."""
 _ROWS_ARE_COLUMNS = {EXIF_TRANSFORMS[orientation] for orientation in (5, 6, 7, 8)}
 _ROWS_FROM_END = {EXIF_TRANSFORMS[orientation] for orientation in (3, 4, 7, 8)}
 

@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
-from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image
+from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image, rotation_words
 from thesisrecon.matching._prepared import select_matches
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.numerics._observations import Observations, sort_observations
@@ -45,11 +45,15 @@ class Given:
 
 @dataclass(frozen=True)
 class Views:
-    """Names and original sizes (V, 2) of the images, and the images or where they are."""
+    """Names and original sizes (V, 2) of the images, and the images or where they are.
+
+    The sizes are of upright images, or ``as_stored`` of the pixels in the files.
+    """
 
     names: list[str]
     sizes: I64
     images: Path | Sequence[Any] | None
+    as_stored: bool = False
 
     def read(self, run: Run, digests: Sequence[str]) -> ImageSet:
         """The images at working size, or grey ones of original size; each with a digest of its input."""
@@ -60,16 +64,17 @@ class Views:
         if self.images is None:
             return DecodedImage(image_without_pixels(self.names[i], (width, height)), digest)
         source = self.images / self.names[i] if isinstance(self.images, Path) else self.images[i]
-        (found,) = read_image(source, max_size_px=run.config.images.max_size_px).decoded
+        size = run.config.images.max_size_px
+        (found,) = read_image(source, max_size_px=size, as_stored=self.as_stored).decoded
         if found.image.original_size != (width, height):
             is_now = "{} x {}".format(*found.image.original_size)
-            rule = "width and height must be those of the image after EXIF rotation"
+            rule = f"width and height must be those of the image {rotation_words(self.as_stored)}"
             raise UsageError(f"image {self.names[i]!r} is {is_now}, not {width} x {height}: {rule}")
         image = replace(found.image, name=self.names[i])
         return replace(found, image=image, digest=key_of(digest, found.digest))
 
 
-def views_of(sizes: Any, names: Sequence[str] | None, images: Any) -> Views:
+def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored: bool = False) -> Views:
     try:
         table = np.asarray(sizes, dtype=np.float64).reshape(len(sizes), 2)
     except (TypeError, ValueError):
@@ -90,7 +95,7 @@ def views_of(sizes: Any, names: Sequence[str] | None, images: Any) -> Views:
         images = folder
     elif images is not None and len(images) != count:
         raise UsageError(f"there are {len(images)} images and {count} sizes")
-    return Views(names, table.astype(np.int64), images)
+    return Views(names, table.astype(np.int64), images, as_stored)
 
 
 def given_matches(

@@ -254,6 +254,7 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "until": until,
         "images_folder": None if run.images_folder is None else str(run.images_folder),
         **({} if run.masks_folder is None else {"masks_folder": str(run.masks_folder)}),
+        **({"as_stored": True} if run.as_stored else {}),
         **({"groups": run.groups} if run.groups else {}),
         "threads": run.workers.threads,
         "executor": run.workers.name,

@@ -194,7 +194,8 @@ def reconstruct_from_colmap(
         A database with keypoints and matches (the verified matches, or the raw ones if there are none), or a
         folder with a sparse model of any kind of camera, binary or text, whose tracks are used.
     out, images, config, seed, progress, **options
-        As for :func:`reconstruct_from_matches`; ``images`` is the folder of COLMAP's images.
+        As for :func:`reconstruct_from_matches`; ``images`` is the folder of COLMAP's images,
+        which are used as stored, without EXIF rotation.
 
     Returns
     -------
@@ -228,11 +229,12 @@ def reconstruct_from_colmap(
         order = np.lexsort((model.view_index, model.point_index))
         view, point = model.view_index[order], model.point_index[order]
         tracks = Tracks(view, point, model.xy[order], len(model.views), len(model.X))
-        views = views_of([view.size for view in model.views if view.size is not None], model.names, images)
+        sizes = [view.size for view in model.views if view.size is not None]
+        views = views_of(sizes, model.names, images, as_stored=model.as_stored)
         given = given_tracks(tracks, views)
     else:
         database = read_database(path)
-        views = views_of(database.sizes, database.names, images)
+        views = views_of(database.sizes, database.names, images, as_stored=True)
         given = given_matches(database.keypoints, database.matches, views)
     return _reconstruct(str(path), given, views, out, config, seed, progress, options)
 
@@ -265,6 +267,7 @@ def _reconstruct(
         config = replace(config, tracks=PlainTracks())
     with _folder(out) as folder:
         until, run, overwrite = start_run(folder, config, seed, progress, options)
+        run.as_stored = views.as_stored
         requested = options.get("until") is not None
         if views.images is None:
             if requested and until in ("dense", "model"):
@@ -282,7 +285,9 @@ def _reconstruct(
                 digests = [key_of(views.names[i], views.sizes[i], xy) for i, xy in enumerate(given.corners)]
                 inputs, warnings = views.read(run, digests), list[str]()
                 if masks is not None:
-                    inputs, warnings = add_masks(inputs, Path(masks), map_all=run.workers.map_all)
+                    inputs, warnings = add_masks(
+                        inputs, Path(masks), as_stored=views.as_stored, map_all=run.workers.map_all
+                    )
                 given = outside_masks(at_working_size(given, inputs.images), inputs.images)
             run.finish("images", counts={"read": len(digests), "refused": 0}, warnings=warnings)
             result = empty_result(run, inputs)

@@ -112,6 +112,7 @@ class Run:
     title: str  #: of the report
     images_folder: Path | None = None  #: of all images, None if they are from several or from memory
     masks_folder: Path | None = None
+    as_stored: bool = False  #: pixels are those of the files without EXIF rotation, as in COLMAP
     logs: dict[str, _StageLog] = field(default_factory=dict)
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)  #: stages read from the cache
@@ -124,7 +125,7 @@ class Run:
         """A run of a part of the images in a folder of its own, by the same workers."""
         options = (self.config, self.seed, self.workers, directory, self.progress)
         title = f"{self.title}, {directory.path.name}"
-        return Run(*options, title, self.images_folder, self.masks_folder)
+        return Run(*options, title, self.images_folder, self.masks_folder, self.as_stored)
 
     @contextmanager
     def clock(self, stage: str) -> Iterator[_StageLog]:
