@@ -14,6 +14,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io._images import MAX_DECODED_BYTES, list_images, read_images, scene_name
+from thesisrecon.records import Image
 
 
 def picture(seed=0, size=(96, 80)):
@@ -74,6 +75,18 @@ def test_transparent_pixels_become_grey(tmp_path):
     image = read_one(save(tmp_path / "a.png", rgba))
     assert (image.rgb[:40] == 128).all()
     np.testing.assert_array_equal(image.rgb[40:], picture()[40:])
+
+
+def test_equal_names_are_numbered(tmp_path):
+    path = save(tmp_path / "frame", picture(3), format="PNG")
+    records = [Image("frame", picture(n), (96, 80)) for n in range(2)] + [
+        Image("image-3", picture(5), (96, 80))
+    ]
+    found = read_images([*records[:2], path, picture(4), records[2]], max_size_px=99)
+    names = ["frame", "frame (2)", "frame (3)", "image-3", "image-3 (2)"]
+    assert [decoded.image.name for decoded in found.decoded] == names
+    for n, image in zip((0, 1, 3, 4, 5), found.images, strict=True):
+        np.testing.assert_array_equal(image.rgb, picture(n))
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])

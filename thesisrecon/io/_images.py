@@ -205,17 +205,16 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
     paths = [Path(item) for item in source if isinstance(item, str | Path)]
     # Files of one name from several folders are distinguished by their paths.
     full = len({path.name for path in paths}) < len(paths)
-    names = iter(_names(str(path) if full else path.name for path in paths))
     width = len(str(len(source)))
-    items: list[tuple[str, Any]] = []
-    for n, item in enumerate(source):
+
+    def name_of(n: int, item: Any) -> str:
         if isinstance(item, str | Path):
-            items.append((next(names), Path(item)))
-        elif isinstance(item, Image):
-            items.append((item.name, item))
-        else:
-            items.append((f"image-{n:0{width}d}", item))
-    return sorted(items, key=lambda pair: pair[0])
+            return str(item) if full else Path(item).name
+        return item.name if isinstance(item, Image) else f"image-{n:0{width}d}"
+
+    names = _names(name_of(n, item) for n, item in enumerate(source))
+    items = [Path(item) if isinstance(item, str) else item for item in source]
+    return sorted(zip(names, items, strict=True), key=lambda pair: pair[0])
 
 
 def _names(names: Iterable[str]) -> list[str]:
@@ -232,7 +231,7 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
     if isinstance(item, Path):
         decoded = decode_file(item, partial(_decoded_image, name, max_size_px, as_stored))
     elif isinstance(item, Image):
-        decoded = DecodedImage(item, "")
+        decoded = DecodedImage(replace(item, name=name), "")
     else:
         array = np.asarray(item)
         if array.dtype != np.uint8 or (array.ndim != 2 and array.shape[2:] != (3,)):
