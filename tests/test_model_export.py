@@ -2,6 +2,8 @@
 
 import json
 import struct
+import threading
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests import fake_stages as fakes
-from thesisrecon import Camera, UsageError, export, reconstruct
+from thesisrecon import Camera, UsageError, export, model_export, reconstruct
 from thesisrecon.cli.main import run_command
+from thesisrecon.io._exports import write_image
+from thesisrecon.io._images import read_image
+from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.stereo._resampling import undistort_image
 
 SIZE = (160, 120)
 NAMES = ["a b.png", "sub/c.png", "d.tif", "é.png"]
@@ -483,6 +489,40 @@ def test_an_export_does_not_replace_its_input(tmp_path, images):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     # Next to the model is no problem for formats without a sparse folder.
     export(tmp_path / "sparse" / "0", tmp_path, to="nerfstudio", images=images)
+
+
+@pytest.mark.parametrize(("total", "together"), [(1e6, 1), (1e9, 4)])
+def test_images_are_undistorted_within_the_memory_budget(tmp_path, images, monkeypatch, total, together):
+    """An image of 160 x 120 px takes 0.6 MB."""
+    working, most, gate = [], [], threading.Barrier(together)
+
+    def read(*arguments, **options):
+        working.append(1)
+        most.append(len(working))
+        gate.wait(60)
+        return read_image(*arguments, **options)
+
+    def write(*arguments):
+        write_image(*arguments)
+        working.pop()
+
+    monkeypatch.setattr(model_export, "_budget", MemoryBudget(int(total)))
+    monkeypatch.setattr(model_export, "read_image", read)
+    monkeypatch.setattr(model_export, "write_image", write)
+    export(make_model(BARREL, PINCUSHION), tmp_path / "out", to="nerfstudio", images=images, threads=4)
+    assert len(most) == 4
+    assert max(most) == together
+
+
+def test_undistorting_an_image_takes_little_memory():
+    rgb, K = np.zeros((2000, 400, 3), np.uint8), make_model(BARREL, BARREL).views[0].K
+    undistort_image(rgb[:40], K, BARREL, K, (40, 40))
+    tracemalloc.start()
+    undistort_image(rgb, K, BARREL, K, (400, 2000))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Two images in single precision, and the positions of a strip.
+    assert peak < 30 * rgb[..., 0].size
 
 
 def test_an_image_ends_where_the_lens_model_folds_back(tmp_path, images):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -19,9 +20,10 @@ from thesisrecon.io._colmap_writing import has_skew, write_sparse_model
 from thesisrecon.io._export_formats import calibration, coefficients
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
-from thesisrecon.io._images import find_images, read_image, rotation_words
+from thesisrecon.io._images import MAX_DECODED_BYTES, find_images, read_image, rotation_words
 from thesisrecon.io._masks import find_masks, read_mask
 from thesisrecon.io._models import model_places
+from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._executors import available_threads
 from thesisrecon.sparse_model import SparseModel, SparseView
@@ -33,6 +35,10 @@ _INNER = 0.99
 """Fraction of the radius at which a lens model folds back that an undistorted image may reach."""
 _MIN_SIDE_PX = 16
 _ROUNDING_PX = 1e-6
+_WORKING_BYTES = 17
+"""Measured memory to undistort an image and its mask, per pixel of the original and of the result."""
+_budget = MemoryBudget(MAX_DECODED_BYTES)
+"""Apart from the budget of decoding, which each image needs while it holds this one."""
 _FLOAT32_REL = 1e-4
 """Largest single-precision rounding of coordinates, as a fraction of the extent of the points."""
 
@@ -324,26 +330,29 @@ def _write_images(
         )
     paths = find_images(Path(images), model.names)
 
+    whole = int(np.iinfo(np.int32).max)
+
     def write(i: int) -> None:
         (K, size), distortion = calibration(model.views[i]), coefficients(model.views[i])
         pinhole_K, pinhole_size = calibration(pinholes.views[i])
-        (image,) = read_image(paths[i], max_size_px=np.iinfo(np.int32).max, as_stored=model.as_stored).images
-        if image.size != size:
-            rule = rotation_words(model.as_stored)
-            sizes = f"{image.size} pixels {rule}, but {size} (width, height) in the model"
-            raise UsageError(f"{paths[i]} has {sizes}; give the images of the model")
-        file, name = (None, "") if masks is None else masks[i]
-        mask = None if file is None else read_mask(file, image, as_stored=model.as_stored)
-        rgb, used = image.rgb, mask
-        if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
-            frames = K, distortion, pinhole_K, pinhole_size
-            rgb, _ = undistort_image(rgb, *frames)
-            if mask is not None:
-                _, used = undistort_image(mask[:, :, None].astype(np.uint8), *frames, mask=mask)
-        write_image(folder / "images" / pinholes.views[i].name, rgb)
-        if name:
-            used = np.ones(rgb.shape[:2], bool) if used is None else used
-            write_image(folder / name, np.where(used, 255, 0).astype(np.uint8))
+        with _budget.reserve(_WORKING_BYTES * (math.prod(size) + math.prod(pinhole_size))):
+            (image,) = read_image(paths[i], max_size_px=whole, as_stored=model.as_stored).images
+            if image.size != size:
+                rule = rotation_words(model.as_stored)
+                sizes = f"{image.size} pixels {rule}, but {size} (width, height) in the model"
+                raise UsageError(f"{paths[i]} has {sizes}; give the images of the model")
+            file, name = (None, "") if masks is None else masks[i]
+            mask = None if file is None else read_mask(file, image, as_stored=model.as_stored)
+            rgb, used = image.rgb, mask
+            if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
+                frames = K, distortion, pinhole_K, pinhole_size
+                rgb, _ = undistort_image(rgb, *frames)
+                if mask is not None:
+                    _, used = undistort_image(mask[:, :, None].astype(np.uint8), *frames, mask=mask)
+            write_image(folder / "images" / pinholes.views[i].name, rgb)
+            if name:
+                used = np.ones(rgb.shape[:2], bool) if used is None else used
+                write_image(folder / name, np.where(used, 255, 0).astype(np.uint8))
 
     with ThreadPoolExecutor(threads or available_threads()) as pool:
         list(pool.map(write, range(len(paths))))

@@ -155,8 +155,12 @@ def undistort_image(
     if mask is not None:
         given[~mask] = np.nan
     pixels = warp_image(given, lookup, size)
+    # In place: a full image in single precision takes 12 bytes per pixel.
+    del given
     seen = np.asarray(np.isfinite(pixels).all(axis=2))
-    return np.clip(np.rint(np.where(seen[:, :, None], pixels, 0.0)), 0.0, 255.0).astype(np.uint8), seen
+    pixels[~seen] = 0.0
+    np.clip(np.rint(pixels, out=pixels), 0.0, 255.0, out=pixels)
+    return pixels.astype(np.uint8), seen
 
 
 def bilinear_samples(values: F32, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]:
