@@ -13,6 +13,7 @@ from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon import Camera, Reconstruction, StageFailure, depth_maps, fuse_depth_maps, texture, write_mesh
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.surface.model import SurfaceModel
 from validation.scenes.real import load_fixture_depth
 
 ROOT = Path(__file__).parent.parent
@@ -91,6 +92,22 @@ def test_a_surface_of_plain_depths_has_them(walled):
     assert np.isfinite(off).mean() > 0.9
     small = fuse_depth_maps([depth[::2, ::2] for depth in depths], cameras)
     assert np.nanmedian(np.abs(thesisrecon.render(small, cameras[1]).depth / depths[1] - 1.0)) < 0.01
+
+
+@pytest.mark.parametrize(("max_size", "side"), [(None, 1600), (1700, 1700), (400, 400)])
+def test_a_texture_is_made_of_images_of_the_requested_size(monkeypatch, max_size, side):
+    given = []
+
+    def color(self, surface, views, *, threads=1):  # noqa: ARG001
+        given.extend(views)
+
+    monkeypatch.setattr(SurfaceModel, "color", color)
+    image = np.random.default_rng(0).integers(0, 256, (300, 1800, 3), dtype=np.uint8)
+    K = np.array([[900.0, 0, 899.5], [0, 900, 149.5], [0, 0, 1]])
+    camera = Camera(K, np.eye(3), np.zeros(3), (1800, 300), np.array([-0.01, 0, 0]))
+    mesh = thesisrecon.TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))
+    texture(mesh, [image], [camera], max_size=max_size)
+    assert given[0].rgb.shape[1] == side
 
 
 def test_the_example_makes_a_glb_of_the_courtyard(tmp_path, monkeypatch):

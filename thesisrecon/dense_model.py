@@ -217,7 +217,7 @@ def texture(
     """
     method = as_config(config)
     read, model = _scene("texture", images, cameras, sizes, max_size or method.images.max_size_px)
-    views = [pinhole_view(image, model, i) for i, image in enumerate(read)]
+    views = [pinhole_view(image, model, i, max_side=max(image.size)) for i, image in enumerate(read)]
     return method.model.color(mesh, views, threads=threads)
 
 
