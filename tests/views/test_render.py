@@ -1,5 +1,6 @@
 """Rendering: what an image must show, and how similar two images are."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import RenderedView, TexturedMesh
 from thesisrecon.surface.linear import surface_from_depth
 from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.views import render as module
 from thesisrecon.views._image_similarity import GREY, _ssim_map, covered_pixels, match_exposure, psnr_db, ssim
 from thesisrecon.views.render import Light, Shading, render
 
@@ -46,6 +48,26 @@ def test_a_finer_picture_is_averaged():
     mesh = wall(texture=np.repeat(board[..., None], 3, axis=2), uv=corner[np.array([[0, 2, 1], [0, 3, 2]])])
     seen = render(mesh, Camera(K, np.eye(3), np.zeros(3), SIZE), samples=2)
     assert np.abs(seen.color.astype(int) - 128).max() <= 2
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_an_image_is_rasterised_in_parts_without_effect_on_it(monkeypatch, samples):
+    colors = np.random.default_rng(0).integers(0, 256, (4, 3), dtype=np.uint8)
+    camera = Camera(K, np.eye(3), np.array([0.3, -0.2, 0.1]), SIZE)
+    options = {"samples": samples, "shading": Shading(ambient=0.8)}
+    whole = render(wall(colors=colors), camera, **options)
+    monkeypatch.setattr(module, "PART_SAMPLES", 64 * samples * samples * 7)
+    for threads in (1, 3):
+        parts = render(wall(colors=colors), camera, **options, threads=threads)
+        for name in ("color", "depth", "valid"):
+            np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    # Colour, depth and validity take 8 bytes per pixel, and the samples of all pixels at one time 20 or 80.
+    large = Camera(np.diag([20.0, 20.0, 1.0]) @ K, np.eye(3), np.zeros(3), (1280, 960))
+    tracemalloc.start()
+    render(wall(colors=colors), large, samples=samples)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 12 * 1280 * 960
 
 
 def test_vertex_colours_run_from_corner_to_corner():

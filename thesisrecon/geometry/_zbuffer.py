@@ -66,7 +66,7 @@ def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int
 def _rasterize_rows(
     corners: F64, near: float, rows: tuple[int, int], depth: F32, face: I64, weights: F32
 ) -> None:
-    """Draw triangles ``corners`` (M, 3, 3) into some rows of a z-buffer; the first of equal depths stays.
+    """Draw triangles ``corners`` (M, 3, 3) into a z-buffer of some rows; the first of equal depths stays.
 
     With the image points of a face as the columns of M, the barycentric coordinates of the point seen at (x,
     y), each over its depth, are M^-1 (x, y, 1): linear in the pixel, exact in perspective, without clipping
@@ -74,6 +74,7 @@ def _rasterize_rows(
     """
     width = depth.shape[1]
     inverse = empty((3, 3))
+    top_row = rows[0]
     for m in range(corners.shape[0]):
         p = corners[m]
         first, last = rows
@@ -102,11 +103,12 @@ def _rasterize_rows(
                 if over_depth <= 0.0:
                     continue
                 z = np.float32(1.0 / over_depth)
-                if z < depth[y, x]:
-                    depth[y, x] = z
-                    face[y, x] = m
-                    weights[y, x, 0] = np.float32(w1 / over_depth)
-                    weights[y, x, 1] = np.float32(w2 / over_depth)
+                i = y - top_row
+                if z < depth[i, x]:
+                    depth[i, x] = z
+                    face[i, x] = m
+                    weights[i, x, 0] = np.float32(w1 / over_depth)
+                    weights[i, x, 1] = np.float32(w2 / over_depth)
 
 
 @kernel
@@ -168,22 +170,41 @@ class Raster:
 
 def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) -> Raster:
     """Find the face, seen from any side, at the centre of each pixel of a camera without distortion."""
+    width, height = camera.size
+    return rasterize_corners(*image_corners(vertices, faces, camera), (height, width), threads=threads)
+
+
+def image_corners(vertices: F64, faces: I64, camera: Camera) -> tuple[F64, float]:
+    """Image points K (R X + t) (M, 3, 3) of the corners of faces, and the nearest depth that is drawn."""
     if not camera.is_pinhole:
         raise ValueError("Rendering needs a camera without distortion: undistort the image first")
-    width, height = camera.size
     seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
     near = _NEAR * max(float(np.abs(seen[:, 2]).max(initial=0.0)), 1e-300)
-    return rasterize_corners(seen[faces], near, (height, width), threads=threads)
+    return np.ascontiguousarray(seen[faces]), near
 
 
 def rasterize_corners(corners: F64, near: float, shape: tuple[int, int], *, threads: int = 1) -> Raster:
     """Find the face at the centre of each pixel from the image points K (R X + t) (M, 3, 3) of corners."""
     corners = np.ascontiguousarray(corners)
-    depth = np.full(shape, np.inf, dtype=np.float32)
-    face = np.full(shape, -1, dtype=np.int64)
-    weights = np.zeros((*shape, 2), dtype=np.float32)
-    run_in_strips(lambda rows: _rasterize_rows(corners, near, rows, depth, face, weights), shape[0], threads)
-    return Raster(depth, face, weights)
+    raster = _empty_raster(shape)
+    run_in_strips(lambda rows: _draw(corners, near, rows, raster[slice(*rows)]), shape[0], threads)
+    return raster
+
+
+def rasterize_rows(corners: F64, near: float, rows: tuple[int, int], width: int) -> Raster:
+    """Return the rows (first, last + 1) of the raster of :func:`rasterize_corners`."""
+    raster = _empty_raster((rows[1] - rows[0], width))
+    _draw(corners, near, rows, raster)
+    return raster
+
+
+def _empty_raster(shape: tuple[int, int]) -> Raster:
+    depth, face = np.full(shape, np.inf, dtype=np.float32), np.full(shape, -1, dtype=np.int64)
+    return Raster(depth, face, np.zeros((*shape, 2), dtype=np.float32))
+
+
+def _draw(corners: F64, near: float, rows: tuple[int, int], raster: Raster) -> None:
+    _rasterize_rows(corners, near, rows, raster.depth, raster.face, raster.weights)
 
 
 def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._zbuffer import Raster, rasterize, run_in_strips, sample_texture
+from thesisrecon.geometry._zbuffer import (
+    Raster,
+    image_corners,
+    rasterize_rows,
+    run_in_strips,
+    sample_texture,
+)
 from thesisrecon.kernels import empty, kernel
 from thesisrecon.records import RenderedView, TexturedMesh
 
 STRIP = 16
 """Rows that are coloured at a time, so that intermediate arrays stay in cache."""
+PART_SAMPLES = 2**21
+"""Samples that are rasterised at a time in each thread: one takes 20 bytes."""
 BARE = (200, 200, 200)
 """Colour of a mesh without texture and vertex colours."""
 
@@ -156,30 +165,52 @@ def render(
     if samples < 1:
         raise ValueError(f"render needs at least one sample a side; got {samples}")
     _check(mesh)
-    centre = rasterize(mesh.vertices, mesh.faces, camera, threads=threads)
-    valid = centre.face >= 0
-    depth = np.where(valid, centre.depth, np.float32(np.nan)).astype(np.float32)
-    fine = centre
-    if samples > 1:
-        fine = rasterize(mesh.vertices, mesh.faces, camera.scaled(samples), threads=threads)
-    rgb = np.empty((*valid.shape, 3), dtype=np.uint8)
+    shape = camera.size[::-1]
+    rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
+    valid = np.empty(shape, dtype=bool)
     behind = np.asarray(background, dtype=np.float32)
     values = mesh.colors if mesh.texture is None or mesh.uv is None else mesh.uv
     source = None if values is None else np.ascontiguousarray(values, dtype=np.float32)
     lit = [] if shading is None else [a.astype(np.float32) for a in (mesh.vertices, _vertex_normals(mesh))]
 
-    def paint(rows: tuple[int, int]) -> None:
-        for first in range(rows[0], rows[1], STRIP):
-            last = min(first + STRIP, rows[1])
-            part = fine[samples * first : samples * last]
+    def measure(start: int, stop: int, raster: Raster) -> None:
+        valid[start:stop] = raster.face >= 0
+        depth[start:stop] = np.where(valid[start:stop], raster.depth, np.float32(np.nan))
+
+    def paint(start: int, stop: int, raster: Raster) -> None:
+        for first in range(start, stop, STRIP):
+            last = min(first + STRIP, stop)
+            part = raster[samples * (first - start) : samples * (last - start)]
             color = _colors(mesh, source, part)
             if shading is not None:
                 points, normals = (part.interpolate(v, mesh.faces).reshape(-1, 3) for v in lit)
                 _shade(color.reshape(-1, 3), points, normals, camera.centre, shading)
             _average_blocks(color, part.face, samples, behind, rgb[first:last])
 
-    run_in_strips(paint, len(rgb), threads)
+    if samples == 1:
+        _in_parts(mesh, camera, 1, threads, measure, paint)
+    else:
+        _in_parts(mesh, camera, 1, threads, measure)
+        _in_parts(mesh, camera.scaled(samples), samples, threads, paint)
     return RenderedView(rgb, depth, valid)
+
+
+def _in_parts(
+    mesh: TexturedMesh, camera: Camera, samples: int, threads: int, *uses: Callable[[int, int, Raster], None]
+) -> None:
+    """Rasterise parts of an image (first row, last + 1) with ``samples`` rows per row, and use each."""
+    corners, near = image_corners(mesh.vertices, mesh.faces, camera)
+    width, height = camera.size
+    step = max(PART_SAMPLES // (samples * width), 1)
+
+    def work(rows: tuple[int, int]) -> None:
+        for first in range(rows[0], rows[1], step):
+            last = min(first + step, rows[1])
+            raster = rasterize_rows(corners, near, (samples * first, samples * last), width)
+            for use in uses:
+                use(first, last, raster)
+
+    run_in_strips(work, height // samples, threads)
 
 
 def _check(mesh: TexturedMesh) -> None:
