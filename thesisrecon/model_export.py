@@ -155,7 +155,20 @@ def require_separate(
     images: str | Path | None = None,
     masks: str | Path | None = None,
 ) -> None:
-    """Refuse an export whose files would replace those that it is made from."""
+    """Refuse an export whose files would replace those that it is made from.
+
+    Parameters
+    ----------
+    folder, to : Path, str
+        Folder and format of the export.
+    model, images, masks : path, optional
+        What it is made from.
+
+    Raises
+    ------
+    UsageError
+        If images, masks or COLMAP files are written to one of these.
+    """
     written = [folder / "images", folder / "masks"] if to in _PINHOLE else []
     written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
     given = [] if model is None else model_places(Path(model))
