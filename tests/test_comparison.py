@@ -118,8 +118,11 @@ def test_distances_of_points_count_both_ways(truth):
 def test_results_folders_and_cameras_by_name_are_models(tmp_path, truth):
     cameras = {v.name: Camera(v.K, v.R, v.t, v.size) for v in truth.views[::-1]}
     (tmp_path / "cameras.json").write_text(TRUTH.read_text(encoding="utf-8"), encoding="utf-8")
-    result = RunResult(tmp_path, (), {}, (), (), np.zeros(0, np.int64), {})
+    (tmp_path / "summary.json").write_text('{"trusted": true}', encoding="utf-8")
+    result = RunResult(tmp_path, (), {}, (), (), np.zeros(0, np.int64), {}, summary={"trusted": True})
     found = compare_models(result, cameras)
+    other = replace(result, summary={"trusted": False})
+    refuses(UsageError, "the result has no cameras", compare_models, other, cameras)
     assert found.names == tuple(truth.names)
     assert found.summary["centre_error"]["max"] < 1e-9
     refuses(UsageError, "the second model of a comparison must be a path", compare_models, cameras, 3)

@@ -79,9 +79,10 @@ def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
         return model
     if not isinstance(model, RunResult):
         return read_model(model)
-    out = model.out if model.metric is None else folder_with(model)
-    if out is not None:
+    if (out := folder_with(model)) is not None:
         return read_model(out)
+    if model.metric is None:
+        raise UsageError("the result has no cameras; it ended before the metric stage")
     with TemporaryDirectory() as folder:
         replace(model, mesh=None).save(folder)
         return read_model(folder)

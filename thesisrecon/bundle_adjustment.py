@@ -109,8 +109,8 @@ def bundle_adjust(
     free : sequence of str
         Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3".
     prior : mapping of str to float, optional
-        Standard deviations of free intrinsics about the given cameras: relative for "focal", in pixels for
-        "principal_point" and "skew".
+        Standard deviations of free intrinsics about the given cameras, of shared ones about their mean:
+        relative for "focal", in pixels for "principal_point" and "skew".
     loss, loss_px : {"huber", "squared"}, float
         Loss, and residual where Huber's turns linear (None: two standard deviations of the noise).
     sigma_px : float, optional

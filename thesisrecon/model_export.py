@@ -22,7 +22,7 @@ from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import MAX_DECODED_BYTES, find_images, read_image, rotation_words
 from thesisrecon.io._masks import find_masks, read_mask
-from thesisrecon.io._models import model_places
+from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._executors import available_threads
@@ -171,8 +171,8 @@ def require_separate(
     """
     written = [folder / "images", folder / "masks"] if to in _PINHOLE else []
     written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
-    given = [] if model is None else model_places(Path(model))
-    given += [Path(path) for path in (images, masks) if path is not None]
+    colmap = None if model is None else colmap_model_in(Path(model))
+    given = [Path(path) for path in (colmap, images, masks) if path is not None]
     replaced = {path.resolve() for path in written}
     lost = next((path for path in given if path.resolve() in replaced), None)
     if lost is not None:

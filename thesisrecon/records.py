@@ -19,7 +19,7 @@ class Image:
     Parameters
     ----------
     name, rgb, original_size : str, ndarray (H, W, 3) uint8, tuple of int
-        File name, pixels, and (width, height) of the file after EXIF rotation.
+        File name, pixels, and (width, height) of the file after EXIF rotation (from COLMAP: as stored).
     mask : ndarray (H, W) of bool, optional
         Pixels to use; None: all.
 

@@ -11,8 +11,9 @@ from tests.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._files import write_json
+from thesisrecon.pipeline import _steps
 from thesisrecon.records import PairChoice, StageReport
-from thesisrecon.runtime._run_folder import RunDirectory, StageFolder
+from thesisrecon.runtime._run_folder import LOCK_FILE, RunDirectory, StageFolder
 from thesisrecon.runtime._run_position import run_position
 
 IMAGES = 10
@@ -42,6 +43,7 @@ def folder(tmp_path):
 
 def test_a_running_folder_tells_its_stage_and_the_time_left(folder, capsys):
     with RunDirectory(folder).claim({}, overwrite=True):
+        os.utime(folder / LOCK_FILE, (begun := time.time() - 200.0, begun))
         assert run_command(["inspect", str(folder)]) == 0
     # 5 pairs in 100 s, 40 are left: 800 s.
     assert re.match(
@@ -55,22 +57,23 @@ def test_a_killed_run_tells_how_to_go_on(folder):
 
 
 def test_resumed_items_do_not_count_for_the_rate(folder):
-    os.utime(folder / "run.json")
-    directory = RunDirectory(folder)
-    for stage, count in (("01-features", IMAGES), ("02-matches", 5)):
-        for n in range(count):
-            directory.mark(directory.stage(stage), f"{n:05d}")
     with RunDirectory(folder).claim({}, overwrite=True):
         assert run_position(folder) == "running: matches, 5 of 45 done"
 
 
-def test_records_of_a_replaced_run_are_not_counted(tmp_path):
+def test_records_of_a_replaced_run_are_not_counted(tmp_path, monkeypatch):
     def run(images, **options):
         return reconstruct(photographs(images), tmp_path, config=fake_config(), threads=1, **options)
 
     run(4)
     with pytest.raises(KeyboardInterrupt):
         run(5, seed=1, overwrite=True, progress=interrupt_at("matches", 2))
+    assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"
+    # Killed while it compiles: what the run had done before still counts.
+    with monkeypatch.context() as patch:
+        patch.setattr(_steps, "precompile", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run(5, seed=1)
     assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"
     with pytest.raises(KeyboardInterrupt):
         run(5, seed=1, progress=interrupt_at("matches", 3))

@@ -127,7 +127,7 @@ def resect(
         if inliers.sum() < needed:
             raise StageFailure(
                 "no camera explains the points",
-                f"{inliers.sum()} of {len(X)} are within {limit:g} px, {needed} are needed",
+                f"{inliers.sum()} of {len(X)} agree with one, {needed} are needed",
                 "check that points and pixels correspond",
             )
         fit = _refine(fit, X, xy, inliers, calibrated=K is not None)

@@ -203,7 +203,8 @@ def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
     Returns
     -------
     ndarray (N, 4)
-        Homogeneous points; zeros if a point is observed in fewer than two views or from one centre only.
+        Homogeneous points; zeros if a point is observed in fewer than two views or from one centre only, and
+        of "midpoint" if its rays are parallel.
 
     Raises
     ------

@@ -36,6 +36,7 @@ def read_model(path: str | Path) -> SparseModel:
         model = _read_folder(path)
     else:
         model = SparseModel(_read_views(path) if path.suffix == ".json" else _read_trajectory(path))
+        model = replace(model, as_stored=_from_colmap(path.parent))
     names = model.names
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
@@ -49,13 +50,14 @@ _KNOWN = (
 )
 
 
-def model_places(folder: Path) -> list[Path]:
-    """Where a COLMAP model is looked for."""
-    return [folder, folder / "sparse" / "0", folder / "sparse", folder / "0"]
+def colmap_model_in(folder: Path) -> Path | None:
+    """The COLMAP model of a folder: itself, or below it."""
+    places = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
+    return next((place for place in places if is_colmap_model(place)), None)
 
 
 def _read_folder(folder: Path) -> SparseModel:
-    colmap = next((place for place in model_places(folder) if is_colmap_model(place)), None)
+    colmap = colmap_model_in(folder)
     if (folder / "cameras.json").is_file():
         views = _read_views(folder / "cameras.json")
         model = SparseModel(views) if colmap is None else _with_views(read_colmap_model(colmap), views)
@@ -63,8 +65,9 @@ def _read_folder(folder: Path) -> SparseModel:
     if colmap is None:
         raise UsageError(f"{folder} holds no model; give {_KNOWN}")
     # The sparse/0 of a run has the pixels of the run.
-    run = colmap.resolve().parents[1]
-    own = (run / "cameras.json").is_file()
+    *_, first, second = ("", *colmap.resolve().parts)
+    run = colmap.resolve().parent.parent
+    own = (first, second) == ("sparse", "0") and (run / "summary.json").is_file()
     return replace(read_colmap_model(colmap), as_stored=not own or _from_colmap(run))
 
 

@@ -161,12 +161,12 @@ def _number_column(
     tightest = np.lexsort((std, value))
     tightest = tightest[np.unique(value[tightest], return_index=True)[1]]
     width, means = std[tightest], _log_focal(prior.mean)[:, c]
-    # The mean of the tightest rows, as a mean of differences: equal rows keep their bytes.
-    mean, tight = means[tightest], np.isfinite(std) & (std == width[value])
-    off = np.bincount(value[tight], (means - mean[value])[tight], minlength=len(width))
-    mean = mean + off / np.maximum(np.bincount(value[tight], minlength=len(width)), 1)
     unobserved = np.bincount(value[used], minlength=len(width)) == 0
     counted = used | unobserved[value]
+    # The mean of the tightest rows, as a mean of differences: equal rows keep their bytes.
+    mean, tight = means[tightest], counted & np.isfinite(std) & (std == width[value])
+    off = np.bincount(value[tight], (means - mean[value])[tight], minlength=len(width))
+    mean = mean + off / np.maximum(np.bincount(value[tight], minlength=len(width)), 1)
     average = np.bincount(value[counted], at[counted]) / np.bincount(value[counted])
     known, fixed = width == 0.0, unobserved | (width == 0.0)
     own = np.where(fixed, NONE, len(parts.start) + np.cumsum(~fixed) - 1)

@@ -223,10 +223,11 @@ class RunDirectory:
         return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
 
     def mark(self, stage: StageFolder, item: str) -> None:
-        """Give a reused record the time of the run, so that only those of replaced runs are older."""
+        """Give a reused record of a replaced run the time of this one: those that are not used are older."""
         with suppress(OSError):
-            start = (self.path / RUN_FILE).stat().st_mtime_ns
-            os.utime(stage.path / f"{item}.npz", ns=(start, start))
+            path, start = stage.path / f"{item}.npz", (self.path / RUN_FILE).stat().st_mtime_ns
+            if path.stat().st_mtime_ns < start:
+                os.utime(path, ns=(start, start))
 
     @contextmanager
     def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
@@ -239,7 +240,9 @@ class RunDirectory:
         """Resume the same run in the claimed folder, or replace another one and remove its ``results``."""
         if self._check(identity, overwrite):
             self.remove(results)
-        write_json(self.path / RUN_FILE, identity)
+        # A resumed run keeps its file and time: its records are not older.
+        if read_json(self.path / RUN_FILE) != as_read(identity):
+            write_json(self.path / RUN_FILE, identity)
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove files (``*`` stands for any part of a name) and the folders that are empty afterwards."""
@@ -344,6 +347,8 @@ def _locked(folder: Path) -> Iterator[None]:
         message = f"another run is writing to the output folder {folder}; choose another one"
         raise UsageError(message) from None
     try:
+        # The time at which a run began or was resumed.
+        os.utime(handle)
         yield
     finally:
         os.close(handle)

@@ -10,7 +10,7 @@ from pathlib import Path
 from thesisrecon.errors import counted
 from thesisrecon.io._files import read_json
 from thesisrecon.runtime._run import FOLDERS
-from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, is_running, read_record
+from thesisrecon.runtime._run_folder import LOCK_FILE, MANIFEST_FILE, RUN_FILE, is_running, read_record
 
 MIN_ITEMS = 3
 """Items from which the time that is left is estimated."""
@@ -35,7 +35,7 @@ def run_position(folder: Path) -> str:
         )
     if not is_running(folder):
         return f"interrupted: {where}; repeat the command to resume"
-    left = _seconds_left(items, total, since)
+    left = _seconds_left(items, total, max(since, (folder / LOCK_FILE).stat().st_mtime))
     return f"running: {where}" + (f", about {_in_words(left)} left in this stage" if left else "")
 
 
@@ -45,7 +45,7 @@ def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
     found = ("images", list[float](), ended)
     for stage, name in FOLDERS.items():
         every = [path.stat().st_mtime for path in (folder / name).glob("*.npz")]
-        # Older records are those of a run that this one replaces; reused ones have the time of the run file.
+        # Older records are those of a run that this one replaces, and that it has not reused.
         times = sorted(when for when in every if when >= started)
         if times:
             found = (stage, times, ended)

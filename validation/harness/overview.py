@@ -19,9 +19,9 @@ DEFINITION = (
 
 
 def cost_ratio(row: Row) -> float | None:
-    """Ours over the best reference (not a variant of ours), inverted where more is better."""
+    """Return ours over the best reference, inverted where more is better; None where neither side is."""
     others = [v for name, v in row.reference.items() if v is not None and not name.startswith("ours")]
-    if row.value is None or not others:
+    if row.value is None or not others or not row.ranked:
         return None
     more_is_better = row.direction == "at least"
     best = max(others) if more_is_better else min(others)

@@ -39,6 +39,7 @@ class Row:
     source: str
     verdict: str
     reason: str = ""
+    ranked: bool = True
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
         metric.definition,
         verdict,
         "" if gate is None else gate.reason,
+        metric.ranked,
     )
 
 

@@ -24,11 +24,15 @@ def row(
     words: str = "",
     *,
     more: bool = False,
+    ranked: bool = True,
     judged: str = OURS,
 ) -> Metric:
-    """Return a number by method, or of ``judged`` alone; with ``more`` a larger one is better."""
+    """Return a number by method, or of ``judged`` alone.
+
+    A smaller one is better, with ``more`` a larger one, and neither if it is not ``ranked``.
+    """
     table = values if isinstance(values, Mapping) else {judged: values}
-    return Metric(scene, name, unit, table, judged, at_most=not more, definition=words)
+    return Metric(scene, name, unit, table, judged, at_most=not more, definition=words, ranked=ranked)
 
 
 def each(results: Mapping[str, Result | None], read: Callable[[Result], Any]) -> Values:

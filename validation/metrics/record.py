@@ -15,6 +15,7 @@ class Metric:
 
     ``values`` maps methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper
     one with ``at_most``; without it the row is only reported. ``definition`` states the number in one line.
+    Neither side of a number that is not ``ranked`` is better, such as a count of faces.
     """
 
     scene: str
@@ -26,6 +27,7 @@ class Metric:
     at_most: bool = True
     note: str = ""
     definition: str = ""
+    ranked: bool = True
 
     @property
     def verdict(self) -> Verdict:

@@ -147,7 +147,10 @@ def _errors(found: Reconstruction, scene: str, size: tuple[int, int]) -> tuple[f
 
 
 def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[str, float]:
-    """COLMAP on the first ``count`` images and the pairs that :func:`measure_cost` listed."""
+    """COLMAP on the first ``count`` images and the pairs that :func:`measure_cost` listed.
+
+    It refines the principal point, which is not at the centre of these images.
+    """
     paths = sorted(images.glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
         folder, out, log = (Path(place) / name for name in ("images", "out", "log"))
@@ -156,6 +159,7 @@ def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[s
             (folder / path.name).symlink_to(path.resolve())
         command = [sys.executable, "-m", "validation.references.colmap", str(folder), str(out)]
         command += ["--threads", str(threads), "--pairs", str(images / f"pairs-{count}.txt")]
+        command += ["--refine-principal-point"]
         process = run_process(command, log=log, cores=own_cores()[:threads], environment=ONE_BLAS_THREAD)
         if process.code != 0:
             raise RuntimeError(log.read_text(encoding="utf-8")[-2000:])

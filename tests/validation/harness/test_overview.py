@@ -23,7 +23,9 @@ def row(key, value, reference, *, direction="at most", limit=None, verdict="repo
     ],
 )
 def test_a_ratio_above_one_is_always_worse(value, reference, direction, expected):
-    assert cost_ratio(row("a/b/c", value, reference, direction=direction)) == expected
+    one = row("a/b/c", value, reference, direction=direction)
+    assert cost_ratio(one) == expected
+    assert cost_ratio(replace(one, ranked=False)) is None
 
 
 def test_the_worst_stage_is_drawn_on_top():

@@ -191,8 +191,11 @@ def _last_record(outcome: Outcome, stage: str) -> Any:
 
 
 def _costs(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    """Return processor seconds and memory; COLMAP's mappers include the shared matching."""
-    done = {n: o if o.ok else None for n, o in outcomes.items() if n != MATCHES}
+    """Return processor seconds and memory; COLMAP's mappers include the shared matching.
+
+    Ours with a camera each continues a finished run, so it has no time of its own.
+    """
+    done = {n: o if o.ok else None for n, o in outcomes.items() if n not in (MATCHES, PER_IMAGE)}
     shared = outcomes[MATCHES].cpu_s if MATCHES in outcomes else 0.0
     times: Values = {n: None if o is None else o.cpu_s + shared * (n in MAPPERS) for n, o in done.items()}
     return [

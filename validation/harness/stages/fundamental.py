@@ -39,7 +39,8 @@ class FundamentalStage(Stage):
     title = "Fundamental matrices"
     definition = (
         "F of the same SIFT matches, threshold 1 px, several seeds, which also order the matches. "
-        "Errors are on correspondences of the true cameras (or hand-made ones) that no method was given."
+        "Errors are on the matches that agree with the true cameras, moved to where they agree exactly, or on"
+        " correspondences made by hand."
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
@@ -122,7 +123,7 @@ def _metrics(
         row(scene, "median error", "px", median, ERROR),
         row(scene, "tenth worst error", "px", worst, "the 90 % quantile of it"),
         row(scene, "failed", "%", failed, f"runs with an error above {FAILED_PX:g} px"),
-        row(scene, "inliers", "%", inliers, "mean share of the matches accepted as inliers"),
+        row(scene, "inliers", "%", inliers, "mean share of the matches accepted as inliers", ranked=False),
         row(scene, "time", "ms", spent, "median processor time of a pair"),
         *(row(scene, f"{name}: median error", "px", median.get(name), ERROR) for name in VARIANTS),
         row(scene, f"{MINIMAL}: rank", "", rank, rank_words),

@@ -64,7 +64,8 @@ class SurfaceStage(Stage):
         meshes = {name: _true_mesh(name, outcome, scene, options) for name, outcome in outcomes.items()}
         judged = {n: None if m is None else judge_surface(m, truth, samples) for n, m in meshes.items()}
         faces = each(meshes, lambda m: len(m.faces))
-        metrics = [*_metrics(scene, judged), row(scene, "faces", "", faces, "triangles of the surface")]
+        words = "triangles of the surface"
+        metrics = [*_metrics(scene, judged), row(scene, "faces", "", faces, words, ranked=False)]
         notes = [f"The scene is {truth.depth_m:.2f} m deep, the median over all true depth maps."]
         place, pictures = options.place(self.name, scene), list[Picture]()
         camera = _camera(scene, options)
