@@ -244,7 +244,7 @@ def _scene(
             raise ValueError(f"{what}; give cameras in pixels of the images, or Camera.scaled(...)")
     scaled = [_scaled(view, image.scale, image.size) for view, image in zip(views, read, strict=True)]
     model = _model(scaled)
-    if isinstance(cameras, Reconstruction) and cameras.inlier.any():
+    if isinstance(cameras, Reconstruction) and len(cameras.tracks.xy):
         kept = cameras.registered[cameras.tracks.view_index]
         t, number = cameras.tracks, np.cumsum(cameras.registered) - 1
         tracks = Tracks(number[t.view_index[kept]], t.point_index[kept], t.xy[kept], len(read), t.n_points)

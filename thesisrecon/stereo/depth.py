@@ -308,7 +308,7 @@ class MultiViewStereo:
         side = min(self.match_side, self.max_side)
         longest = max((max(frame.seen.shape) for frame in frames.values()), default=0)
         matched = undistorted(side) if longest > side else views
-        if depth_range is None and reconstruction.inlier.any():
+        if depth_range is None and len(reconstruction.tracks.xy):
             points = _sparse_points(reconstruction)
         else:
             points = SparsePoints(*frustum_samples(frames, len(images), depth_range), sampled=True)

@@ -80,6 +80,7 @@ OF_PAGES = {
         ["--scene", "street", "--sizes", "100", "1000"],
         ["--until", "model", "--sizes", "12", "48", "100"],
     ],
+    "main-job": [["--repeats", "3"]],
     "package": [["--steps", "build", "install", "imports", "typed", "quiet", "demo"]],
     "subsets": [["--trials", "25"]],
 }
