@@ -43,8 +43,8 @@ def depth_maps(
     images : path or sequence of paths or ndarray (H, W) or (H, W, 3) uint8
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
-        Their cameras in pixels of the images (arrays with ``sizes``); of a reconstruction with points and
-        their observations these give the depth range and the neighbours.
+        Their cameras in pixels of the images after EXIF rotation (arrays with ``sizes``); of a
+        reconstruction with points and their observations these give the depth range and the neighbours.
     sizes : array_like (V, 2) or (2,), optional
         Image width and height, for plain arrays.
     depth_range : array_like (2,) or (V, 2), optional
@@ -241,7 +241,8 @@ def _scene(
     for name, image, view in zip(names, read, views, strict=True):
         if image.original_size != view.size:
             what = f"image {name} has (width, height) {image.original_size}, its camera is for {view.size}"
-            raise ValueError(f"{what}; give cameras in pixels of the images, or Camera.scaled(...)")
+            rule = "cameras in pixels of the images after EXIF rotation, or Camera.scaled(...)"
+            raise ValueError(f"{what}; give {rule}")
     scaled = [_scaled(view, image.scale, image.size) for view, image in zip(views, read, strict=True)]
     model = _model(scaled)
     if isinstance(cameras, Reconstruction) and len(cameras.tracks.xy):

@@ -65,9 +65,8 @@ def _read_folder(folder: Path) -> SparseModel:
     if colmap is None:
         raise UsageError(f"{folder} holds no model; give {_KNOWN}")
     # The sparse/0 of a run has the pixels of the run.
-    *_, first, second = ("", *colmap.resolve().parts)
     run = colmap.resolve().parent.parent
-    own = (first, second) == ("sparse", "0") and (run / "summary.json").is_file()
+    own = colmap.resolve().match("sparse/0") and (run / "summary.json").is_file()
     return replace(read_colmap_model(colmap), as_stored=not own or _from_colmap(run))
 
 
