@@ -162,7 +162,7 @@ def require_separate(
     folder, to : Path, str
         Folder and format of the export.
     model, images, masks : path, optional
-        What it is made from.
+        The model, and the folders of images and masks, that the export reads.
 
     Raises
     ------

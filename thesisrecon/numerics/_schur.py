@@ -159,11 +159,11 @@ class BundleSystem:
         return ReducedSystem(layout.row, layout.column, total), points, damped
 
     def solve(self, damping: float) -> tuple[BundleStep, float, float] | None:
-        """Return the damped step, its predicted gain of cost, and that of the cameras; None if the
-        reduced matrix is not positive definite.
+        """Return the damped step, its predicted gain of cost, and that of the cameras.
 
-        The gain of the cameras, half their squared distance in standard deviations, decides about the end:
-        points whose observations contradict each other move for many iterations, and no camera with them.
+        None if the reduced matrix is not positive definite. The gain of the cameras, half their squared
+        distance in standard deviations, decides about the end: points whose observations contradict each
+        other move for many iterations, and no camera with them.
         """
         reduced, points, damped = self.reduce(damping)
         solver = self.layout.solver

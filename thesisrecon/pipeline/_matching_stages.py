@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -18,20 +17,10 @@ from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
 from thesisrecon.matching.tracks import tracks_of_corners
-from thesisrecon.pipeline._image_pair import (
-    detect_features,
-    match_views,
-    oblique_pairs,
-    prepare_oblique,
-)
+from thesisrecon.pipeline._image_pair import detect_features, match_views, oblique_pairs, prepare_oblique
 from thesisrecon.pipeline._parts import has_narrow_cut
 from thesisrecon.pipeline._state import PipelineState, PreparedViews, batch_pairs
-from thesisrecon.records import (
-    Features,
-    Image,
-    PairChoice,
-    TwoView,
-)
+from thesisrecon.records import Features, Image, PairChoice, TwoView
 from thesisrecon.runtime._run import Batch, stream
 
 FEWER, FINAL = "-fewer", "final"
@@ -174,10 +163,10 @@ def finish_matches(
     If these are not all records as they are stored, another record lists those that count, of ``kinds``, and
     the reasons of those ``rejected`` (by number) because of other pairs.
     """
-    run, rejected = state.run, rejected or {}
+    run, rejected, kinds = state.run, rejected or {}, kinds or [""] * len(two_views)
     state.result = replace(state.result, pairs=tuple(two_views))
-    items = [_item(p.i, p.j, kind) for p, kind in zip(two_views, kinds or repeat(""), strict=False)]
-    if rejected or any(kinds or ()) or items != sorted(run.logs["matches"].keys):
+    items = [_item(pair.i, pair.j, kind) for pair, kind in zip(two_views, kinds, strict=True)]
+    if rejected or any(kinds) or items != sorted(run.logs["matches"].keys):
         final = {"items": items, "rejected": {items[n]: reason for n, reason in rejected.items()}}
         run.cached("matches", FINAL, run.key("matches", FINAL, final), lambda: final)
     accepted = [pair for pair in two_views if pair.accepted]
