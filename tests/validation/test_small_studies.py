@@ -200,6 +200,7 @@ def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_
     assert next(row for row in rows if row.startswith("| matches, processor s")).endswith("| 1.50 |")
     assert next(row for row in rows if row.startswith("| whole run, peak MB")).endswith("| 1.00 |")
     assert next(row for row in rows if row.startswith("| points")).endswith("| 2.00 |")
+    assert not any("dense, peak MB" in row for row in rows), "rows of zeros are left out"
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -104,7 +104,12 @@ class Cost:
 
 
 def measure_cost(
-    images: str, count: int, threads: int, scene: str, until: Until = "metric"
+    images: str,
+    count: int,
+    threads: int,
+    scene: str,
+    until: Until = "metric",
+    settings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Reconstruct in this process, its kernels loaded before; return the fields of :class:`Cost`.
 
@@ -116,7 +121,12 @@ def measure_cost(
         meter, failure, errors = Meter(), "", (float("nan"), float("nan"))
         try:
             result = reconstruct(
-                paths, Path(place) / "run", until=until, threads=threads, progress=meter.progress
+                paths,
+                Path(place) / "run",
+                until=until,
+                set=list(settings),
+                threads=threads,
+                progress=meter.progress,
             )
             errors = _errors(result.reconstruction, scene, _size(paths))
             listed = [f"{paths[pair.i].name} {paths[pair.j].name}\n" for pair in result.pairs]
@@ -185,10 +195,12 @@ def counts_of(summary: Mapping[str, Any]) -> dict[str, int]:
 
 
 def cost_table(costs: Sequence[Cost]) -> str:
-    """Return processor seconds, memory and counts by stage, with their powers of N."""
+    """Return processor seconds, memory and counts by stage, with their powers of N, without rows of zeros."""
     sizes, lines = [float(cost.images) for cost in costs], []
 
     def row(name: str, values: Sequence[float], digits: int) -> None:
+        if not any(values):
+            return
         power = f"{exponent(sizes, values):.2f}" if len(sizes) > 1 and min(values) > 0.0 else "-"
         lines.append([name, *(f"{v:.{digits}f}" for v in values), power])
 
@@ -234,14 +246,17 @@ def growth_of_cost_study(
     threads: int = 2,
     colmap: bool = False,
     until: Until = "metric",
+    set_: Sequence[str] = (),
 ) -> Iterator[Part]:
     """Measure what each stage costs by the number of images of one place or of a street."""
     write_scene(out, scene, max(sizes), long_side, threads)
-    yield f"{scene}, long side {long_side} px, {threads} threads, {os.cpu_count()} cores"
+    head = [scene, f"long side {long_side} px", f"{threads} threads", f"{os.cpu_count()} cores", *set_]
+    yield ", ".join(head)
     costs = []
     for count in sorted(sizes):
-        costs.append(Cost(**call_apart(measure_cost, out, count, threads, scene, until, cores=threads)[0]))
-        yield cost_table(costs[-1:])
+        arguments = (out, count, threads, scene, until, list(set_))
+        costs.append(Cost(**call_apart(measure_cost, *arguments, cores=threads)[0]))
+        yield cost_table(costs[-1:]) if len(sizes) > 1 else ""
         if colmap and not costs[-1].failure:
             costs[-1] = replace(costs[-1], colmap=measure_colmap(out, count, threads, scene))
     yield cost_table(costs)
