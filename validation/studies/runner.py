@@ -77,7 +77,7 @@ OF_PAGES = {
     "growth-of-cameras": [[], ["--core-views", "0", "--kinds", "place", "--sizes", "100", "300"]],
     "growth-of-cost": [
         ["--colmap", "--sizes", "100", "300"],
-        ["--sizes", "100", "1000"],
+        ["--sizes", "1000"],
         ["--sizes", "100", "--set", "matching.many_share=1"],
         ["--scene", "street", "--sizes", "100", "1000"],
         ["--until", "model", "--sizes", "12", "48", "100"],
