@@ -54,7 +54,7 @@ _HOMES = {
     "triangulate": "geometry.triangulation",
     "write_mesh": "io._meshes",
 }
-"""Modules of what needs no configuration, whose import takes longest; the others are in `api`."""
+"""Modules of the names that do not import the configuration, which takes long; the others are in `api`."""
 
 
 def __getattr__(name: str) -> Any:

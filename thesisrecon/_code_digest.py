@@ -1,4 +1,4 @@
-"""Digest of code and of all that it reaches: the key of stored machine code and of stored results."""
+"""Digest of functions and classes with the code that they use: the key of stored kernels and results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OWN = __name__.partition(".")[0]
 _IMPORT = dis.opmap["IMPORT_NAME"]
 _LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")]
 
-# Libraries that count by name, even as the value itself.
+# Libraries of which only the name is hashed, even if the value itself belongs to one.
 _BY_NAME = {*sys.stdlib_module_names, "numpy", "scipy", "numba"}
 _PLAIN = {int, float, str, bytes, bool, type(None)}
 _NOTED = {"_abc_impl", "_is_protocol", "_is_runtime_protocol"}
@@ -33,10 +33,10 @@ _NOTED = {"_abc_impl", "_is_protocol", "_is_runtime_protocol"}
 def code_digest(*values: Any) -> str:
     """SHA-256 digest of functions, classes or objects and of all code that they refer to.
 
-    Followed are constants, defaults, closures, base classes, methods, fields and imports inside functions.
-    Code of installed libraries counts by its name only, unless a value belongs to it. Comments, docstrings
-    and line numbers do not enter. Objects count by their pickled state; one that cannot be pickled, as an
-    object of a C++ library, gives another digest each time, so that nothing stored is used for it.
+    Constants, defaults, closures, base classes, methods, fields and imports inside functions are followed.
+    Of an installed library only the name is hashed, unless a value belongs to it. Comments, docstrings and
+    line numbers have no effect. Objects are hashed by their pickled state; an object that cannot be pickled
+    (of a C++ library, for example) gives a new digest each time, so stored results are never used for it.
     """
     walk = _Walk({OWN, *(_package_of(value) for value in values)} - _BY_NAME)
     walk.follow(values)
@@ -54,7 +54,7 @@ def _is_library(package: str) -> bool:
     if package in sys.builtin_module_names or package == "builtins":
         return True
     place = Path(file).resolve() if file else None
-    # What is defined at a prompt belongs to __main__, whose file may be that of an installed command.
+    # Functions defined at a prompt belong to __main__, whose file may be that of an installed command.
     return (
         package != "__main__"
         and place is not None
@@ -77,7 +77,7 @@ class _Pickler(pickle.Pickler):
 
 
 class _Walk:
-    """Collects what the meaning of a value depends on, as text."""
+    """Collects as text everything that the behaviour of a value depends on."""
 
     def __init__(self, packages: set[str]) -> None:
         self._packages = packages
@@ -89,7 +89,7 @@ class _Walk:
         return package in self._packages or not _is_library(package)
 
     def follow(self, value: Any) -> None:
-        """Note what the meaning of a value depends on."""
+        """Add everything that the behaviour of a value depends on."""
         if type(value) in _PLAIN:
             self.found.append(repr(value))
             return

@@ -1,7 +1,7 @@
-"""Methods from outside: plain functions as stages, objects with the right methods, and code in a file.
+"""User-defined methods of stages: functions, objects with the required methods, and code in a file.
 
 :class:`~thesisrecon.config.PipelineConfig` passes every method through :func:`as_method`, which wraps
-functions and checks objects. ``path/to/file.py:name`` is the text form of what is defined in a file.
+functions and checks objects. ``path/to/file.py:name`` is the text form of a function or class in a file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thesisrecon.errors import StageFailure, UsageError, in_words, unknown_word
 from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, PairChoice
 
-# ruff: noqa: ARG002 (methods take what their stage passes)
+# ruff: noqa: ARG002 (all methods of a stage have the same arguments)
 
 MIN_INLIERS = 8
 NOT_IN_A_FILE = " (defined in a running program, not in a file)"
@@ -42,7 +42,7 @@ def name_of(value: Any) -> str:
 
 @dataclass(frozen=True)
 class _Check:
-    """Checks of what a function ``who`` returned; ``returns`` says what it must return."""
+    """Checks of the values that a function ``who`` returned; ``returns`` describes the required values."""
 
     who: str
     returns: str
@@ -96,7 +96,7 @@ class _Check:
 
 
 def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence[Any]) -> Matches:
-    """Check what an object from outside returned as matches: the kernels behind it check nothing."""
+    """Check the matches that a user-defined matcher returned: the kernels that use them check nothing."""
     check = _Check(
         f"the method match of {type(matching).__name__}", f"Matches, or {FUNCTIONS['matching'][2]}"
     )
@@ -263,11 +263,11 @@ FUNCTIONS: Mapping[str, tuple[type[FunctionAdapter], tuple[str, ...], str]] = {
     "matching": (FunctionMatcher, ("image1", "image2"), "xy1, xy2 (N, 2) px, or xy1, xy2, score (N,)"),
     "epipolar": (FunctionFundamental, ("xy1", "xy2"), "F (3, 3) and a mask (N,) of inliers"),
 }
-"""Stages that take a function: its adapter, its arguments, and what it returns."""
+"""Stages that take a function: its adapter, its arguments, and its return values."""
 
 
 def as_method(stage: str, value: Any, protocol: type[Any]) -> Any:
-    """A method of a stage: a function in its adapter, an object whose methods take what they must."""
+    """Return the method of a stage: a function in its adapter, or an object whose methods were checked."""
     needed = {name: member for name, member in vars(protocol).items() if isinstance(member, FunctionType)}
     needed = {name: member for name, member in needed.items() if not name.startswith("_")}
     takes = f"{stage} takes an object with the method{'s' * (len(needed) > 1)} {' and '.join(needed)}"
@@ -279,7 +279,7 @@ def as_method(stage: str, value: Any, protocol: type[Any]) -> Any:
     if not missing:
         for name, member in needed.items():
             parameters = list(inspect.signature(member).parameters.values())[1:]
-            # The library leaves out no argument that has no default.
+            # The pipeline always passes the arguments without a default.
             fixed = [p for p in parameters if p.default is p.empty]
             _check_arguments(
                 getattr(value, name), fixed, f"the method {name} of {stage}={type(value).__name__}"
@@ -319,7 +319,7 @@ def text_of(value: Any) -> str:
     home = sys.modules.get(str(getattr(made, "__module__", "")))
     file = getattr(home, "__file__", None)
     code = getattr(inspect.unwrap(made) if callable(made) else made, "__code__", None)
-    # What is typed after a script has run is in its module and not in its file.
+    # A function typed at the prompt after a script has run is in the script's module, not in its file.
     in_file = code is None or Path(code.co_filename).resolve() == Path(file or "").resolve()
     # Files of a package may need their package.
     if (
@@ -344,7 +344,7 @@ def is_reference(kind: Any) -> bool:
 
 
 def load_reference(reference: str, where: str) -> Any:
-    """Load what ``file.py:name`` names; running the file defines it."""
+    """Run ``file.py`` and return the object ``name`` that it defines, for a reference ``file.py:name``."""
     file, _, name = reference.rpartition(":")
     path = Path(file).expanduser().resolve()
     if not path.is_file():

@@ -86,7 +86,7 @@ def build_config(
 
 
 def as_config(config: Config | None) -> PipelineConfig:
-    """Return the configuration, of a preset by its name, or of a TOML file; None: the preset ``default``."""
+    """Return a configuration given as such, as a preset name or as a TOML file; None: preset ``default``."""
     return config if isinstance(config, PipelineConfig) else build_config(config)
 
 
@@ -141,7 +141,7 @@ def config_from_toml(
 
 
 def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
-    """``over`` merged into ``under``; another kind drops the settings of the old one."""
+    """``over`` merged into ``under``; if the kind changes, the settings of the old kind are dropped."""
     merged = dict(under)
     for stage, table in over.items():
         old = under.get(stage)
@@ -201,7 +201,7 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
 
 
 def _method_of_kind(stage: str, kind: Any, current: Any) -> Any:
-    """The class of a word, or what ``file.py:name`` names; the current object if it has this kind."""
+    """The class of a kind, or the object of ``file.py:name``; the current object if it has this kind."""
     if is_reference(kind):
         return load_reference(kind, f"{stage}.{_KIND}")
     if isinstance(kind, str) and kind.endswith(NOT_IN_A_FILE):
@@ -273,7 +273,7 @@ def tables_from_config(config: PipelineConfig) -> dict[str, Table]:
 
 
 def table_from_dataclass(value: Any) -> Table:
-    """A dataclass as a table; one of several begins with ``kind``, an object that is none is empty."""
+    """A dataclass as a table, with ``kind`` if the field takes several classes; {} for other objects."""
     if not dataclasses.is_dataclass(value):
         return {}
     hints = _hints(type(value))

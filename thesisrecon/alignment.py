@@ -25,7 +25,7 @@ _MAX_TRIPLES = 1000
 _INLIER_SIGMAS = 3.37
 """99 % of the lengths of three-dimensional normal residuals are shorter."""
 _MIN_WIDTH_REL = 1e-3
-"""Smallest spread of the positions beside their line, as a fraction of the spread along it."""
+"""Smallest spread of the positions across their main direction, as a fraction of the spread along it."""
 _ROUNDING_REL = 1e-9
 """Residuals below this fraction of the extent are rounding."""
 _PARAMETERS = 7
@@ -104,7 +104,7 @@ def align_to_positions(
     positions : mapping of str to (3,)
         Image name -> position, in metres or any other unit.
     seed : int
-        Of the triples, above 18 positions.
+        Random seed of the triples, which are drawn only for more than 18 positions.
 
     Returns
     -------
@@ -114,7 +114,8 @@ def align_to_positions(
     Raises
     ------
     UsageError
-        If fewer than three images have a position, or the positions lie on one line within their noise.
+        If fewer than three images have a position, a position is not three finite numbers, or the positions
+        or the camera centres lie on one line within their noise.
 
     Examples
     --------
@@ -208,12 +209,12 @@ def scaled(
     model : SparseModel, RunResult or path
         A model, a run or its output folder, or a COLMAP model.
     name1, name2, distance : str, str, float
-        Two images, and the distance of their cameras in the wanted unit.
+        Two images, and the distance of their camera centres in the new unit.
 
     Returns
     -------
     SparseModel
-        The model about the same origin.
+        The scaled model; the origin stays.
 
     Raises
     ------

@@ -122,7 +122,7 @@ def rectify(
     ValueError
         If an array has the wrong shape.
     StageFailure
-        If the pair has no parallax or too few matches; an epipole inside an image with ``planar``.
+        If the pair has no parallax or too few matches, or with ``planar`` an epipole lies inside an image.
 
     Examples
     --------
@@ -152,8 +152,8 @@ def match_rectified(
     Parameters
     ----------
     left, right : path or ndarray (H, W) or (H, W, 3)
-        Files (read at full size; ``UsageError`` or ``StageFailure`` if one cannot be read), or grey levels 0
-        to 255 with NaN for missing pixels; of one size.
+        Two images of the same size: files (read at full size; ``UsageError`` or ``StageFailure`` if one
+        cannot be read), or grey levels 0 to 255 with NaN for missing pixels.
     max_disparity_px : float
         Largest disparity; x_right = x_left - d with d from 0 to this.
     config : PipelineConfig, str or path, optional

@@ -30,15 +30,15 @@ _HUBER_SIGMAS = 2.0
 _LEAST_SIGMA_PX = 1e-6
 _SIMILARITY_DOF = 7
 _MAX_BEHIND = 0.5
-"""Share of points behind their cameras that shows another convention of the poses."""
+"""Fraction of observed points behind their cameras above which the poses must use another convention."""
 
 
 @dataclass(frozen=True)
 class BundleAdjustment:
     """Refined cameras and points with their uncertainty.
 
-    All covariances are those of the inner gauge: among the solutions that differ by a similarity, the one
-    that moved the cameras least. They contain the uncertainty of all other unknowns.
+    The gauge of all covariances is fixed by inner constraints (free network): among the solutions that differ
+    by a similarity, the one that moves the cameras least. They contain the uncertainty of all other unknowns.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ class BundleAdjustment:
     residual_px : ndarray (V, N, 2) or (K, 2)
         Projection minus observation in the order of the observations; NaN where there is none.
     sigma_px, cost : float
-        Standard deviation of one image coordinate, estimated from the residuals, and 1/2 sum rho, priors
-        included, in units of it.
+        Standard deviation of one image coordinate, estimated from the residuals; and 1/2 sum rho with the
+        priors, in units of the noise that weighted the residuals (``sigma_px`` of :func:`bundle_adjust`).
     pose_covariance : ndarray (V, 6, 6)
-        Of (rotation vector in rad, translation) of x -> exp(w) x + d in each camera frame.
+        Covariance of the motion x -> exp(w) x + d in each camera frame, (rotation vector w in rad, d).
     intrinsics_covariance : ndarray (V, 8, 8)
-        Of focal, aspect, skew, principal x and y, k1, k2 and k3; zero where not free.
+        In the order focal, aspect, skew, principal x and y, k1, k2, k3; zero where not free.
     point_covariance : ndarray (N, 3, 3)
         Infinite for points in fewer than two views.
     """
@@ -95,24 +95,25 @@ def bundle_adjust(
     Parameters
     ----------
     cameras : sequence of Camera, tuple (K, R, t) or Reconstruction
-        Start: cameras; K (3, 3) or (V, 3, 3), R (V, 3, 3) and t (V, 3) with ``sizes``; or a metric
-        reconstruction: its registered views and, if X is not given, its valid points and inliers.
+        Initial cameras; or K (3, 3) or (V, 3, 3), R (V, 3, 3) and t (V, 3) with ``sizes``; or a metric
+        reconstruction: its registered views and, if X and xy are not given, its valid points and inliers.
     X : ndarray (N, 3)
-        Start of the points.
+        Initial points.
     xy : ndarray (V, N, 2), Tracks or Observations
         Pixels of the points, NaN = not seen; or a list with ``view_index``, ``point_index`` and ``xy``.
     sizes : array_like (V, 2) or (2,), optional
         Image width and height, for plain arrays.
     shared : bool or ndarray (V,) of int
-        True: images of one size share their free intrinsics (they start at their mean); False: each image has
-        its own; or a camera number per image.
+        True: images of the same size share their free intrinsics, which start at their mean; False: each
+        image has its own; or a camera number per image.
     free : sequence of str
         Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3".
     prior : mapping of str to float, optional
         Standard deviations of free intrinsics about the given cameras, of shared ones about their mean:
         relative for "focal", in pixels for "principal_point" and "skew".
     loss, loss_px : {"huber", "squared"}, float
-        Loss, and residual where Huber's turns linear (None: two standard deviations of the noise).
+        Loss, and the residual at which Huber's loss becomes linear (None: two standard deviations of the
+        noise).
     sigma_px : float, optional
         Standard deviation of one image coordinate. None: estimated from the residuals.
     max_iterations : int
@@ -126,14 +127,14 @@ def bundle_adjust(
     Raises
     ------
     ValueError
-        If the arrays do not fit together, most points lie behind the cameras, there are fewer observations
-        than unknowns, or an option is unknown.
+        If the arrays do not fit together, pixels lie far outside their images, most points lie behind the
+        cameras, there are fewer equations than unknowns, or an option is invalid.
 
     Notes
     -----
-    The covariances are those of the linearised problem at the minimum with the noise that the residuals show
-    (``sigma_px`` only weights the data against the prior). The blocks of the points follow from the Schur
-    complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation.
+    The covariances are those of the linearised problem at the minimum, with the noise estimated from the
+    residuals (``sigma_px`` only weights the data against the prior). The blocks of the points follow from the
+    Schur complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation.
 
     Examples
     --------
@@ -161,13 +162,13 @@ def bundle_adjust(
     _check(start, X, observed, chosen, bool(prior))
     require_inside(observed.view_index, observed.xy, np.array([view.size for view in views]))
     fit, noise = None, 1.0 if sigma_px is None else sigma_px
-    # Without a given noise the first pass finds it: it weights the prior and places the turn of the loss.
+    # A first pass estimates noise that is not given: the weight of the prior and the width depend on it.
     for last in (True,) if sigma_px is not None else (False, True):
-        turn = _HUBER_SIGMAS * noise if loss_px is None else loss_px
-        turn = np.inf if loss == "squared" else turn
+        width = _HUBER_SIGMAS * noise if loss_px is None else loss_px
+        width = np.inf if loss == "squared" else width
         options = BundleOptions(
             sigma_px=noise,
-            loss_px=turn,
+            loss_px=width,
             max_iterations=max_iterations,
             covariance=last,
             point_covariance=last,
@@ -246,7 +247,7 @@ def _free(names: Sequence[str]) -> B8:
 
 
 def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCameras:
-    """The cameras as a table with a row per view; views of one number share the free columns."""
+    """The cameras as a table with a row per view; views with equal numbers share the free columns."""
     n = len(views)
     if isinstance(shared, bool | np.bool_):
         sizes = list(dict.fromkeys(view.size for view in views))

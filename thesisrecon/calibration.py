@@ -1,4 +1,4 @@
-"""Chapter 7 in one call each: plane at infinity, affine frame, absolute dual quadric, metric frame."""
+"""The steps of chapter 7, one function each: plane at infinity, affine frame, dual quadric, metric frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ METHODS: Mapping[str, Callable[[], SelfCalibrator]] = {
     "modulus-constraint": lambda: Stratified(ModulusConstraint()),
     "parallel-lines": lambda: Stratified(ParallelLines()),
 }
-"""Methods by name; the last three are the ways of "stratified" to the plane at infinity."""
+"""Methods by name; the last three are "stratified" with different methods for the plane at infinity."""
 
 
 def self_calibrate(
@@ -52,11 +52,11 @@ def self_calibrate(
         Points and their pixels for plain P, as in :meth:`Reconstruction.from_cameras`. Without them the world
         may be mirrored, and noise is not considered.
     method : str or SelfCalibrator, optional
-        "hypotheses-and-refinement", "nonlinear-quadric", "linear-quadric", "kruppa-equations", "stratified"
-        with "cheirality-search", "modulus-constraint" or "parallel-lines", or a method object; None:
-        ``config.selfcalibration``.
+        "hypotheses-and-refinement", "nonlinear-quadric", "linear-quadric", "kruppa-equations", "stratified";
+        "cheirality-search", "modulus-constraint" or "parallel-lines", which are "stratified" with this method
+        for the plane at infinity; or a method object. None: ``config.selfcalibration``.
     config : PipelineConfig, str or path, optional
-        ``config.intrinsics`` is the prior knowledge; by default images of one size share one camera.
+        ``config.intrinsics`` is the prior knowledge; by default images of the same size share one camera.
     images, seed : sequence of Image, int
         The images, one per view, for methods that detect parallel lines; and the random seed.
 
@@ -114,7 +114,8 @@ def absolute_dual_quadric(
     reconstruction, sizes, X, xy, config
         As for :func:`self_calibrate`.
     method : {"nonlinear", "linear"}
-        Over all unknown intrinsics, or by linear equations, which are biased for most lenses.
+        Nonlinear least squares over all unknown intrinsics, or linear equations, which are biased for most
+        lenses.
 
     Returns
     -------
@@ -163,7 +164,7 @@ def plane_at_infinity(
         Pixels of the vanishing points of D >= 3 directions, each seen in at least two views, NaN where not;
         homogeneous for points at infinity of the image.
     method : str or SelfCalibrator, optional
-        As for :func:`self_calibrate`. Those of "stratified" need no calibration.
+        As for :func:`self_calibrate`. "stratified" locates the plane only; the others calibrate as well.
 
     Returns
     -------
@@ -292,7 +293,7 @@ def _method(
         and not projective.inlier.any()
     ):
         raise StageFailure(
-            "this method searches the plane at infinity within bounds that points set",
+            "this method searches for the plane at infinity within bounds that the points give",
             "the cameras come without points",
             "give xy (V, N, 2), the pixels of points, or use nonlinear-quadric",
         )

@@ -23,7 +23,7 @@ from thesisrecon.sparse_model import SparseModel, SparseView
 THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Distances of points, relative to the size of the scene."""
 _LINE = 0.01
-"""Extent of the centres across a line, relative to that along it, below which they hardly leave the line."""
+"""Extent of the centres across a line, relative to that along it, below which they are almost collinear."""
 _SHOWN = 3
 
 
@@ -71,7 +71,7 @@ class ModelComparison:
     only_a, only_b : tuple of str
         Cameras that the other model does not have.
     notes : tuple of str
-        What could not be compared, and why.
+        Quantities that could not be compared, and the reasons.
     a, b : SparseModel
         The models; ``a`` in the world of b if there is a similarity.
     """
@@ -213,7 +213,7 @@ def _model(model: Model, which: str) -> SparseModel:
 
 
 def _pairs(a: SparseModel, b: SparseModel) -> list[tuple[int, int]]:
-    """Pairs of cameras of one name, in the order of a."""
+    """Pairs of cameras with the same name, in the order of a."""
     for key in (str, _stem):
         keys, keys_b = ([key(view.name) for view in model.views] for model in (a, b))
         counts, counts_b = Counter(keys), Counter(keys_b)

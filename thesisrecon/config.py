@@ -136,7 +136,7 @@ class Matcher(Protocol):
         Returns
         -------
         Any
-            What ``match`` needs of the image.
+            The data of the image that ``match`` needs.
         """
 
     def match(
@@ -306,7 +306,7 @@ class StereoMatcher(Protocol):
 
 
 class DepthEstimator(StereoMatcher, Protocol):
-    """Estimate depth maps one view at a time (2.5); ``scene`` has all or the ``required_views``."""
+    """Estimate depth maps view by view (2.5); ``scene`` contains all views or at least ``required_views``."""
 
     def prepare(
         self,
@@ -378,7 +378,7 @@ class ModelBuilder(Protocol):
         without: int | None = None,
         threads: int = 1,
     ) -> TexturedMesh:
-        """Texture a surface by all views, except view ``without`` if its image is compared with the model.
+        """Texture a surface from all views except ``without``, whose image is to be compared with the model.
 
         Returns
         -------
@@ -398,8 +398,8 @@ class ImageOptions:
     groups : bool
         Reconstruct each group of 3 or more images without overlap with the others.
     part_views : int
-        More images are reconstructed in overlapping parts of at most about so many, if cuts between parts
-        sever few of the common points; 0: never.
+        Maximum number of images (approximately) that are reconstructed together. Larger sets are divided
+        into overlapping parts if a division separates few of the common points; 0: never.
     """
 
     max_size_px: int = 1600

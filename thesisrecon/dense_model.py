@@ -43,8 +43,8 @@ def depth_maps(
     images : path or sequence of paths or ndarray (H, W) or (H, W, 3) uint8
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
-        Their cameras in pixels of the images after EXIF rotation (arrays with ``sizes``); of a
-        reconstruction with points and their observations these give the depth range and the neighbours.
+        Their cameras in pixels of the images after EXIF rotation (arrays with ``sizes``). If a
+        reconstruction has points with observations, these give the depth range and the neighbours.
     sizes : array_like (V, 2) or (2,), optional
         Image width and height, for plain arrays.
     depth_range : array_like (2,) or (V, 2), optional
@@ -65,13 +65,13 @@ def depth_maps(
     ValueError
         If a camera is missing or is not of its image's size, or the range is not 0 < nearest < farthest.
     StageFailure
-        If no two images show common space, or no depth is found.
+        If no two images see common space, or no depth is found.
 
     Notes
     -----
     Without points and range, a pair is searched at the depths at which both images contain a point and its
-    rays meet at 0.5 to 40 degrees. Neighbours are the views with most of the common space at about 10
-    degrees. A range that is known saves time and errors.
+    rays meet at 0.5 to 40 degrees. The neighbours of a view are those that share the most space with it at
+    angles of about 10 degrees. A known range saves time and avoids errors.
 
     Examples
     --------
@@ -130,8 +130,8 @@ def fuse_depth_maps(
     Parameters
     ----------
     depth_maps : sequence of DepthMap or ndarray (H, W)
-        Of :func:`depth_maps`, or plain depths z in the camera frame, NaN where unknown, of images without
-        distortion; their standard deviation is then taken as the size of a pixel.
+        Result of :func:`depth_maps`; or plain depths z in the camera frame, NaN where unknown, of images
+        without distortion, whose standard deviation is taken as the size of a pixel.
     cameras, sizes : sequence of Camera, tuple (K, R, t) or Reconstruction, array_like
         For plain depths: their cameras; for maps of another size they are scaled, (x + 0.5) s - 0.5.
     config, threads : PipelineConfig, str or Path, int
@@ -182,7 +182,7 @@ def texture(
     config: Config | None = None,
     threads: int = 1,
 ) -> TexturedMesh:
-    """Texture a surface by images with known cameras (2.6).
+    """Texture a surface from images with known cameras (2.6).
 
     Parameters
     ----------

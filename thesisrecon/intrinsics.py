@@ -47,14 +47,14 @@ class IntrinsicsPrior:
         and principal point; the focal's std is relative (the prior acts on log f). std 0: known, the value
         does not move; std inf: unknown, and the mean is only a starting value (NaN for a focal without one).
     shared : ndarray (V, C) of int
-        Rows with equal numbers in a column have one value there. Bundle adjustment takes the sharing from its
-        cameras instead.
+        Rows with equal numbers in a column share the value of this column. Bundle adjustment takes the
+        sharing from its cameras instead.
     kind : ndarray (V,) of int
-        Rows of equal number are cameras of one kind (the same lens model); -1 for none.
+        Rows with equal numbers are cameras of the same kind (the same lens model); -1 for none.
     spread : ndarray (C,) or (V, C), optional
-        Hierarchical prior: standard deviation of the values of one kind about their unknown common mean
-        (relative for the focal, inf = no such prior; the first row of a kind counts). None before it is
-        measured.
+        Hierarchical prior: standard deviation of the values of a kind about their unknown common mean
+        (relative for the focal; inf = no such prior; the first row of a kind is used). None: not yet
+        estimated.
     """
 
     mean: F64
@@ -103,10 +103,10 @@ class IntrinsicsOptions:
     Parameters
     ----------
     cameras : {"shared", "per-image"}
-        "shared": images of one size come from one camera; "per-image": each image has its own camera.
+        "shared": images of the same size come from one camera; "per-image": each image has its own camera.
     common_prior : bool
-        Images of one size come from cameras of one kind: values that are not shared scatter about a common
-        mean (hierarchical prior; the scatter is estimated).
+        Images of the same size come from cameras of the same kind: values that are not shared scatter about a
+        common mean (hierarchical prior; the scatter is estimated).
     focal, focal_px, focal_std_rel, exif : Mode, float, float, bool
         Focal length in pixels of the original images; its standard deviation is relative. ``exif``: read it
         from EXIF (35 mm equivalent) if ``focal_px`` is not given; a known focal length that is missing there
@@ -162,7 +162,7 @@ class IntrinsicsOptions:
         self._check_stds(given)
 
     def _check_stds(self, focal_given: bool) -> None:
-        """Refuse standard deviations that are no positive number or have no effect."""
+        """Raise ``ValueError`` for standard deviations that are not positive or have no effect."""
         for name, intrinsic in _STD_SETTINGS.items():
             value = getattr(self, name)
             if value is None:
@@ -195,7 +195,7 @@ def _numbered(keys: Sequence[tuple[float, ...]]) -> I64:
 def camera_numbers(
     original_sizes: Sequence[tuple[int, int]], options: IntrinsicsOptions, exif_focal_px: F64 | None = None
 ) -> I64:
-    """Number the cameras so that views of one number agree in all intrinsics, known or shared.
+    """Number the cameras so that views with equal numbers agree in all intrinsics, known or shared.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ def prior_from_options(
     missing = ~np.isfinite(mean[:, 0])
     std[missing, 0] = np.inf
     if options.focal == "known":
-        # A known focal that EXIF lacks becomes constant: one number for such views of a camera.
+        # A known focal that is missing in EXIF becomes constant: these views of a camera share one unknown.
         first = {g: i for i, g in reversed(list(enumerate(group.tolist()))) if missing[i]}
         shared[missing, 0] = [first[g] for g in group[missing].tolist()]
     return IntrinsicsPrior(mean, std, shared, kind)

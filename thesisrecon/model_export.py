@@ -32,13 +32,13 @@ from thesisrecon.stereo._resampling import undistort_image
 _MAX_GROWTH = 0.5
 """Largest extension of an undistorted image beyond each side of the original, as a fraction of the side."""
 _INNER = 0.99
-"""Fraction of the radius at which a lens model folds back that an undistorted image may reach."""
+"""Largest radius in an undistorted image, relative to that at which the distorted radius stops growing."""
 _MIN_SIDE_PX = 16
 _ROUNDING_PX = 1e-6
 _WORKING_BYTES = 17
 """Measured memory to undistort an image and its mask, per pixel of the original and of the result."""
 _budget = MemoryBudget(MAX_DECODED_BYTES)
-"""Apart from the budget of decoding, which each image needs while it holds this one."""
+"""Separate from the budget for decoding, which each image needs while it occupies this one."""
 _FLOAT32_REL = 1e-4
 """Largest single-precision rounding of coordinates, as a fraction of the extent of the points."""
 
@@ -98,12 +98,12 @@ def export(
     masks : path, optional
         Folder of the masks of the original images; None: that of the run, if it had masks.
     threads : int
-        Images that are undistorted at one time; 0: one per processor.
+        Number of images that are undistorted at the same time; 0: one per processor.
 
     Returns
     -------
     ExportReport
-        ``file``: what the other program opens; ``notes``: differences from the model.
+        ``file``: the file or folder to open in the other program; ``notes``: differences from the model.
 
     Raises
     ------

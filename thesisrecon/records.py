@@ -36,7 +36,7 @@ class Image:
 
     @property
     def has_pixels(self) -> bool:
-        """Whether the image was read, and is not a grey one in its place, which takes no memory."""
+        """Whether the image was read; otherwise its pixels are a grey placeholder without memory."""
         return any(self.rgb.strides)
 
     @property
@@ -114,10 +114,10 @@ class DegeneracyReport:
     determined: bool
     reasons: tuple[str, ...] = ()  #: why F is undetermined
     off_plane: float = 0.0  #: inliers off the dominant plane; matches at one position count once
-    contradicted: float = 0.0  #: those among them between matches of the plane, where no surface can be
-    log10_false_alarms: float = 0.0  #: of how often chance gives as many inliers off the plane
-    competing_margin: float = float("inf")  #: standard errors by which the best one explains fewer
-    competing_model: F64 | None = None
+    contradicted: float = 0.0  #: the part of them that neighbours on the plane contradict
+    log10_false_alarms: float = 0.0  #: log10 of the expected number of chance models with as many
+    competing_margin: float = float("inf")  #: standard errors by which F explains more than the other F
+    competing_model: F64 | None = None  #: best other F (3, 3) that differs at a relevant distance
     expected_error_px: float = float("inf")  #: RMS epipolar distance of exact matches by the covariance of F
 
 
@@ -278,7 +278,7 @@ class Reconstruction:
         Returns
         -------
         Reconstruction
-            All views registered; ``ValueError`` if the arrays do not fit together, or pixels lie outside
+            All views registered; ``ValueError`` if the arrays do not fit together, or pixels lie far outside
             their images.
 
         Examples
@@ -316,7 +316,7 @@ class Upgrade:
 class IdentifiabilityReport:
     """Whether the views determine the calibration under the prior, and the nearest critical motion."""
 
-    identifiable: bool  #: the prior may resolve a critical motion
+    identifiable: bool  #: whether the calibration is determined; the prior may resolve a critical motion
     motion: str  #: nearest critical motion ("pure translation", "turntable", ...), empty if not measurable
     critical: bool  #: whether the cameras cannot be distinguished from that motion
     evidence: Mapping[str, float]
@@ -385,8 +385,8 @@ class MetricResult:
     self_check: Mapping[str, float]
     trusted: bool  #: whether the self-check passed
     failed_checks: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()  #: about a trusted result, such as focals that rest on other cameras
-    limitations: tuple[str, ...] = ()  #: where images differ from the simplest camera model
+    warnings: tuple[str, ...] = ()  #: remarks on a trusted result, such as focals inferred from other cameras
+    limitations: tuple[str, ...] = ()  #: differences between the images and the simplest camera model
 
 
 @dataclass(frozen=True)

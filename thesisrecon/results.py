@@ -45,7 +45,8 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
     Parameters
     ----------
     name, interval, scale : str, IntrinsicInterval, float
-        Only names that end in ``_px`` have a unit; working over original size.
+        Name of the intrinsic, which is converted only if it ends in ``_px``; its value; and working size over
+        original size.
 
     Returns
     -------
@@ -58,12 +59,12 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
 
 
 def folder_with(result: RunResult) -> Path | None:
-    """Return the output folder of a result if it still holds it.
+    """Return the output folder of a result if the folder still contains this result.
 
     Parameters
     ----------
     result : RunResult
-        Its summary, with times, tells it from every other result, of an equal run too.
+        Compared by its summary, which contains times and so differs from that of every other run.
 
     Returns
     -------
@@ -254,7 +255,7 @@ class RunResult:
         OutputError
             If a file cannot be written.
         """
-        # The writers know this record.
+        # Imported on use, because the writers import this module.
         from thesisrecon.pipeline._outputs import save_result
 
         save_result(self, Path(folder))

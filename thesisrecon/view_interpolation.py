@@ -27,7 +27,7 @@ _COARSE = 4
 _MIN_SIDE = 64
 """Smaller images are not reduced."""
 _MIN_CONFIDENCE = 0.3
-"""Of the disparities that determine the largest one."""
+"""Minimum confidence of the disparities from which the largest one is estimated."""
 _SIDE_BY_SIDE = "take the images side by side, not one behind the other"
 
 
@@ -48,8 +48,8 @@ def interpolate_view(
     s : float
         Position on the baseline, from 0 (left image) to 1 (right image).
     disparity : ndarray (H, W), DisparityMap or tuple of both sides, optional
-        Disparities of the left image, x_right = x_left - d, NaN = unknown; those of the right image add what
-        only it shows. Matched by ``config.dense`` if None.
+        Disparities of the left image, x_right = x_left - d, NaN = unknown; those of the right image add the
+        regions that only it shows. None: matched by ``config.dense``.
     config : PipelineConfig, str or path, optional
         The default configuration if None.
 
@@ -158,7 +158,7 @@ def prepare_pair(
     Parameters
     ----------
     image1, image2 : str, Path, ndarray (H, W, 3) uint8 or Image
-        Images of one size.
+        Images of the same size.
     config, seed : PipelineConfig or str or path, int
         Configuration (None: the default) and random seed.
 
@@ -171,8 +171,7 @@ def prepare_pair(
     ------
     UsageError, StageFailure
         If the images are the same or differ in size; if they do not match, show no parallax, or the camera
-        moved forwards: epipolar lines then cannot become rows, and every view in between is one of the
-        images, scaled.
+        moved forwards (an epipole lies inside an image: its epipolar lines cannot become rows).
     """
     config = as_config(config)
     first, second = (
@@ -193,7 +192,7 @@ def prepare_pair(
 
 
 def require_comparable_images(images: Sequence[Image]) -> None:
-    """Raise ``UsageError`` unless the images have one size and different content.
+    """Raise ``UsageError`` unless the images have the same size and different content.
 
     Parameters
     ----------

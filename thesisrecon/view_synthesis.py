@@ -145,7 +145,7 @@ def synthesize_view(
         ...
     ValueError: the rotation is not orthogonal
     """
-    # Checked before minutes of matching.
+    # Checked before the matching, which takes minutes.
     rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
     _given_intrinsics(K)
     VirtualCamera(rotation, translation, np.eye(3), (1, 1))

@@ -51,7 +51,7 @@ def run_command(arguments: list[str]) -> int:
 
 
 def _silence_c_libraries() -> None:
-    """Send what C libraries print on stderr to nowhere: libtiff prints a line for each damaged byte."""
+    """Discard messages of C libraries on stderr: libtiff prints a line for each damaged byte."""
     try:
         ours, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     except OSError:

@@ -12,14 +12,14 @@ from thesisrecon.arrays import F64
 from thesisrecon.kernels import kernel
 from thesisrecon.numerics._noise import MAD_FACTOR
 
-# Standard deviations of the noise's tail, and the least of wrong residuals, relative to the noise.
+# Standard deviation of the noise's tail, and lower bound of that of wrong residuals, relative to the noise.
 TAIL, _SEPARATION = 4.0, 12.0
 # Prior counts of each component.
 _CORE_COUNT, _TAIL_COUNT, _WRONG_COUNT = 1.0, 0.5, 1.0
 _MEDIAN_RATIO, _MAX_WIDENINGS = 0.22, 6
 # Trimming point in standard deviations, variance of a normal variable trimmed there, and rounds.
 _TRIM, _TRIMMED_VARIANCE, _TRIM_ROUNDS = 2.5, 0.91125, 5
-# EM rounds of a mixture, and the number of residuals (evenly spaced in order) that represent more.
+# EM rounds of a mixture, and maximum number of residuals, evenly spaced in order, that it is fitted to.
 _EM_ROUNDS, _QUANTILES = 6, 300
 _BISECTIONS = 20
 # Matches within a cell of this size, px, count as one place.
@@ -84,10 +84,11 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 
 
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
-    """Return the width that contains the noise: ``threshold``, or more if the residuals continue.
+    """Return the width that contains the noise: ``threshold``, or more if the noise exceeds it.
 
-    Normal noise has its median at 0.22 of a width of 3 standard deviations. The width grows by steps of 1.5
-    until its median is there; if that takes more than 11 thresholds, the residuals are of wrong matches.
+    The median of normal noise is 0.22 of a width of 3 standard deviations. The width is multiplied by 1.5
+    until this holds for the residuals within it; beyond 11 thresholds these are wrong matches, and
+    ``threshold`` is returned.
     """
     width, ordered = threshold, np.sort(residuals)
     for _ in range(_MAX_WIDENINGS + 1):
@@ -101,7 +102,7 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
 
 
 def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
-    """The root mean square of the residuals >= 0 within 2.5 of it; ``start`` if too few are left."""
+    """Standard deviation of residuals >= 0 within 2.5 standard deviations; ``start`` if these are too few."""
     sigma = start
     for _ in range(_TRIM_ROUNDS):
         kept = residuals[residuals <= _TRIM * sigma]
@@ -113,10 +114,10 @@ def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) ->
 
 @dataclass(frozen=True)
 class NoiseMixture:
-    """Residuals as normal noise, its tail four times as wide, and wrong matches.
+    """Mixture model of residuals: normal noise, its tail four times as wide, and wrong matches.
 
     ``sigma`` and ``spread`` are the standard deviations of noise and wrong residuals, ``core``, ``tail`` and
-    ``wrong`` the fractions. Of two models the one with the higher mean ``log_likelihood`` is better.
+    ``wrong`` the fractions, ``log_likelihood`` is the mean over the residuals.
     """
 
     sigma: float
@@ -194,6 +195,6 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
 
 
 def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:
-    """Probability that a wrong match lies within the band of any F, of width 2 sqrt(2) band_px."""
+    """Bound of the probability that a wrong match lies in the band of an F, of width 2 sqrt(2) band_px."""
     narrow = min(float(np.ptp(xy)) for xy in (*xy1.T, *xy2.T))
     return min(1.0, float(2.0 * np.sqrt(2.0) * band_px / max(narrow, 1e-300)))

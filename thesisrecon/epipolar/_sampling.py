@@ -20,7 +20,7 @@ LANES = 32
 TO_BASIS_1, TO_BASIS_2, FIRST, SECOND, ROWS = 0, 9, 39, 45, 54
 # Points scored between two tests.
 STRIDE = 16
-# The sequential test calls at most one right matrix in a thousand wrong.
+# The sequential test rejects at most one correct F in a thousand.
 LOG_REJECTION_RATIO = np.log(1e3)
 LARGEST = 1 << 40
 
@@ -69,7 +69,7 @@ def _determinant(a: Three, b: Three, c: Three) -> float:
 
 @kernel(fastmath={"contract"}, forceinline=True)
 def solve_seven_point_batch(X: F64, Y: F64) -> None:
-    """Write the pencils and cubics of LANES samples to ``Y`` (ROWS, LANES); not finite if degenerate.
+    """Write the pencils and cubics of LANES samples to ``Y`` (ROWS, LANES), not finite if degenerate.
 
     ``X`` (28, LANES) holds x1, y1, x2, y2 of seven matches. With t p + q a member of a pencil, det(t p + q) =
     t^3 + ... has products of entries as coefficients, since F12 F23 F31 + F13 F21 F32 is the determinant of a

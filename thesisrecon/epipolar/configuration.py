@@ -47,7 +47,7 @@ MINIMUM = 12
 NEAR = 11.0
 NEAR_MEAN, CHI2_MEDIAN = 0.97743, 1.386294
 TRIMMINGS = 3
-# The F of a plane chooses the epipole with the smallest noise along its lines: 1.5 +- 1 standard errors.
+# For a plane F fits the epipole to the noise, which makes the excess 1.5 +- 1 standard errors.
 STANDARD_ERRORS = 4.0
 # Squared distance in sigma^2 beyond which a match is off the homography; noise exceeds it once in 3000.
 FAR = 16.0
@@ -58,10 +58,10 @@ BAND = 2.5
 FLEXIBLE = 2.0
 # Degrees of freedom of F beyond a homography and beyond [e]x.
 EPIPOLE, BEYOND_TRANSLATION = 2, 5
-# Probability to reject a pure translation for normal residuals, and the tolerance added if wrong matches are
-# expected in the band, which attract F.
+# Probability of rejecting a pure translation for normal residuals, and tolerance added if wrong matches are
+# expected in the band, which bias F.
 RISK, ALLOWANCE = 2e-3, 0.4
-# Probability to reject a rotation by its eigenvalues (either side) and by the camera test.
+# Probability of rejecting a rotation by its eigenvalues (two-sided) and by the camera test.
 ROTATION_RISK = 1e-3
 # Matches within this many sigma of a translation are compared with F.
 TRANSLATED = 3.3
@@ -277,7 +277,7 @@ def _translation_ratio(case: _InlierData) -> float:
     degrees = len(near) - 7
     if degrees < MINIMUM - 7:
         return float("inf")
-    # Both models use the same matches; those that F fits best would favour F.
+    # Both models use the same matches: to take those that F fits best would favour F.
     _refine_translation(f, near, np.inf)
     rss_simple = float(np.sum(np.asarray(sampson_distances(f, near)) ** 2))
     rss = min(rss_simple, *(_least_squares(start, near) for start in (case.f, f)))
@@ -342,7 +342,7 @@ def _correct_epipole(e: F64, points: F64) -> None:
                 gradient[i] += J[i] * residual
                 for j in range(3):
                     normal[i, j] += J[i] * J[j]
-        # The length of e has no effect on the distances: e e' holds it.
+        # The length of e has no effect on the distances: e e' fixes it.
         held = normal[0, 0] + normal[1, 1] + normal[2, 2]
         for i in range(3):
             for j in range(3):

@@ -20,7 +20,7 @@ from thesisrecon.records import DegeneracyReport, FundamentalFit
 Method = Literal[
     "locally-optimised", "ransac", "least-median", "gold-standard", "eight-point", "seven-point"
 ]  # fmt: skip
-# Seven matches agree with every F that they give.
+# The solutions of the seven-point algorithm fit their matches exactly.
 MIN_TESTED = 8
 
 
@@ -70,23 +70,23 @@ def estimate_fundamental(
     xy1, xy2 : array_like (N, 2)
         Matched points, N >= 8 (N = 7 for "seven-point"), px.
     method : str
-        With wrong matches: "locally-optimised"
+        For matches with outliers: "locally-optimised"
         (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
-        the thesis) or "least-median". Of all matches: "gold-standard" (least reprojection error, HZ 11.4.1),
-        "eight-point" (normalised) or "seven-point" (up to three solutions).
+        the thesis) or "least-median". For matches without outliers: "gold-standard" (least reprojection
+        error, HZ 11.4.1), "eight-point" (normalised) or "seven-point" (up to three solutions).
     threshold_px : float or None
-        Sampson distance of an inlier during the search of the first two methods. None: all matches are right,
-        and these methods are "gold-standard".
+        Largest Sampson distance of an inlier during the search of the first two methods. None: no outliers;
+        "gold-standard" is used instead of these two.
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from; the same seed gives the same result.
 
     Returns
     -------
     FundamentalEstimate
-        F with x2' F x1 = 0, inliers, noise, covariance, and ``determined`` with its ``reasons``: whether no
-        other F explains the matches as well. The covariance is that of the least Sampson distance at F; that
-        of the linear methods is not smaller. Seven matches leave no residuals: their noise and covariance are
-        NaN, the other solutions are ``competing_models``.
+        F with x2' F x1 = 0, inliers, noise and covariance. ``determined``: no other F explains the matches as
+        well; otherwise ``reasons`` says why. The covariance is that of the minimum of the Sampson distances,
+        a lower bound for the linear methods. For "seven-point" noise and covariance are NaN (there are no
+        residuals), and ``competing_models`` are the other solutions.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def estimate_fundamental(
     elif method not in get_args(Method):
         raise ValueError(unknown_word("method", method, get_args(Method)))
     else:
-        # Imported on use: the default needs none of it.
+        # Imported on use: the default method does not need it.
         from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
 
         if method == "ransac":

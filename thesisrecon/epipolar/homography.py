@@ -39,7 +39,8 @@ class HomographyFit:
     H, covariance : ndarray (3, 3), ndarray (9, 9)
         x2 ~ H x1, unit norm, and the covariance of its entries (row-major), rank 8.
     inliers, sigma_px : ndarray (N,) of bool, float
-        Inliers, and the standard deviation of one image coordinate; NaN, as the covariance, for 4 matches.
+        Inliers, and the standard deviation of one image coordinate; for 4 matches it and the covariance are
+        NaN.
     """
 
     H: F64
@@ -75,7 +76,7 @@ def estimate_homography(
     ValueError
         If the shapes differ or coordinates are not finite.
     StageFailure
-        If there are too few matches or inliers, or they do not determine H, as collinear points.
+        If there are too few matches or inliers, or they do not determine H (collinear points, for example).
 
     Examples
     --------

@@ -32,7 +32,8 @@ PRIOR = (100.0, 5.0)
 EXACT = 1e-9
 # Searches that share the minimum number of samples; one of them draws a sample without outliers.
 SEARCHES = 6
-# Sums of truncated squares of N matches that differ by less than this times sqrt(N) are of one minimum.
+# Two searches end at the same minimum if their sums of truncated squares of N matches differ by less than
+# this times sqrt(N).
 SAME_SCORE = 0.03
 # Prior spread of wrong matches in units of the frame.
 SPREAD = 1.0
@@ -41,12 +42,12 @@ FEW_MATCHES = 28.0
 # Standard deviations that contain nearly all noise.
 COVERED = 3.0
 COMPETING = 3
-# Distances in gates at which noise decides whether a match is inside. Two searches that end in one minimum
-# differ by about the square root of the number of such matches.
+# Range of distances, in gates, in which noise decides whether a match is inside. Two searches that end at the
+# same minimum differ by about the square root of the number of such matches.
 NEAR_GATE = 0.7, 1.3
 # Distances are truncated at this many gates when two F are compared.
 FAR = 20.0
-# Samples of a round among the matches near an F, what is near in gates, and the most rounds.
+# Samples in a round among the matches near an F, limit of these distances in gates, and maximum rounds.
 NEAR_SAMPLES, NEAR_INLIERS, MOST_ROUNDS = 256, 3.0, 10
 # Gate of the second search, and width of the ring beyond the noise that is examined, in gates.
 WIDER, RING = 4.0, 15.0
@@ -61,29 +62,29 @@ class LocallyOptimisedRansac:
 
     A search draws samples until one without outliers is likely; its best F is refined by Levenberg-Marquardt
     on the Sampson distances (5.4) with Huber's loss. Searches are repeated until ``starts`` of them end at
-    the best score: they disagree if a plane or a repeated pattern has many inliers, or if few matches are
-    right. Then each search continues with samples of the matches near its F, an inner RANSAC [2]_.
+    the best score. They disagree if a plane or a repeated pattern has many inliers, or if few matches are
+    correct; each search then continues with samples of the matches near its F, an inner RANSAC [2]_.
 
     The best F is refined once more with a loss fitted to its residuals: a mixture of noise, its heavier tail
     and wrong matches gives the inlier limit and the best width of Huber's loss. If more matches than expected
-    lie just beyond, the noise may exceed the threshold: the search is repeated with a wider gate, and the
-    likelier result is used if it leaves few matches unexplained.
+    lie just beyond that limit, the noise may exceed the threshold: the search is repeated with a wider gate,
+    and its result is used if it is more likely and leaves few matches unexplained.
 
     Parameters
     ----------
     threshold_px : float
-        Sampson distance of an inlier during the search.
+        Largest Sampson distance of an inlier during the search.
     confidence : float
         Probability that one of six searches draws a sample without outliers.
     starts, max_starts : int
         Number of searches that must end at the same score, and maximum number of searches.
     min_samples : int
-        Minimum total of samples over six searches, for any inlier ratio: a wrong F of a dominant plane has
-        many inliers.
+        Minimum number of samples of six searches together. It holds for any inlier ratio, because a wrong F
+        of a dominant plane also has many inliers.
     max_samples : int
-        Maximum number of samples of all searches.
+        Maximum number of samples of all searches together.
     gates : tuple of float
-        Gates of the successive refinements, in thresholds.
+        Residual limits of the successive refinements, in units of ``threshold_px``.
     inlier_sigmas : float
         Maximum residual of an inlier in standard deviations; infinite includes the tail of the noise.
     inlier_floor_px : float
@@ -163,7 +164,7 @@ class LocallyOptimisedRansac:
         return found, samples
 
     def _agree(self, found: list[tuple[float, F64]], points: F64, gate: float) -> bool:
-        """Whether enough searches end at the best score, up to what the matches near the gate decide."""
+        """Whether enough searches end at the best score, within the effect of the matches near the gate."""
         if len(found) < self.starts:
             return False
         best, f = min(found, key=lambda end: end[0])
@@ -222,7 +223,7 @@ class LocallyOptimisedRansac:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Result of the searches with one gate, the noise (None without F), and limit and width of the loss."""
+    """Result of the searches with a gate: ``loss`` are limit and width, ``noise`` is None without an F."""
 
     f: F64
     samples: int
@@ -232,10 +233,10 @@ class _Candidate:
     competing_models: list[F64]
 
     def explains_more_than(self, other: _Candidate) -> bool:
-        """Whether this result of a wider gate is likelier and leaves few matches unexplained.
+        """Whether this result of a wider gate is more likely and leaves few matches unexplained.
 
-        A wide gate finds wrong matrices that many wrong matches are near. It must explain most of the matches
-        that ``other`` rejects, or nearly all.
+        A wide gate accepts wrong F that are near many wrong matches. This F must explain most of the matches
+        that ``other`` rejects, or nearly all matches.
         """
         if self.noise is None or other.noise is None:
             return other.noise is None
@@ -294,7 +295,10 @@ def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float)
 
 
 def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
-    """Refine ``f`` in place with the loss fitted to its residuals; return the noise (None) and the loss."""
+    """Refine ``f`` in place with the loss fitted to its residuals; return the noise and the loss.
+
+    The noise is None if too few residuals are within it.
+    """
     loss = (0.0, 0.0)
     for k in range(NOISE_REFINEMENTS + 1):
         r = np.sort(sampson_distances(f, points))
@@ -319,7 +323,7 @@ def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | N
 
 
 def _noise_exceeds_gate(r: F64, noise: NoiseMixture, gate: float) -> bool:
-    """Whether more residuals (N,) lie just beyond the noise than wrong matches explain."""
+    """Whether more residuals (N,) lie just beyond the noise than are expected of wrong matches."""
     end = COVERED * noise.sigma
     inside = int(np.count_nonzero(r < end))
     beyond = len(r) - inside

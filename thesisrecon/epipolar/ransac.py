@@ -25,7 +25,8 @@ CHI2_1_95, CHI2_2_95 = 3.841458820694124, 5.991464547107979
 MINIMUM = 8
 # Residuals below this are rounding errors, not noise.
 EXACT_PX = 1e-6
-# Matches over which the last rounds take the median; over all matches it grows with the wrong ones.
+# The last rounds take the median over the matches within this many sigma; that of all matches is biased by
+# the wrong ones.
 NEAR_SIGMAS = 2.5
 
 
@@ -58,10 +59,10 @@ INLIER_TESTS = {
 def discard_outliers(
     F: F64, xy1: F64, xy2: F64, *, limit_px: float = np.inf, test: InlierTest = "sampson"
 ) -> tuple[float, B8]:
-    """Noise from the median distance within ``limit_px`` (of at least 8 matches), and the matches that pass.
+    """Return the noise, from the median distance within ``limit_px``, and the matches (N,) that pass.
 
-    sigma = 1.4826 (1 + 5 / (n - 7)) median |d|; the thesis divides by Phi(0.75) where Phi^-1(0.75) is meant.
-    Without a limit sigma is too large if more than half of the matches are wrong.
+    sigma = 1.4826 (1 + 5 / (n - 7)) median |d| over at least 8 matches; the thesis divides by Phi(0.75) where
+    Phi^-1(0.75) is meant. Without a limit sigma is too large if more than half of the matches are wrong.
     """
     distances, ratio, most = INLIER_TESTS[test]
     residuals = np.abs(distances(F, xy1, xy2))
@@ -123,9 +124,10 @@ class ThesisRansac:
     Draw samples of seven, keep the F with the most inliers, estimate sigma from the median distance, discard
     outliers, then refine and discard again ``rounds`` times.
 
-    Departures: matches are tested by the Sampson distance unless ``inlier_test`` selects a test of the text;
-    the search counts inliers within a fixed threshold, since the fraction within a multiple of the median is
-    the same for every F; the refinement uses the orthonormal representation, which reaches every epipole.
+    Differences from the thesis: matches are tested by the Sampson distance unless ``inlier_test`` selects a
+    test of section 5.4; the search counts inliers within a fixed threshold, since the fraction within a
+    multiple of the median is the same for every F; the refinement uses the orthonormal representation, which
+    reaches every epipole.
 
     Parameters
     ----------
@@ -136,7 +138,8 @@ class ThesisRansac:
     stop_inlier_ratio : float
         Inlier ratio at which sampling stops.
     epipolar_distance : bool
-        Refine the distances to epipolar lines (5.6) instead of the Sampson distances (5.4).
+        Minimise the distances to epipolar lines (5.6) in the refinement instead of the Sampson distances
+        (5.4).
     rounds : int
         Rounds of refinement.
     inlier_test : {"sampson", "epipolar-distance", "symmetric-distance"}
@@ -173,9 +176,9 @@ class ThesisRansac:
 class LeastMedianOfSquares:
     """F with the least median squared Sampson distance among random samples of seven (Zhang, IJCV 1998).
 
-    Refined as :class:`ThesisRansac`, sigma from the matches within 2.5 sigma. No threshold is needed, but
-    with more than half of the matches wrong the median belongs to wrong matches. 900 samples contain one
-    without outliers with 99.9 % probability if half of the matches are wrong.
+    It is refined as in :class:`ThesisRansac`, with sigma from the matches within 2.5 sigma. No threshold is
+    needed, but the method fails if more than half of the matches are wrong. If half of them are wrong, 900
+    samples contain one without outliers with probability 99.9 %.
 
     Parameters
     ----------
@@ -208,7 +211,7 @@ def _search_and_refine(
     test: InlierTest = "sampson",
     criterion: Criterion = "sampson",
 ) -> FundamentalFit:
-    """Search with a threshold in pixels, then refine and discard; without a limit sigma sets it."""
+    """Search, then refine and discard outliers; without ``limit_px`` the limit follows from sigma."""
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     frame = PairFrame.of(xy1, xy2)
     points = frame.points(xy1, xy2)

@@ -51,8 +51,8 @@ def refine_fundamental(
     criterion : {"sampson", "epipolar-distance", "reprojection"}
         (5.4), (5.6) or the reprojection error.
     parameters : {"orthonormal", "row", "row-and-column"}
-        The above, or one row (and one column) a combination of the others as in the thesis: 18 (36) maps,
-        which reach the same minimum more slowly.
+        "orthonormal": as above. "row", "row-and-column": one row (and one column) of F is a combination of
+        the others, as in the thesis; its 18 (36) maps reach the same minimum more slowly.
 
     Returns
     -------
@@ -98,9 +98,9 @@ class _RowMap:
     """F = L B R: row ``row`` of F, and optionally column ``column``, are combinations of the others.
 
     L (3, 2) holds the identity and (alpha, beta) in the dependent row: the epipole e2 is (alpha, beta, -1) in
-    that order of coordinates, where the thesis has e1. With a dependent column (Luong and Faugeras, IJCV
-    1996) R (2, 3) does the same for e1, else it is the identity. No map reaches an epipole with a zero in the
-    place of its dependent row: 18 maps (36 with columns) reach every matrix of rank 2.
+    that order of coordinates (the thesis has e1 here). With a dependent column (Luong and Faugeras, IJCV
+    1996) R (2, 3) does the same for e1, else it is the identity. No map represents an epipole whose
+    coordinate of the dependent row is zero: 18 maps (36 with columns) are needed for all matrices of rank 2.
     ``fixed`` is the entry of B, row by row, that is 1.
     """
 

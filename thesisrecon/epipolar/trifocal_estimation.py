@@ -40,7 +40,7 @@ WEAK = 0.4
 # lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls at most 5, which the
 # constraints of the cameras resolve.
 SAME_NOISE, FAMILY = 1.25, 6
-# Points below which no wrong ones are searched for.
+# Minimum number of points for the search for wrong ones.
 _SEARCHED = 12
 NO_POINTS, NO_SEGMENTS = np.zeros((0, 2)), np.zeros((3, 0, 2, 2))
 UNDETERMINED = "the matches do not determine the trifocal tensor"
@@ -57,14 +57,15 @@ class TrifocalFit:
     T : ndarray (3, 3, 3)
         Tensor in pixels, unit norm; its cameras are exact.
     point_residuals_px, line_residuals_px : ndarray (3, N), (3, M, 2)
-        Distances of the points to their reprojections and of the segment ends to the reprojected lines.
+        Distances of the points to their reprojections and of the endpoints to the reprojected lines.
     sigma_px : float
         Noise of one coordinate from all residuals and degrees of freedom.
     covariance : ndarray (27, 27)
         First-order covariance of T, row-major, rank 18.
     relative_std : float
         Largest standard deviation of T in conditioned coordinates, times the root of the number of matches.
-        Near 1 a change of T by its own size moves the images no more than their noise.
+        At values near 1, T is undetermined: changing it by its own size moves the reprojections no more than
+        their noise.
     inliers : ndarray (N,) of bool
         Points that were used; the residuals of the others are NaN.
     """
@@ -90,7 +91,7 @@ def estimate_trifocal(
 ) -> TrifocalFit:
     """Estimate the trifocal tensor from points and lines of three views.
 
-    Minimises Huber's loss of the distances of points to their reprojections and of segment ends to their
+    Minimises Huber's loss of the distances of points to their reprojections and of segment endpoints to the
     reprojected lines: the maximum likelihood for Gaussian noise, tolerant of a few wrong matches. Points that
     contradict the epipolar geometry of a pair of views are left out first.
 
@@ -99,11 +100,12 @@ def estimate_trifocal(
     xy1, xy2, xy3 : array_like (N, 2)
         Matched points of the three views, px.
     segments : ndarray (3, M, 2, 2), optional
-        Ends of matched line segments, px, which need not match between views; 4 N + 2 M >= 26.
+        Endpoints of matched line segments, px; the endpoints need not correspond. 4 N + 2 M >= 26.
     threshold_px : float or None
-        Threshold of the fundamental matrices that find wrong points among 12 or more; None: no search.
+        Threshold of the fundamental matrices by which wrong points are found, from 12 points on; None: no
+        search.
     loss_px : float
-        Turning point of Huber's loss.
+        Residual at which Huber's loss becomes linear.
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from.
 

@@ -24,7 +24,7 @@ TRIPLES = 200
 
 @dataclass(frozen=True)
 class PairVerification:
-    """Keep the matches that agree with F; accept the pair if they are numerous and most of all matches.
+    """Keep the matches that agree with F; accept the pair if their number and their ratio are large enough.
 
     A wrong F on a repetitive facade has about 30 inliers and a small inlier ratio; a right one has more. A
     plane or a pure rotation gives good tracks and an undetermined F: the pair is accepted, and its

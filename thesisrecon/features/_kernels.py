@@ -198,7 +198,7 @@ def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -
 
 @kernel
 def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
-    """Of the indices ``order`` those at least ``distance`` from every corner selected before."""
+    """Select indices in the sequence of ``order``, each at least ``distance`` from all selected before."""
     kept = empty(len(order), np.int64)
     n = 0
     for i in order:

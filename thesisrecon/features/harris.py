@@ -24,7 +24,7 @@ from thesisrecon.records import Features, Image
 NOISE_RESPONSE = 0.05
 # Candidates of a selection, as a multiple of the number selected.
 POOL_RATIO = 1.7
-# Maximum fraction of the pool that one part of the image may fill, relative to an even distribution.
+# Maximum number of candidates in a cell of the image, relative to an even distribution.
 POOL_LIMIT = 1.5
 # Ratio of responses that counts as clearly stronger.
 ROBUSTNESS = 0.9
@@ -177,8 +177,9 @@ class HarrisCorners:
 def select_spread(xy: F64, response: F32, count: int) -> I64:
     """Select corners that cover the image (adaptive non-maximal suppression) [1]_.
 
-    Among the 1.7 ``count`` strongest those farthest from any that is clearly stronger. No sixth of the
-    long side fills the pool beyond ``POOL_LIMIT`` times its part, so that a shaded half still gets corners.
+    Selects, among the 1.7 ``count`` strongest corners, those farthest from any clearly stronger one. A square
+    cell of a sixth of the long side contributes at most ``POOL_LIMIT`` times its even part of these
+    candidates, so that dark parts of the image get corners as well.
 
     Parameters
     ----------
@@ -207,7 +208,7 @@ def select_spread(xy: F64, response: F32, count: int) -> I64:
 
 
 def _shared_pool(xy: F64, pool: int) -> I64:
-    """The first ``pool`` of the corners, with a limit for each part of the image."""
+    """The first ``pool`` of the corners, with a limit for each cell of the image."""
     if len(xy) <= pool:
         return np.arange(len(xy), dtype=np.int64)
     part = np.floor(6.0 * (xy - xy.min(axis=0)) / (float(np.ptp(xy, axis=0).max()) + 1.0)).astype(np.int64)

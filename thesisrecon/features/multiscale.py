@@ -18,7 +18,7 @@ from thesisrecon.records import Features, Image, Seeds
 PATCH_SIDE = 8
 PATCH_VALUES = 32
 """Values of a patch: half of its cosine coefficients, those of low frequency, which a small shift keeps."""
-# Seeds of a simulated view, relative to those of the image on the same area: many views show each place.
+# Density of the seeds of a simulated view relative to that of the image: many views show the same surface.
 OBLIQUE_DENSITY = 0.5
 
 
@@ -37,7 +37,7 @@ class _PyramidLevel:
 
 @dataclass(frozen=True)
 class MultiScaleCorners:
-    """Harris corners at full and half size, with seed patches at five levels of 1/sqrt(2).
+    """Harris corners at full and half size, and seed patches at several levels, each 1/sqrt(2) as large.
 
     Seeds are the multi-scale oriented patches of Brown, Szeliski and Winder (CVPR 2005), each upright and
     rotated to its dominant gradient. Small images are doubled first: the scales of the corners are 1 and 2,
@@ -57,7 +57,7 @@ class MultiScaleCorners:
     upsample_below_px : int
         Long side below which the image is doubled; 0 for never.
     oblique_tilts : tuple of float
-        Compressions of the simulated views that give seeds for pairs with a wide step; () for none.
+        Compressions of the simulated views that give seeds for pairs with a wide baseline; () for none.
     measure : CornerMeasure
         Response and its parameters at every size.
     """
@@ -156,14 +156,14 @@ class MultiScaleCorners:
     def _seeds_of_view(
         self, view: ObliqueView, size: tuple[int, int]
     ) -> list[tuple[F64, F32, F32, F32, F64]]:
-        """Fields of the seeds of each level of one simulated view, the patches as they are."""
+        """Fields of the seeds of each level of one simulated view, with patches that are not normalised."""
         parts, to_image = [], np.linalg.inv(view.to_view)
         grays, scales = _image_pyramid(view.gray, self.levels, doubled=False)
         for index, (gray, scale) in enumerate(zip(grays, scales, strict=True)):
             corners, response = self.measure._find(gray[None])
             xy = (_PyramidLevel(gray[None], gray, scale).to_image(corners) - view.offset) @ to_image.T
             spacing = np.sqrt(np.prod(scale))
-            # Half a patch of the image's own pixels: what lies outside repeats its border.
+            # Half a patch: beyond the border of the image the view repeats border pixels.
             margin = PATCH_SIDE * spacing * np.sqrt(np.linalg.det(to_image))
             inside = ((xy > margin) & (xy < np.array(size) - 1.0 - margin)).all(axis=1)
             corners, response, xy = corners[inside], response[inside], xy[inside]

@@ -18,7 +18,7 @@ from thesisrecon.records import Reconstruction
 CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction
 """Cameras, (K, R, t), cameras by image name, or a metric reconstruction."""
 
-# Pixels this far outside an image, in long sides, show that width and height are swapped or belong elsewhere.
+# Pixels this far outside an image, in long sides, show that the size is wrong, for example height x width.
 _OUTSIDE = 0.1
 
 
@@ -55,7 +55,7 @@ def checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tupl
 
 
 def require_inside(view: I64, xy: F64, sizes: I64) -> None:
-    """``ValueError`` if pixels (K, 2) lie far outside the images (V, 2) of their views."""
+    """Raise ``ValueError`` if pixels (K, 2) lie far outside the images of their views; ``sizes`` (V, 2)."""
     size = sizes[view]
     reach = (np.maximum(-xy, xy - size) / size.max(axis=1, keepdims=True)).max(axis=1)
     if len(reach) and reach.max() > _OUTSIDE:

@@ -15,7 +15,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import sampson_residuals
 
 _PARALLAX_PER_NOISE, _MIN_PARALLAX_PX = 3.0, 0.05
-"""Least displacement that no homography explains (90 % quantile), over the epipolar distances and in px."""
+"""Least parallax (90 % quantile): this multiple of the epipolar distances plus this many px."""
 
 
 def homography_linear(xy1: F64, xy2: F64) -> F64:
@@ -83,9 +83,9 @@ def require_parallax_of_matches(
 
 
 def _homography_residuals(xy1: F64, xy2: F64) -> F64:
-    """Residuals of the homography of most matches: least squares, repeated twice without the worst tenth.
+    """Residuals (N,) of a least-squares homography, fitted twice more without the worst tenth of the matches.
 
-    Four matches always remain.
+    At least four matches remain.
     """
     inliers, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
     for _ in range(3):

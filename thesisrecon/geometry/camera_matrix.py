@@ -311,7 +311,8 @@ def depth(P: F64, X: F64) -> F64:
 def orient_signs(P: F64, X: F64, view: I64, point: I64) -> tuple[F64, F64, float]:
     """Choose signs of cameras and points that make the projective depths w of P X = w (u, v, 1) positive.
 
-    Votes of the neighbours decide, so that a few wrong matches do not spread.
+    Starts from the view with most observations; then the sign of each point and of each camera is that of the
+    majority of its observations, so that a few wrong matches do not spread.
 
     Parameters
     ----------

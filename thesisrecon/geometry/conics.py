@@ -62,9 +62,9 @@ def dual(C: F64) -> F64:
 
 
 def _length_scale(C: F64) -> float:
-    """Size of the coordinates of a conic or quadric [A b; b' c] about the origin, at least 1.
+    """Unit of length, at least 1, in which the blocks of a conic or quadric [A b; b' c] are of similar size.
 
-    In this unit of length its parts are of one size, although it may be far from the origin.
+    It conditions conics and quadrics far from the origin.
     """
     a, b, c = (float(np.linalg.norm(part)) for part in (C[:-1, :-1], C[:-1, -1], C[-1, -1]))
     return max(1.0, b / a, math.sqrt(c / a)) if a > 1e-15 * max(b, c) else 1.0

@@ -16,7 +16,7 @@ from thesisrecon.geometry.polynomial_triangulation import correct_matches
 
 _SKEW = cross_matrix(np.array([0.31, 0.17, 0.53]))
 _TURN = np.linalg.solve(np.eye(3) - _SKEW, np.eye(3) + _SKEW)
-"""A rotation without symmetry, whose rows are no epipoles of common camera positions."""
+"""A rotation without symmetry: its rows are not the epipoles of usual camera positions."""
 
 
 def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
@@ -137,8 +137,8 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
     """Return the unit epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
 
     e2 is orthogonal to the left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones; least
-    squares for a noisy T. The T_i are those of turned coordinates of view 1: T_i has rank 1, and a plane of
-    null vectors, if the i-th unit point of view 1 is an epipole, as in images rectified to each other.
+    squares for a noisy T. The coordinates of view 1 are rotated first, because T_i has rank 1 (a plane of
+    null vectors) if the i-th unit vector of view 1 is an epipole, as in rectified images.
 
     Parameters
     ----------

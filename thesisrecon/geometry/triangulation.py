@@ -254,7 +254,7 @@ def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: i
 
 
 def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: int) -> F64:
-    """Return the largest angle between a point's rays and the ray of its first observation.
+    """Return for each point the largest angle between one of its rays and the ray of its first observation.
 
     Parameters
     ----------
@@ -303,8 +303,8 @@ def _listed(xy: F64) -> _SortedPixels:
 def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
     """Linear method (6.3.1): least sum of squares of u p3'X - p1'X and v p3'X - p2'X over unit X.
 
-    The rows of a view are divided by the norm of M's first two, with the pixel origin in the middle of the
-    view's points: in a metric frame the focal length. ``passes`` > 0: Iterative-LS.
+    The rows of a view are divided by the norm of the first two rows of M (in a metric frame the focal
+    length), with the pixel origin in the middle of the view's points. ``passes`` > 0: Iterative-LS.
     """
     start, view, xy = listed
     P = np.ascontiguousarray(P, dtype=np.float64)

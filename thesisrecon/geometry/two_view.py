@@ -230,8 +230,8 @@ def quasi_euclidean_planes(F: F64) -> F64:
     """Return the two v that make the left part of P2 (:func:`canonical_cameras`) nearest to a rotation.
 
     v = +-(s1 + s2) / 2 e1 with the singular values s1 >= s2 of F gives the left part the singular values s1,
-    (s1 + s2) / 2, s2. With a calibration near the identity v is near the plane at infinity. The two differ by
-    half a turn about the baseline; only matches decide.
+    (s1 + s2) / 2, s2. With a calibration near the identity v is near the plane at infinity. The two solutions
+    differ by a rotation of 180 degrees about the baseline; only matches decide between them.
 
     Parameters
     ----------
