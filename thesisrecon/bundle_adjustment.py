@@ -37,8 +37,8 @@ _MAX_BEHIND = 0.5
 class BundleAdjustment:
     """Refined cameras and points with their uncertainty.
 
-    The gauge of all covariances is fixed by inner constraints (free network): among the solutions that differ
-    by a similarity, the one that moves the cameras least. They contain the uncertainty of all other unknowns.
+    All covariances are those of the inner gauge (free network adjustment): among the solutions that differ by
+    a similarity, the one that moves the cameras least. They contain the uncertainty of all other unknowns.
 
     Parameters
     ----------

@@ -29,10 +29,9 @@ from thesisrecon.matching._prepared import (
 from thesisrecon.numerics._small_solvers import solve_damped
 from thesisrecon.records import Matches
 
-# The kernels below are called for every window and step, so they are inlined.
 WIDE = SIDE + 2
 HALF = SIDE // 2
-# Below this correlation the windows show different things and the iteration does not converge.
+# Below this correlation the windows show different surfaces and the iteration does not converge.
 MIN_WINDOW_CORRELATION = 0.3
 # Minimum det / product of the diagonal of the normal matrix: structure in one direction gives no position.
 MIN_CONDITION = 1e-4
@@ -109,6 +108,7 @@ def _align_windows(
     return xy2, affine, score
 
 
+# Inlined, as the next two kernels: they are called for every window or step.
 @kernel(forceinline=True)
 def _read_template(
     pixels: F32,

@@ -222,7 +222,7 @@ def empty_matches(pair: tuple[int, int]) -> Matches:
 
 
 def one_to_one(index: I64, score: F32) -> I64:
-    """Rows, sorted, of the best ``score`` for each corner of image 2; ``index`` (N,) claims it, -1: none."""
+    """Rows, sorted, of the best ``score`` of each corner of image 2, given by ``index`` (N,); -1: none."""
     rows = np.flatnonzero(index >= 0)
     rows = rows[np.lexsort((rows, -score[rows]))]
     return np.sort(rows[np.unique(index[rows], return_index=True)[1]])

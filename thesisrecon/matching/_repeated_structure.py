@@ -1,4 +1,4 @@
-"""Pairs of places that look alike: few matches between views that are far apart by the strong pairs."""
+"""Rejection of pairs that match repeated structure: few matches between views that show different places."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.records import TwoView
 
 MANY_VIEWS = 40
-"""Fewer views have few pairs, none of which is redundant."""
+"""Up to this number of views no pair is rejected: few pairs are redundant then."""
 STRONG = 0.1
 """A pair is strong if it has this fraction of the matches, or common points, of the best pair of one of its
 views."""
 MAX_STEPS = 5
-"""Strong pairs that connect the views of a weak one at most, if both show one place."""
+"""Maximum number of strong pairs on the shortest path between two views of the same place."""
 
 
 def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[TwoView]:
-    """Reject weak pairs whose views many strong pairs separate.
+    """Reject weak pairs whose views are connected only by long paths of strong pairs.
 
-    Views with a common part are connected through views between them, which share more with both. The same
-    windows on two houses give few matches, and the houses are far apart. Weak pairs that connect groups of
-    strongly connected views stay: nothing else relates these.
+    Views that overlap are connected by a short path of strong pairs through the views between them. Equal
+    windows of two houses give few matches between views that only a long path connects. Weak pairs between
+    groups that no strong pair connects stay, because nothing else relates these groups.
     """
     accepted = [pair for pair in pairs if pair.accepted]
     if n_views <= MANY_VIEWS or not accepted:
@@ -54,7 +54,7 @@ def strong_pairs(i: I64, j: I64, count: I64 | F64, n_views: int) -> B8:
 
 
 def _steps_within(graph: scipy.sparse.csr_array, start: np.ndarray, steps: int) -> np.ndarray:
-    """Views (M, 2) that at most so many edges connect, of those that begin at ``start``."""
+    """Pairs of views (M, 2), the first one from ``start``, that at most ``steps`` edges connect."""
     reached = scipy.sparse.csr_array((np.ones(len(start)), (start, start)), (graph.shape[0], graph.shape[0]))
     for _ in range(steps):
         reached = reached + reached @ graph

@@ -167,8 +167,8 @@ def seed_matches(
 ) -> Iterator[SeedSet]:
     """Sets of matched seeds: one of each orientation, or one of all if there are simulated oblique views.
 
-    These are matched with the other image itself: compressing one of two images makes any two views of a
-    plane alike but for a similarity.
+    Simulated views of one image are matched with the other image itself: if one of two views of a plane is
+    compressed suitably, they differ only by a similarity.
     """
     seeds1, seeds2 = features1.seeds, features2.seeds
     assert seeds1 is not None
@@ -240,9 +240,9 @@ def map_support(matches: Matches) -> F64:
 
 @kernel
 def _agreement(here: F64, there: F64, maps: F64, neighbours: int) -> F64:
-    """Number (M,) of the nearest neighbours, in part, that are where the ``maps`` (M, 2, 2) lead.
+    """Number (M,) of the nearest neighbours that are where the ``maps`` (M, 2, 2) predict them, weighted.
 
-    One map (1, 2, 2) is that of all.
+    A single map (1, 2, 2) is used for all matches.
     """
     support = zeros(len(here))
     near = nearest_neighbours(here, here, min(neighbours + 1, len(here)))

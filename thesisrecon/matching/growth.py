@@ -41,13 +41,14 @@ MIN_FOR_F = 8
 MIN_SUPPORT, MIN_SEEDS = 2.0, 12
 # The same of seeds whose maps are affine.
 MIN_MAP_SUPPORT = 1.0
-# Number of supported seeds that agree at which all seeds are not tried: weak pairs gain by the second trial.
+# Number of agreeing supported seeds from which the second trial, with all seeds, is omitted: it helps weak
+# pairs only.
 DECIDING_SEEDS = 100
 # Maximum search radius around a prediction relative to the long side, and minimum correlation there.
 RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
-# Pairs with a wide step have few seeds, whose maps are known to a fifth and positions to a few pixels.
+# Pairs with a wide baseline have few seeds: their maps are accurate to 20 %, their positions to a few pixels.
 OBLIQUE_NEIGHBOURS, SEED_AFFINE_STD, GROWN_AFFINE_STD, SEED_SHIFT = 3, 0.2, 0.1, 5.0
-# Share of the corners of image 1 whose matches are dense enough not to match these again.
+# Fraction of the corners of image 1 above which matched corners are not matched again.
 EXPLAINED = 1.0 / 3.0
 # Rounds of least squares of a local map: the first unweighted, the others reweighted.
 ROUNDS = 3
@@ -283,7 +284,7 @@ def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> 
 
 @dataclass(frozen=True)
 class SeedsAndGrowth:
-    """Seeds give F; F and local affine maps of known matches guide the search for each corner (4.2.2).
+    """Matching by seeds, then guided by their F and by local affine maps of known matches (4.2.2).
 
     Parameters
     ----------
@@ -297,11 +298,12 @@ class SeedsAndGrowth:
     affine_std : float
         Prior standard deviation of an affine coefficient in the alignment.
     orientation : {"auto", "upright", "rotated"}
-        Seeds by upright patches, by patches rotated to their gradient, or the latter too if the upright ones
-        do not relate the pair well.
+        Patches of the seeds: upright, rotated to their dominant gradient, or upright first and rotated if
+        few upright ones agree with one F.
     support : {"auto", "always", "never"}
-        "always": estimate F from the seeds whose neighbours move alike; "never": from all seeds; "auto": from
-        the former, and also from all if few of them or fewer than half agree; the F with more inliers counts.
+        "always": estimate F from the seeds whose neighbours have similar displacements; "never": from all
+        seeds; "auto": from the former, and also from all seeds if few of the former or fewer than half agree;
+        the F with more inliers is used.
     growth : bool
         Match all corners by guided search, else only corners at seeds.
     coarse_first : bool
@@ -312,12 +314,12 @@ class SeedsAndGrowth:
     align : bool
         Align positions in image 2 by least-squares matching, else keep the corners.
     many_images : int
-        Number of images above which pairs are first matched with fewer corners and seeds, since more images
-        show each place, and with all only if these give few matches or the images form a long row.
+        Number of images above which pairs are first matched with fewer corners and seeds, since many images
+        show each point, and with all only if these give few matches or the images form a long sequence.
     many_share : float
         Share of the corners and seeds that are matched first.
     oblique_pairs : int
-        Number of pairs that each image outside the largest group of matched images is tried in again, with
+        Number of pairs of each image outside the largest group of matched images that are matched again with
         seeds of simulated oblique views; 0 for none.
     """
 
@@ -384,7 +386,7 @@ class SeedsAndGrowth:
     def _verified_seeds(
         self, sets: Iterable[SeedSet], estimate: EstimateFundamental, rng: np.random.Generator
     ) -> tuple[Matches, F64] | None:
-        """Most seeds that agree with one F, and F; later sets only if the earlier ones agree little."""
+        """The largest set of seeds that agree with one F, and F; tries later sets only if few agree."""
         best: tuple[Matches, F64] | None = None
         most = 0
         for seeds, support in sets:
@@ -418,7 +420,7 @@ class SeedsAndGrowth:
         estimate: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match corners near few seeds, whose maps count: align them, then the matches of a first pass."""
+        """Match corners near few seeds: align the seeds and their maps, then the matches of a first pass."""
         known, F = start
         near = replace(self, neighbours=min(self.neighbours, OBLIQUE_NEIGHBOURS))
         scale = np.full(len(known.xy1), view1.features.scale.max(), np.float32)
@@ -441,9 +443,9 @@ class SeedsAndGrowth:
         estimate: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match the corners of the coarser scale, then all twice, guided by the previous matches.
+        """Match the corners of the coarser scale, then all corners twice, guided by the previous matches.
 
-        If the first time matches enough, only the other corners are matched again.
+        If the first pass over all corners matches enough, the second one is restricted to the other corners.
         """
         scale = view1.features.scale
         everything = np.arange(len(scale))

@@ -170,8 +170,9 @@ class OverlapEstimate:
     nearest : int
         Pairs of each image that are always taken.
     most, spread : int
-        Number of pairs taken for each image, the best of those with enough evidence, and number taken evenly
-        from the rest: wider steps, so that many images from nearly one place do not keep to themselves.
+        Numbers of pairs taken for each image among those with enough evidence: the best ones, and further
+        ones evenly from the rest. The latter have wider baselines, so that many images from nearly the same
+        place are also connected with others.
     shortlist : int
         Number of images that each is compared with.
     words : int
@@ -210,7 +211,7 @@ class OverlapEstimate:
             compared = _most_similar(words, self.shortlist)
         evidence = np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), compared.tolist()))
         rank, enough = _ranks(compared, evidence, n), evidence >= self.min_evidence
-        # Of the further pairs of an image, those at which the number that is due grows.
+        # The further pairs of an image are taken at equal steps of the rank.
         further = np.bincount(compared[enough].ravel(), minlength=n)[compared.T] - self.most
         steps = [(rank - self.most + k) * self.spread // np.maximum(further, 1) for k in (0, 1)]
         taken = (rank < self.most) | (steps[1] > steps[0])
@@ -259,8 +260,8 @@ def _ranks(pairs: I64, value: F64, n: int) -> I64:
 def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: scipy.sparse.csr_array) -> I64:
     """Pairs (M, 2) that connect the groups of the ``chosen``: of most evidence, else of most similar words.
 
-    The edges that a maximum spanning tree of the compared pairs adds to the chosen ones if these cost
-    nothing; groups without a compared pair are joined by their most similar images, the smallest first.
+    They are the edges of a maximum spanning tree of the compared pairs that contains the chosen pairs first.
+    Groups without a compared pair are joined by their most similar images, the smallest group first.
     """
     n, m = words.shape[0], len(compared)
     cost = np.empty(m)
@@ -387,8 +388,8 @@ def _word_weights(
     """Weighted word counts (N, W) of images with unit patches (S, D); products of the rows are cosines.
 
     A word is weighted by how few images contain it, and square roots of the counts limit the effect of
-    repeated structure. Words must be many: if each image contains most of them, all places look alike. The
-    transpose is the inverted file: the images of each word.
+    repeated structure. The vocabulary must be large: if each image contains most words, all images are
+    similar. The transpose is the inverted file: the images of each word.
     """
     everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
     if not len(everything):
@@ -409,7 +410,7 @@ _Vocabulary = tuple[F32, F32]
 
 
 def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Generator) -> _Vocabulary:
-    """A tree of two levels with about so many words (D. Nister and H. Stewenius, CVPR 2006)."""
+    """A tree of two levels with about ``words`` words (D. Nister and H. Stewenius, CVPR 2006)."""
     branches = max(int(np.sqrt(words)), 1)
     sample = patches[rng.permutation(len(patches))[: SAMPLES_PER_WORD * branches**2]]
     top = _centres(sample, branches)
@@ -424,7 +425,7 @@ def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Gen
 
 
 def _centres(sample: F32, count: int) -> F32:
-    """Centres (at most ``count``, D) of spherical k-means; the first rows begin."""
+    """Centres (at most ``count``, D) of spherical k-means, initialised by the first rows."""
     centres = sample[:count]
     for _ in range(ROUNDS):
         nearest = np.argmax(sample @ centres.T, axis=1)

@@ -20,7 +20,7 @@ from thesisrecon.numerics._observations import cached_pair_order
 from thesisrecon.records import Matches, Tracks, TwoView
 
 MERGE_PX = 1.0
-"""Default distance of positions that are one corner: the noise of positions that differ from pair to pair."""
+"""Default distance up to which positions become one corner: their noise from pair to pair."""
 BATCH = 256
 """Groups of observations that one thread aligns at a time."""
 Pair = TypeVar("Pair", Matches, TwoView)
@@ -202,8 +202,8 @@ class PlainTracks:
     Parameters
     ----------
     merge_px : float
-        Distance of positions of one view that are one corner (matches without corners only), px at working
-        size.
+        Distance up to which positions of one view become one corner, px at working size; used only for
+        matches without corners.
     """
 
     merge_px: float = MERGE_PX
@@ -229,8 +229,8 @@ class PlainTracks:
 class AlignedTracks:
     """Tracks whose observations are aligned by least squares with the window of their middle view.
 
-    The middle view of a track has most direct matches in it; local maps to the other views are chained along
-    the matches. Matches without corners, and views that another matcher has prepared, give
+    The middle view of a track is the one with most matches in it; local maps to the other views are chained
+    along the matches. Matches without corners, and views that another matcher has prepared, give
     :class:`PlainTracks`.
     """
 
@@ -295,8 +295,8 @@ def corners_from_matches(
     """Number the positions of matches that have no corners, as matchers without a detector give them.
 
     Positions of one view that are equal or within ``merge_px`` of a common centre become one corner, at their
-    mean. Centres are at least ``merge_px`` apart, positions of many matches first, so that chains of near
-    positions do not join.
+    mean. Centres are at least ``merge_px`` apart and are chosen first where many matches have their position,
+    so that chains of close positions do not merge.
 
     Parameters
     ----------

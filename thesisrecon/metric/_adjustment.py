@@ -1,4 +1,4 @@
-"""Bundle adjustment of a metric estimate under its prior, with noise and loss measured on the residuals."""
+"""Bundle adjustment of a metric estimate under its prior; noise and loss are estimated from the residuals."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from thesisrecon.numerics._observations import Observations
 
 MIN_OBSERVATIONS = 40
 MAX_LOSS_SIGMAS = 20.0
-"""Huber widths above this many sigmas are least squares."""
+"""For a larger width of Huber's loss, in sigmas, least squares is used."""
 RAYLEIGH_90 = 2.1460
 """90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
 LITTLE_DAMPING = 1e-8
-"""Long rows of many views bend against little resistance: stronger damping would hold them as they are."""
+"""Long image sequences have bending modes of low curvature: stronger damping would keep their drift."""
 SETTLED, ROUND_SETTLED = 1e-5, 1e-3
 """Predicted gain of the cameras, half a squared distance in standard deviations, at which an adjustment ends;
 larger if the observations are chosen again after it."""
@@ -43,8 +43,8 @@ class BundleAdjustment:
     """Settings of the bundle adjustments of one metric stage.
 
     ``lens_std`` is the prior standard deviation of k2 and k3 about 0 (0 fixes them), ``noise_floor_px`` the
-    lower bound of the measured noise, ``inflation`` a factor on the noise in the weights, for correlated
-    residuals. ``threads`` share the work.
+    lower bound of the estimated noise, ``inflation`` a factor on the noise in the weights, for correlated
+    residuals. The result does not depend on ``threads``.
     """
 
     prior: IntrinsicsPrior
@@ -126,7 +126,7 @@ class BundleAdjustment:
         return model, result
 
     def scatter(self, model: MetricEstimate) -> BlockScatter:
-        """Covariance of the cameras, and how far blocks of the scene disagree about them."""
+        """Covariance of the cameras, and the scatter of their estimates between blocks of the scene."""
         return block_scatter(
             model.cameras,
             model.X,

@@ -1,8 +1,8 @@
-"""A richer camera model where the images contradict the shared one.
+"""A richer camera model (intrinsics per image) where the images contradict shared intrinsics.
 
 Optical stabilisation and crops move the principal point, focus and zoom change the focal length. Shared
-values that the images contradict become values of each image, and the richer model is kept if it predicts
-observations far better that neither model was adjusted to.
+values that the images contradict are replaced by one value per image. The richer model is kept if it predicts
+held-out observations far better.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows
 from thesisrecon.numerics._block_scatter import point_blocks
 
 FOLDS = 5
-"""One of so many blocks of the scene is held out in each view."""
+"""In each view one of this number of blocks of the scene is held out."""
 MIN_HELD_OUT = 30
 MAX_REMAINING = 0.25
-"""Share of the cost of held-out observations that a richer model may leave to be adopted."""
+"""Largest cost of held-out observations of a richer model that is adopted, relative to the simple one."""
 ITERATIONS = 25
 MAX_CHANGE = 0.05
-"""Relative change of centres and focal lengths up to which a model is right although it is too simple."""
+"""Relative change of centres and focal lengths up to which the simpler model is accurate enough."""
 
 RICHER: tuple[tuple[int, ...], ...] = (CENTRE, (FOCAL,), (FOCAL, *CENTRE))
-"""Columns of intrinsics with values of each image, from the simplest model on."""
+"""Columns of intrinsics with one value per image, from the simplest model on."""
 
 
 def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[int, ...]]:
@@ -46,7 +46,7 @@ def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[in
 def with_own_values(
     model: MetricEstimate, adjustment: BundleAdjustment, columns: tuple[int, ...]
 ) -> tuple[MetricEstimate, BundleAdjustment]:
-    """The model with values of each image in some columns of the intrinsics, without hierarchical prior."""
+    """The model with one value per image in some columns of the intrinsics, without hierarchical prior."""
     shared = adjustment.prior.shared.copy()
     shared[:, columns] = np.arange(len(shared))[:, None]
     prior = replace(adjustment.prior, shared=shared)
@@ -116,10 +116,10 @@ def differences_of_images(model: MetricEstimate, columns: tuple[int, ...]) -> st
 
 @dataclass(frozen=True)
 class CameraDifferences:
-    """How much two camera models change the cameras.
+    """Largest differences of the cameras between two camera models.
 
-    The largest one of the ``centre``, relative to the RMS radius of the camera path, of the ``focal``,
-    relative, and of the ``principal_point`` over the focal length.
+    ``centre`` relative to the RMS radius of the camera path, ``focal`` relative, ``principal_point`` over the
+    focal length.
     """
 
     centre: float
@@ -128,7 +128,7 @@ class CameraDifferences:
 
     @property
     def harmless(self) -> bool:
-        """Whether the cameras hardly depend on the camera model."""
+        """Whether centres and focal lengths hardly depend on the camera model."""
         return max(self.centre, self.focal) < MAX_CHANGE
 
 

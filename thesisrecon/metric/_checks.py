@@ -1,7 +1,7 @@
 """The self-check of a metric result: numbers per view and for the whole, and a sentence for each failure.
 
-Averages hide a wrong camera, so each view is also measured alone. Sentences name images as ``#number``; the
-pipeline replaces it by the file name.
+Averages hide a wrong camera, so each view is also checked on its own. Sentences name images as ``#number``,
+which the pipeline replaces by the file name.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ OWN = 2
 MAX_OBSERVATIONS = 1500
 MIN_OBSERVATIONS = 30
 MIN_BASELINE_RATIO = 2e-3
-"""Baseline over distance to the scene; views nearer together have no usable parallax."""
+"""Baseline over distance to the scene below which two views have no usable parallax."""
 MIN_REDUNDANCY = 0.1
-"""Coordinates with a smaller share of their variance left in the residual do not measure the noise."""
+"""Residuals that keep a smaller fraction of the variance of their coordinate are not used for the noise."""
 _FOCAL_RANGE = (0.2, 20.0)
 _MAX_FOCAL_STD = 0.15
 _MIN_MODEL_INLIER_RATIO = 0.6
@@ -42,8 +42,8 @@ _MAX_FOCAL_CHANGE = 0.25
 MIN_INLIER_RATIO = 0.5
 """Inlier ratio of a view, wrong matches included."""
 MIN_CONFIRMED_RATIO = 0.6
-"""The same for points that others determine: correct cameras reach 0.9 (of blurred phone
-images 0.63), wrong ones stay below 0.5."""
+"""The same for points that other views determine. Correct cameras reach 0.9 (0.63 in blurred phone images),
+wrong ones stay below 0.5."""
 MAX_BEHIND = 0.05
 MAX_NOISE_RATIO = 3.0
 MAX_OWN_FOCAL = 0.03
@@ -89,7 +89,7 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     # Points that are inliers in two or more other views.
     count = np.bincount(t.point_index[agree], minlength=t.n_points)
     fixed = count[t.point_index] - agree >= 2
-    # Wrong matches of two views meet behind them as often as before them.
+    # Points of wrong two-view matches lie behind the views as often as in front of them.
     known = near & fixed & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
     _, depth = reproject_observations(model, t.view_index, t.point_index)
     rows = rows_of_views(t.view_index, n)
@@ -185,7 +185,7 @@ def self_check(
 ) -> tuple[dict[str, float], list[str], list[str]]:
     """Check a metric model: numbers, sentences for failed checks (none: trusted), limitations (chapter 7).
 
-    A limitation is what the camera model does not describe although the cameras are right.
+    A limitation is a deviation of the images from the camera model that leaves the cameras right.
     ``intervals`` are the intrinsics of each view as in ``MetricResult``; ``sigmas`` is the gate of inliers.
     """
     views = np.flatnonzero(model.registered).tolist()
@@ -258,7 +258,7 @@ def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str
         )
     limitations = []
     if len(noisy := take(views.noise_ratio > MAX_NOISE_RATIO)):
-        # Blur and moving scenes are noise too; a wrong camera loses matches or asks for another focal.
+        # Blur and motion cause noise as well; a wrong camera loses matches or needs another focal length.
         ratio = views.noise_ratio[noisy].max()
         limitations.append(
             f"{_named(noisy)}: reprojection noise is {ratio:.1f} times that of the other images, as with "

@@ -22,12 +22,13 @@ EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0
 MIN_ANGLE = float(np.radians(0.05))
 """Smallest triangulation angle of a point."""
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
-"""Of more observations, points are chosen for adjustment until each view has its part of this number; of more
-views, until each has the numbers below. A view is divided into ``CELLS`` along each side."""
+"""Larger sets are adjusted on a selection of points: more than ``MAX_OBSERVATIONS`` are divided evenly among
+the views; of more than ``MANY_VIEWS`` each view gets the numbers below. A view has ``CELLS`` along a side."""
 LONG_PER_VIEW, PRECISE_PER_VIEW = 1000, 500
-"""Observations of each of many views: of long tracks while the model grows, then of the most precise ones."""
+"""Observations per view of large sets: of the longest tracks while views are added, then of the most precise
+points."""
 PRIOR_RESIDUALS = 6
-"""Residuals of a point that its prior noise counts as."""
+"""Weight of the prior in the noise of a point, as a number of residuals."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,10 @@ def seen_views(tracks: Tracks) -> int:
 
 
 def with_enough_points(model: MetricEstimate) -> MetricEstimate:
-    """The model with points that constrain every view, spread over its image: known ones first, then long
-    tracks.
+    """The model with a selection of points that cover every image: known points first, then long tracks.
 
-    All points up to ``MAX_OBSERVATIONS`` of at most ``MANY_VIEWS``; of more, the rest adds little to the
-    precision of the cameras.
+    Up to ``MAX_OBSERVATIONS`` and ``MANY_VIEWS`` all points are used; beyond, the others would add little to
+    the precision of the cameras.
     """
     if len(model.tracks.xy) <= MAX_OBSERVATIONS and seen_views(model.tracks) <= MANY_VIEWS:
         return model
@@ -85,10 +85,10 @@ def with_enough_points(model: MetricEstimate) -> MetricEstimate:
 
 
 def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
-    """Choose among the points of all ``tracks`` those of the least residuals first; return their numbers.
+    """Select among the points of all ``tracks`` those of the least residuals first; return their numbers too.
 
-    Where the surface has relief, a corner is not one point of it: what is seen of a joint or an edge changes
-    with the direction. That is less than the noise, but the same in every view, and bends long rows of views.
+    On a surface with relief a corner is not a fixed point: its position changes with the viewing direction.
+    This error is smaller than the noise, but systematic, and bends long sequences of views.
     """
     model = with_tracks(model, tracks)
     t, variance = model.tracks, model.sigma_px**2
@@ -99,7 +99,7 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
     squared = np.minimum(squared, (LATE_SIGMAS * model.gate_px) ** 2)
     total = np.bincount(point, squared, minlength=t.n_points)
     count = np.bincount(point, minlength=t.n_points)
-    # The mean of the variance under an inverse gamma prior at that of all points, which holds short tracks.
+    # Posterior mean of the variance; the inverse gamma prior is that of all points and limits short tracks.
     noise = (total + PRIOR_RESIDUALS * variance) / np.maximum(2 * count - 3 + PRIOR_RESIDUALS, 1)
     order = np.argsort(np.where(model.valid, noise, np.inf), kind="stable")
     points = _select_spread_points(model, order, PRECISE_PER_VIEW)
@@ -107,9 +107,9 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
 
 
 def _select_spread_points(model: MetricEstimate, order: I64, per_view: int) -> I64:
-    """Points, tried in ``order``, until every view has enough of them, spread over its image.
+    """Select points in the sequence of ``order`` until every view has enough of them in each cell.
 
-    ``per_view`` is the number that each of many views needs.
+    ``per_view`` is the number of points per view if there are more than ``MANY_VIEWS``.
     """
     t = model.tracks
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
@@ -126,7 +126,7 @@ def _select_spread_points(model: MetricEstimate, order: I64, per_view: int) -> I
 
 @kernel
 def choose_points(order: I64, start: I64, cell: I64, needed: I64, keep: B8) -> None:
-    """Mark points that half of their cells need; point j has those of start[j] <= k < start[j + 1]."""
+    """Mark each point that at least half of its cells need, cell[k] with start[j] <= k < start[j + 1]."""
     for j in order:
         missing = 0
         for k in range(start[j], start[j + 1]):

@@ -29,18 +29,18 @@ from thesisrecon.numerics._partial_bundle import refine_pose
 ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 """Factors tried on the focal length of a camera that shares it with no registered view."""
 WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
-"""k1 is free from the start: without it gates would have to admit wrong points."""
+"""k1 is free from the start: with k1 fixed, gates wide enough for right points would accept wrong ones."""
 MIN_POINTS = 15
 """Points of the model that a missing camera must see."""
 MIN_SHARE = 0.2
-"""Share of its points that the model should have before one of many views joins: views of other places with
-the same windows wait until the model has reached them."""
+"""In large sets, views with a smaller fraction of their points in the model are registered last: they may
+show another place with repeated structure."""
 MAX_ROUNDS = 6
 MIN_GAIN = 0.003
 """Increase of the inlier ratio below which the rounds end."""
 MIN_INLIER_RATIO = 0.5
 GLOBAL_GROWTH, ITERATIONS = 1.2, 12
-"""Of more than ``MANY_VIEWS`` views, everything is adjusted after this growth of the number of cameras."""
+"""For more than ``MANY_VIEWS`` views, everything is adjusted when the number of cameras has grown by this."""
 
 
 def _pose_and_focal(
@@ -70,7 +70,7 @@ def _pose_and_focal(
 def register_missing_cameras(
     model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator
 ) -> tuple[MetricEstimate, dict[int, str]]:
-    """Register missing and contradicting cameras; return the model, and view -> reason where that failed."""
+    """Register missing and inconsistent cameras; return the model, and the reason of each view that failed."""
     model, rejected = _grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
     suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)
     if suspects.any() and (model.registered & ~suspects).sum() >= 3:

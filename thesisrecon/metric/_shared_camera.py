@@ -1,8 +1,9 @@
 """Tests of shared intrinsics and given focal lengths against the images.
 
-Small zoom differences and crops deform a model quietly. The model is adjusted again with own values per view:
-twice the decrease in cost is chi-square under the hypothesis of one camera (likelihood ratio). If own focal
-lengths stay undetermined, the test cannot decide and the interval is widened.
+Small zoom differences and crops deform a model without large residuals. The model is adjusted again with one
+value per view: twice the decrease in cost is chi-square under the hypothesis of one camera (likelihood
+ratio). If the focal lengths of single views are undetermined, the test cannot decide and the interval is
+widened.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ CENTRE_STD = 0.1
 """Prior of free principal points in long sides; images may be crops."""
 MAX_OBSERVATIONS = 15000
 MAX_VIEWS, RUN = 200, 20
-"""Of more views, runs of neighbours are tested: 15,000 observations are too few for all."""
+"""Maximum number of views tested, and length of the runs of neighbours that are chosen from more views:
+15,000 observations are too few for all."""
 ITERATIONS = 30
-"""A deformed model lies in a long valley of the cost: a dozen iterations do not suffice."""
+"""A deformed model is in a long valley of the cost, where a dozen iterations do not suffice."""
 FALSE_ALARM_RATE = 1e-3
 STD_FLOOR = 2e-3
 """Floor of the relative standard deviation of an own focal."""
@@ -103,12 +105,13 @@ def _adjust_per_view(
 
 @dataclass(frozen=True)
 class SharedCameraTest:
-    """Contradictions of shared values, with advice, and sentences on sets of views that cannot be tested.
+    """Result of the test of shared intrinsics.
 
-    ``focal_std`` (V,) is the relative standard deviation of focal lengths whose sharing cannot be tested, NaN
-    elsewhere; ``contradicted`` (8,) are the intrinsics that differ from view to view. ``misfit`` is the
-    decrease in cost by own focal lengths per degree of freedom, 1 for noise alone, if they differ by harmless
-    amounts but more than by chance; else 1.
+    ``found`` are contradictions, each with advice; ``warnings`` are on sets of views that cannot be tested,
+    and ``focal_std`` (V,) is the relative standard deviation of their focal lengths, NaN elsewhere.
+    ``contradicted`` (8,) are the intrinsics that differ between views. ``misfit`` is chi-square per degree of
+    freedom of the shared focal lengths if those of single views differ by more than chance but only by
+    harmless amounts, else 1.
     """
 
     found: tuple[tuple[str, str], ...]
@@ -187,7 +190,7 @@ def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, colum
 def _decrease_beyond_chance(
     before: MetricBundleResult, after: MetricBundleResult, sets: list[_SharedGroup], values: int
 ) -> float:
-    """Decrease in cost by own values, chi-square per degree of freedom; 0 if it may be chance."""
+    """Decrease in cost by one value per view, chi-square per degree of freedom; 0 if it may be chance."""
     saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
     freedom = values * sum(s.degrees_of_freedom for s in sets)
     return saved / freedom if saved > scipy.special.chdtri(freedom, FALSE_ALARM_RATE) else 0.0
@@ -284,7 +287,7 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustmen
 def inconsistent_principal_point(
     model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter
 ) -> list[str]:
-    """Detect a deformed model: a moved principal point with blocks that disagree, unlike those of crops."""
+    """Detect a deformed model: a moved principal point and blocks that disagree (those of crops agree)."""
     views = np.flatnonzero(model.registered)
     if scatter.blocks < MIN_BLOCKS or not scatter.overdispersion > MAX_OVERDISPERSION:
         return []

@@ -1,13 +1,13 @@
-"""Standard deviations of the intrinsics, and the hierarchical prior of cameras of one kind.
+"""Standard deviations of the intrinsics, and the hierarchical prior of cameras of the same kind.
 
 The covariance of bundle adjustment assumes independent noise and an exact camera model. It is inflated by the
 disagreement of blocks of the scene (:mod:`thesisrecon.numerics._block_scatter`). Errors common to all blocks
 do not show there; a floor stands for them, applied only if the data show lack of fit.
 
-Images of one size are likely of one kind of lens. With own estimates q_i of variance s_i^2 the values of a
-kind are modelled as N(mu, tau^2), mu and tau unknown (random-effects model; tau by restricted maximum
-likelihood, Harville 1977). A poorly determined camera is shrunk towards the others if tau is small; with
-zoomed images tau is large and has no effect. Outliers are left out.
+Images of the same size are likely from the same kind of lens. With per-camera estimates q_i of variance s_i^2
+the values of a kind are modelled as N(mu, tau^2), mu and tau unknown (random-effects model; tau by restricted
+maximum likelihood, Harville 1977). A poorly determined camera is shrunk towards the others if tau is small;
+with zoomed images tau is large and has no effect. Outliers are left out.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ to one or two parts in a thousand."""
 MIN_BLOCKS = 4
 """Fewer blocks give no inflation."""
 OVERDISPERSION_RANGE = (1.3, 1.8)
-"""Pure noise stays below the first; at the second the model is certainly inexact."""
+"""Overdispersion that pure noise does not reach, and that at which the model is certainly inexact."""
 TAIL_RANGE = (1.2, 1.6)
-"""The same for the residuals' tail: normal noise has 1, matches of real images 2 to 3."""
+"""The same for the width of the tail of the residuals: 1 for normal noise, 2 to 3 for real images."""
 COLUMNS = (FOCAL, *CENTRE, K1)
 """Intrinsics with a hierarchical prior."""
 MIN_MEMBERS = 3
@@ -72,7 +72,7 @@ def _std_floor(model: MetricEstimate, scatter: BlockScatter) -> F64:
 
 @dataclass(frozen=True)
 class PerCameraEstimates:
-    """Intrinsics (G, 8) of each camera by its own matches (log f), with noise and model error."""
+    """Intrinsics (G, 8) of each camera from its own matches (focal as log f), with noise and model error."""
 
     value: F64
     std: F64
@@ -97,7 +97,7 @@ def per_camera_estimates(
 
 
 def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> HierarchicalPrior | None:
-    """Estimate how much the intrinsics of cameras of one kind scatter; None if no intrinsic has a prior."""
+    """Estimate the scatter of the intrinsics of cameras of a kind; None if no intrinsic has an estimate."""
     kinds = own.kind.copy()
     spread = np.full((len(kinds), WIDTH), np.inf)
     outside = np.zeros(len(kinds), dtype=bool)
@@ -159,13 +159,16 @@ def apply_hierarchical_prior(
 
 @dataclass(frozen=True)
 class FocalShrinkage:
-    """Own relative deviation of each focal, and its weight tau^2 / (tau^2 + s^2); 1 without shrinkage."""
+    """Per view: relative standard deviation of the focal from its own matches, weight tau^2 / (tau^2 + s^2).
+
+    The weight is 1 without shrinkage.
+    """
 
     own_std: F64
     weight: F64
 
     def is_shrunk(self, view: int, std: float) -> bool:
-        """Whether a stated relative ``std`` rests mainly on the other cameras of the kind."""
+        """Whether a stated relative ``std`` depends mainly on the other cameras of the kind."""
         return bool(self.weight[view] < 0.5 and self.own_std[view] > std)
 
     def warnings(self, registered: Sequence[int], least: float) -> tuple[str, ...]:
@@ -256,10 +259,10 @@ def widen_unverified_focals(
 def widen_by_camera_model(
     intervals: Sequence[Mapping[str, IntrinsicInterval]], difference: tuple[float, float], misfit: float
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
-    """Add the differences to a richer camera model to the standard deviations, or multiply by its misfit.
+    """Add the differences to a richer camera model to the standard deviations, or scale these by the misfit.
 
-    ``difference`` of the focal lengths and of the principal points, over the focal length. Without one, a
-    chi-square ``misfit`` above 1 per degree of freedom is a variance ratio (Birge ratio).
+    ``difference`` are those of the focal lengths and of the principal points, over the focal length. If both
+    are 0, variances are multiplied by ``misfit``, chi-square per degree of freedom (Birge ratio).
     """
     moved = {"focal_px": difference[0], "principal_x_px": difference[1], "principal_y_px": difference[1]}
     factor = 1.0 if any(difference) else np.sqrt(misfit)

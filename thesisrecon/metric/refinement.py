@@ -1,8 +1,8 @@
 """The metric stage: from self-calibration (chapter 7) to the final metric model.
 
 Every candidate calibration is adjusted on its cameras; the best is completed by calibrated resection of the
-missing cameras, triangulated and adjusted under the prior until the inliers settle. A hierarchical prior
-binds cameras of one kind that have own values. The result is checked.
+missing cameras, triangulated and adjusted under the prior until the inliers no longer change. Intrinsics of
+cameras of the same kind that are not shared get a hierarchical prior. The result is checked.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, Upgrade
 
 MIN_CHANGE = 0.002
-"""Share of observations that change sides below which the rounds end."""
+"""Fraction of observations that become inliers or outliers in a round, below which the rounds end."""
 START_ROUNDS = 3
 MAX_ROUNDS = 4
 """Final rounds of triangulation and adjustment."""
 PRECISE_ROUNDS, PRECISE_ITERATIONS, SAME_POINTS = 5, 15, 0.98
-"""Times that the points of a large set are chosen again, at most, iterations of each adjustment to them, and
-the share that stays at the end."""
+"""Maximum number of selections of points in large sets, iterations of the adjustment to each, and fraction of
+unchanged points at which the selection ends."""
 LENS_STD = 0.02
 """Prior standard deviation about 0 of k2 and k3 of a camera with several images."""
 NOISE_FLOOR_PX = 0.02
@@ -82,7 +82,7 @@ MAX_ROTATION_RESIDUAL = 0.3
 UNDETERMINED_REL = 0.1
 """Focal lengths that their own matches determine worse than this (95 %, relative) are reported."""
 LAST_ITERATIONS = 25
-"""Zoomed images lie in a long valley of the cost: the last adjustment must reach its bottom."""
+"""Zoomed images give a long valley of the cost: the last adjustment must reach its bottom."""
 NOT_EXPLAINED = (
     "Values of each image hardly predict other observations better, so the shared ones stay; their "
     "intervals contain the difference"
@@ -162,11 +162,11 @@ _Finished = tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockSca
 def settle_camera_model(
     simple: _Finished,
 ) -> tuple[_Finished, SharedCameraTest, tuple[str, ...], tuple[float, float]]:
-    """Settle intrinsics that the images contradict.
+    """Choose between the shared camera model and richer ones if the images contradict shared intrinsics.
 
-    They become values of each image if that predicts held-out observations far better. Contradictions that
-    no richer model explains are limitations if such a model hardly changes the cameras: the differences of
-    the focal lengths and principal points, over the focal length, then widen their intervals.
+    A richer model, with one value per image, is adopted if it predicts held-out observations far better. If
+    it is not adopted and hardly changes the cameras, the contradictions are only limitations; the returned
+    differences of focal lengths and principal points, over the focal length, then widen the intervals.
     """
     chosen, sharing = simple, check_shared_cameras(*simple[:2])
     limitations, difference = tuple[str, ...](), (0.0, 0.0)
@@ -220,7 +220,7 @@ def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> Met
 def _adjust_to_precise_points(
     model: MetricEstimate, tracks: Tracks, adjustment: BundleAdjustment
 ) -> MetricEstimate:
-    """Choose the points again, if points were chosen, by the residuals of the model adjusted to them."""
+    """In large sets, select the points again by the residuals of the model adjusted to the selection."""
     if model.tracks.n_points == tracks.n_points:
         return model
     before = np.empty(0, dtype=np.int64)

@@ -1,7 +1,7 @@
-"""Contradictions between parts of the scene after bundle adjustment, compared with the expected noise.
+"""Scatter of the intrinsics between blocks of the scene after bundle adjustment, relative to expected noise.
 
 The sandwich covariance (Huber 1967, White 1980) summed by clusters (Liang and Zeger 1986): correlated errors
-and lenses beyond the model make gradients summed by parts larger than independent noise allows.
+and errors of the lens model make the gradients of blocks larger than independent noise does.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from thesisrecon.numerics._observations import Jacobians, Observations, Weightin
 # Number of pose unknowns tested besides all intrinsics.
 _MAX_POSES = 30
 _MAX_BLOCKS, _MIN_BLOCK_POINTS = 32, 12
-# Unknowns, and the share of pairs of views with a common point, up to which the information is sparse.
+# Number of unknowns above which matrices are sparse, if fewer than this fraction of the pairs of views share
+# points.
 _MANY, _SPARSE = 1200, 0.2
 
 _Solve = Callable[[F64], F64]
@@ -35,9 +36,9 @@ _Solve = Callable[[F64], F64]
 class BlockScatter:
     """Variances of the intrinsics (the focal relative) and their scatter between blocks of points.
 
-    ``shared_variance`` (C,) holds if all views shared one camera. ``ratio`` (G, C) is the scatter over its
-    expectation, NaN for fixed intrinsics. ``overdispersion`` is the scatter between blocks over that between
-    single points: 1 if the noise of different points is independent, for any distribution.
+    ``shared_variance`` (C,) would hold if all views shared one camera. ``ratio`` (G, C) is the scatter over
+    its expectation, NaN for fixed intrinsics. ``overdispersion`` is the scatter between blocks over that
+    between single points: 1 if the noise of different points is independent, for any distribution.
     """
 
     variance: F64
@@ -89,11 +90,11 @@ def block_scatter(
 ) -> BlockScatter:
     """Measure the scatter of the intrinsics' gradients between blocks of points after an adjustment (6.7).
 
-    With S_b the information of block b on the cameras (its points eliminated), g_b its gradient and C the
-    covariance, the pull of a block on value a is c_a' g_b; without correlation between blocks sum (c_a'
-    g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a, and the ratio of the two is 1. Huber's loss
-    weights as if its weight were its slope; the ratio of their means corrects the covariance. Where most
-    views have no common point, as in a street, the information stays sparse.
+    Let S_b be the information of block b on the cameras (its points eliminated), g_b its gradient and C the
+    covariance with the column c_a of value a. Block b pulls value a by c_a' g_b; without correlation between
+    blocks sum (c_a' g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a, and the ratio of the two is 1.
+    The information uses the weights of Huber's loss instead of its second derivatives, which
+    :func:`_loss_correction` corrects.
     """
     o, group = observations, cameras.group
     observed = np.bincount(o.view_index, minlength=len(group)) > 0

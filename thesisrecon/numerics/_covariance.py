@@ -16,18 +16,22 @@ from thesisrecon.numerics._reduced_solvers import ReducedSystem, order_views
 SIMILARITY_DOF = 7
 # Largest number of unknowns for dense inversion.
 MAX_DENSE = 1200
-# Of more, the largest share 1 / BAND of the views that a band may span to be less work.
+# For more unknowns, a banded factor is less work if its band spans at most 1 / BAND of the views.
 BAND = 5
 # Pairs of observations at a time.
 PAIRS = 16384
 # Trimming point and variance of a standard normal variable trimmed there.
 TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
-# Least fraction of the variance that a coordinate must keep to contribute.
+# Least fraction of its variance that a residual must keep to be used for the noise.
 MIN_KEPT = 0.1
 
 
 def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
-    """Standard deviation of a coordinate from residuals (K, 2) within 2.5 sigma, over what fits absorb."""
+    """Standard deviation of a coordinate from residuals (K, 2) within 2.5 sigma, corrected for the fit.
+
+    ``leverage`` (K, 2) is the fraction of the variance absorbed by the points, ``dof`` the number of other
+    unknowns.
+    """
     if not len(residual):
         return 0.0
     kept = 1.0 - leverage - max(dof, 0) / residual.size

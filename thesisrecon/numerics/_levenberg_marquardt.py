@@ -17,8 +17,8 @@ Step = TypeVar("Step")
 StepOut = TypeVar("StepOut", covariant=True)
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
-# Curvature, relative to the diagonal, of the weakest combination of unknowns that must converge. Stronger
-# damping divides the predicted gain of such a combination by up to damping / _WEAKEST.
+# Curvature, relative to the diagonal, of the least determined combination of unknowns that must converge.
+# Stronger damping divides the predicted gain of such a combination by up to damping / _WEAKEST.
 _WEAKEST = 1e-8
 # Unknowns above which information is inverted by Cholesky.
 _MANY = 1200
@@ -27,8 +27,8 @@ _MANY = 1200
 class _LinearSystem(Protocol[StepOut]):
     """Normal equations at one state.
 
-    ``solve`` gives the damped step, its predicted gain of cost, and the part of that which only the cameras
-    gain (small problems: all of it), or None.
+    ``solve`` returns the damped step, its predicted decrease in cost (gain), and the part of the gain due to
+    the cameras (in small problems all of it); None if the system is singular.
     """
 
     @property
@@ -102,7 +102,7 @@ class DenseSystem:
     gradient: F64
 
     def solve(self, damping: float) -> tuple[F64, float, float] | None:
-        """The step by Cholesky and its predicted gain, which also is the gain of the cameras; or None.
+        """Return the step by Cholesky and its predicted gain, also as the gain of the cameras; or None.
 
         Unknowns without effect do not move.
         """
@@ -127,7 +127,7 @@ def invert_information(information: F64) -> F64:
     scale = 1.0 / np.sqrt(floored_diagonal(np.diag(information)))
     scaled = information * scale * scale[:, None]
     if len(scaled) > _MANY:
-        # A tenth of the work. It fails if an eigenvalue is near the floor.
+        # Cholesky is a tenth of the work, but fails if an eigenvalue is near the floor.
         factor, fault = scipy.linalg.lapack.dpotrf(scaled, lower=1)
         if not fault:
             lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=1)[0])

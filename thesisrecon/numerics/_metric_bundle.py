@@ -42,20 +42,23 @@ from thesisrecon.numerics._observations import (
 )
 from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, CameraPrior, build_layout
 
-# Below a relative gain of NEWTON_GAIN, MIN_CURVATURE of the curvature along a residual is kept if its loss
-# bends: reweighting is safe far from the minimum, Newton's method is faster near it.
+# Below a relative gain of NEWTON_GAIN the second derivative of the loss is used; at least MIN_CURVATURE of
+# the curvature along a residual is kept. Reweighting is safe far from the minimum, Newton's method faster
+# near it.
 _MIN_CURVATURE, _NEWTON_GAIN = 0.3, 1e-3
 
 _Covariances = tuple[F64, F64 | None, F64 | None]
-"""Of intrinsics (G, C, C), poses (V, 6, 6) and points (N, 3, 3)."""
+"""Covariances of intrinsics (G, C, C), poses (V, 6, 6) and points (N, 3, 3)."""
 
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """Weighting, end, first damping, wanted covariances, the least noise assumed for them, and threads.
+    """Options of :func:`refine_metric_bundle`.
 
-    The adjustment also ends when the predicted gain of the cameras is below ``settled``: half the squared
-    distance of all cameras from the minimum, in standard deviations.
+    ``sigma_px`` is the noise that weights the residuals, ``loss_px`` the width of Huber's loss. The
+    adjustment also ends when the predicted gain of the cameras is below ``settled``: half the squared
+    distance of all cameras from the minimum, in standard deviations. ``damping`` is the initial damping; the
+    covariances are computed with a noise of at least ``noise_floor_px``.
     """
 
     sigma_px: float = 1.0
@@ -213,7 +216,7 @@ def refine_metric_bundle(
 
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> tuple[_State, float]:
-    """Return the minimum and its cost: by reweighting first, nearly Newton's steps where the loss bends."""
+    """Return the minimum and its cost: by reweighting, then by steps close to Newton's."""
     most, damping, settled = options.max_iterations, options.damping, options.settled
     state, cost, iterations = run_levenberg_marquardt(
         problem,

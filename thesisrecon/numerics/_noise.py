@@ -42,7 +42,7 @@ def student_factor(dof: int) -> float:
 
 
 def next_inlier_limit(distance: F64, inliers: B8, limit: float, *, unknowns: int) -> float:
-    """``INLIER_SIGMAS`` standard deviations of the noise around a fit, for its next inliers."""
+    """Limit of the inliers of the next round: ``INLIER_SIGMAS`` standard deviations of the noise of a fit."""
     # The median of the inliers alone would be too small, since their limit cuts off the noise.
     near = distance <= max(2.0 * limit, float(np.median(distance[inliers])))
     fitted = 2.0 * int(inliers.sum())
@@ -55,8 +55,8 @@ def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> fl
     """The width of Huber's loss with the least expected variance, infinite for least squares.
 
     The asymptotic variance mean(psi^2) / mean(psi')^2 (Huber, 1964) is estimated from the residuals (N,) >= 0
-    (Jaeckel, 1971). Few residuals look heavy-tailed easily: Huber's loss must gain more than twice the
-    chance.
+    (Jaeckel, 1971). Few residuals may appear heavy-tailed by chance: Huber's loss must reduce the variance by
+    more than twice the effect of chance.
     """
     n = len(residuals)
     if n <= 2 * parameters:

@@ -66,10 +66,10 @@ class Jacobians(NamedTuple):
 
 
 class Weighting(NamedTuple):
-    """Weighting of residuals: in units of ``sigma``, under Huber's loss that turns at ``delta``.
+    """Weighting of residuals: in units of ``sigma``, with Huber's loss of width ``delta``.
 
-    ``min_curvature`` is the least fraction of the curvature along a residual that is kept if its loss bends
-    (Triggs et al., Bundle Adjustment, 1999, equation 11): 1 is plain reweighting.
+    ``min_curvature`` is the least fraction of the curvature along a residual that is kept where the second
+    derivative of the loss reduces it (Triggs et al., Bundle Adjustment, 1999, equation 11); 1: reweighting.
     """
 
     sigma: float

@@ -1,4 +1,4 @@
-"""Values that are made when they are used, the least recently used ones dropped beyond a number of bytes."""
+"""Values that are computed when they are used, in least-recently-used caches of a number of bytes."""
 
 from __future__ import annotations
 

@@ -41,7 +41,11 @@ _ROUNDING = 1e-15
 
 
 class _PointOptions(NamedTuple):
-    """``patience`` gains below ``tolerance`` end it; no step may change the views a point lies behind."""
+    """The refinement ends after ``patience`` relative gains below ``tolerance``.
+
+    ``delta`` is the width of Huber's loss. With ``keep_cheirality`` steps that change the number of cameras
+    that a point lies behind are rejected.
+    """
 
     delta: float
     iterations: int
@@ -150,7 +154,7 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
                     break
             else:
                 damping *= 10.0
-                # At the minimum rounding decides about a step; shorter ones gain nothing either.
+                # At the minimum rounding decides whether a step is accepted; shorter steps gain nothing.
                 if damping > 1e12 or promised <= _ROUNDING * cost:
                     break
 

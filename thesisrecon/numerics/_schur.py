@@ -46,8 +46,8 @@ class BundleLayout:
     """Structure of one problem.
 
     The camera unknowns are ``width`` columns for each view's block, then ``border`` common columns; ``row``
-    and ``column`` (n,) are the views of each block of the reduced matrix, ``chunks`` ranges of points, which
-    ``threads`` share; their number does not depend on the threads, so that sums are the same.
+    and ``column`` (n,) are the views of each block of the reduced matrix, ``chunks`` ranges of points. The
+    chunks do not depend on ``threads``, so that sums are the same for any number.
     """
 
     observations: SortedObservations
@@ -162,8 +162,8 @@ class BundleSystem:
         """Return the damped step, its predicted gain of cost, and that of the cameras.
 
         None if the reduced matrix is not positive definite. The gain of the cameras, half their squared
-        distance in standard deviations, decides about the end: points whose observations contradict each
-        other move for many iterations, and no camera with them.
+        distance in standard deviations, is the criterion of convergence: points whose observations contradict
+        each other move for many iterations without any effect on the cameras.
         """
         reduced, points, damped = self.reduce(damping)
         solver = self.layout.solver

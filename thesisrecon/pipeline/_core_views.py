@@ -1,6 +1,6 @@
-"""Self-calibration from a few well-connected views where all views together have no solution.
+"""Self-calibration from a few well-connected views if all views together have no solution.
 
-Drift and wrong tracks bend long projective reconstructions, as of streets, so that no calibration puts the
+Drift and wrong tracks bend projective reconstructions of long sequences, so that no calibration places the
 points in front of all cameras. Neighbouring views still determine one; the metric stage registers the others.
 """
 

@@ -36,7 +36,7 @@ MIN_COMMON_POINTS = 16
 
 @dataclass(frozen=True)
 class Given:
-    """Corners (N_i, 2) of V views in working pixels, their matches, and tracks unless they are built."""
+    """Corners (N_i, 2) of V views in working pixels, their matches, and the tracks; None: to be built."""
 
     corners: Sequence[F64]
     matches: Sequence[Matches]
@@ -45,9 +45,9 @@ class Given:
 
 @dataclass(frozen=True)
 class Views:
-    """Names and original sizes (V, 2) of the images, and the images or where they are.
+    """Names and original sizes (V, 2) of the images; the images or their folder, None if not given.
 
-    The sizes are of upright images, or ``as_stored`` of the pixels in the files.
+    The sizes are those after EXIF rotation, or with ``as_stored`` those of the pixels in the files.
     """
 
     names: list[str]
@@ -56,7 +56,7 @@ class Views:
     as_stored: bool = False
 
     def read(self, run: Run, digests: Sequence[str]) -> ImageSet:
-        """The images at working size, or grey ones of original size; each with a digest of its input."""
+        """The images at working size, or grey placeholders of original size; each with its input digest."""
         return ImageSet(tuple(self._read(run, i, digest) for i, digest in enumerate(digests)), {})
 
     def _read(self, run: Run, i: int, digest: str) -> DecodedImage:
@@ -179,7 +179,7 @@ def _positions(xy: Any, i: int, views: Views) -> F64:
 
 
 def _rows(given: Any, pair: tuple[int, int], corners: Sequence[F64]) -> I64:
-    """Checked rows (M, 2) of keypoints, each keypoint at most once: the first match counts."""
+    """Checked rows (M, 2) of keypoints; of several matches of a keypoint only the first is kept."""
     rows = np.asarray(given)
     if rows.size == 0:
         return np.zeros((0, 2), dtype=np.int64)
@@ -251,7 +251,7 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
 
 
 def outside_masks(given: Given, images: Sequence[Image]) -> Given:
-    """The same without matches and observations in masked pixels; all at working size."""
+    """``given`` without matches and observations in masked pixels; all at working size."""
     if all(image.mask is None for image in images):
         return given
     clear = [
@@ -272,7 +272,7 @@ def outside_masks(given: Given, images: Sequence[Image]) -> Given:
 
 
 def at_working_size(given: Given, images: Sequence[Image]) -> Given:
-    """The same in pixels at working size."""
+    """``given`` in pixels at working size."""
     scales = np.array([image.scale for image in images])
     if (scales == 1.0).all():
         return given

@@ -24,12 +24,12 @@ from thesisrecon.records import Features, Image, PairChoice, TwoView
 from thesisrecon.runtime._run import Batch, stream
 
 FEWER, FINAL = "-fewer", "final"
-"""End of the names of pairs matched by a share of the corners, and name of the record of the final pairs."""
+"""Suffix of the records of pairs matched with part of the corners, and name of the record of final pairs."""
 MIN_CORNERS = 16
 MIN_VERIFIED = 240
-"""Verified matches of a pair, from a share of its corners, that need no more."""
+"""Number of verified matches from part of the corners above which a pair is not matched again with all."""
 MIN_GROUP = 3
-"""Images of a group that is reconstructed for itself."""
+"""Minimum number of images of a group that is reconstructed separately."""
 
 
 def find_features(state: PipelineState) -> None:
@@ -95,9 +95,9 @@ def match_pairs(state: PipelineState) -> None:
 def _matched_in_turn(
     state: PipelineState, pairs: Sequence[tuple[int, int]]
 ) -> tuple[list[TwoView], list[str]]:
-    """Match pairs; those of many images by a share of their corners, and by all where these are too few.
+    """Match pairs; in large sets first with part of the corners, then with all where this is not enough.
 
-    They are too few for weak pairs, and for all pairs of a long row of images, where errors add up. Returns
+    It is not enough for weak pairs, and for all pairs of a long sequence, where errors accumulate. Returns
     the pairs, and the kind of record of each.
     """
     features, matching = state.result.features, state.config.matching
@@ -121,7 +121,7 @@ def _matched_in_turn(
 
 
 def of_all_corners(pairs: Sequence[TwoView], features: Sequence[Features], share: float) -> list[TwoView]:
-    """Pairs matched by a share of the corners, with the numbers of all corners."""
+    """Pairs matched with part of the corners, with indices into all corners."""
     rows = [strongest_corners(f, share) for f in features]
     return [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in pairs]
 
@@ -160,8 +160,8 @@ def finish_matches(
 ) -> None:
     """Report the matched pairs; sets ``result.pairs``.
 
-    If these are not all records as they are stored, another record lists those that count, of ``kinds``, and
-    the reasons of those ``rejected`` (by number) because of other pairs.
+    If the final pairs are not exactly the stored records, another record lists the final ones with their
+    ``kinds``, and the reasons of those that are ``rejected`` (by number) because of other pairs.
     """
     run, rejected, kinds = state.run, rejected or {}, kinds or [""] * len(two_views)
     state.result = replace(state.result, pairs=tuple(two_views))
@@ -217,7 +217,7 @@ def split_groups(state: PipelineState) -> None:
 
 
 def take_group(whole: PipelineState, views: Sequence[int], state: PipelineState) -> None:
-    """Features and pairs of some views of a run, in the place of the first three steps."""
+    """Take features and pairs of some views from a run, instead of the first three steps."""
     run, number = state.run, {view: k for k, view in enumerate(views)}
     keys = list(whole.run.logs["features"].keys.values())
     features = [
@@ -230,7 +230,7 @@ def take_group(whole: PipelineState, views: Sequence[int], state: PipelineState)
     for n in inside:
         pair = whole.result.pairs[n]
         pair = replace(pair, i=number[pair.i], j=number[pair.j])
-        # Which matches count, and whether they do, depends on all images and not only on the two.
+        # The final matches and the decision about a pair depend on all images, not only on its two.
         content = [pair.index1, pair.index2, pair.xy1, pair.xy2, pair.affine, pair.accepted, pair.reason]
         key = run.key("matches", keys[n], pair.i, pair.j, content)
         pairs.append(run.cached("matches", _item(pair.i, pair.j, ""), key, partial(replace, pair)))

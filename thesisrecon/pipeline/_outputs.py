@@ -41,9 +41,9 @@ SURFACE_FILES = ("model.glb", "model-full.glb", *TILE_FILES)
 MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 REPLACED_FILES = (*RESULT_FILES, *(f"group-*/{name}" for name in RESULT_FILES))
-"""What a run removes of another one in its folder."""
+"""Files of another run that a run removes from its folder."""
 MAX_AFFINE = 1e3
-"""Largest affine coordinate written to affine.ply, in standard deviations of the points."""
+"""Largest affine coordinate written to affine.ply, in median depths of the best observed view."""
 
 
 def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
@@ -69,7 +69,7 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
 
 
 def with_image_names(result: RunResult) -> RunResult:
-    """Sentences about images by file name."""
+    """Replace image numbers by file names in all sentences of a result."""
     names = [image.name for image in result.images]
 
     def named(texts: tuple[str, ...]) -> tuple[str, ...]:
@@ -152,7 +152,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
 
 
 def save_result(result: RunResult, folder: Path) -> None:
-    """Copy the result files of a run, or write those that no folder holds (without the page)."""
+    """Copy the result files of a run; those that no folder contains are written, except the page."""
     if (out := folder_with(result)) is not None:
         for path in (path for name in RESULT_FILES for path in sorted(out.glob(name))):
             if path.is_file():

@@ -1,7 +1,7 @@
 """Many images in overlapping parts: each is reconstructed alone, all are aligned and then adjusted together.
 
-A part is a task of its own. Wrong matches between places that look alike cannot bend a part that does not
-contain both places, and a part that fails leaves the others whole: its images join the aligned ones later.
+Parts are independent tasks. Wrong matches between two similar places cannot deform a part that contains only
+one of them, and a part that fails does not affect the others: its images are registered after the alignment.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 from thesisrecon.runtime._run import Batch, stream
 
 MAX_CUT = 0.1
-"""Largest fraction of the common points of a part that a cut may sever; one place has no such cut."""
+"""Largest fraction of the common points of a part that a cut may sever; images of a single place have no such
+cut."""
 MIN_SIDE = 0.3
 """Smallest fraction of the views on either side of a cut."""
 OVERLAP = 12
@@ -122,7 +123,7 @@ def _best_cut(graph: scipy.sparse.csr_array, views: I64) -> list[I64] | None:
     place[order] = np.arange(len(views))
     ties = inside.tocoo()
     first, last = np.minimum(place[ties.row], place[ties.col]), np.maximum(place[ties.row], place[ties.col])
-    # Each tie stands twice in the symmetric matrix; it is severed by the cuts behind first ... last - 1.
+    # Each pair is twice in the symmetric matrix; the cuts behind first ... last - 1 sever it.
     change = np.bincount(first, ties.data, len(views)) - np.bincount(last, ties.data, len(views))
     severed = np.cumsum(change)[:-1]
     *volume, total = np.cumsum(np.asarray(inside.sum(axis=1)).ravel()[order])
@@ -151,7 +152,7 @@ def overlapping_parts(graph: scipy.sparse.csr_array, parts: Sequence[I64]) -> li
 
 @dataclass(frozen=True)
 class PartInput:
-    """What the reconstruction of some views needs; views and points have numbers of their own."""
+    """Input of the reconstruction of some views, with views and points renumbered."""
 
     tracks: Tracks
     pairs: tuple[TwoView, ...]
@@ -183,7 +184,7 @@ def _tracks_of_part(tracks: Tracks, views: I64) -> Tracks:
 def input_of_part(
     tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, prior: IntrinsicsPrior, views: I64
 ) -> PartInput:
-    """The input of a part; of the pairs only what the projective reconstruction reads."""
+    """The input of a part; the pairs contain only the fields that the projective reconstruction reads."""
     view = np.full(tracks.n_views, -1)
     view[views] = np.arange(len(views))
     none, affine = np.zeros(0, np.int64), np.zeros((0, 2, 2))
@@ -199,9 +200,9 @@ def input_of_part(
 def reconstruct_part(
     config: PipelineConfig, given: PartInput, number: int, seed: int, attempts: int
 ) -> list[Reconstruction]:
-    """The metric reconstruction of a part, from other initial pairs until it is trusted.
+    """Reconstruct a part, from one initial pair after another until the result is trusted.
 
-    Without a trusted one no camera is registered: the other parts then register its views.
+    If no result is trusted, no camera is registered: the views are then registered with the other parts.
     """
     for attempt in range(attempts):
         rng = stream(seed, "part", number, attempt)
@@ -314,9 +315,10 @@ def _poses(model: Reconstruction, views: I64) -> tuple[F64, F64]:
 
 
 def _similarity_of_cameras(Ra: F64, Ca: F64, Rb: F64, Cb: F64) -> Similarity:
-    """The similarity between common cameras: rotations determine its rotation, also of centres on one line.
+    """The similarity from cameras b to the same cameras a; its rotation follows from the camera rotations.
 
-    Cameras further off than three times the median are left out in each round.
+    It is therefore determined for collinear centres, too. Cameras with more than three times the median error
+    are left out in each round.
     """
     use = np.ones(len(Ra), dtype=bool)
     for _ in range(ROUNDS):
@@ -363,7 +365,7 @@ def _in_one_frame(
 def _cameras_in_one_frame(
     n_views: int, own: Sequence[I64], parts: Sequence[_Part], placed: dict[int, Similarity]
 ) -> tuple[B8, F64, F64, F64]:
-    """Which views have a camera (V,), and P, K and distortion, of the part that owns the view if it can."""
+    """Registered views (V,), P, K and distortion, from the part that owns a view if it has its camera."""
     registered, distortion = np.zeros(n_views, dtype=bool), np.zeros((n_views, 3))
     P, K = np.zeros((n_views, 3, 4)), np.zeros((n_views, 3, 3))
     for inner in (True, False):

@@ -1,7 +1,7 @@
-"""The second pass for images that the metric model lacks: the matches of rejected pairs meet known cameras.
+"""Second pass for images that are not registered: resection with the matches of rejected pairs.
 
-A pair with few matches cannot prove its own epipolar geometry. The same matches lead to points of the model,
-where one camera must explain them with twice as many equations. They are used for missing images only.
+A few matches are not enough to verify the epipolar geometry of a pair. If they lead to points of the model, a
+camera must explain them with twice as many equations. They are used for missing images only.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def pairs_of_missing(pairs: Sequence[TwoView], missing: B8) -> list[TwoView]:
 
 
 def register_more(state: PipelineState, attempt: int, metric: MetricResult) -> MetricResult:
-    """Register images that the metric model lacks; the model as it was if none joins, or trust is lost."""
+    """Register missing images; return the old model if none is added or the new one is not trusted."""
     missing = ~metric.reconstruction.registered
     pairs = pairs_of_missing(state.used_pairs, missing)
     if len(pairs) <= sum(pair.accepted for pair in state.used_pairs):

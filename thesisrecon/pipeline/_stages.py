@@ -40,7 +40,7 @@ from thesisrecon.views.render import render
 ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""
 MIN_VIEWS = 3
-"""With fewer views, others may not see the surface of the held-out one."""
+"""With fewer views no view is held out: the others may not see its surface."""
 MAP_BYTES = 2**29
 """Depth maps in memory, those before and those after confirmation; more are read when they are used."""
 
@@ -99,7 +99,8 @@ def reconstruct_projective(state: PipelineState, attempt: int = 0) -> None:
 
     ``attempt`` is the rank of the initial pair.
 
-    Of many views only a core (``projective.core_views``): the metric stage registers the others, calibrated.
+    Of large sets only a core of ``projective.core_views`` views is reconstructed: the metric stage registers
+    the others by calibrated resection.
     """
     run, result = state.run, state.result
     assert result.tracks is not None

@@ -1,4 +1,4 @@
-"""The state that the steps of a run pass on, and the prepared views of the matching stage."""
+"""The state shared by the steps of a run, and the prepared views of the matching stage."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ class PreparedViews(Sequence[Any]):
 def batch_pairs(
     pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None, corners: Sequence[int]
 ) -> list[list[int]]:
-    """Divide the numbers of pairs, smaller views first, into batches of pairs of few views.
+    """Divide the ``numbers`` of pairs into batches, each of pairs of few different views.
 
-    A corner is matched once in a pair, so the ``corners`` of each view bound the bytes of a result. None
-    workers: batches of one pair, in an order for cached views.
+    The smaller view is first in a pair. A corner is matched once in a pair, so the ``corners`` of each view
+    bound the bytes of a result. ``workers`` None: batches of one pair, in an order that reuses cached views.
     """
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
     left = {pairs[numbers[k]]: numbers[k] for k in cached_pair_order(first, second)}
@@ -93,7 +93,7 @@ def batch_pairs(
 def _pairs_of_few_views(
     left: Mapping[tuple[int, int], int], near: Mapping[int, set[int]]
 ) -> Iterator[tuple[int, int]]:
-    """Pairs of a growing set of views: the next one has most pairs with them, and few others.
+    """Yield pairs of a growing set of views; the view added next has most pairs with the set and few others.
 
     The caller removes each pair from ``left`` and from ``near`` (view -> views of its pairs).
     """
@@ -115,7 +115,7 @@ def _pairs_of_few_views(
 
 @dataclass
 class PipelineState:
-    """What the steps of one run pass on; ``result`` grows with each step."""
+    """The state shared by the steps of one run; each step adds to ``result``."""
 
     run: Run
     inputs: ImageSet

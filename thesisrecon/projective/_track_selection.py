@@ -56,10 +56,10 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
 
 def select_core(pairs: Sequence[TwoView], n_views: int, size: int) -> B8:
-    """Select ``size`` well-connected views (V,): from the best pair on, the one with most ties to the chosen.
+    """Select ``size`` well-connected views (V,): a view of the best pair, then always the best connected.
 
-    The tie of two views is the number of their matches that no homography explains: it needs both many
-    matches and a baseline.
+    The connection of two views is the number of their matches that no homography explains, which is large
+    only with many matches and a baseline.
     """
     tie = np.zeros((n_views, n_views))
     for pair in pairs:
@@ -120,7 +120,7 @@ _CELLS = 8
 
 
 def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView]) -> B8:
-    """Select tracks (N,) seen from more than one position; free depths of others distort the frame."""
+    """Select tracks (N,) seen from several positions; undetermined depths of others distort the frame."""
     apart = np.ones((tracks.n_views, tracks.n_views), dtype=np.float32)
     np.fill_diagonal(apart, 0.0)
     for pair in pairs:

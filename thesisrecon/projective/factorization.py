@@ -87,8 +87,8 @@ def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> tup
     Parameters
     ----------
     xy, depths : ndarray (V, N, 2), (V, N)
-        Eight or more matches in pixels, and initial depths; equal by default, an affine camera, which needs
-        ``iterations``.
+        Eight or more matches in pixels, and initial depths. By default these are equal, as for affine
+        cameras; ``iterations`` are needed then.
     iterations : int
         Maximum number of depth updates; 0 is the published algorithm. Stops when the rank-4 residual of the
         balanced matrix, which approximates the reprojection error, no longer falls.
@@ -144,8 +144,8 @@ class Factorization:
     Parameters
     ----------
     core_points, iterations, growth : int, int, IncrementalProjective
-        Views join the core while this many tracks are seen in all of it; maximum number of depth updates, 0
-        for the published algorithm of Sturm and Triggs; and what adds the other views.
+        Minimum number of tracks seen in all views of the core; maximum number of depth updates, 0 for the
+        published algorithm of Sturm and Triggs; and the method that adds the other views.
     """
 
     core_points: int = 100

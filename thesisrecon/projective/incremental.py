@@ -87,8 +87,8 @@ class IncrementalProjective:
     Parameters
     ----------
     points_per_view, min_points : int
-        Approximate number of tracks per view, longest first (the metric stage uses all), and matches needed
-        for resection: twice the six that always agree.
+        Approximate number of tracks per view, longest first (the metric stage uses all), and minimum number
+        of matches for resection (default: twice the six of a minimal sample).
     outlier_sigmas, noise_floor_px : (float, float), float
         Inlier thresholds in noise sigmas of the early and late rounds, and lower bound of the noise.
     max_projection_std_rel : float, optional
@@ -100,10 +100,11 @@ class IncrementalProjective:
     bundle_iterations, final_rounds : int
         Levenberg-Marquardt steps after each camera; final rounds of triangulation, adjustment and filtering.
     global_bundle_growth, local_bundle_views : float, int
-        Everything is adjusted after this growth of the number of cameras, this many views with a new one.
+        Growth factor of the number of cameras after which everything is adjusted, and number of views that
+        are adjusted with each new one.
     core_views : int
-        Of more views, a core of so many well-connected ones is reconstructed, twice as many at each further
-        attempt; the metric stage registers the others. 0: all views are reconstructed.
+        Number of views above which only a core of this many well-connected views is reconstructed, twice as
+        many at each further attempt; the metric stage registers the others. 0: all views are reconstructed.
     """
 
     points_per_view: int = 1500

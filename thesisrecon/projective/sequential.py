@@ -19,8 +19,8 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 class SequentialProjective:
     """Projective reconstruction of one view after the other in image order (6.6).
 
-    The pair of neighbours with most matches begins; each further view is resected, new points are
-    triangulated and outliers removed. One bundle adjustment at the end replaces the lost chapter on it.
+    Starts with the pair of neighbours with most matches; each further view is resected, new points are
+    triangulated and outliers removed. One bundle adjustment at the end replaces a lost chapter of the thesis.
 
     Parameters
     ----------

@@ -28,11 +28,11 @@ from thesisrecon.records import (
 from thesisrecon.results import RunResult, in_original_pixels
 
 MAX_PICTURED = 100
-"""Images with pictures on the page; of more, these are evenly spread, and a table lists the others."""
+"""Maximum number of images with thumbnails on the page, evenly spread; a table lists the others."""
 
 
 def pictured(images: int) -> list[int]:
-    """Numbers of the images with pictures on the page."""
+    """Numbers of the images with thumbnails on the page."""
     spread = np.rint(np.linspace(0, images - 1, min(images, MAX_PICTURED)))
     return [int(number) for number in np.unique(spread)]
 

@@ -1,8 +1,8 @@
 """``report.html`` of a run and ``strip.html`` of a view sequence: single files without network access.
 
-Nothing on a page comes from elsewhere, and no file name can run as code: the template escapes all text, data
-for scripts is JSON that cannot close its element, and a content security policy lists the scripts by their
-hashes and forbids every address but ``data:``.
+A page loads nothing, and no file name can run as code: the template escapes all text, data for scripts is
+JSON that cannot close its element, and a content security policy lists the scripts by their hashes and
+forbids all addresses except ``data:``.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ from thesisrecon.report._figures import (
 from thesisrecon.report._viewer import viewer_data
 
 _FRAME_SIDE_PX, _FRAME_QUALITY = 960, 85
-"""Of the frames on a strip page; the files beside it have full size and quality."""
+"""Size and JPEG quality of the frames on a strip page; the files beside it have full size and quality."""
 _HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT = 200.0, 44.0
 _MAX_LISTED_PAIRS = 120
 _AFFINE_POINTS = 5_000
@@ -129,7 +129,7 @@ def _packed(script: str) -> str:
 
 
 def figure_content(figures: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """Return the scripts that draw plotly.js figures by element id, and what the template needs for them."""
+    """Return the scripts that draw plotly.js figures by element id, and their values for the template."""
     library = plotly_script() if figures else ""
     scripts = [page_resource("unpack.js"), page_resource("page.js")] if figures else []
     # page.js adds the unpacked library as a script, which the policy of the page must list too.
@@ -210,12 +210,12 @@ def render_report(data: ReportData) -> str:
 
 
 def _sharing(images: int) -> int:
-    """The number of pictures for which a kind of picture has space; half of it if not all are shown."""
+    """Number of thumbnails that share a size budget: that of the images, at most twice ``MAX_PICTURED``."""
     return min(images, 2 * MAX_PICTURED)
 
 
 def _shortened(summary: Mapping[str, object]) -> dict[str, object]:
-    """The summary without lists of more entries than images with pictures."""
+    """The summary without lists of more than ``MAX_PICTURED`` entries."""
     return {
         name: f"{len(value)} entries, see summary.json"
         if isinstance(value, list) and len(value) > MAX_PICTURED

@@ -37,7 +37,7 @@ Finished = Callable[[int, Any], None]
 
 NAMES = ("local", "processes", "dask://HOST:PORT")
 AHEAD = 2
-"""Submitted tasks per worker: enough to keep it busy, few in memory."""
+"""Tasks submitted per worker: enough to keep it busy, but few in memory."""
 SIGTERM_DELAY_S = 1.0
 """Time a worker process waits for its parent to end after SIGTERM."""
 CHECK_S = 5.0
@@ -48,7 +48,7 @@ ANSWER_S = 10.0
 WORKERLESS_S = 60.0
 """Time a cluster may be without workers during a run, so that they can be restarted."""
 REACH_S = 2.0
-"""Time to connect to a worker from here."""
+"""Timeout of a connection from this machine to a worker."""
 _ADDRESS = re.compile(r"(?P<host>[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 
 
@@ -130,7 +130,8 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
             except (OSError, futures.TimeoutError):
                 advice = f"start some with: dask worker {address}"
                 raise UsageError(f"the Dask scheduler at {place} has no workers; {advice}") from None
-            # By default results pass the scheduler. Arguments must: scattered ones would die with a worker.
+            # By default results pass through the scheduler. Arguments must: scattered ones would be lost with
+            # their worker.
             client.direct_to_workers = _reachable(client.nthreads())
             # pure=False: do not hash all bytes of the tasks.
             yield Cluster(place, client, client.get_executor(pure=False))
@@ -288,7 +289,7 @@ def _run_all(
     left = enumerate(tasks)
     try:
         while True:
-            # After workers died, more tasks may be waiting than AHEAD allows.
+            # After the loss of workers more tasks may be waiting than AHEAD allows.
             for n, given in islice(left, max(AHEAD * remote.parallel() - len(waiting), 0)):
                 call: Task = (function, *given)
                 if pickled:

@@ -139,7 +139,7 @@ def _started() -> subprocess.Popen[str]:
     # multiprocessing would import the script of the user again. In a session of its own the process does not
     # get the Ctrl-C of the terminal; without its input it ends.
     return subprocess.Popen(
-        [sys.executable, "-P", "-c", WORKER],  # -P: not what lies in the current folder
+        [sys.executable, "-P", "-c", WORKER],  # -P: no imports from the current folder
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

@@ -109,15 +109,15 @@ class Run:
     workers: Workers
     directory: RunDirectory
     progress: Progress
-    title: str  #: of the report
-    images_folder: Path | None = None  #: of all images, None if they are from several or from memory
+    title: str  #: title of the report
+    images_folder: Path | None = None  #: folder of all images; None: several folders, or images in memory
     masks_folder: Path | None = None
     as_stored: bool = False  #: pixels are those of the files without EXIF rotation, as in COLMAP
     logs: dict[str, _StageLog] = field(default_factory=dict)
     reports: dict[str, StageReport] = field(default_factory=dict)
     resumed: list[str] = field(default_factory=list)  #: stages read from the cache
     warnings: list[str] = field(default_factory=list)
-    groups: list[dict[str, Any]] = field(default_factory=list)  #: what the runs inside this one found
+    groups: list[dict[str, Any]] = field(default_factory=list)  #: results of the runs inside this one
     started: float = field(default_factory=time.perf_counter)
     _stage: str = ""  # the one being computed
 

@@ -56,10 +56,10 @@ def bytes_from_record(record: Any, key: str) -> bytes:
 
 
 def _seal(archive: zipfile.ZipFile) -> bytes:
-    """Digest of the checksums of all parts, the comment of an archive.
+    """Digest of the checksums of all parts, stored as the comment of the archive.
 
-    Kernels do not check their input, so a record is used only if it is unchanged: damaged parts fail their
-    checksum, rewritten parts the seal, which detects accidents, not forgery.
+    Kernels do not check their input, so a record is used only if it is unchanged: damaged parts do not match
+    their checksum, rewritten parts not this digest. It detects accidents, not forgery.
     """
     parts = [(part.filename, part.CRC, part.file_size) for part in archive.infolist()]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32].encode()
@@ -126,7 +126,7 @@ def _require(holds: bool, rule: str) -> None:
 
 
 def _seal_of_plain(stream: BinaryIO) -> bytes:
-    """Expected seal of an archive; compressed ones, which may be bombs, are refused."""
+    """Expected seal of an archive; ``ValueError`` if it is compressed, since it may be a zip bomb."""
     with zipfile.ZipFile(stream) as archive:
         packed = [entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()]
         size = sum(entry.file_size for entry in archive.infolist())
@@ -223,7 +223,7 @@ class RunDirectory:
         return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
 
     def mark(self, stage: StageFolder, item: str) -> None:
-        """Give a reused record of a replaced run the time of this one: those that are not used are older."""
+        """Set the time of a reused record to that of this run, so that only unused records are older."""
         with suppress(OSError):
             path, start = stage.path / f"{item}.npz", (self.path / RUN_FILE).stat().st_mtime_ns
             if path.stat().st_mtime_ns < start:
@@ -231,7 +231,7 @@ class RunDirectory:
 
     @contextmanager
     def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
-        """Lock the folder for a run of this identity, so far as that is known before the images are read."""
+        """Lock the folder for a run; ``identity`` is the part known before the images are read."""
         with _locked(self.path):
             self._check(identity, overwrite)
             yield

@@ -1,4 +1,4 @@
-"""Where a run stands that has not finished: read from its folder, so that it also serves for killed runs."""
+"""Progress of an unfinished run, read from its folder, so that it also works for killed runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import LOCK_FILE, MANIFEST_FILE, RUN_FILE, is_running, read_record
 
 MIN_ITEMS = 3
-"""Items from which the time that is left is estimated."""
+"""Minimum number of items from which the remaining time is estimated."""
 
 
 def run_position(folder: Path) -> str:
@@ -45,7 +45,7 @@ def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
     found = ("images", list[float](), ended)
     for stage, name in FOLDERS.items():
         every = [path.stat().st_mtime for path in (folder / name).glob("*.npz")]
-        # Older records are those of a run that this one replaces, and that it has not reused.
+        # Older records belong to a replaced run and were not reused.
         times = sorted(when for when in every if when >= started)
         if times:
             found = (stage, times, ended)
@@ -67,7 +67,7 @@ def _total(folder: Path, stage: str, images: int) -> int:
 
 
 def _seconds_left(items: Sequence[float], total: int, since: float) -> float:
-    """Time left at the rate of this run's items; 0 if unknown. Items of an earlier run came in no time."""
+    """Remaining time at the rate of this run's items, without those of an earlier run; 0 if unknown."""
     new = [when for when in items if when > since]
     if len(new) < MIN_ITEMS or len(items) >= total:
         return 0.0
