@@ -111,7 +111,7 @@ def test_kruppa_says_if_the_focal_length_is_undetermined():
     refuses(StageFailure, text, thesisrecon.kruppa, fundamentals(P), (640, 480))
     refuses(StageFailure, text, thesisrecon.self_calibrate, P @ G, (640, 480), method="kruppa-equations")
     F = fundamentals(P)
-    refuses(ValueError, "images of one size", thesisrecon.kruppa, F, [(640, 480), (480, 640)])
+    refuses(ValueError, "images of the same size", thesisrecon.kruppa, F, [(640, 480), (480, 640)])
     refuses(ValueError, "each of rank 2", thesisrecon.kruppa, np.ones((3, 3)), (640, 480))
     refuses(ValueError, r"kruppa needs F \(M, 3, 3\)", thesisrecon.kruppa, np.ones((4, 4)), (640, 480))
 

@@ -262,7 +262,7 @@ def test_an_object_is_checked_like_a_function(tmp_path):
     matches.index1[:1] = 7**7
     assert len(matches.xy1)
     config = PipelineConfig(images=SMALL, features=strong, matching=Corrupt(matches))
-    refuses(UsageError, "indices that are no corners", match_pair, *images(2), config=config)
+    refuses(UsageError, "indices that are not corners", match_pair, *images(2), config=config)
 
 
 class Corrupt(Wrong):

@@ -69,7 +69,7 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
 def test_wrong_calls_of_the_front_door_are_refused(wall):
     left, right = wall
     refuses(ValueError, "between 0", thesisrecon.interpolate_view, left, right, 1.5)
-    refuses(ValueError, "one size", thesisrecon.interpolate_view, left, right[:-3], 0.5)
+    refuses(ValueError, "the same size", thesisrecon.interpolate_view, left, right[:-3], 0.5)
     refuses(ValueError, "uint8", thesisrecon.interpolate_view, left.astype(float), right, 0.5)
     with pytest.raises(ValueError, match="shape of the images"):
         thesisrecon.interpolate_view(left, right, 0.5, disparity=np.zeros((3, 4), np.float32))
@@ -85,10 +85,10 @@ def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monke
     a, b = photograph(0), photograph(1)
     with pytest.raises(UsageError, match=r"0\.jpg and 0\.jpg are the same image"):
         between.prepare_pair(a, Image("0.jpg", a.rgb.copy(), a.size))
-    with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
+    with pytest.raises(UsageError, match=r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         between.prepare_pair(a, photograph(2, (40, 20)))
     refuses(UsageError, "same image", interpolated_sequence, [a, b, a], 3)
-    with pytest.raises(UsageError, match=r"one size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
+    with pytest.raises(UsageError, match=r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
         interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
     # Forward motion: both epipoles at (21, 14).
     e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
@@ -224,7 +224,7 @@ def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
         (["0004.jpg", "copy.jpg"], "0004.jpg and copy.jpg are the same image", 2),
         (["0004.jpg", "nowhere.jpg"], "there is no image file", 2),
         (["0004.jpg", "text.jpg"], "text.jpg is not an image", 3),
-        (["0004.jpg", "small.jpg"], "one size; 0004.jpg is 1024 x 768 and small.jpg is 512 x 384 px", 2),
+        (["0004.jpg", "small.jpg"], "the same size; 0004.jpg is 1024 x 768 and small.jpg is 512 x 384 px", 2),
         (["0004.jpg", "noise.png", "--max-size", "256"], "do not match", 3),
         (["0004.jpg"], "2 or 3 images; got 1", 2),
         (["0004.jpg", "folder"], "is a folder", 2),

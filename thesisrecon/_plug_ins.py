@@ -116,7 +116,7 @@ def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence
             or number.dtype.kind != "i"
             or (n and not -1 <= number.min() <= number.max() < most)
         ):
-            raise check.wrong("indices that are no corners of the view (-1: none)")
+            raise check.wrong("indices that are not corners of the view (-1: none)")
     return replace(
         found, xy1=xy1, xy2=xy2, index1=index[0].astype(np.int64), index2=index[1].astype(np.int64)
     )

@@ -151,10 +151,10 @@ def _require_width(points: F64, what: str, sigma: float) -> None:
     """Require points off a line by more than their noise: the rotation about the line is free otherwise."""
     along, across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2] / math.sqrt(len(points))
     if across <= max(_MIN_WIDTH_REL * along, sigma):
-        beside = f"RMS {across:.3g} beside the line, {along:.3g} along it, noise {sigma:.2g}"
+        spread = f"RMS {across:.3g} across the line, {along:.3g} along it, noise {sigma:.2g}"
         raise UsageError(
-            f"the {what} of the {len(points)} images lie on one line ({beside}), which leaves the rotation "
-            "about it free; add positions beside the line, or use only the scale (--scale)"
+            f"the {what} of the {len(points)} images lie on one line ({spread}), which leaves the rotation "
+            "about it undetermined; add positions off the line, or use only the scale (--scale)"
         )
 
 

@@ -218,7 +218,7 @@ class KernelCache(NullCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         path = self._path(sig, data.codegen)
-        # A full disk or a read-only folder costs the cache, not the result.
+        # With a full disk or a read-only folder the kernel still runs, without a cache.
         try:
             _write(path, _pickled(data._reduce()))
         except OSError as error:
@@ -239,7 +239,7 @@ class KernelCache(NullCache):
         return cache_folder() / f"{self._name}-{key}"
 
     def is_for_kernels(self) -> bool:
-        """Whether what is compiled now needs no function for Python, a tenth of the compile time."""
+        """Whether the current compilation needs no wrapper for Python, which takes a tenth of the time."""
         return getattr(_caller, "is_kernel", False) and self._name not in _called_by_python()
 
     def with_or_without_wrapper(self, flags: Any) -> Any:
@@ -248,7 +248,7 @@ class KernelCache(NullCache):
         return flags
 
     def releasing(self, compile_signature: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """Release the lock of a compilation however it ends; loading and saving happen inside it."""
+        """Release the lock of a compilation even if it fails; loading and saving happen inside it."""
 
         def compile_and_release(signature: Any) -> Any:
             before = set(self._locks)
@@ -267,7 +267,7 @@ class KernelCache(NullCache):
         return compile_and_release
 
     def registering(self, add_overload: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """Hide from Python what is compiled for kernels."""
+        """Hide from Python the code that is compiled only for other kernels."""
 
         def add(compiled: Any) -> None:
             arguments = tuple(compiled.signature.args)
@@ -281,7 +281,7 @@ class KernelCache(NullCache):
 
     def _lock(self, path: Path) -> None:
         """Lock an entry; wait at most MAX_WAIT_S for another process that compiles it."""
-        # Where the file system has no locks, two processes may compile the same: no harm.
+        # On a file system without locks two processes may compile the same kernel, which is harmless.
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             file = path.with_name(path.name + ".lock").open("wb")

@@ -104,7 +104,7 @@ def prepare_rectified_pair(
     images = read_pixels(left), read_pixels(right)
     shapes = [image.shape[:2] for image in images]
     if shapes[0] != shapes[1]:
-        raise ValueError(f"rectified images must have one size; got {shapes[0]} and {shapes[1]}")
+        raise ValueError(f"rectified images must have the same size; got {shapes[0]} and {shapes[1]}")
     if disparity is None:
         config = as_config(config)
         most = _largest_disparity(*images, config)
@@ -202,7 +202,7 @@ def require_comparable_images(images: Sequence[Image]) -> None:
     for first, second in combinations(images, 2):
         if first.size != second.size:
             sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
-            raise UsageError(f"interpolation needs images of one size; {sizes} px")
+            raise UsageError(f"interpolation needs images of the same size; {sizes} px")
         if np.array_equal(first.rgb, second.rgb):
             raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
 

@@ -215,7 +215,7 @@ def test_pairs_without_depth_are_refused_with_a_reason():
     refuses(StageFailure, "no parallax", rectify_pair, scene.F, scene.xy1, turned, SIZE, SIZE)
     same = scene.P.copy()
     same[1] = same[1, :, :3] @ np.column_stack([np.eye(3), np.zeros(3)])
-    refuses(StageFailure, "one centre", rectify_cameras, *same, SIZE, SIZE)
+    refuses(StageFailure, "the same centre", rectify_cameras, *same, SIZE, SIZE)
     near = scene.P.copy()
     near[1, :, 3] *= 1e-5
     x2 = project(near[1], scene.X) + 0.05 * rng.normal(size=scene.xy1.shape)

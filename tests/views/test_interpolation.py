@@ -252,8 +252,8 @@ def test_wrong_calls_are_refused():
     pair = rectified_pair(image, image, (nothing, nothing))
     for s in (-0.1, 1.01, np.nan):
         refuses(ValueError, "from 0", pair.view, s)
-    refuses(ValueError, "one size", rectified_pair, image, image[:-1], (nothing, nothing))
-    with pytest.raises(ValueError, match="one shape"):
+    refuses(ValueError, "the same size", rectified_pair, image, image[:-1], (nothing, nothing))
+    with pytest.raises(ValueError, match="the same shape"):
         rectified_pair(image, image, (nothing, sure(np.zeros((20, 29), np.float32))))
 
 

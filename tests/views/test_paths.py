@@ -237,5 +237,5 @@ def test_wrong_calls_are_refused():
         refuses(ValueError, "at least one camera", path, [], 5)
         refuses(ValueError, "at least one frame; got 0", path, cameras, 0)
     refuses(ValueError, "none that is finite", paths.orbit, cameras, np.full((4, 3), np.nan), 5)
-    with pytest.raises(ValueError, match="all points and cameras are in one place"):
+    with pytest.raises(ValueError, match="all points and cameras coincide"):
         paths.orbit(cameras, np.tile(cameras[0].centre, (4, 1)), 5)

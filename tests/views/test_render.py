@@ -225,5 +225,5 @@ def test_pixels_at_the_rim_are_not_whole():
 @pytest.mark.parametrize("compare", [psnr_db, ssim, match_exposure])
 def test_pictures_that_do_not_belong_together_are_refused(compare):
     real, noisy = pictures()
-    refuses(ValueError, "one size", compare, real, noisy[:-1], np.ones((40, 50), bool))
+    refuses(ValueError, "the same size", compare, real, noisy[:-1], np.ones((40, 50), bool))
     refuses(ValueError, "no pixel is shown by both", compare, real, noisy, np.zeros((40, 50), bool))

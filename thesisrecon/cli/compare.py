@@ -16,7 +16,7 @@ _KINDS = "folder of a run, COLMAP model, cameras.json, or trajectory (TUM or KIT
 
 def compare(
     a: Annotated[Path, typer.Argument(parser=parse_folder, metavar="A", help=f"Model: {_KINDS}.")],
-    b: Annotated[Path, typer.Argument(parser=parse_folder, metavar="B", help="Reference, of any kind too.")],
+    b: Annotated[Path, typer.Argument(parser=parse_folder, metavar="B", help="Reference: any of these.")],
     json: Annotated[Path | None, typer.Option("--json", help="Write all numbers to this file.")] = None,
     page: Annotated[
         Path | None, typer.Option("--page", help="Write a page (HTML) with both models in 3D.")

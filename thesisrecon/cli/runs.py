@@ -49,7 +49,7 @@ def reconstruct(
             "--from",
             metavar="DATABASE|SPARSE",
             help="Take the matches of a COLMAP database, or the tracks of a COLMAP sparse model; its cameras "
-            "are forgotten.",
+            "are not used.",
         ),
     ] = None,
     images_folder: Annotated[

@@ -3,7 +3,7 @@
 In the projective basis of four of the seven matches F has a zero diagonal and entries that sum to zero, and
 three equations leave a pencil by minors without pivoting: the loop vectorises and is four times faster than
 :func:`thesisrecon.epipolar.linear.seven_point`. It may miss a double root, which random sampling tolerates.
-Points are rows (x1, y1, x2, y2) in a frame that scales both images alike, F is a row-major vector of 9.
+Points are rows (x1, y1, x2, y2) in a frame that scales both images equally, F is a row-major vector of 9.
 """
 
 from __future__ import annotations

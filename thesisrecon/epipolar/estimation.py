@@ -41,7 +41,7 @@ class FundamentalEstimate(FundamentalFit):
     def degeneracy(self) -> DegeneracyReport:
         """The test of section 5.5 with its evidence; the same for the same matches and F."""
         if len(self.xy1) < MIN_TESTED:
-            return DegeneracyReport(False, (f"{len(self.xy1)} matches leave none to test F with",))
+            return DegeneracyReport(False, (f"{len(self.xy1)} matches are too few to test F",))
         return assess_degeneracy(self, self.xy1, self.xy2, rng=np.random.default_rng(0))
 
     @property

@@ -154,7 +154,7 @@ def estimate_trifocal(
     try:
         T = _minimize_algebraic_error(equations, equations.solve())
     except ValueError as error:
-        raise StageFailure(UNDETERMINED, "they are in a special position", REMEDY) from error
+        raise StageFailure(UNDETERMINED, "they are in a degenerate configuration", REMEDY) from error
     problem = _ReprojectionProblem(T, points, segments, equations.transforms, loss_px)
     fit = _minimize_reprojection_error(problem, equations)
     _require_determined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))

@@ -71,7 +71,7 @@ def is_colmap_model(folder: Path) -> bool:
 def read_colmap_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, binary rather than text; UsageError if it is damaged.
 
-    Images hold their poses, so that rigs and frames are not needed. Of two observations of a point in an
+    The poses are those of the images; rigs and frames are not read. Of two observations of a point in an
     image the first is kept. Views have no K if their camera has no focal length (EQUIRECTANGULAR).
     """
     binary = all((folder / f"{name}.bin").is_file() for name in _FILES)

@@ -82,7 +82,7 @@ def animation_suffix() -> str:
 
 
 def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 40) -> Path:
-    """Write an endless animation of frame files of one size; equal frames give equal bytes."""
+    """Write an endless animation of frame files of the same size; equal frames give equal bytes."""
     encoded, webp = io.BytesIO(), path.suffix == ".webp"
     lossy = {"quality": _WEBP_QUALITY, "method": _WEBP_METHOD} if webp else {}
     kind = "WEBP" if webp else "PNG"

@@ -21,7 +21,7 @@ from typing import Any
 from thesisrecon.errors import OutputError, UsageError
 
 MAX_TEXT_BYTES = 2**26
-"""Far above any list of pairs, far below the memory of a computer."""
+"""Limit of text files: far above any list of pairs, far below the memory of a computer."""
 _MAX_LINE = 2**14
 """Characters of a line of a pair list; two file names with folders are shorter on every system."""
 FRAMES_FOLDER = "00-frames"
@@ -141,7 +141,7 @@ def read_json(path: Path) -> Any:
 
 def link(source: Path, target: Path) -> None:
     """Give a file a second name, by a hard link if possible, else by a copy."""
-    # Several programs may link the same target in a shared folder at one time.
+    # Several programs may link the same target in a shared folder at the same time.
     partial = target.with_name(f".{target.name}.{os.getpid()}{_PARTIAL}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

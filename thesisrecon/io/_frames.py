@@ -30,7 +30,7 @@ from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
 _CHOICE = "frames.json"
 _MEASURED_SIDE = 1024
 _CONTRAST_FLOOR = 64.0
-"""Squared grey levels: the noise of a dark frame is not sharpness."""
+"""Added to the variance of the grey levels, so that the noise of a dark frame does not count as sharpness."""
 _UPRIGHT = {turn: EXIF_TRANSFORMS[k] for turn, k in ((90, 8), (-90, 6), (180, 3), (-180, 3))}
 """Transform to the upright image by the rotation (degrees, counter-clockwise) that a video states."""
 _INSTALL = 'install the extra video (pip install ".[video]" in the clone), or give a folder of its frames'

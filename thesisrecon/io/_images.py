@@ -38,7 +38,7 @@ from thesisrecon.io._pixels import (
 from thesisrecon.records import Image
 
 DEMO_IMAGES = 6
-"""Enough neighbouring views for self-calibration, and a small wheel."""
+"""Enough neighbouring views for self-calibration, few enough for a small wheel."""
 
 
 def demo_images() -> list[Path]:
@@ -67,11 +67,11 @@ _GENERIC_FOLDERS = ("images", "photographs", "photos", "pictures", "dcim")
 MAX_FILE_BYTES = 2**31
 """Uncompressed images of the largest sensors take less than half of it."""
 MAX_DECODED_BYTES = 3 * 2**29
-"""Memory of all images decoded at one time: enough for 151 megapixels of progressive JPEG."""
+"""Memory of all images decoded at the same time: enough for 151 megapixels of progressive JPEG."""
 MIN_SIDE = 64
 BLANK_RANGE = 8
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "GIF", "JPEG2000", "AVIF", "HEIF", "PPM")
-"""Formats that Pillow may recognize: some of its other readers start programs."""
+"""Formats that Pillow may open: some of its other readers start external programs."""
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _WIDTH_35MM = 36.0
 _FOCAL_RANGE_35MM = (1.0, 1e5)
@@ -81,7 +81,7 @@ _budget = MemoryBudget(MAX_DECODED_BYTES)
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """An image at working size, a hash of all that decides it, a warning, and the focal length from EXIF."""
+    """An image at working size, a digest of its content, a warning, and the focal length from EXIF."""
 
     image: Image
     digest: str
@@ -108,7 +108,7 @@ class ImageSet:
 
 
 def image_without_pixels(name: str, size: tuple[int, int]) -> Image:
-    """A grey image of (width, height) in the place of one that is not available."""
+    """A grey image of (width, height) as a placeholder for one that is not available."""
     return Image(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), size)
 
 
@@ -171,12 +171,12 @@ def read_images(
     as_stored: bool = False,
     map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
 ) -> ImageSet:
-    """Read all images of a folder or a list, at most ``max_size_px`` long; the rest is refused with a reason.
+    """Read all images of a folder or a list, reduced to ``max_size_px``; unusable ones get a reason.
 
-    ``source`` is a folder, or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and Image records;
-    ``map_all`` an ordered map: that of a thread pool reads several images at one time. Files are turned
-    upright unless they are read ``as_stored``. Names are printable; equal names are numbered. Duplicates,
-    blank and small images are refused too.
+    ``source`` is a folder, or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and Image records.
+    ``map_all`` is an ordered map; that of a thread pool reads several images at the same time. Files are
+    rotated upright unless they are read ``as_stored``. Names are printable; equal names are numbered.
+    Duplicates, blank and small images are unusable too.
     """
     items = _named_items(source)
 
@@ -343,7 +343,7 @@ def load_pixels(file: PIL.Image.Image, *, as_stored: bool) -> tuple[StoredImage,
 
 
 def rotation_words(as_stored: bool) -> str:
-    """State which pixels of a file are meant."""
+    """Words for the orientation in which the pixels of a file are used."""
     return "without EXIF rotation, as in COLMAP" if as_stored else "after EXIF rotation"
 
 

@@ -24,7 +24,7 @@ _TEXTURE_FORMATS = ("JPEG", "PNG")
 _MAX_TEXELS = 2**26
 """Many times the size of a run's texture, and within the limit of Pillow."""
 _JPEG_QUALITY = 92
-"""Of the texture in a GLB: a quarter of the size of PNG without visible differences."""
+"""JPEG quality of the texture in a GLB: a quarter of the size of PNG without visible differences."""
 _MAX_MESH_BYTES = 2**31
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 """Rotation by 180 degrees about x, between the camera axes and those of glTF; its own inverse."""

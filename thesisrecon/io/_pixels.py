@@ -34,14 +34,14 @@ class UnusableImage(Exception):
 
 
 class MemoryBudget:
-    """A number of bytes that the threads of the program share."""
+    """A memory limit in bytes that the threads of the program share."""
 
     def __init__(self, total: int) -> None:
         self._total, self._held, self._change = total, 0, threading.Condition()
 
     @contextmanager
     def reserve(self, amount: int) -> Iterator[None]:
-        """Hold bytes for a block; wait until they are free, or until nothing else is held."""
+        """Reserve bytes for a block; wait until they are free, or until nothing else is reserved."""
         with self._change:
             self._change.wait_for(lambda: not self._held or self._held + amount <= self._total)
             self._held += amount

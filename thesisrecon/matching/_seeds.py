@@ -214,7 +214,7 @@ def _common_similarity(matches: Matches) -> F64:
 
 
 def neighbour_support(matches: Matches) -> F64:
-    """Strength (M,) of each match: the number of neighbours that move alike ((4.1) with c = 1).
+    """Strength (M,) of each match: the number of neighbours with similar displacements ((4.1) with c = 1).
 
     Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (TOLERANCE |u_m - u_k|))^2), with d the displacement
     after removing the common rotation and scale; both images serve as the first in turn.

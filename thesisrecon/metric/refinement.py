@@ -84,7 +84,7 @@ UNDETERMINED_REL = 0.1
 LAST_ITERATIONS = 25
 """Zoomed images give a long valley of the cost: the last adjustment must reach its bottom."""
 NOT_EXPLAINED = (
-    "Values of each image hardly predict other observations better, so the shared ones stay; their "
+    "One value per image hardly predicts held-out observations better, so the shared values stay; their "
     "intervals contain the difference"
 )
 NO_COMMON_POINTS = "shares no points with the model"

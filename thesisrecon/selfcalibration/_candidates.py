@@ -185,7 +185,7 @@ def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction,
     )
     given = frame.views[frame.prior.focal_known[frame.views]]
     if len(given):
-        # The prior drew all candidates towards it, so that "give the focal length" is no advice here.
+        # All candidates are near the given focal length, so the advice to give one does not help here.
         focal = frame.prior.mean[given, 0]
         values = f"{focal.min():.0f}" if np.ptp(focal) < 0.5 else f"{focal.min():.0f} to {focal.max():.0f}"
         return StageFailure(

@@ -114,8 +114,8 @@ def _cheirality_inequalities(
 ) -> tuple[F64, F64]:
     """Return oriented points (N, 4) and camera centres (R, 4) in the reference frame, unit norm.
 
-    Only points of at least three views take part: one wrong two-view point, which nothing contradicts, would
-    cut the true plane away. Points whose depths have no consistent sign are omitted.
+    Only points of at least three views are used: a single wrong two-view point, which no other view can
+    contradict, would exclude the true plane. Points whose depths have no consistent sign are omitted.
     """
     tracks, inlier = reconstruction.tracks, reconstruction.inlier
     view, point = tracks.view_index[inlier], tracks.point_index[inlier]

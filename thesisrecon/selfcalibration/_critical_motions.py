@@ -23,8 +23,8 @@ TURNTABLE = "turntable"
 PLANAR = "planar motion"
 PARALLEL_AXES = "parallel rotation axes"
 
-# Unintended motion of a hand-held camera: rotations of a degree about each axis (twice that between two
-# images), positions to a hundredth of the distance.
+# Tolerances for the unintended motion of a hand-held camera: rotations of a degree about each axis (twice
+# that between two images), translations of a hundredth of the distance.
 TOLERANCES: Mapping[str, float] = {
     "scene_planarity_ratio": 0.02,
     "centre_spread_over_distance": 0.03,
@@ -56,8 +56,8 @@ _MEASURES_OF: Mapping[str, tuple[str, ...]] = {
     PARALLEL_AXES: ("rotation_axis_spread_deg",),
 }
 
-# Hand rotation moves the image more with a long lens, so either measure may be within tolerance. The angle
-# depends on the focal length, which may be undetermined; the shift does not.
+# With a long lens an unintended rotation moves the image more, so it is enough if the shift or the angle is
+# within its tolerance. The angle depends on the focal length, which may be undetermined; the shift does not.
 _ALTERNATIVE: Mapping[str, str] = {
     "infinity_shift": "rotation_rms_deg",
     "infinity_shift_beyond_roll": "optical_axis_rms_deg",

@@ -25,9 +25,9 @@ _NOISE_PASSES = 6
 def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
     """Solve the weighted linear equations for normalizing focal lengths (B,); return quadrics Q (B, 4, 4).
 
-    Uncertainties: 9 (focal length), 0.2 (aspect), 0.01 (skew), 0.1 (principal point); rows are divided by w33
-    of the previous iterate, first by the norm of its row (the 1 of the paper depends on the camera scale).
-    Q has unit norm, and rank 4 under noise.
+    Rows are divided by uncertainties, 9 (focal length), 0.2 (aspect), 0.01 (skew), 0.1 (principal point), and
+    by w33 of the previous iterate; the first iteration divides by the norm of the row of w33, since the 1 of
+    the paper depends on the camera scale. Q has unit norm, and rank 4 under noise.
     """
     P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
     P[:, :, :2] /= focals[:, None, None, None]
@@ -80,10 +80,10 @@ def minimize_quadric(
 ) -> Candidate:  # fmt: skip
     """Minimize the nonlinear criterion from one plane (3,) and log focal lengths (R,).
 
-    The priors are weighed against the noise of the residuals: the first pass assumes 1 %, each further one
-    uses the previous estimate until it no longer falls. Huber's loss is linear beyond ``loss_scale``.
+    The priors are weighted relative to the noise of the residuals: the first pass assumes 1 %, each further
+    one uses the previous estimate until it no longer falls. Huber's loss is linear beyond ``loss_scale``.
     """
-    # Both sides also agree as all focal lengths go to 0: the weak prior makes that cost more than noise.
+    # The residuals also vanish as all focal lengths go to 0: the weak prior makes this cost more than noise.
     unknown = unknown.with_focal_prior()
     theta, noise = np.concatenate([plane, unknown.from_log_focals(log_f[None])[0]]), 0.01
     for _ in range(_NOISE_PASSES):

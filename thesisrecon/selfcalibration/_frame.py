@@ -34,9 +34,9 @@ _KNOWN_FOCAL_STD = 1e-4
 class ReferenceFrame:
     """Registered cameras [A_i | a_i] up to scale, in unit-free pixels, the reference camera at [I | 0].
 
-    ``views`` (R,) are view numbers, ``reference`` a place in ``views``; cameras of one ``group`` (R,)
-    share their focal length. ``pixel_from_unit`` (V, 3, 3) is of all views. ``focal_mean`` and ``focal_std``
-    (G,) are the prior of the log focal lengths, NaN and inf where unknown.
+    ``views`` (R,) are view numbers, ``reference`` an index into ``views``; cameras of the same ``group`` (R,)
+    share their focal length. ``pixel_from_unit`` (V, 3, 3) is that of all views. ``focal_mean`` and
+    ``focal_std`` (G,) are the prior of the log focal lengths, NaN and inf where unknown.
     """
 
     A: F64
@@ -160,7 +160,7 @@ def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
 
 @dataclass(frozen=True)
 class SolverUnknowns:
-    """D unknown intrinsics and their places in the calibrations of R cameras.
+    """D unknown intrinsics and their positions in the calibrations of R cameras.
 
     ``index`` (R, 5) is the number of the unknown, -1 where ``known`` (R, 5) holds. Columns: log focal, log of
     aspect / prior aspect, skew, principal point x and y relative to the normalized frame. ``mean``, ``std``

@@ -39,14 +39,14 @@ MAX_FOCAL_STD = 0.15
 # it exceeds its standard deviation by this factor.
 MIN_ROTATION_SIGNIFICANCE = 4.0
 # Noise of metric over projective cameras: a larger ratio means a wrong prior. A principal point or distortion
-# that the projective cameras absorbed costs less.
+# that only the projective cameras can absorb gives a smaller one.
 MAX_NOISE_RATIO = 3.0
-# In long sides. Unmodelled lens errors (resampling, focus breathing) move images by about 1e-4, alike in all
-# parts of the scene, so that no covariance contains them. A rotation that moves the image by s determines f
-# by its second-order part s (x / f)^2, about s / 10: for f to 15 %, 2 (s / 10) 0.15 must exceed 1e-4.
+# In long sides. Unmodelled lens errors (resampling, focus breathing) move images by about 1e-4, equally in
+# all parts of the scene, so that no covariance contains them. A rotation that moves the image by s determines
+# f by its second-order part s (x / f)^2, about s / 10: for f to 15 %, 2 (s / 10) 0.15 must exceed 1e-4.
 MIN_INFINITY_SHIFT = 0.003
 
-# Localisation of corners; a few of them may agree better by chance.
+# Lower bound of the noise of corner positions; few residuals may be smaller by chance.
 _NOISE_FLOOR_PX = 0.05
 # The same in long sides, for ratios of noise.
 _NOISE_FLOOR_REL = 3e-5
@@ -119,8 +119,8 @@ def check_identifiability(
     """Check whether a self-calibration is determined by the images and the prior (chapter 7).
 
     A metric bundle adjustment of a subset of the observations gives cameras and the covariance of their focal
-    lengths under the prior; a second covariance, with free aspect ratio and principal point, shows what
-    depends on these. ``evidence`` holds the measures of critical motions and those of :func:`_report`.
+    lengths under the prior; a second covariance, with free aspect ratio and principal point, shows the effect
+    of the prior of these. ``evidence`` holds the measures of critical motions and those of :func:`_report`.
     """
     problem = None
     if reconstruction.inlier.any():
@@ -300,7 +300,7 @@ def _metric_frame(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) 
     usable = reconstruction.valid & np.isfinite(X).all(axis=1)
     X = np.where(usable[:, None], X, 0.0)
     spread = float(np.median(np.linalg.norm(X[usable] - np.median(X[usable], axis=0), axis=1)))
-    # A point far behind the others is uninformative and distorts every scale.
+    # A very distant point has no information on the focal length and dominates the conditioning.
     usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
     t = Q[:, :, 3] / S.mean(axis=1)[:, None]
     return U @ Vt, t / spread, X / spread, usable
@@ -396,7 +396,7 @@ def _sentences(
 
 
 def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
-    """Return what determines the focal length in spite of the critical motion."""
+    """Return clauses on how the focal length is determined in spite of the critical motion."""
     std, free_std = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
     if motion in _RESOLVED_BY_ASPECT and free_std > 2.0 * std:
         return [
@@ -416,7 +416,7 @@ def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
 
 
 def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, focal_std: float) -> list[str]:
-    """Return why the focal length is not determined, and what to do."""
+    """Return clauses with the reason why the focal length is not determined, and advice."""
     advice = _ADVICE.get(motion, _ROTATE) if is_critical else _ROTATE
     if advice in _RESOLVED_BY_FOCAL and focal_std > 0.0:
         given = " more exactly" if focal_std < float("inf") else ""

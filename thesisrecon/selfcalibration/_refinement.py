@@ -93,7 +93,7 @@ class RotationCriterion:
 
 
 class _Schedule(NamedTuple):
-    """Damping of a descent; with ``skip_nonfinite`` rows of non-finite cost count as finished."""
+    """Damping of the minimisation; with ``skip_nonfinite`` rows of non-finite cost count as finished."""
 
     damping: float
     decrease: float

@@ -1,4 +1,4 @@
-"""Chapter 7 combined: each closed form fails on some image sets, so all of them only propose hypotheses."""
+"""The methods of chapter 7 combined: each closed form fails on some image sets, so all propose hypotheses."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ _MAX_OFFSET_STD = 0.02
 
 @dataclass(frozen=True)
 class HypothesesAndRefinement:
-    """Self-calibration by hypotheses of every method, one refinement and cheirality.
+    """Self-calibration by hypotheses of all methods, a common refinement and a cheirality test.
 
-    The refinement estimates focal lengths. If the prior leaves more undetermined than a small offset of the
-    principal point, the best candidates are refined by the nonlinear quadric over all unknown intrinsics.
+    The refinement estimates focal lengths only. If the other intrinsics are less well known than by a small
+    offset of the principal point, the best candidates are refined by the nonlinear quadric over all unknowns.
 
     Parameters
     ----------

@@ -43,13 +43,13 @@ from thesisrecon.selfcalibration._refinement import RotationCriterion, central_d
 _ROOT2 = np.sqrt(2.0)
 # Number of planes to refine for each calibration.
 _MAX_PLANES = 8
-# Residual of a good pair, against which priors are weighed, and that of rounding.
+# Residual of a good pair, the noise to which the priors are weighted, and residual that is rounding.
 _NOISE, _ROUNDING = 0.01, 1e-9
 # Standard deviation of the log focal length from which it is undetermined, and the step of its derivative.
 _MAX_FOCAL_STD, _STEP = 0.15, 0.05
 # Prior of the principal point in long sides, as for all methods by default.
 _CENTRE_STD = 0.01
-# Log focal lengths that differ by less are the same; ratio of residuals up to which two solutions fit alike.
+# Difference of log focal lengths below which they are the same; ratio of residuals of equally good solutions.
 _SAME, _ALIKE = 0.03, 2.0
 
 
@@ -278,7 +278,7 @@ def kruppa(F: F64, sizes: I64) -> F64:
     require_finite("kruppa", F)
     sizes = np.unique(np.atleast_2d(sizes), axis=0)
     if sizes.shape != (1, 2):
-        raise ValueError(f"kruppa needs images of one size, width and height; got {sizes.tolist()}")
+        raise ValueError(f"kruppa needs images of the same size, width and height; got {sizes.tolist()}")
     unit = pixel_from_unit(sizes)[0]
     F = unit_norm(unit.T @ F @ unit)
     if not len(F) or not (np.linalg.svd(F, compute_uv=False)[:, 1] > 1e-9).all():
@@ -292,7 +292,7 @@ def kruppa(F: F64, sizes: I64) -> F64:
         if abs(np.log(f / focal[0])) > _SAME and residual <= max(_ALIKE * best[2], _ROUNDING):
             raise StageFailure(
                 "the Kruppa equations have several solutions",
-                f"focal lengths of {focal[0]:.0f} and {f:.0f} px satisfy {counted(len(F), 'pair')} alike",
+                f"focal lengths of {focal[0]:.0f} and {f:.0f} px fit {counted(len(F), 'pair')} equally well",
                 "add pairs of images, or calibrate from projective cameras (self_calibrate)",
             )
     return np.asarray(unit @ best[0][0])

@@ -1,7 +1,7 @@
 """Plane at infinity from parallel lines, given or detected in the images (chapter 7, stratified).
 
-Vanishing points of two images triangulate to a point of projective space; its support are the segments of all
-images that point to it. Three such points span the plane.
+Vanishing points of a direction in two images are triangulated to a point at infinity; its support are the
+segments of all images whose lines pass through its images. Three such points span the plane.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thesisrecon.selfcalibration._frame import (
 from thesisrecon.selfcalibration._line_segments import LineSegments
 from thesisrecon.selfcalibration._refinement import minimize_batch
 
-# Segments within this many tolerances of a direction are not offered to another one.
+# Segments within this many tolerances of a direction are not used for another one.
 _NEAR_TOLERANCES = 4.0
 _AMBIGUOUS = -2
 _FIRST_NOISE_PX, _MIN_NOISE_PX = 0.5, 1e-3

@@ -1,4 +1,4 @@
-"""Methods of the pipeline: self-calibration by the absolute dual quadric (section 7.3, direct; HZ 19.3)."""
+"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3)."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from thesisrecon.selfcalibration._refinement import RotationCriterion
 class LinearQuadric:
     """Self-calibration by the linear quadric for one normalizing focal length, without refinement.
 
-    The equation that expects this focal length biases the result even without noise, by tens of percent for
-    another lens: the focal lengths have no standard deviation (NaN).
+    The equations assume focal lengths near this one and bias the result even without noise, by tens of
+    percent for other lenses: the focal lengths have no standard deviation (NaN).
 
     Parameters
     ----------

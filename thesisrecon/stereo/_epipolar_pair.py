@@ -35,7 +35,7 @@ FOCAL_PER_SIDE = 1.2
 _J = np.array([[0.0, -1.0], [1.0, 0.0]])
 MIN_MATCHES = 8
 MIN_SAME_HALF = 0.8
-"""Share of matches that must lie on corresponding half-lines; wrong matches do by chance."""
+"""Minimum fraction of matches on corresponding half-lines; half of the wrong matches are there by chance."""
 SAMPLES = 16
 """Samples along each image side at which distortion is measured."""
 MAX_SHRINK = 1.4
@@ -223,7 +223,7 @@ def pair_of_cameras(
     if not apart > 1e-12 * (1.0 + float(np.abs(centres).max())):
         evidence = f"the distance of the centres is {apart:.1g}"
         advice = "take images from different positions, or choose other views"
-        raise StageFailure("both cameras have one centre", evidence, advice)
+        raise StageFailure("both cameras have the same centre", evidence, advice)
     F = fundamental_from_cameras(P[0], P[1])
     if len(matches[0]) >= MIN_MATCHES:
         require_parallax_of_matches(F, *matches, at_infinity=infinite_homography(P[0], P[1]))

@@ -1,4 +1,4 @@
-"""Samples of the space that several known cameras see, in the place of scene points."""
+"""Samples of the space that several known cameras see, used instead of scene points."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def frustum_samples(
 ) -> tuple[F64, B8]:
     """Sample the common frusta; return points (N, 3) and whether each of ``n_views`` shows them (V, N).
 
-    Points stand on the rays of a grid of pixels of each view, at the depths of ``depth_range`` (V, 2), each
-    shown by the views whose image contains it. Without a range a view shows the points of another one at
-    triangulation angles between ``MIN_ANGLE_DEG`` and ``MAX_ANGLE_DEG``; points that only their own view
-    shows are left out.
+    The points lie on the rays of a grid of pixels of each view, at the depths of ``depth_range`` (V, 2), and
+    are shown by the views whose image contains them. Without a range, another view shows a point only at a
+    triangulation angle between ``MIN_ANGLE_DEG`` and ``MAX_ANGLE_DEG``. Points shown only by their own view
+    are left out.
     """
     centres = {i: dehomogenize(camera_centre(view.P)) for i, view in views.items()}
     points, shown = [np.zeros((0, 3))], [np.zeros((n_views, 0), dtype=bool)]

@@ -76,7 +76,7 @@ def pack_squares(gray: F32, squares: U32) -> None:
 def fit_planes(rho: F32, radius: int, alike: float, gx: F32, gy: F32) -> None:
     """Fit the gradient of the inverse depth (H, W) around every known pixel.
 
-    Pixels that differ from the centre by at most the share ``alike`` are used; 0 with too few of them.
+    Pixels that differ from the centre by at most the fraction ``alike`` are used; 0 if these are too few.
     """
     height, width = rho.shape
     for v in range(height):

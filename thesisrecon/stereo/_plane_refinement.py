@@ -81,7 +81,7 @@ def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: 
 def search_planes(
     reference: PinholeView, others: Sequence[PinholeView], rho: F32, *, wanted: B8, sweeps: int
 ) -> tuple[F32, F32, U8]:
-    """Search the planes of ``wanted`` pixels; return inverse depths, deviations and support (H, W)."""
+    """Search the planes of ``wanted`` pixels; return inverse depths, their std and support, (H, W) each."""
     search, unknown = _search_arguments(reference, others), np.float32(np.nan)
     # Planes start and arrive from pixels at most one away.
     near = scipy.ndimage.binary_dilation(wanted, np.ones((3, 3)), RADIUS + 1)
@@ -108,7 +108,7 @@ def _is_supported(least: F32, support: U8) -> B8:
 
 
 def _continuing_surfaces(search: _Search, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
-    """(H, W) doubtful planes that continue the surface of accepted ones; standard deviations."""
+    """(H, W) planes of higher cost that continue the surface of accepted ones, and standard deviations."""
     doubtful = ~seen & (least <= MAX_CONTINUATION_COST)
     std = _rate(search, np.where(doubtful[..., None], planes, np.float32(np.nan)), MAX_CONTINUATION_COST)[2]
     joins = np.zeros(seen.shape, dtype=np.uint8)

@@ -17,7 +17,7 @@ UNREACHED = np.uint16(65535)
 MIN_FACTOR = np.float32(0.05)
 """Factor of the confidence without texture."""
 MIN_TEXTURED = 20
-"""One textured pixel is required for every so many pixels of a region."""
+"""A region needs one textured pixel per this number of pixels."""
 STEP_PX = np.float32(1.0)
 """Largest disparity difference of neighbours on one surface."""
 SUBSAMPLING = 5

@@ -26,11 +26,11 @@ from thesisrecon.stereo.correspondence import Correspondence, PairMatching, Rect
 BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
 """Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones."""
 MIN_ANGLE_DEG, MIN_POINTS = 1.0, 12
-"""A neighbour has at least so many common points of at least this angle."""
+"""A neighbour has at least ``MIN_POINTS`` common points with triangulation angles of ``MIN_ANGLE_DEG``."""
 MIN_SIDE = 64
-"""Least longest side of depth maps and of images for stereo matching, in pixels."""
+"""Lower limit of the settings for the longest side of depth maps and of images for matching, in pixels."""
 VIEW_BYTES = 2**29
-"""Undistorted views of one size in memory; more are made again when they are used."""
+"""Memory for undistorted views at each of the two sizes; others are computed again when they are used."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def _select_neighbours(
 
     The weight of a common point is a Gaussian of its triangulation angle. Points that earlier neighbours
     observe count less, and so does a view whose baseline has the direction of an earlier one, because views
-    from other sides see what is occluded.
+    from other sides see surfaces that are occluded here.
     """
     own = np.flatnonzero(points.seen[view])
     points = replace(points, X=points.X[own], seen=points.seen[:, own])
@@ -126,7 +126,7 @@ RADIUS, GATE = 5, 2.0
 MAX_SOURCES = 4
 """Largest number of views from which a depth map is completed."""
 GAP_PX, SWEEPS = 1, 2
-"""Completion also searches gaps of this size between projected pixels, in so many passes."""
+"""Size of the gaps between projected pixels that completion fills, and number of passes of its search."""
 
 
 def _confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
@@ -255,7 +255,8 @@ class MultiViewStereo:
     pairs: PairMatching = field(default_factory=PairMatching)  #: dense correspondence of two views
     max_neighbours: int = 4  #: largest number of neighbouring views
     sequence_links: int = 0
-    """0: fuse the correspondences with all neighbours; else link so many along the sequence each way."""
+    """0: fuse the correspondences with all neighbours; else number of views linked in each direction of the
+    sequence."""
     refinement: bool = True
     """Refine depth maps with slanted windows, and complete them from those of other views."""
     min_comparison_views: int = 12  #: number of depth maps to compare with, if there are as many

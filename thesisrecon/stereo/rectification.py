@@ -163,7 +163,9 @@ def _cost(found: Rectification, quality: RectificationQuality) -> tuple[bool, fl
 def rectify_pair(
     F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size, *, methods: Sequence[Method] = METHODS
 ) -> Rectification:
-    """Rectify two images with known fundamental matrix; "nearer" is judged with usual focal lengths.
+    """Rectify two images with known fundamental matrix.
+
+    The direction of larger disparities for nearer points is determined with typical focal lengths.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ ROWS, WARM_UP = 96, 8
 MATCH_NATS = 0.5
 """Expected cost of a match per component: (z - z')^2 / (2 s^2) is chi-square distributed."""
 STEPS_PER_NAT = 16.0
-"""Resolution of equal likelihoods: costs are integers; the grey levels and s^2 = 4 of the paper give 16."""
+"""Cost steps per nat; smaller differences are equal. The grey levels and s^2 = 4 of the paper give 16."""
 SIGNIFICANT = 30.0
 """Nats above the minimum from which the probability is taken as 0."""
 

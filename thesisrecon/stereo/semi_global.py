@@ -66,16 +66,16 @@ class SemiGlobalMatching:
 
     The cost is the Hamming distance of 5 x 5 census transforms (Zabih and Woodfill 1994), which are invariant
     to exposure, plus the truncated colour difference, which distinguishes regions of equal pattern. Costs
-    averaged over an adaptive support gain little from the diagonals, which extend foreground disparities past
-    the corners of objects.
+    averaged over an adaptive support improve little with diagonal paths, which extend foreground disparities
+    beyond the corners of objects.
     """
 
     paths: int = 4  #: 4 (rows and columns) or 8 (with diagonals)
     census_share: float = 0.56  #: share of the census in the maximal cost; the colours have the rest
-    truncation: float = 10.0  #: of the colour difference, in standard deviations of the noise
+    truncation: float = 10.0  #: largest colour difference in the cost, in standard deviations of the noise
     support: bool = True
     """Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels."""
-    smoothing_radius: int = 2  #: of the edge-preserving mean over similar disparities; 0 = none
+    smoothing_radius: int = 2  #: radius of the edge-preserving mean over similar disparities; 0 = none
     memory_mb: float = 256.0  #: limit for costs and path sums of one strip of rows
 
     def __post_init__(self) -> None:

@@ -149,7 +149,7 @@ class SplinePieces:
 
 
 def domain_of(depth_map: DepthMap, *, least: int, reach: float) -> Domain:
-    """Connect the depths of a map to surfaces of ``least`` pixels, which cover what is within ``reach``."""
+    """Connect the depths of a map to surfaces of at least ``least`` pixels, extended by ``reach`` pixels."""
     depth, std = depth_map.depth.astype(np.float64), depth_map.std.astype(np.float64)
     slope = max_depth_slope(depth_map.P, GRAZING_DEG)
     known = np.isfinite(depth) & (depth > 0.0) & (std > 0.0) & np.isfinite(std)

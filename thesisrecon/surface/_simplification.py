@@ -28,7 +28,7 @@ PASSES = 10
 BORDER_WEIGHT = 0.3
 """Weight of the planes that keep the borders in place, relative to that of the faces."""
 FITTED_POINTS = 0.3
-"""Original vertices, counted by their share in a new one, that it needs to be moved."""
+"""Minimum weight of the original vertices around a new vertex for it to be moved."""
 TOWARDS_MIDDLE = 1e-3
 """Weight of the middle of the edge where planes leave directions undetermined."""
 MAX_TURN = 0.5

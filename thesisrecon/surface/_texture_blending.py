@@ -113,9 +113,9 @@ def choose_views(
 ) -> I64:
     """Choose the view (M,) from which each face is textured, -1 if no view sees it.
 
-    Shares of the best quality are diffused over faces among the views that see them, and small charts join
-    the neighbour with the longest common border: the best view of each face alone would give many small
-    charts. Eight views are in memory at a time.
+    The best view of each face alone would give many small charts. Therefore the quality of each view relative
+    to the best one is diffused over the faces that it sees, and small charts join the neighbour with the
+    longest common border. Eight views are in memory at a time.
     """
     visible = np.zeros((len(mesh.faces), -(-len(views) // 8)), dtype=np.uint8)
     label = np.full(len(mesh.faces), -1, dtype=np.int64)
@@ -155,7 +155,7 @@ def label_charts(label: I64, neighbours: I64) -> I64:
 
 
 def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
-    """Small charts join a neighbour; the bits of ``visible`` (M, V / 8) tell the views that see a face."""
+    """Join small charts to a neighbour; the bits of ``visible`` (M, V / 8) are the views that see a face."""
     chart = label_charts(label, neighbours)
     faces = np.bincount(chart)
     small = (faces[chart] < MIN_CHART_FACES) & (label >= 0)
@@ -178,7 +178,7 @@ def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
 
 
 PART_TEXELS, LARGE_PART_TEXELS, CHUNK_POINTS = 1 << 17, 1 << 19, 1 << 14
-"""Texels of a part of the surface, if all views are in memory, and else; points of one task."""
+"""Texels of a part of the surface if all views are in memory, and otherwise; points of one task."""
 PREPARED_BYTES = 11
 """Bytes of a pixel of a view that is prepared for blending."""
 BATCH_VIEWS, OBSERVED = 8, 1 << 22
@@ -196,7 +196,7 @@ OUTLINE_PX = 10.0
 MIN_TRUST = 1e-3
 """Weight of pixels at outlines and image borders, which count where no other image shows the point."""
 GAIN_POINTS = 50_000
-"""Points at which image gains are estimated, fewer of more than 80 views."""
+"""Maximum number of points at which image gains are estimated; fewer with more than 80 views."""
 DARK, BRIGHT = 16.0, 240.0
 """Colours outside this range are clipped or noisy and not used for gains."""
 POWER = 2.0

@@ -143,8 +143,8 @@ class BSplineSurface:
         Returns
         -------
         DepthMap
-            The same view with its standard deviations, because a fit cannot reveal errors that neighbours
-            share.
+            The same view with its standard deviations unchanged, because a fit cannot detect errors that
+            neighbours share.
         """
         cell = self.knot_px
         domain = domain_of(depth_map, least=cell * cell, reach=float(cell))

@@ -1,4 +1,4 @@
-"""Fusion of depth maps to one surface (thesis, section 2.6): TSDF, or as a union of sheets.
+"""Fusion of depth maps to one surface (thesis, section 2.6): volumetric, or as a union of sheets.
 
 :class:`VolumetricFusion` averages signed distances in a sparse voxel grid (Curless and Levoy 1996), measured
 across the surface instead of along the rays, and extracts the zero level as a surface net (Gibson 1998): one
@@ -50,7 +50,7 @@ GROUP_BYTES, MEDIAN_PIXELS = 2**30, 2**26
 SLAB_BLOCKS, TASK_BLOCKS = 8192, 512
 """Blocks in memory at a time, besides a layer before and after them, and blocks of one task."""
 MAX_STD_VOXELS = 1.0
-"""Upper limit of the standard deviations that count for the simplification."""
+"""Upper limit of the standard deviations in the tolerance of the simplification."""
 LONGEST_VOXELS = 16.0
 """Longest side of a simplified face: a texture needs images that show a face completely."""
 
@@ -75,8 +75,8 @@ class VolumetricFusion:
         Voxel size in pixels of the depth maps at their median depth, and largest number of blocks of
         8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
     tolerance : float
-        Root mean square distance by which the simplified surface may leave the faces it replaces, in standard
-        deviations of the fused depths there (of at most a voxel); 0: all faces stay.
+        RMS distance by which the simplified surface may deviate from the faces it replaces, in standard
+        deviations of the fused depths there (of at most a voxel); 0: no simplification.
     """
 
     voxel_px: float = 1.5

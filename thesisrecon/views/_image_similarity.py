@@ -61,7 +61,7 @@ def _ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
 def _check(real: U8, rendered: U8, compared: B8) -> None:
     if real.shape != rendered.shape or real.shape != (*compared.shape, 3):
         shapes = f"{real.shape}, {rendered.shape} and {compared.shape}"
-        raise ValueError(f"images and mask must have one size; got {shapes}")
+        raise ValueError(f"images and mask must have the same size; got {shapes}")
     if not compared.any():
         raise ValueError("no pixel is shown by both images")
 

@@ -146,9 +146,9 @@ def blend(
 ) -> None:
     """Blend two warped images of colours (H, W, 3), inverse depths ``fronts`` and positions ``sources``.
 
-    Where both inverse depths agree, the weighted mean is taken. Otherwise known pixels win over guessed ones;
-    of two known pixels the nearer wins, of two guessed ones the farther. ``weights`` (h, w) are of the source
-    pixels; ``limits``: tolerance of inverse depth, weight up to which a pixel counts as guessed, and s.
+    Where both inverse depths agree, the weighted mean is used. Otherwise known pixels replace guessed ones,
+    the nearer of two known pixels is used, and the farther of two guessed ones. ``weights`` (h, w) belong to
+    the source pixels; ``limits``: tolerance of inverse depth, weight up to which a pixel is guessed, and s.
     """
     alike, guess, s = limits
     rgb, near = out

@@ -15,7 +15,7 @@ from thesisrecon.geometry._zbuffer import run_in_strips
 from thesisrecon.kernels import empty, kernel
 
 SLACK = 1e-7
-"""Barycentric distance by which a triangle reaches beyond its edges, so that no rounding opens a crack."""
+"""Barycentric distance by which a triangle extends beyond its edges, so that rounding leaves no gaps."""
 BACKGROUND_FRACTION = 0.4
 """Pixels in this farther part of the range of inverse depth count as background; a single far pixel
 may be an outlier."""
@@ -336,10 +336,10 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
 
 
 def fill_holes(rgb: F32, inverse_depth: F32, *, step: float) -> F32:
-    """Fill holes (NaN inverse depth) with the background around them, since what was occluded is background.
+    """Fill holes (NaN inverse depth) with the background around them: occluded surfaces are background.
 
-    Of the nearest known pixels in sixteen directions those count whose inverse depth is at most ``step``, or
-    0.4 of its range, above the smallest. Their colours are averaged with weights 1 / distance^2.
+    The nearest known pixel in each of sixteen directions is used if its inverse depth is at most ``step``, or
+    0.4 of the range, above the smallest. Their colours are averaged with weights 1 / distance^2.
     """
     filled = rgb.copy()
     distance = distances_to_known(inverse_depth)

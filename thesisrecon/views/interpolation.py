@@ -26,11 +26,11 @@ SHRINK = 0.8
 MIN_DEPTH = 0.2
 """Minimum third coordinate of its corners, in units of that of its centre."""
 SLACK_PX = 0.5
-"""Correspondences may cross by this much: less is noise of the disparities."""
+"""Largest violation of monotonicity that counts as noise of the disparities."""
 SPARSE = 7
 """Subsampling step for medians."""
 PREPARING = 2
-"""Threads that prepare an image."""
+"""Number of threads that prepare an image."""
 DARK, BRIGHT = 8.0, 247.0
 """Range of levels used for the ratio of exposures."""
 SAME_SURFACE_PX = 1.5
@@ -82,7 +82,7 @@ def _homography(source: F64, target: F64) -> F64:
     for (x, y), (u, v) in zip(source, target, strict=True):
         rows.append([x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, -u])
         rows.append([0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, -v])
-    # Columns of one size: coordinates are of thousands.
+    # Scaled to columns of similar size, since coordinates reach thousands.
     system = np.array(rows)
     scale = np.linalg.norm(system, axis=0)
     H = (np.linalg.svd(system / scale)[2][-1] / scale).reshape(3, 3)
@@ -147,10 +147,10 @@ class InterpolatedPair:
     def __post_init__(self) -> None:
         a, b = (image.shape for image in self.images)
         if a != b or len(a) != 3 or a[2] != 3:
-            raise ValueError(f"views lie between two images (h, w, 3) of one size; got {a} and {b}")
+            raise ValueError(f"views need two images (h, w, 3) of the same size; got {a} and {b}")
         if self.left.disparity.shape != self.right.disparity.shape:
             shapes = f"{self.left.disparity.shape} and {self.right.disparity.shape}"
-            raise ValueError(f"disparities of both sides must have one shape; got {shapes}")
+            raise ValueError(f"disparities of both sides must have the same shape; got {shapes}")
 
     @property
     def size(self) -> tuple[int, int]:

@@ -26,7 +26,7 @@ CLEARANCE = 0.5
 SHOWN = 0.9
 """Minimum visible share of the model, in units of the median over the cameras."""
 TURNING = 3.0
-"""If rotation per path length exceeds the mean of the path by this factor, rotation determines the time."""
+"""Where the rotation per path length exceeds this multiple of its mean, it determines the speed."""
 STEPS = 64
 """Samples per spline segment for measuring its length."""
 SAMPLE = 5000
@@ -129,8 +129,9 @@ def interpolate_cameras(
 def estimate_up(cameras: Sequence[Camera]) -> F64:
     """Estimate the up direction of the scene.
 
-    It is most nearly perpendicular to the image rows, and weakly to the optical axes: hand-held cameras are
-    tilted but hardly rolled. The image up directions, or else cameras that look down, give its sign.
+    It is the direction nearest to perpendicular to the image rows, and with a small weight to the optical
+    axes: hand-held cameras are tilted but hardly rolled. Its sign is that of the image up directions or, if
+    these cancel, follows from cameras that look down.
 
     Parameters
     ----------
@@ -200,12 +201,12 @@ def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
     radius = float(np.median(np.linalg.norm(offset - np.outer(offset @ up, up), axis=1)))
     least = MIN_HORIZONTAL_DISTANCE * max(np.hypot(radius, height), spread)
     if not least > 0.0:
-        raise ValueError("an orbit needs a distance; all points and cameras are in one place")
+        raise ValueError("an orbit needs a distance; all points and cameras coincide")
     return max(radius, least), height
 
 
 def _azimuths(of_cameras: F64, frames: int) -> F64:
-    """Angles (frames,) in rad, all round the circle or to and fro over the arc of the cameras."""
+    """Angles (frames,) in rad, around the full circle or back and forth over the arc of the cameras."""
     ordered = np.sort(of_cameras)
     gaps = np.diff(ordered, append=ordered[0] + 2.0 * np.pi)
     phase = 2.0 * np.pi * np.arange(frames) / frames
@@ -230,7 +231,7 @@ def _widening(circle: Callable[[float], list[Camera]], cameras: Sequence[Camera]
     tree, nearest = scipy.spatial.cKDTree(X), [1 + len(X) // 1000]
 
     def distances(path: Sequence[Camera]) -> F64:
-        # Not the very nearest: single points float before every reconstruction.
+        # Not the nearest point: every reconstruction has single wrong points near its cameras.
         return np.asarray(tree.query([camera.centre for camera in path], k=nearest)[0])
 
     def shares(path: Sequence[Camera]) -> F64:

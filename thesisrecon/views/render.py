@@ -34,10 +34,10 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 @kernel
-def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lamps: F64, ambient: float) -> None:
+def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lights: F64, ambient: float) -> None:
     """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye.
 
-    ``lamps`` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
+    ``lights`` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
     """
     light = empty(3)
     for p in range(color.shape[0]):
@@ -47,13 +47,13 @@ def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lamps: F64, a
         if nx * ex + ny * ey + nz * ez < 0.0:
             nx, ny, nz = -nx, -ny, -nz
         light[:] = ambient
-        for k in range(lamps.shape[0]):
-            at = lamps[k, 0]
-            lx, ly, lz = _unit(lamps[k, 1] - at * px, lamps[k, 2] - at * py, lamps[k, 3] - at * pz)
+        for k in range(lights.shape[0]):
+            at = lights[k, 0]
+            lx, ly, lz = _unit(lights[k, 1] - at * px, lights[k, 2] - at * py, lights[k, 3] - at * pz)
             cosine = nx * lx + ny * ly + nz * lz
             if cosine > 0.0:
                 for c in range(3):
-                    light[c] += cosine * lamps[k, 4 + c]
+                    light[c] += cosine * lights[k, 4 + c]
         for c in range(3):
             color[p, c] = np.float32(color[p, c] * light[c])
 
@@ -98,14 +98,14 @@ class Light:
 
     @property
     def _row(self) -> list[float]:
-        """Row of ``lamps`` in :func:`_shade_points`."""
+        """Row of ``lights`` in :func:`_shade_points`."""
         place = self.direction if self.position is None else self.position
         return [float(self.position is not None), *(place or (0.0, 0.0, 0.0)), *self.color]
 
 
 @dataclass(frozen=True)
 class Shading:
-    """Ambient light and light sources. Both sides of a surface are lit alike.
+    """Ambient light and light sources. Both sides of a surface are lit equally.
 
     Parameters
     ----------
@@ -239,5 +239,5 @@ def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
 
 def _shade(color: F32, points: F32, normals: F32, eye: F64, shading: Shading) -> None:
     """Shade the colours (P, 3) of surface points in place."""
-    lamps = np.array([light._row for light in shading.lights], dtype=np.float64).reshape(-1, 7)
-    _shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lamps, float(shading.ambient))
+    lights = np.array([light._row for light in shading.lights], dtype=np.float64).reshape(-1, 7)
+    _shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lights, float(shading.ambient))

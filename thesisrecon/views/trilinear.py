@@ -224,7 +224,7 @@ def _decompose_small(E: F64) -> list[tuple[F64, F64]]:
 
 @dataclass(frozen=True)
 class VirtualCamera:
-    """The third camera of the seed after a motion from X_3 to R X_3 + t.
+    """A virtual camera: the third camera of the seed tensor, moved from X_3 to R X_3 + t.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ class VirtualCamera:
 def camera_at(
     pair: CalibratedPair, s: float, *, sizes: tuple[tuple[int, int], tuple[int, int]]
 ) -> VirtualCamera:
-    """Place a virtual camera on the baseline: the rotation about its axis is a share of that of the pair.
+    """Place a virtual camera on the baseline; its rotation angle is the fraction ``s`` of that of the pair.
 
     K is interpolated if both sizes are equal, otherwise it is K2.
 

@@ -208,7 +208,7 @@ class TensorSynthesis:
         if not seen.mean() >= MIN_SEEN:
             raise StageFailure(
                 "the virtual camera sees almost nothing of the scene",
-                f"{100.0 * seen.mean():.1f} % of its picture, needed {100.0 * MIN_SEEN:.0f} %",
+                f"{100.0 * seen.mean():.1f} % of its image, needed {100.0 * MIN_SEEN:.0f} %",
                 "move the camera less (in baselines) or rotate it back",
             )
         rgb, inverse_depth = self._mixed(layers, self._share_of_second(moved[0]), step)
@@ -235,9 +235,9 @@ class TensorSynthesis:
 def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: float) -> F32:
     """Blending weight (H, W) of the second image, NaN where both are empty.
 
-    Where both show the same surface it is ``share``. Where they differ the nearer surface is shown,
-    fully in the half next to its own image and not at all in the last quarter before the other one,
-    which would have shown it.
+    Where both show the same surface it is ``share``. Where they differ, the nearer surface is shown: with
+    full weight if the camera is in the half of the baseline next to its own image, with weight 0 in the last
+    quarter before the other image, which does not show it.
     """
     (first, near1), (second, near2) = layers
     seen1, seen2 = np.isfinite(near1), np.isfinite(near2)
@@ -246,7 +246,7 @@ def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: fl
     alike = seen1 & seen2 & (sure1 == sure2)
     weight[alike & (near2 > near1 + step)] = np.clip(4.0 * share - 1.0, 0.0, 1.0)
     weight[alike & (near1 > near2 + step)] = np.clip(4.0 * share - 2.0, 0.0, 1.0)
-    # Known correspondences win at any depth, except close to the image of the extrapolated pixel.
+    # Known correspondences are used at any depth, except close to the image of the extrapolated pixel.
     weight[seen1 & seen2 & sure1 & ~sure2] = np.clip(4.0 * share - 3.0, 0.0, 1.0)
     weight[seen1 & seen2 & sure2 & ~sure1] = np.clip(4.0 * share, 0.0, 1.0)
     weight[seen1 & ~seen2] = 0.0
