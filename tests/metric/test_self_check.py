@@ -7,7 +7,7 @@ import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import check_views, self_check, triangulable_observations
 from thesisrecon.metric._model import (
     MetricEstimate,
@@ -103,7 +103,7 @@ def test_points_behind_a_camera_are_detected():
 @pytest.mark.parametrize(("off", "deviation", "reported"), [(1.0, 0.01, 0), (1.05, 0.003, 1), (1.05, 0.1, 0)])
 def test_a_focal_that_the_images_contradict_is_reported(off, deviation, reported):
     _, prior, model = setting(focal_px=1500.0 * off, focal_std_rel=deviation)
-    adjustment = BundleAdjustment(prior, 0.0, 0.02)
+    adjustment = MetricAdjustment(prior, 0.0, 0.02)
     model = adjustment.run(model, iterations=10)[0]
     model = retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
     failed_checks = contradicted_focal_priors(model, adjustment)
@@ -113,13 +113,13 @@ def test_a_focal_that_the_images_contradict_is_reported(off, deviation, reported
 
 def test_a_contradicted_known_focal_is_reported_once_without_advice_on_weights():
     _, prior, model = setting(focal="known", focal_px=1600.0)
-    failed_checks = contradicted_focal_priors(model, BundleAdjustment(prior, 0.0, 0.02))
+    failed_checks = contradicted_focal_priors(model, MetricAdjustment(prior, 0.0, 0.02))
     assert len(failed_checks) == 1
     assert "shorter" in failed_checks[0]
     assert "px" not in failed_checks[0]
     assert "focal_std_rel" not in failed_checks[0]
     _, without, model = setting()
-    assert contradicted_focal_priors(model, BundleAdjustment(without, 0.0, 0.02)) == []
+    assert contradicted_focal_priors(model, MetricAdjustment(without, 0.0, 0.02)) == []
 
 
 def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_doubted():
@@ -162,7 +162,7 @@ def test_two_images_from_one_place_are_not_rejected_for_points_only_they_share()
 def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself_too():
     scene = make_scene(sigma_px=0.3, principal_shift=(140.0, 0.0), seed=3)
     prior = prior_for(projective_reconstruction(scene))
-    model, adjustment = true_model(scene, prior), BundleAdjustment(prior, 0.0, 0.02)
+    model, adjustment = true_model(scene, prior), MetricAdjustment(prior, 0.0, 0.02)
 
     def scatter(contradiction):
         return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, 32)
@@ -176,7 +176,7 @@ def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself
 def settled(scene, **options):
     """The model as the metric stage ends with it: adjusted and triangulated by turns."""
     prior = prior_for(projective_reconstruction(scene), IntrinsicsOptions(**options))
-    adjustment = BundleAdjustment(prior, 0.0, 0.02)
+    adjustment = MetricAdjustment(prior, 0.0, 0.02)
     model = true_model(scene, adjustment.prior)
     model = replace(model, sigma_px=30.0)
     for _ in range(3):

@@ -39,8 +39,8 @@ class HierarchicalPrior:
 
 
 @dataclass(frozen=True)
-class BundleAdjustment:
-    """Settings of the bundle adjustments of one metric stage.
+class MetricAdjustment:
+    """Bundle adjustments of one metric stage: settings, and :meth:`run` for a model.
 
     ``lens_std`` is the prior standard deviation of k2 and k3 about 0 (0 fixes them), ``noise_floor_px`` the
     lower bound of the estimated noise, ``inflation`` a factor on the noise in the weights, for correlated

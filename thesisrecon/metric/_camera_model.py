@@ -15,7 +15,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows, reproject_observations
 from thesisrecon.numerics._block_scatter import point_blocks
 
@@ -44,8 +44,8 @@ def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[in
 
 
 def with_own_values(
-    model: MetricEstimate, adjustment: BundleAdjustment, columns: tuple[int, ...]
-) -> tuple[MetricEstimate, BundleAdjustment]:
+    model: MetricEstimate, adjustment: MetricAdjustment, columns: tuple[int, ...]
+) -> tuple[MetricEstimate, MetricAdjustment]:
     """The model with one value per image in some columns of the intrinsics, without hierarchical prior."""
     shared = adjustment.prior.shared.copy()
     shared[:, columns] = np.arange(len(shared))[:, None]
@@ -71,7 +71,7 @@ def held_out_observations(model: MetricEstimate) -> I64:
 
 
 def remaining_cost(
-    simple: tuple[MetricEstimate, BundleAdjustment], rich: tuple[MetricEstimate, BundleAdjustment]
+    simple: tuple[MetricEstimate, MetricAdjustment], rich: tuple[MetricEstimate, MetricAdjustment]
 ) -> float:
     """Cost of held-out observations, richer over simple model; 1 if there are few."""
     model = simple[0]
@@ -82,7 +82,7 @@ def remaining_cost(
 
 
 def _held_out_cost(
-    model: MetricEstimate, adjustment: BundleAdjustment, held: I64, unit: MetricEstimate
+    model: MetricEstimate, adjustment: MetricAdjustment, held: I64, unit: MetricEstimate
 ) -> F64:
     """Huber's loss of held-out observations, in the noise and the loss of the model ``unit``."""
     inlier = model.inlier.copy()

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import counted
 from thesisrecon.geometry.robust_resection import resect_calibrated
-from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, BundleAdjustment
+from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
@@ -68,7 +68,7 @@ def _pose_and_focal(
 
 
 def register_missing_cameras(
-    model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator
+    model: MetricEstimate, adjustment: MetricAdjustment, rng: np.random.Generator
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Register missing and inconsistent cameras; return the model, and the reason of each view that failed."""
     model, rejected = _grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
@@ -79,7 +79,7 @@ def register_missing_cameras(
 
 
 def _grow(
-    model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, allowed: B8
+    model: MetricEstimate, adjustment: MetricAdjustment, rng: np.random.Generator, allowed: B8
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
     model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
@@ -105,7 +105,7 @@ def _grow(
             return model, rejected
 
 
-def _adjust_window(model: MetricEstimate, adjustment: BundleAdjustment, views: B8) -> MetricEstimate:
+def _adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B8) -> MetricEstimate:
     """Triangulate the points of some views and adjust both; other cameras and shared intrinsics are fixed."""
     t, cameras = model.tracks, model.cameras
     points = np.unique(t.point_index[views[t.view_index]])
@@ -178,7 +178,7 @@ def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Genera
 
 
 def _register_again(
-    model: MetricEstimate, adjustment: BundleAdjustment, rng: np.random.Generator, suspects: B8
+    model: MetricEstimate, adjustment: MetricAdjustment, rng: np.random.Generator, suspects: B8
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Remove suspects, adjust the rest without them, then register them again if they fit."""
     none = np.zeros(len(suspects), dtype=bool)

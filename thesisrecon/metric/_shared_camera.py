@@ -15,7 +15,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, WIDTH, MetricEstimate
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
 from thesisrecon.numerics._block_scatter import BlockScatter
@@ -71,7 +71,7 @@ def _subsample_inliers(model: MetricEstimate) -> Observations:
 
 def _adjust_per_view(
     model: MetricEstimate,
-    adjustment: BundleAdjustment,
+    adjustment: MetricAdjustment,
     columns: tuple[int, ...],
     *,
     focal_spread: float = np.inf,
@@ -138,7 +138,7 @@ class _SharedGroup:
         return len(self.places) - (0 if self.known else 1)
 
 
-def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) -> SharedCameraTest:
+def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) -> SharedCameraTest:
     """Test shared focals and principal points of two views or more by the decrease in cost (chi-square)."""
     everywhere, model = model.registered, _runs_of_views(model)
     views = np.flatnonzero(model.registered)
@@ -175,7 +175,7 @@ def check_shared_cameras(model: MetricEstimate, adjustment: BundleAdjustment) ->
     return SharedCameraTest(tuple(found), tuple(warnings), focal_std, contradicted, misfit)
 
 
-def _sets(model: MetricEstimate, adjustment: BundleAdjustment, views: I64, column: int) -> list[_SharedGroup]:
+def _sets(model: MetricEstimate, adjustment: MetricAdjustment, views: I64, column: int) -> list[_SharedGroup]:
     """Views that share a column; those whose principal point is known."""
     assert model.cameras.shared is not None
     rows = model.cameras.group[views]
@@ -209,7 +209,7 @@ def _focals_apart(alone: MetricBundleResult, s: _SharedGroup) -> bool:
     return bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE)
 
 
-def _std_of_a_kind(model: MetricEstimate, adjustment: BundleAdjustment, s: _SharedGroup) -> float:
+def _std_of_a_kind(model: MetricEstimate, adjustment: MetricAdjustment, s: _SharedGroup) -> float:
     """Relative standard deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
     # Standard deviations are inflated afterwards, the assumed scatter must not be.
     scattered = _adjust_per_view(model, adjustment, (FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
@@ -219,7 +219,7 @@ def _std_of_a_kind(model: MetricEstimate, adjustment: BundleAdjustment, s: _Shar
 
 
 def _centres_off(
-    model: MetricEstimate, adjustment: BundleAdjustment, views: I64, both: MetricBundleResult, s: _SharedGroup
+    model: MetricEstimate, adjustment: MetricAdjustment, views: I64, both: MetricBundleResult, s: _SharedGroup
 ) -> F64:
     """(n, 2) offsets, in long sides, of own principal points from the known one or the median."""
     rows = model.cameras.group[views[s.places]]
@@ -262,7 +262,7 @@ def _untestable(std: float) -> str:
     )
 
 
-def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustment) -> list[str]:
+def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustment) -> list[str]:
     """A sentence for each given focal length that differs from an adjustment without them."""
     prior = adjustment.prior
     given = np.flatnonzero(prior.focal_known & model.registered)
@@ -285,7 +285,7 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: BundleAdjustmen
 
 
 def inconsistent_principal_point(
-    model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter
+    model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter
 ) -> list[str]:
     """Detect a deformed model: a moved principal point and blocks that disagree (those of crops agree)."""
     views = np.flatnonzero(model.registered)
@@ -307,7 +307,7 @@ def inconsistent_principal_point(
     ]
 
 
-def _free_focals(model: MetricEstimate, adjustment: BundleAdjustment) -> tuple[F64, F64, I64]:
+def _free_focals(model: MetricEstimate, adjustment: MetricAdjustment) -> tuple[F64, F64, I64]:
     """Focals (V,) without prior, relative standard deviations, and numbers: equal ones share their focal."""
     cameras = model.cameras
     assert cameras.shared is not None

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.metric._adjustment import BundleAdjustment, HierarchicalPrior
+from thesisrecon.metric._adjustment import MetricAdjustment, HierarchicalPrior
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._noise import MAD_FACTOR, student_factor
@@ -81,7 +81,7 @@ class PerCameraEstimates:
 
 
 def per_camera_estimates(
-    model: MetricEstimate, adjustment: BundleAdjustment, scatter: BlockScatter
+    model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter
 ) -> PerCameraEstimates:
     """Intrinsics of each camera of a model that was adjusted without hierarchical prior."""
     group = model.cameras.group
@@ -144,8 +144,8 @@ def estimate_spread(value: F64, std: F64, total: F64) -> float:
 
 
 def apply_hierarchical_prior(
-    model: MetricEstimate, adjustment: BundleAdjustment, hierarchical: HierarchicalPrior
-) -> tuple[MetricEstimate, BundleAdjustment]:
+    model: MetricEstimate, adjustment: MetricAdjustment, hierarchical: HierarchicalPrior
+) -> tuple[MetricEstimate, MetricAdjustment]:
     """Add the hierarchical prior, and share k2 and k3 among cameras of one zoom setting."""
     assert model.cameras.shared is not None
     shared = model.cameras.shared.copy()
@@ -202,7 +202,7 @@ def focal_shrinkage(
 
 def intrinsic_intervals(
     model: MetricEstimate,
-    adjustment: BundleAdjustment,
+    adjustment: MetricAdjustment,
     scatter: BlockScatter,
     shrinkage: FocalShrinkage,
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:

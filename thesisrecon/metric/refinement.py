@@ -17,7 +17,7 @@ from thesisrecon.metric._adjustment import (
     FOCAL_AND_CENTRE,
     MIN_OBSERVATIONS,
     SETTLED,
-    BundleAdjustment,
+    MetricAdjustment,
     with_initial_gate,
 )
 from thesisrecon.metric._camera_model import (
@@ -104,7 +104,7 @@ class MetricRefinement:
         threads: int = 1,
     ) -> MetricResult:
         """See `thesisrecon.config.MetricRefiner.refine`."""
-        adjustment = BundleAdjustment(prior, LENS_STD, NOISE_FLOOR_PX, threads=threads)
+        adjustment = MetricAdjustment(prior, LENS_STD, NOISE_FLOOR_PX, threads=threads)
         trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:
@@ -136,7 +136,7 @@ class MetricRefinement:
 
 
 def _start(
-    reconstruction: Reconstruction, upgrade: Upgrade, adjustment: BundleAdjustment
+    reconstruction: Reconstruction, upgrade: Upgrade, adjustment: MetricAdjustment
 ) -> MetricEstimate | None:
     """Upgrade the core cameras and adjust them on projective inliers while the gate narrows."""
     model = upgraded_model(reconstruction, upgrade, adjustment.prior, MAX_ROTATION_RESIDUAL)
@@ -156,7 +156,7 @@ def _start(
     return select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
 
 
-_Finished = tuple[MetricEstimate, BundleAdjustment, PerCameraEstimates, BlockScatter]
+_Finished = tuple[MetricEstimate, MetricAdjustment, PerCameraEstimates, BlockScatter]
 
 
 def settle_camera_model(
@@ -185,7 +185,7 @@ def settle_camera_model(
     return chosen, sharing, limitations, difference
 
 
-def finish_metric(model: MetricEstimate, adjustment: BundleAdjustment) -> _Finished:
+def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finished:
     """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
     model = _iterate_inliers(model, adjustment)
     scatter = adjustment.scatter(model)
@@ -206,7 +206,7 @@ def _selected(model: MetricEstimate) -> MetricEstimate:
     return select_inliers(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
 
 
-def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate:
+def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:
     """Adjust and triangulate until the inliers stay the same, then adjust to convergence."""
     for _ in range(MAX_ROUNDS):
         before = model.inlier
@@ -218,7 +218,7 @@ def _iterate_inliers(model: MetricEstimate, adjustment: BundleAdjustment) -> Met
 
 
 def _adjust_to_precise_points(
-    model: MetricEstimate, tracks: Tracks, adjustment: BundleAdjustment
+    model: MetricEstimate, tracks: Tracks, adjustment: MetricAdjustment
 ) -> MetricEstimate:
     """In large sets, select the points again by the residuals of the model adjusted to the selection."""
     if model.tracks.n_points == tracks.n_points:

@@ -19,7 +19,7 @@ import thesisrecon
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
-from thesisrecon.metric._adjustment import BundleAdjustment
+from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
 from thesisrecon.metric._shared_camera import contradicted_focal_priors
@@ -44,7 +44,7 @@ class Outcome:
     doubted: bool
 
 
-def settle(model: MetricEstimate, adjustment: BundleAdjustment) -> MetricEstimate | None:
+def settle(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate | None:
     """Triangulate and adjust in turn, as the metric stage ends; None if nothing is left."""
     try:
         for _ in range(ROUNDS):
@@ -72,7 +72,7 @@ def is_wrong(model: MetricEstimate, right: MetricEstimate) -> bool:
     )
 
 
-def is_doubted(model: MetricEstimate, calibration: SelfCalibration, adjustment: BundleAdjustment) -> bool:
+def is_doubted(model: MetricEstimate, calibration: SelfCalibration, adjustment: MetricAdjustment) -> bool:
     """Return whether the self-check doubts a model with narrow intervals, sharing aside."""
     said = [
         {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 0.0, "")}
@@ -83,7 +83,7 @@ def is_doubted(model: MetricEstimate, calibration: SelfCalibration, adjustment: 
 
 
 def judge(
-    model: MetricEstimate, right: MetricEstimate, calibration: SelfCalibration, adjustment: BundleAdjustment
+    model: MetricEstimate, right: MetricEstimate, calibration: SelfCalibration, adjustment: MetricAdjustment
 ) -> Outcome | None:
     settled = settle(model, adjustment)
     if settled is None:
@@ -101,7 +101,7 @@ def spoiled_outcomes(
 ) -> dict[str, list[Outcome | None]]:
     assert result.metric is not None
     assert result.calibration is not None
-    adjustment = BundleAdjustment(prior, 0.02, 0.02)
+    adjustment = MetricAdjustment(prior, 0.02, 0.02)
     right = settle(model_from_reconstruction(result.metric.reconstruction, prior), adjustment)
     assert right is not None
     found: dict[str, list[Outcome | None]] = defaultdict(list)
@@ -111,7 +111,7 @@ def spoiled_outcomes(
             found[name].append(judge(bad, right, result.calibration, adjustment))
     held, prior_held = _focal_held(right, prior)
     found["focal held 10 % off"].append(
-        judge(held, right, result.calibration, BundleAdjustment(prior_held, 0.02, 0.02))
+        judge(held, right, result.calibration, MetricAdjustment(prior_held, 0.02, 0.02))
     )
     found["right, as it is"].append(judge(right, right, result.calibration, adjustment))
     # Few views with a focal each leave the focals open, which only their intervals show.
