@@ -64,12 +64,12 @@ class AlignmentReport:
 
 
 def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
-    """Return the model of a run or a file.
+    """Return the sparse model of a run or a file.
 
     Parameters
     ----------
     model : SparseModel, RunResult or path
-        A model, a run or its output folder, or a COLMAP model.
+        A model, a run or its output folder, or a COLMAP model; a ``UsageError`` if it has no cameras.
 
     Returns
     -------

@@ -122,7 +122,7 @@ class Camera:
         Parameters
         ----------
         X : ndarray (N, 3)
-            Points in the world frame. Points behind the camera are projected too; check their depth.
+            Points in the world frame. Points behind the camera are projected, too.
 
         Returns
         -------
@@ -139,12 +139,12 @@ class Camera:
         Parameters
         ----------
         xy, depth : ndarray (N, 2), ndarray (N,)
-            Pixels of the (distorted) image and depths z in the camera frame (optional).
+            Pixels of the (distorted) image, and depths z in the camera frame (optional).
 
         Returns
         -------
         ndarray (N, 3)
-            Points, or without depth unit directions from the centre, in the world frame.
+            Points in the world frame; without ``depth`` unit vectors of the viewing rays in the world frame.
         """
         xy = np.asarray(xy, dtype=np.float64)
         given = {} if depth is None else {"depth": (depth, ("N",))}
@@ -156,17 +156,17 @@ class Camera:
         return np.asarray((rays * np.asarray(depth)[:, None] - self.t) @ self.R)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the same view with resized pixels: x goes to (x + 0.5) factor - 0.5.
+        """Return the camera of the resized image: x goes to (x + 0.5) s - 0.5 along each side.
 
         Parameters
         ----------
         factor : float
-            New size over old size, above 0; the sides are rounded to whole pixels.
+            New over old size, finite and above 0, otherwise a ``ValueError``. The sides are rounded to whole
+            pixels; s is the ratio of the rounded side to the old one.
 
         Returns
         -------
         Camera
-            The camera of the resized image.
         """
         if not 0.0 < factor < math.inf:
             raise ValueError(f"Camera.scaled needs a finite factor above 0; got {factor}")

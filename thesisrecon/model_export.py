@@ -107,8 +107,9 @@ def export(
 
     Raises
     ------
-    UsageError
-        If the format is unknown, cannot hold the cameras, or the images are not found.
+    UsageError, StageFailure, OutputError
+        If the format is unknown or cannot represent the cameras, or the images are not found, have another
+        size or would be replaced; if an image cannot be read; if a file cannot be written.
 
     Examples
     --------
@@ -155,7 +156,7 @@ def require_separate(
     images: str | Path | None = None,
     masks: str | Path | None = None,
 ) -> None:
-    """Refuse an export whose files would replace those that it is made from.
+    """Raise ``UsageError`` if an export would replace the files that it reads.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: 
     Parameters
     ----------
     f_u, f_v, u_0, v_0 : float
-        Focal lengths, positive, and principal point, px.
+        Focal lengths, positive (otherwise a ``ValueError``), and principal point, px.
     skew : float
         f_v tan(alpha), px, for pixel sides that deviate from a right angle by alpha (table 3.1).
 

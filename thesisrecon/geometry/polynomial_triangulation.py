@@ -317,7 +317,7 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     Parameters
     ----------
     F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix of rank 2, any scale, and matches, px.
+        Fundamental matrix of rank 2 (``ValueError`` for rank 1), any scale, and matches, px.
 
     Returns
     -------
@@ -350,7 +350,8 @@ def triangulate_polynomial(P: F64, xy: F64) -> F64:
     Parameters
     ----------
     P, xy : ndarray (2, 3, 4) and (2, N, 2)
-        Cameras of rank 3 with different centres, and pixels; NaN for not observed.
+        Cameras of rank 3 with different centres (others are a ``ValueError``), and pixels; NaN for not
+        observed.
 
     Returns
     -------

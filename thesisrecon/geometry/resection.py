@@ -11,12 +11,13 @@ from thesisrecon.geometry._conditioning import normalizing_transform, require_fi
 def resect_linear(X: F64, xy: F64) -> F64:
     """Estimate cameras by the direct linear transform, least algebraic residual.
 
-    Coplanar points leave a family of cameras; some member is returned.
+    Coplanar points do not determine the camera; one of the solutions is returned.
 
     Parameters
     ----------
     X, xy : ndarray (..., M, 4) and (..., M, 2)
-        M >= 6 homogeneous points, best as whitened unit vectors, and their pixels.
+        M >= 6 homogeneous points, best as whitened unit vectors, and their pixels; fewer are a
+        ``ValueError``.
 
     Returns
     -------

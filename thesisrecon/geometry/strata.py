@@ -69,14 +69,13 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
 def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
     """Return the smallest group that a transform belongs to (figure 3.1).
 
-    Affine: the last row is a multiple of (0, 0, 0, 1). Metric: A'A is a multiple of I too, det A > 0 for
-    W = 1. Euclidean: the multiple is 1. Tested in the unit of length of G, or of its translation |t|/|A| if
-    that is larger.
+    With G = [A t; b' 1] the transform is affine if b = 0, metric if also A'A = s^2 I and det A > 0, and
+    Euclidean if also s = 1. The unit of length of the test is that of G, or |t| / |A| if this is larger.
 
     Parameters
     ----------
     G, tolerance : ndarray (4, 4), float
-        Transform of any scale, finite and invertible, and relative tolerance.
+        Transform of any scale, finite and invertible (otherwise a ``ValueError``), and relative tolerance.
 
     Returns
     -------
@@ -107,7 +106,7 @@ def affine_from_projective(plane: F64) -> F64:
     Parameters
     ----------
     plane : ndarray (4,)
-        Plane at infinity in the projective frame, not 0.
+        Plane at infinity in the projective frame, finite and not 0 (otherwise a ``ValueError``).
 
     Returns
     -------
@@ -134,7 +133,7 @@ def metric_from_affine(absolute_conic: F64) -> F64:
     Parameters
     ----------
     absolute_conic : ndarray (3, 3)
-        Definite conic on the plane at infinity, of any sign.
+        Definite conic on the plane at infinity, of any sign; an indefinite one is a ``ValueError``.
 
     Returns
     -------
@@ -158,7 +157,8 @@ def metric_from_projective(dual_quadric: F64) -> F64:
     Parameters
     ----------
     dual_quadric : ndarray (4, 4)
-        Absolute dual quadric of a projective frame, of any sign; s1, s2 and s3 have one sign.
+        Absolute dual quadric of a projective frame, of any sign; a ``ValueError`` unless s1, s2 and s3 have
+        the same sign.
 
     Returns
     -------
@@ -180,7 +180,8 @@ def cross_ratio(X: F64) -> float:
     Parameters
     ----------
     X : ndarray (4, d)
-        Homogeneous collinear points of any scale, d = 2, 3 or 4, at most two of them equal.
+        Homogeneous points of any scale, d = 2, 3 or 4, collinear and at most two of them equal (otherwise a
+        ``ValueError``).
 
     Returns
     -------

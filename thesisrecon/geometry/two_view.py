@@ -190,7 +190,7 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
     Parameters
     ----------
     P1, P2, plane : ndarray (3, 4), (3, 4) and (4,)
-        Cameras and plane that does not contain the first centre.
+        Cameras, and a plane that does not contain the first centre (otherwise a ``ValueError``).
 
     Returns
     -------
@@ -213,7 +213,7 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
     Parameters
     ----------
     P1, P2 : ndarray (3, 4)
-        Cameras, the first not at infinity.
+        Cameras; a first camera at infinity is a ``ValueError``.
 
     Returns
     -------
@@ -266,7 +266,7 @@ def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -
     F : ndarray (3, 3)
         Fundamental matrix.
     plane, scale : ndarray (3,), optional; float
-        v, by default the first of :func:`quasi_euclidean_planes`, and the scale, not 0.
+        v, by default the first of :func:`quasi_euclidean_planes`, and the scale, not 0 (a ``ValueError``).
 
     Returns
     -------

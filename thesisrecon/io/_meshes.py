@@ -123,7 +123,7 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     Raises
     ------
     UsageError, OutputError
-        If the name does not end in .glb; if the file cannot be written.
+        If the name does not end in .glb or ``mesh`` is not a TexturedMesh; if the file cannot be written.
 
     Examples
     --------

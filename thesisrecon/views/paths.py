@@ -56,7 +56,8 @@ def orbit(
     cameras : sequence of Camera
         At least one registered camera.
     X : ndarray (N, 3)
-        Scene points, evenly spread over the surface if there is one; non-finite points are ignored.
+        Scene points, evenly spread over the surface if there is one; non-finite points are ignored. A
+        ``ValueError`` if none is left or all points and cameras coincide.
     frames, size : int; tuple of int, optional
         Number of cameras, and image size (width, height); default: that of the first camera.
 

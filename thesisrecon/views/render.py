@@ -154,6 +154,11 @@ def render(
     -------
     RenderedView
 
+    Raises
+    ------
+    ValueError
+        If the camera has distortion, ``samples`` is below 1, or the mesh is invalid.
+
     Examples
     --------
     >>> triangle = TexturedMesh(np.array([[-1.0, -1, 2], [1, -1, 2], [0, 1, 2]]), np.array([[0, 1, 2]]))
