@@ -159,7 +159,7 @@ def test_the_model_needs_images():
 
 def test_wrong_tracks_are_refused():
     for wrong, words in (
-        (replace(SCENE.tracks, n_views=4), "tracks are of 4 images, the sizes of 5"),
+        (replace(SCENE.tracks, n_views=4), "there are tracks of 4 images and 5 sizes"),
         (replace(SCENE.tracks, view_index=SCENE.tracks.view_index + 1), "beyond the 5 views"),
         (replace(SCENE.tracks, xy=SCENE.tracks.xy[:9]), r"xy \(K, 2\)"),
         (SCENE.keypoints, r"must be thesisrecon.Tracks or an array of pixels \(V, N, 2\)"),

@@ -90,15 +90,14 @@ def checked_points(
 def as_cameras(
     caller: str, cameras: CameraInput, sizes: I64 | None = None, names: Sequence[str] = ()
 ) -> list[Camera]:
-    """The cameras in order, of a reconstruction the registered ones; with ``names`` those of these images."""
+    """The cameras in order; the registered ones of a reconstruction; of a mapping those of ``names``."""
     if isinstance(cameras, Reconstruction):
         return _of_reconstruction(caller, cameras)
     if isinstance(cameras, Mapping):
         missing = [name for name in names if name not in cameras]
         if missing:
-            raise ValueError(
-                f"{caller} has no camera for {missing[0]}; the first of them is {next(iter(cameras), None)}"
-            )
+            first = next(iter(cameras), None)
+            raise ValueError(f"{caller} got no camera for {missing[0]}; the first camera is that of {first}")
         return [cameras[name] for name in names or cameras]
     given: list[Any] = list(cameras) if isinstance(cameras, Sequence) else []
     if given and all(isinstance(one, Camera) for one in given):

@@ -115,8 +115,9 @@ def resect(
         raise StageFailure("too few points for resection", f"{counted(len(X), 'point')}, {needed} are needed")
     extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if not extent[2 if K is None else 1] > _FLAT * extent[0]:
+        place = "in one plane" if K is None else "on one line"
         raise StageFailure(
-            f"the points do not determine the camera: they lie in one {'plane' if K is None else 'line'}",
+            f"the points do not determine the camera: they lie {place}",
             "",
             "add points off it" + (", or give the calibration matrix K" if K is None else ""),
         )

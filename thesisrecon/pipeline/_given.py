@@ -89,9 +89,8 @@ def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored:
         folder = Path(images)
         missing = [name for name in names if not (folder / name).is_file()]
         if missing:
-            raise UsageError(
-                f"{missing[0]!r} and {len(missing) - 1} more of {count} images are not in {folder}"
-            )
+            some = f"{len(missing)} of the {count} images"
+            raise UsageError(f"{some} are not in {folder}, such as {missing[0]!r}")
         images = folder
     elif images is not None and len(images) != count:
         raise UsageError(f"there are {len(images)} images and {count} sizes")
@@ -118,7 +117,8 @@ def given_matches(
             xy1, xy2 = _positions(pair[0], i, views), _positions(pair[1], j, views)
             if len(xy1) != len(xy2):
                 raise UsageError(
-                    f"matches of images {i} and {j}: {len(xy1)} positions and {len(xy2)} positions"
+                    f"matches of images {i} and {j} need as many positions in both images; "
+                    f"got {len(xy1)} and {len(xy2)}"
                 )
             none = np.full(len(xy1), -1)
             found.append(_match_record((i, j), none, none, xy1, xy2))
@@ -225,11 +225,11 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
         tracks = Tracks(view, point, tracks[view, point], *tracks.shape[:2])
     view, point = np.asarray(tracks.view_index), np.asarray(tracks.point_index)
     if tracks.n_views != count:
-        raise UsageError(f"the tracks are of {tracks.n_views} images, the sizes of {count}")
+        raise UsageError(f"there are tracks of {tracks.n_views} images and {count} sizes")
     try:
         sort_observations(Observations(view, point, tracks.xy), count, tracks.n_points)
     except ValueError as error:
-        raise UsageError(f"these are no tracks: {error}") from None
+        raise UsageError(f"the tracks are not valid: {error}") from None
     # One observation of a point in a view, sorted by point and view.
     _, kept = np.unique(np.asarray(point, dtype=np.int64) * count + view, return_index=True)
     kept = kept[np.bincount(point[kept], minlength=tracks.n_points)[point[kept]] >= 2]

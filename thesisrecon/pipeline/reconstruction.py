@@ -158,7 +158,7 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
             inputs, unused = add_masks(inputs, masks, map_all=run.workers.map_all)
     found, refused = len(inputs.decoded), len(inputs.refused)
     if found + refused == 0:
-        raise UsageError("no images")
+        raise UsageError("the list of images is empty")
     warnings += [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
     warnings += [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
     # The masks of frames that were not chosen are no mistake.

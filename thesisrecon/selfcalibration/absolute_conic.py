@@ -63,7 +63,7 @@ class LinearAbsoluteConic:
             raise StageFailure(
                 "the image of the absolute conic is not that of a real camera",
                 f"its eigenvalues are {values[0]:.2e}, {values[1]:.2e} and {values[2]:.2e}, not all positive",
-                "the plane at infinity or the prior of the intrinsics is wrong",
+                "check the plane at infinity and the prior of the intrinsics: one of them is wrong",
             )
         K = np.array([calibration_from_image(w) for w in transferred_conics(H, conic.w)])
         return _apply_known_values(scene.unknown, K)
@@ -153,7 +153,7 @@ def _undetermined_failure(frame: ReferenceFrame, H: F64, conic: ImageConic | Non
     with np.errstate(divide="ignore", invalid="ignore"):
         place = pixel[:2] / pixel[2]
     return StageFailure(
-        "a one-parameter family of calibrations fits the plane at infinity: all rotations have one axis",
+        "a one-parameter family of calibrations fits the plane at infinity: all rotations have the same axis",
         f"{found}; largest rotation {angle:.1f} deg with its axis at ({place[0]:.0f}, {place[1]:.0f}) px",
         "rotate the camera about a second axis, or assume square pixels without skew",
     )

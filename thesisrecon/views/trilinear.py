@@ -152,7 +152,7 @@ def pair_from_fundamental(
     if not shares[best] >= IN_FRONT:
         raise StageFailure(
             "the scene is not in front of both cameras",
-            f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, for the best of {len(shares)} cameras",
+            f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, with the best of {len(shares)} solutions",
             "check the fundamental matrix and the intrinsics",
         )
     return _pair_with(F, K1, K2, *candidates[best])
@@ -216,7 +216,7 @@ def _decompose_small(E: F64) -> list[tuple[F64, F64]]:
         raise StageFailure(
             "the rotation between the two images is not small",
             "no small rotation explains the fundamental matrix",
-            "allow any rotation",
+            "set small_rotation to False",
         )
     R = scipy.spatial.transform.Rotation.from_rotvec(solution[1:] / solution[0]).as_matrix()
     return [(R, t), (R, -t)]
