@@ -278,7 +278,7 @@ def _prior(table: F64, prior: Mapping[str, float], free: B8, names: Sequence[str
 
 
 def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound: bool) -> None:
-    """Refuse cameras that look away from the points, and fewer equations than unknowns."""
+    """Raise ``ValueError`` if most points are behind the cameras, or for fewer equations than unknowns."""
     sort_observations(observed, len(start.R), len(X))
     view, point = observed.view_index, observed.point_index
     require_finite("bundle_adjust, for points with observations,", X[point])

@@ -278,7 +278,7 @@ def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None 
 
 
 def _check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]]) -> None:
-    """Refuse a principal point that lies more than one long side outside an image."""
+    """Raise ``UsageError`` for a principal point more than one long side outside an image."""
     if options.principal_point_px is None:
         return
     x, y = options.principal_point_px

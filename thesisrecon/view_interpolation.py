@@ -208,7 +208,7 @@ def require_comparable_images(images: Sequence[Image]) -> None:
 
 
 def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None:
-    """Refuse a pair with an epipole inside an image."""
+    """Raise ``StageFailure`` if an epipole lies inside an image."""
     size = images[0].size
     for image, e in zip(images, epipoles(pair.F), strict=True):
         if abs(e[2]) * max(size) <= 1e-9 * np.hypot(e[0], e[1]):

@@ -39,7 +39,7 @@ _NO_MODEL = "No surface model was built"
 """Beginning of the warning of a run whose surface stage failed."""
 _MIDWAY = 0.5
 _BEYOND = 0.5
-"""Baselines by which a sequence of the tensor extends beyond either camera."""
+"""Length, in baselines, by which the sequence of the tensor extends beyond each camera."""
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ def _missing_model(out: Path) -> str:
 
 
 def _claim(folder: Path) -> None:
-    """Refuse a folder with files that these commands did not write: an image may be called frame-0001.png."""
+    """Raise ``UsageError`` if a folder contains other files: an image may be called frame-0001.png."""
     if isinstance(read_json(folder / FRAMES), dict):
         return
     try:

@@ -76,7 +76,7 @@ def discard_outliers(
 class _SampleConsensus:
     """Algorithm 2: the model with the most data within a threshold.
 
-    Of two models with equally many inliers the one with the lower standard deviation wins (Fischler and
+    Between models with the same number of inliers the lower standard deviation decides (Fischler and
     Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
     n! / s!). ``stop_inlier_ratio`` ends the search; ``least_median`` ranks models by the median of their
     residuals instead (Rousseeuw, 1984).

@@ -17,7 +17,7 @@ from thesisrecon.records import Features, Image, Seeds
 
 PATCH_SIDE = 8
 PATCH_VALUES = 32
-"""Values of a patch: half of its cosine coefficients, those of low frequency, which a small shift keeps."""
+"""Values of a patch: half of its cosine coefficients, those of low frequency, insensitive to small shifts."""
 # Density of the seeds of a simulated view relative to that of the image: many views show the same surface.
 OBLIQUE_DENSITY = 0.5
 

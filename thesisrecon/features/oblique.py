@@ -33,7 +33,7 @@ class ObliqueView:
 
 
 def oblique_views(gray: F32, tilts: Sequence[float], enlargement: float) -> Iterator[ObliqueView]:
-    """Compress an image (H, W) by each tilt along directions over a half turn; a tiny one has no views."""
+    """Compress an image (H, W) by each tilt, in directions over 180 degrees; tiny images have no views."""
     for tilt in tilts if min(gray.shape) >= MIN_SIDE else ():
         count = int(np.ceil(np.pi * tilt / DIRECTION_STEP))
         for k in range(count):
@@ -41,7 +41,7 @@ def oblique_views(gray: F32, tilts: Sequence[float], enlargement: float) -> Iter
 
 
 def simulate_view(gray: F32, tilt: float, direction: float, enlargement: float = 1.0) -> ObliqueView:
-    """Compress an image by ``tilt`` along the ``direction`` (rad), which is turned to the x axis.
+    """Compress an image by ``tilt`` along the ``direction`` (rad), which becomes the x axis of the view.
 
     Examples
     --------

@@ -108,7 +108,7 @@ def normalize_camera(P: F64) -> F64:
 
 
 def _left_determinant(P: F64, caller: str) -> F64:
-    """det M (...) of cameras (..., 3, 4), refused where it is 0 to rounding."""
+    """det M (...) of cameras (..., 3, 4); ``ValueError`` if one is 0 to rounding."""
     if not np.isfinite(P).all():
         raise ValueError(f"{caller} needs finite cameras; some entries are NaN or infinite")
     det = np.linalg.det(P[..., :3])

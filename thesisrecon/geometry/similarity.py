@@ -50,7 +50,7 @@ class Similarity:
 
 
 def estimate_similarity(source: F64, target: F64) -> Similarity:
-    """Estimate the similarity that takes points to points with the least sum of squared distances.
+    """Estimate the similarity from ``source`` to ``target`` with the least sum of squared distances.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def estimate_similarity(source: F64, target: F64) -> Similarity:
 def rotation_errors_deg(R: F64, R_true: F64) -> F64:
     """Compute the angles between rotations after the rotation of the world that fits them best.
 
-    The best one is the chordal mean, so that two rotations suffice and the centres do not matter.
+    It is the chordal mean of the relative rotations: two views suffice, and the centres have no effect.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ _MVS_VERSION = 2
 
 
 def mask_name(to: str, image: str) -> str:
-    """File of the mask of an image where the program looks for it: OpenMVS drops its folders and suffix."""
+    """File name of the mask of an image as the program expects it: OpenMVS drops folders and suffix."""
     return f"masks/{PurePath(image).stem}.mask.png" if to == "openmvs" else f"masks/{image}.png"
 
 

@@ -141,7 +141,7 @@ def _file_sharpness(path: Path) -> float:
 
 
 def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[Any, int]]:
-    """Frames of a video as PyAV gives them, with their stated number (0 = not stated); adds a warning."""
+    """PyAV frames of a video, each with the stated number of all frames (0: not stated); adds a warning."""
     try:
         av = import_module("av")
     except ImportError:

@@ -77,7 +77,7 @@ def _from_colmap(run: Path) -> bool:
 
 
 def _with_views(model: SparseModel, views: list[SparseView]) -> SparseModel:
-    """The points of a model, seen by these views of equal names."""
+    """The model with other ``views`` of the same names; observations in missing views are dropped."""
     index = {view.name: i for i, view in enumerate(views)}
     place = np.array([index.get(name, -1) for name in model.names], np.int64)[model.view_index]
     kept = place >= 0

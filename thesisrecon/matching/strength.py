@@ -138,8 +138,8 @@ class StrengthOfMatch:
     Each corner is compared with those within a radius; the strength (4.1) of its best candidates is computed
     over its neighbours, and of matches that share a corner the strongest is kept. Figure 4.4 with the weight
     functions is lost; lambda is the product of direction max(0, cos), length min / max and distance 1 - d /
-    radius as in the text. ``colour`` is of the thesis; ``weight`` = "relative-difference" and the fields
-    after it extend it and are off.
+    radius as in the text. ``weight`` = "relative-difference" and the fields after it are not in the thesis
+    and off by default.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class StrengthOfMatch:
     candidates : int
         K, number of corners of highest correlation whose strength is computed.
     neighbours : int
-        M, number of neighbours of a corner, and half as many again in the other image.
+        M, number of neighbours of a corner in image 1; in image 2 these are 1.5 M.
     window : int
         K = L, side of the correlation window, px, odd.
     colour : bool

@@ -142,7 +142,7 @@ def _information(
 
 
 def _gram_matrix(A: scipy.sparse.csr_matrix) -> F64:
-    """Return A'A, dense: most cameras of a place share points."""
+    """Return A'A as a dense matrix, since most pairs of views share points here."""
     G = np.zeros((A.shape[1], A.shape[1]))
     add_gram(A.indptr, A.indices, A.data, G)
     return G + np.tril(G, -1).T

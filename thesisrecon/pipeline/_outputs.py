@@ -164,7 +164,10 @@ def save_result(result: RunResult, folder: Path) -> None:
 
 
 def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, threads: int) -> list[str]:
-    """Write the mesh as GLB; one above ``max_mb`` whole, in tiles and reduced. Returns warnings."""
+    """Write the mesh as GLB, above ``max_mb`` reduced, with the whole mesh in one file and in tiles.
+
+    Returns warnings.
+    """
     mesh, path, whole = result.mesh, directory.path / "model.glb", directory.path / "model-full.glb"
     directory.remove(SURFACE_FILES if mesh is None else SURFACE_FILES[1:])
     if mesh is None:

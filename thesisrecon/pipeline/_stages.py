@@ -203,7 +203,7 @@ def reconstruct_metric(state: PipelineState) -> None:
 
 
 def best_result(tried: Sequence[RunResult]) -> RunResult:
-    """The result of the attempt that counts: metric, trusted, with most cameras, then most points."""
+    """The best result: metric before projective, then trusted, then with most cameras, then most points."""
     return max(tried, key=_quality)
 
 

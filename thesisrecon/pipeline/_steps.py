@@ -54,7 +54,7 @@ Source = Mapping[str, str]
 
 @contextmanager
 def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Iterator[None]:
-    """Hold the workers and the output folder of a run."""
+    """Start the workers and lock the output folder of a run."""
     claim = run.directory.claim(_settings_identity(run, source), overwrite=overwrite)
     with run.workers, claim, run.resumable():
         yield
@@ -125,7 +125,7 @@ def _run_group(
 
 
 def _with_group_reasons(state: PipelineState) -> RunResult:
-    """The result in which the images of other groups are refused for that reason."""
+    """The result in which the reason against each image of another group is that group."""
     folder_of = {i: f"group-{n}" for n, group in enumerate(state.groups[1:], 2) for i in group}
 
     def named(found: Reconstruction) -> Reconstruction:

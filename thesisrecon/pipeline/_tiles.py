@@ -40,6 +40,6 @@ def write_tiles(directory: RunDirectory, whole: TexturedMesh, coarse: TexturedMe
 
 
 def _halves(mesh: TexturedMesh, faces: I64, largest: int) -> list[I64]:
-    """The numbers ``faces`` (M,) of the faces of a mesh, in parts of at most ``largest``, the last first."""
+    """Divide the numbers ``faces`` (M,) of faces into parts of at most ``largest``, in reverse order."""
     part = halve_surface(mesh, np.ones(len(faces), dtype=np.int64), largest)
     return [faces[part == k] for k in range(part.max(), -1, -1)]

@@ -70,7 +70,7 @@ def reconstruct_from_matches(
 ) -> RunResult:
     """Reconstruct metric cameras and points from matches of any program.
 
-    The matches are verified (chapter 5), joined to tracks and used as those of the own front end.
+    The matches are verified (chapter 5), joined to tracks and used like those of thesisrecon's matching.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def reconstruct_from_matches(
     sizes : array_like (V, 2)
         Width and height of the images.
     out : path, optional
-        Output folder, as for :func:`reconstruct`; None: nothing is kept but the result.
+        Output folder, as for :func:`reconstruct`; None: no files are written.
     names : sequence of V str, optional
         Names of the images; by default "image-0" and so on.
     images : path, or sequence of V path, array or Image, optional
@@ -144,8 +144,8 @@ def reconstruct_from_tracks(
     Parameters
     ----------
     tracks : Tracks or ndarray (V, N, 2)
-        Observations in pixels of the images, in an array NaN where a point is not seen; wrong ones are found.
-        Pairs of images are verified by the points that they share.
+        Observations in pixels of the images; in an array NaN where a point is not seen. They may contain
+        outliers: pairs of images are verified by the points that they share.
     sizes, out, names, images, config, seed, progress, **options
         As for :func:`reconstruct_from_matches`.
 

@@ -190,7 +190,7 @@ def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
 def adjust_locally(
     model: ProjectiveModel, view: int, iterations: int, sigmas: float, *, n_views: int
 ) -> None:
-    """Adjust one view, the ``n_views`` that share most points with it, their points; others fixed (6.6)."""
+    """Adjust a view, the ``n_views`` that share most points with it, and their points (6.6)."""
     t, used = model.tracks, model.used
     its = np.bincount(t.point_index[used & (t.view_index == view)], minlength=t.n_points) > 0
     shared = np.bincount(t.view_index[used & its[t.point_index]], minlength=t.n_views)

@@ -216,7 +216,7 @@ class Rectification(ABC):
 def pinhole_frame(
     image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
 ) -> PinholeView:
-    """The view of :func:`pinhole_view` without its pixels: black, and all of them seen."""
+    """The view of :func:`pinhole_view` without reading pixels: all are black and valid."""
     P, _, size = _pinhole_camera(image, reconstruction, view, max_side)
     black, seen = np.broadcast_to(np.uint8(0), (*size[::-1], 3)), np.broadcast_to(np.True_, size[::-1])
     return PinholeView(view, P, black, seen)

@@ -68,10 +68,10 @@ def _transfer_rows(T: F64, P2: F64, places: F32, first: int, xy: F64, inverse_de
 def _extrapolate_inverse_depth(
     inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
 ) -> None:
-    """Complete the inverse depth of an image, given with that of the other one, from the pixels around.
+    """Complete the inverse depth of the first image of two from the surrounding pixels.
 
-    Of the known pixels around (``distance`` steps away, see :func:`distances_to_known`) the nearest is taken
-    whose surface would not stand in front of what the other image shows; if all would, the nearest of all.
+    The nearest known pixel in any direction (``distance`` steps away, see :func:`distances_to_known`) is used
+    whose surface would not occlude a surface that the other image shows; if all would, the nearest of all.
     """
     own, other = inverse_depth
     for y in range(own.shape[0]):
@@ -94,7 +94,7 @@ def _extrapolate_inverse_depth(
 
 @kernel
 def _occludes(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> bool:
-    """Whether a pixel at an inverse depth lies in front of what the other image shows there."""
+    """Whether a pixel at inverse depth ``rho`` lies in front of the surface in the other image there."""
     u = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2] + rho * P2[0, 3]
     v = P2[1, 0] * x + P2[1, 1] * y + P2[1, 2] + rho * P2[1, 3]
     w = P2[2, 0] * x + P2[2, 1] * y + P2[2, 2] + rho * P2[2, 3]
