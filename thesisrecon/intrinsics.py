@@ -171,7 +171,7 @@ class IntrinsicsOptions:
                 raise ValueError(f"{name} must be above 0; got {value} (for an exact value use mode known)")
             if math.isinf(value):
                 raise ValueError(f"{name} must be finite; got {value} (none means unknown)")
-            # A default that the mode makes idle was not set by the user.
+            # A default value was not set by the user, so it is no error if it has no effect.
             if getattr(self, intrinsic) == "known" and value != type(self).__dataclass_fields__[name].default:
                 raise ValueError(f"{name} = {value} has no effect with {intrinsic} = known: leave one out")
         if self.focal_std_rel is not None and not focal_given:

@@ -337,7 +337,8 @@ class SelfCalibration:
         known, that of the prior if not estimated, NaN if unknown.
     identifiable, reasons, identifiability : bool, tuple of str, IdentifiabilityReport
         Whether the views determine the calibration, and the evidence (None: not tested). The reasons say why
-        not, or that bundle adjustment moves the focal length far from ``K``, which is then a start only.
+        not, or that bundle adjustment moves the focal length far from ``K``, which is then only an initial
+        value.
     candidates : tuple of Upgrade
         All candidates, best first.
     """

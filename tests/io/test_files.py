@@ -43,9 +43,9 @@ def test_a_file_stands_where_a_folder_belongs(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     for path in (tmp_path / "file" / "x", tmp_path / "file" / "deep" / "x"):
-        with pytest.raises(OutputError, match="move away the file that stands where a folder belongs"):
+        with pytest.raises(OutputError, match="move the file that is in the place of a folder"):
             files.write_atomically(path, b"")
-    with pytest.raises(OutputError, match="move away the folder that stands where a file belongs"):
+    with pytest.raises(OutputError, match="move the folder that is in the place of a file"):
         files.write_atomically(tmp_path / "folder", b"")
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder"]
 

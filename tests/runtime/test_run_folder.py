@@ -323,7 +323,7 @@ def test_a_file_in_the_place_of_a_folder_of_the_run(whole, tmp_path):
     out = tmp_path / "out"
     run(out, until="features")
     (out / "02-matches").write_text("of nobody")
-    refuses(OutputError, r"02-matches.* move away the file that stands where a folder", run, out)
+    refuses(OutputError, r"02-matches.* move the file that is in the place of a folder", run, out)
     (out / "02-matches").unlink()
     run(out)
     assert different(outputs(out), whole[0]) == ()

@@ -123,7 +123,7 @@ def exit_code_of(command: Callable[[], object]) -> int:
     except StageFailure as failure:
         return _report(str(failure), IMPOSSIBLE)
     except (_Interrupted, KeyboardInterrupt) as stop:
-        # Only if another program called us: the installed command leaves in `install_signal_handlers`.
+        # Only if called by another program: the command itself exits in `install_signal_handlers`.
         return _report("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
     except MemoryError:
         return _report("out of memory; try a smaller --max-size or fewer --threads", IMPOSSIBLE)
@@ -142,7 +142,7 @@ def exit_code_of(command: Callable[[], object]) -> int:
             return _report(f"{message} (see thesisrecon --help)", USAGE)
         if os.environ.get(DEBUG_VARIABLE):
             raise
-        # The last place is that of a user's own method, if its code failed.
+        # The last frame: in a user's own method, if that failed.
         *_, (frame, line) = traceback.walk_tb(error.__traceback__)
         place = f"{Path(frame.f_code.co_filename).name} line {line}"
         sentence = f"{type(error).__name__} in {place}: {error}; set {DEBUG_VARIABLE}=1 for a traceback"

@@ -62,7 +62,7 @@ def export(
 
     if folder.resolve() == model.resolve():
         raise UsageError(f"the folder {folder} holds the model; export to another folder")
-    # The export itself is given the model in memory.
+    # Checked here, because `export` gets the model from memory and cannot compare its folder.
     require_separate(folder, to, model=model)
     found = read_model(model)
     if scale is not None:

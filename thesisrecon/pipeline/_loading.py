@@ -66,7 +66,7 @@ def load(out: str | Path) -> RunResult:
 
 
 def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
-    # The folders of later stages may hold those of a run that this one replaced.
+    # The folders of later stages may be those of a run that this one replaced.
     finished = {stage: folder / name for stage, name in FOLDERS.items() if stage in summary["seconds"]}
     reports = [StageFolder(path).finished(_keys(path)) for path in finished.values()]
     stages: dict[str, dict[str, Any]] = {stage: {} for stage in FOLDERS}

@@ -268,7 +268,7 @@ class Workers:
                 yield _Remote(pool, lambda: self.threads)
                 pool.shutdown(wait=True)
             finally:
-                # At once after an error.
+                # After an error the processes end at once.
                 pool.abandon()
 
 

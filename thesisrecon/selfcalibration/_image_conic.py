@@ -96,7 +96,7 @@ class ImageConic:
     def determined(self) -> bool:
         """Whether the equations have one solution: the second smallest singular value stands out."""
         s = self.singular_values
-        # The second bound is for cameras that do not rotate: their equations are rounding errors only.
+        # The second bound excludes cameras without rotation, whose equations are only rounding errors.
         return bool(s[4] > 1e-7 * max(s[0], 1e-3) and s[4] > 2.0 * s[5])
 
 

@@ -136,9 +136,9 @@ class Stratified:
 def upgrade_to_affine(reconstruction: Reconstruction, plane: F64) -> Reconstruction:
     """Upgrade a projective reconstruction to an affine one (3.4.3): P G^-1, G X by the table of 3.3.
 
-    Parallelism and ratios of lengths on parallel lines are correct, angles are not. The camera with most
-    observations is [I | 0] behind a nominal calibration (focal length of one long side), its points at a
-    median depth of 1.
+    Parallelism and ratios of lengths on parallel lines are correct, angles are not. In the affine frame the
+    camera with most observations is K [I | 0] with a nominal K (focal length of one long side), and its
+    points have a median depth of 1.
 
     Parameters
     ----------

@@ -225,7 +225,7 @@ def _is_simple(mesh: MeshState, v: int, w: int, ring: I64) -> bool:
                 if ring[n] == other:
                     common += 1
                     ring[n] = -1
-    # Two borders that an inner edge joins stay apart.
+    # An inner edge between two borders does not collapse: it would join the borders.
     apart = shared == 2 and mesh.border[v] and mesh.border[w]
     return 1 <= shared <= 2 and common == shared and around <= MAX_FAN and not apart
 
