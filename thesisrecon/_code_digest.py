@@ -24,7 +24,7 @@ OWN = __name__.partition(".")[0]
 _IMPORT = dis.opmap["IMPORT_NAME"]
 _LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")]
 
-# Libraries of which only the name is hashed, even if the value itself belongs to one.
+# Only the names of these libraries are hashed, even if the value itself belongs to one.
 _BY_NAME = {*sys.stdlib_module_names, "numpy", "scipy", "numba"}
 _PLAIN = {int, float, str, bytes, bool, type(None)}
 _NOTED = {"_abc_impl", "_is_protocol", "_is_runtime_protocol"}
