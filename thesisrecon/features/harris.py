@@ -177,9 +177,9 @@ class HarrisCorners:
 def select_spread(xy: F64, response: F32, count: int) -> I64:
     """Select corners that cover the image (adaptive non-maximal suppression) [1]_.
 
-    Selects, among the 1.7 ``count`` strongest corners, those farthest from any clearly stronger one. A square
-    cell of a sixth of the long side contributes at most ``POOL_LIMIT`` times its even part of these
-    candidates, so that dark parts of the image get corners as well.
+    Selects, among the 1.7 ``count`` strongest corners, those farthest from any clearly stronger one. A cell
+    of a sixth of the long side contributes at most ``POOL_LIMIT`` times as many of these candidates as in an
+    even distribution, so that dark parts of the image get corners as well.
 
     Parameters
     ----------

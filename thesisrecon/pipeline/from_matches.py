@@ -83,7 +83,7 @@ def reconstruct_from_matches(
     sizes : array_like (V, 2)
         Width and height of the images.
     out : path, optional
-        Output folder, as for :func:`reconstruct`; None: no files are written.
+        Output folder, as for :func:`reconstruct`; None: no files are kept.
     names : sequence of V str, optional
         Names of the images; by default "image-0" and so on.
     images : path, or sequence of V path, array or Image, optional

@@ -1,8 +1,8 @@
 """``report.html`` of a run and ``strip.html`` of a view sequence: single files without network access.
 
-A page loads nothing, and no file name can run as code: the template escapes all text, data for scripts is
-JSON that cannot close its element, and a content security policy lists the scripts by their hashes and
-forbids all addresses except ``data:``.
+A page loads nothing from the network, and no file name can run as code: the template escapes all text, data
+for scripts is JSON that cannot close its element, and a content security policy lists the scripts by their
+hashes and forbids all addresses except ``data:``.
 """
 
 from __future__ import annotations
