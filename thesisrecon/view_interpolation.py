@@ -100,6 +100,11 @@ def prepare_rectified_pair(
     -------
     InterpolatedPair
         Its ``view(s)`` interpolates.
+
+    Raises
+    ------
+    ValueError, UsageError, StageFailure
+        If shapes differ, or a file does not exist or cannot be read.
     """
     images = read_pixels(left), read_pixels(right)
     shapes = [image.shape[:2] for image in images]

@@ -84,8 +84,8 @@ def prepare_trilinear_views(
 
     Raises
     ------
-    StageFailure
-        If the matches contradict F, or no solution has the scene in front of both cameras.
+    ValueError, StageFailure
+        If K is invalid; if the matches contradict F, or no solution has the scene in front of both cameras.
     """
     config = as_config(config)
     K1, K2 = _intrinsics(found, K, config)
