@@ -70,7 +70,7 @@ def _pose_and_focal(
 def register_missing_cameras(
     model: MetricEstimate, adjustment: MetricAdjustment, rng: np.random.Generator
 ) -> tuple[MetricEstimate, dict[int, str]]:
-    """Register missing and inconsistent cameras; return the model, and the reason of each view that failed."""
+    """Register missing and inconsistent cameras; return the model, and the reasons of those that failed."""
     model, rejected = _grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
     suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)
     if suspects.any() and (model.registered & ~suspects).sum() >= 3:

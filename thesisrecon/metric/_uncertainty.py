@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.metric._adjustment import MetricAdjustment, HierarchicalPrior
+from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._noise import MAD_FACTOR, student_factor

@@ -152,7 +152,7 @@ def pair_from_fundamental(
     if not shares[best] >= IN_FRONT:
         raise StageFailure(
             "the scene is not in front of both cameras",
-            f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, with the best of {len(shares)} solutions",
+            f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, with the best of {len(shares)} cameras",
             "check the fundamental matrix and the intrinsics",
         )
     return _pair_with(F, K1, K2, *candidates[best])
