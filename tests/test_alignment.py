@@ -90,7 +90,7 @@ def test_too_few_and_collinear_positions_are_refused():
     rng = np.random.default_rng(1)
     street = [SparseView(v.name, v.R, v.t + rng.normal(0, 0.02, 3)) for v in line]
     noisy = {view.name: view.centre + rng.normal(0, 0.05, 3) for view in line}
-    with pytest.raises(UsageError, match="rotation about it free"):
+    with pytest.raises(UsageError, match="rotation about it undetermined"):
         align_to_positions(SparseModel(street), noisy)
 
 
