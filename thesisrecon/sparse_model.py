@@ -21,7 +21,7 @@ class SparseView:
     K: F64 | None = None  #: (3, 3); None for a trajectory without intrinsics
     size: tuple[int, int] | None = None  #: width, height
     distortion: F64 | None = None  #: (3,) k1, k2, k3, zeros for a pinhole; None if unknown or of another kind
-    camera: int = 0  #: number of the camera; views of one number have the same intrinsics in the file
+    camera: int = 0  #: number of the camera; views with equal numbers have the same intrinsics
 
     @property
     def centre(self) -> F64:
