@@ -90,7 +90,8 @@ def test_pycolmap_on_small_photographs_comes_back_in_our_types(tmp_path):
         exif = Image.Exif()
         exif[0x8769] = {0x920A: 5.0, 0xA405: 300}
         small.save(images / path.name, quality=95, exif=exif)
-    run = reconstruct_with_pycolmap(images, tmp_path / "out")
+    reconstruct_with_pycolmap(images, tmp_path / "out")
+    run = read_run(images, tmp_path / "out")
     assert run.names == tuple(path.name for path in scene.image_paths[views])
     assert run.reconstruction.registered.sum() == 5
     assert set(run.seconds) == {"extract", "match", "map"}

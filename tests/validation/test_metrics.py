@@ -10,7 +10,13 @@ from tests.synthetic import reconstruction_of
 from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
 from thesisrecon.views._image_similarity import GREY
-from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection, rotation_errors_deg
+from validation.metrics.cameras import (
+    TrueCameras,
+    measure_cameras,
+    measure_reprojection,
+    relative_centre_error,
+    rotation_errors_deg,
+)
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
 from validation.metrics.pictures import psnr_db, ssim
 from validation.studies.coverage import named, run_trial
@@ -163,6 +169,8 @@ def test_known_errors_are_measured_in_their_units():
     assert centre is not None
     # The alignment takes part of one camera's 60 mm away and spreads the rest over all six.
     assert 0.004 < centre < 0.02
+    errors = replace(errors, centre_error=0.1)
+    assert relative_centre_error(errors, np.array([[0.0, 0, 0], [4.0, 0, 0]])) == pytest.approx(0.025)
 
 
 def test_only_registered_views_count():
@@ -177,6 +185,7 @@ def test_only_registered_views_count():
     assert measure_reprojection(partial).observations == (V - 1) * N
     two = replace(partial, registered=np.arange(V) < 2)
     assert measure_cameras(two, truth).centre_error is None
+    assert np.isnan(relative_centre_error(measure_cameras(two, truth), truth.C))
     with pytest.raises(ValueError, match="at least one registered"):
         measure_cameras(replace(partial, registered=np.zeros(V, bool)), truth)
     with pytest.raises(ValueError, match="one truth per view"):

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -201,6 +202,34 @@ def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_
     assert next(row for row in rows if row.startswith("| whole run, peak MB")).endswith("| 1.00 |")
     assert next(row for row in rows if row.startswith("| points")).endswith("| 2.00 |")
     assert not any("dense, peak MB" in row for row in rows), "rows of zeros are left out"
+
+
+def test_a_size_that_failed_leaves_the_numbers_of_the_others():
+    stages = dict.fromkeys(growth.STAGES, 1.0)
+    failed = Cost(10, stages, {"images": 30.0}, {"points": 0}, 1.0, np.nan, failure="no pair was found")
+    counts, colmap = {"points": 7, "report.html, kB": 5}, {"wall s": 20.0}
+    whole = Cost(100, stages, {"images": 90.0}, counts, 9.0, 0.01, 0.02, colmap=colmap)
+    for costs, walls in (((failed, whole), "nan | 20"), ((whole, failed), "20 | nan")):
+        rows = growth.cost_table(costs).splitlines()
+        assert f"| COLMAP, wall s | {walls} | - |" in rows
+        assert next(row for row in rows if row.startswith("| focal error, %")).endswith("| - |")
+        assert any(row.startswith("| report.html, kB") for row in rows)
+        assert rows[-1] == "10 images: no pair was found"
+
+
+def test_imports_do_not_count_as_time_of_colmap(monkeypatch):
+    calls = []
+    monkeypatch.setattr(growth, "load", lambda name: calls.append(name) or time.sleep(0.3))
+    monkeypatch.setattr(growth, "reconstruct_with_pycolmap", lambda *_, **given: calls.append(given["pairs"]))
+    assert growth.run_colmap("images", "out", "pairs.txt", 1)["wall s"] < 0.2
+    assert calls == ["pycolmap", Path("pairs.txt")]
+
+
+def test_images_of_another_scene_or_size_are_not_taken_for_those_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(growth, "WALKS", {s: (None, lambda *_, **__: None) for s in ("place", "street")})
+    asked = [("place", 480), ("street", 480), ("place", 640)]
+    folders = [growth.write_scene(tmp_path, scene, 3, side, 1) for scene, side in asked]
+    assert len(set(folders)) == 3
 
 
 @pytest.mark.parametrize("name", MODULES)

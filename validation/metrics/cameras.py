@@ -75,6 +75,12 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
     )
 
 
+def relative_centre_error(errors: CameraErrors, C: F64) -> float:
+    """Return ``centre_error`` over the extent of the true centres C (V, 3); NaN where it is unknown."""
+    extent = 2.0 * float(np.linalg.norm(C - C.mean(axis=0), axis=1).max())
+    return float("nan") if errors.centre_error is None else errors.centre_error / extent
+
+
 def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
     """Project every point into every registered view that sees it as an inlier, and measure the distances.
 

@@ -106,11 +106,11 @@ def map_with_pycolmap(
     start: Start | None = None,
     threads: int = 2,
     mapper: Literal["incremental", "global"] = "incremental",
-) -> ReferenceRun:
+) -> None:
     """Map the matches of ``match_with_pycolmap`` in ``matched`` from ``start``.
 
-    ``out`` is another folder, emptied first; the global mapper (GLOMAP) refines what it refines by default.
-    Raises :class:`StageFailure` if COLMAP makes no model.
+    ``out`` is another folder, emptied first, for :func:`read_run`; the global mapper (GLOMAP) refines what it
+    refines by default. Raises :class:`StageFailure` if COLMAP makes no model.
     """
     start = start or Start()
     if not (matched / "seconds.json").is_file():
@@ -121,24 +121,31 @@ def map_with_pycolmap(
     _guess_focals(out / "database.db", start.focal_rel)
     if start.K is not None:
         give_calibration(out / "database.db", start.K)
-    return _map(images, out, start, threads=threads, mapper=mapper)
+    _map(images, out, start, threads=threads, mapper=mapper)
 
 
 def read_run(images: Path, out: Path) -> ReferenceRun:
     """Return the mapping in ``out``; :class:`StageFailure` without a model."""
-    folders = sorted(path for path in (out / "sparse").glob("*") if path.is_dir())
-    if not folders:
-        raise StageFailure("COLMAP made no model of these images")
     names = tuple(sorted(path.name for path in images.iterdir() if path.is_file()))
-    models = [read_colmap_model(path, names) for path in folders]
+    models = [read_colmap_model(path, names) for path in _model_folders(out)]
     seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
     return ReferenceRun(names, max(models, key=lambda model: model.registered.sum()), seconds)
 
 
+def _model_folders(out: Path) -> list[Path]:
+    folders = sorted(path for path in (out / "sparse").glob("*") if path.is_dir())
+    if not folders:
+        raise StageFailure("COLMAP made no model of these images")
+    return folders
+
+
 def _map(
     images: Path, out: Path, start: Start, *, threads: int, mapper: Literal["incremental", "global"]
-) -> ReferenceRun:
-    """Map the database in ``out``, whose folder "sparse" the models go to, with COLMAP's defaults."""
+) -> None:
+    """Map the database in ``out``, whose folder "sparse" the models go to, with COLMAP's defaults.
+
+    The models are not read: that is our work, which would count as COLMAP's.
+    """
     seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
     pycolmap.set_random_seed(0)
     paths, begun = (out / "database.db", images, out / "sparse"), time.perf_counter()
@@ -154,7 +161,7 @@ def _map(
         pycolmap.incremental_mapping(*paths, options)
     seconds["map"] = time.perf_counter() - begun
     write_text(out / "seconds.json", json.dumps(seconds))
-    return read_run(images, out)
+    _model_folders(out)
 
 
 def give_calibration(database: Path, K: Mapping[str, F64]) -> None:
@@ -177,15 +184,15 @@ def reconstruct_with_pycolmap(
     refine_principal_point: bool = False,
     threads: int = 2,
     pairs: Path | None = None,
-) -> ReferenceRun:
+) -> None:
     """SIFT, matching (of a list of ``pairs``, else of all) and incremental mapping with COLMAP's default
     options, on the CPU.
 
     ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database, the
-    models and the times. Raises ``StageFailure`` if COLMAP makes no model.
+    models and the times, for :func:`read_run`. Raises ``StageFailure`` if COLMAP makes no model.
     """
     match_with_pycolmap(images, out, threads=threads, pairs=pairs)
-    return _map(images, out, Start(refine_principal_point), threads=threads, mapper="incremental")
+    _map(images, out, Start(refine_principal_point), threads=threads, mapper="incremental")
 
 
 def main() -> None:

@@ -66,19 +66,16 @@ class Bench:
         """Run COLMAP, or read an earlier run. None if it fails."""
         images, place = self.scene.image_paths[0].parent, self.out / f"colmap-{cameras}"
         try:
-            if (place / name / "sparse" / "0").is_dir():
-                return read_run(images, place / name).reconstruction
             if not (place / "matched" / "seconds.json").is_file():
                 match_with_pycolmap(
                     images, place / "matched", shared_camera=cameras == "shared", threads=self.threads
                 )
-            run = map_with_pycolmap(
-                images, place / "matched", place / name, start=start, threads=self.threads
-            )
+            if not (place / name / "sparse" / "0").is_dir():
+                map_with_pycolmap(images, place / "matched", place / name, start=start, threads=self.threads)
+            return read_run(images, place / name).reconstruction
         except StageFailure as failure:
             report_progress(f"{self.scene.name}: COLMAP, {name}: {failure}")
             return None
-        return run.reconstruction
 
     def methods(self, cameras: Cameras) -> tuple[RunResult | None, dict[str, Reconstruction | None]]:
         """Return our run and the models of ours and of COLMAP, also with its principal point refined."""

@@ -202,9 +202,9 @@ def cluster_efficiency_study(
     set_: Sequence[str] = (),
 ) -> Iterator[Part]:
     """Simulate the efficiency of 1 to 16 workers from the tasks of a run with one."""
-    write_scene(out, scene, max(sizes), long_side, threads=1)
+    images = write_scene(out, scene, max(sizes), long_side, threads=1)
     for count in sorted(sizes):
-        found, _ = call_apart(measure_tasks, out, count, until, list(set_), cores=1)
+        found, _ = call_apart(measure_tasks, images, count, until, list(set_), cores=1)
         by_workers = {
             int(workers): {stage: [Task(**task) for task in tasks] for stage, tasks in stages.items()}
             for workers, stages in found["tasks"].items()

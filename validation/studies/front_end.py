@@ -23,7 +23,7 @@ from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_resi
 from thesisrecon.records import Reconstruction, TwoView
 from thesisrecon.results import RunResult
 from validation.metrics.record import Metric
-from validation.references.colmap import reconstruct_with_pycolmap
+from validation.references.colmap import read_run, reconstruct_with_pycolmap
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS
 from validation.studies.front_end_pairs import (
     OURS,
@@ -74,7 +74,8 @@ def measure_kermit() -> KermitRun | None:
     images = scene.image_paths[0].parent
     with tempfile.TemporaryDirectory() as folder:
         result = reconstruct(images, Path(folder) / "ours", until="metric")
-        reference = reconstruct_with_pycolmap(images, Path(folder) / "colmap")
+        reconstruct_with_pycolmap(images, Path(folder) / "colmap")
+        reference = read_run(images, Path(folder) / "colmap")
     assert result.metric is not None
     models = {OUR_MODEL: result.metric.reconstruction, COLMAP_MODEL: reference.reconstruction}
     by = {name: [judge(v, models) for v in _all_pairs(name, result)] for name in (OURS, THESIS, SIFT)}

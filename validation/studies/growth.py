@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,12 +24,12 @@ from thesisrecon.io._files import write_text
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run import Until
-from validation.harness.process import own_cores, run_process
-from validation.metrics.cameras import TrueCameras, measure_cameras
-from validation.references.colmap import read_run
+from validation.metrics.cameras import TrueCameras, measure_cameras, relative_centre_error
+from validation.references.colmap import read_run, reconstruct_with_pycolmap
+from validation.references.libraries import load
 from validation.scenes.many_views import walk, write_views
 from validation.scenes.street import walk_street, write_street
-from validation.studies.measuring import ONE_BLAS_THREAD, call_apart, exponent
+from validation.studies.measuring import call_apart, exponent, peak_mb, reset_peak, timed
 from validation.studies.runner import Part, text_table
 
 STAGES = (
@@ -65,21 +64,11 @@ class Meter:
             self.enter(AFTER[stage])
 
     def enter(self, stage: str) -> None:
-        now, peak = time.process_time(), _peak_mb()
+        now, peak = time.process_time(), peak_mb()
         self.cpu_s[self.stage] = self.cpu_s.get(self.stage, 0.0) + now - self.since
         self.peak_mb[self.stage] = max(self.peak_mb.get(self.stage, 0.0), peak)
         self.stage, self.since = stage, now
-        _reset_peak()
-
-
-def _peak_mb() -> float:
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
-    return float(line.split()[1]) / 1024.0
-
-
-def _reset_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        reset_peak()
 
 
 @dataclass(frozen=True)
@@ -128,7 +117,8 @@ def measure_cost(
                 threads=threads,
                 progress=meter.progress,
             )
-            errors = _errors(result.reconstruction, scene, _size(paths))
+            if result.metric is not None:
+                errors = _errors(result.metric.reconstruction, scene, _size(paths))
             listed = [f"{paths[pair.i].name} {paths[pair.j].name}\n" for pair in result.pairs]
             write_text(Path(images) / f"pairs-{count}.txt", "".join(listed))
         except StageFailure as error:
@@ -152,8 +142,7 @@ def _errors(found: Reconstruction, scene: str, size: tuple[int, int]) -> tuple[f
     poses = WALKS[scene][0](len(found.P), size)
     K, R, C = (np.array([getattr(pose, name) for pose in poses]) for name in "KRC")
     errors = measure_cameras(found, TrueCameras(K, R, C))
-    extent = 2.0 * float(np.linalg.norm(C - C.mean(axis=0), axis=1).max())
-    return errors.focal_error_pct / 100.0, (errors.centre_error or float("nan")) / extent
+    return errors.focal_error_pct / 100.0, relative_centre_error(errors, C)
 
 
 def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[str, float]:
@@ -163,28 +152,30 @@ def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[s
     """
     paths = sorted(images.glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
-        folder, out, log = (Path(place) / name for name in ("images", "out", "log"))
+        folder, out = Path(place) / "images", Path(place) / "out"
         folder.mkdir()
         for path in paths:
             (folder / path.name).symlink_to(path.resolve())
-        command = [sys.executable, "-m", "validation.references.colmap", str(folder), str(out)]
-        command += ["--threads", str(threads), "--pairs", str(images / f"pairs-{count}.txt")]
-        command += ["--refine-principal-point"]
-        process = run_process(command, log=log, cores=own_cores()[:threads], environment=ONE_BLAS_THREAD)
-        if process.code != 0:
-            raise RuntimeError(log.read_text(encoding="utf-8")[-2000:])
+        pairs = images / f"pairs-{count}.txt"
+        costs, process = call_apart(run_colmap, folder, out, pairs, threads, cores=threads)
         run = read_run(folder, out)
     focal, centre = _errors(run.reconstruction, scene, _size(paths))
-    costs = {"wall s": process.wall_s, "processor s": process.cpu_s, "peak MB": process.peak_mb}
-    parts = {f"{name}, wall s": seconds for name, seconds in run.seconds.items()}
-    registered = float(run.reconstruction.registered.sum())
     return {
         **costs,
-        **parts,
-        "registered": registered,
+        "peak MB": process.peak_mb,
+        **{f"{name}, wall s": seconds for name, seconds in run.seconds.items()},
+        "registered": float(run.reconstruction.registered.sum()),
         "focal error, %": 100 * focal,
         "centres, %": 100 * centre,
     }
+
+
+def run_colmap(images: str, out: str, pairs: str, threads: int) -> dict[str, float]:
+    """Run COLMAP in this process; return its wall and processor seconds, without imports as for ours."""
+    load("pycolmap")
+    given: dict[str, Any] = {"pairs": Path(pairs), "threads": threads, "refine_principal_point": True}
+    _, wall, cpu = timed(lambda: reconstruct_with_pycolmap(Path(images), Path(out), **given))
+    return {"wall s": wall, "processor s": cpu}
 
 
 def counts_of(summary: Mapping[str, Any]) -> dict[str, int]:
@@ -201,7 +192,8 @@ def cost_table(costs: Sequence[Cost]) -> str:
     def row(name: str, values: Sequence[float], digits: int) -> None:
         if not any(values):
             return
-        power = f"{exponent(sizes, values):.2f}" if len(sizes) > 1 and min(values) > 0.0 else "-"
+        known = len(sizes) > 1 and bool(np.isfinite(values).all()) and min(values) > 0.0
+        power = f"{exponent(sizes, values):.2f}" if known else "-"
         lines.append([name, *(f"{v:.{digits}f}" for v in values), power])
 
     for stage in STAGES:
@@ -210,12 +202,12 @@ def cost_table(costs: Sequence[Cost]) -> str:
     for stage in STAGES:
         row(f"{stage}, peak MB", [cost.peak_mb.get(stage, 0.0) for cost in costs], 0)
     row("whole run, peak MB", [max(cost.peak_mb.values()) for cost in costs], 0)
-    for name in costs[0].counts:
-        row(name, [float(cost.counts[name] or 0) for cost in costs], 0)
+    for name in dict.fromkeys(name for cost in costs for name in cost.counts):
+        row(name, [float(cost.counts.get(name) or 0) for cost in costs], 0)
     row("focal error, %", [100.0 * cost.focal_error_rel for cost in costs], 3)
     row("centres, % of their extent", [100.0 * cost.centre_error_rel for cost in costs], 4)
     row("wall s", [cost.wall_s for cost in costs], 0)
-    for name in costs[0].colmap:
+    for name in dict.fromkeys(name for cost in costs for name in cost.colmap):
         row(
             f"COLMAP, {name}",
             [cost.colmap.get(name, float("nan")) for cost in costs],
@@ -231,11 +223,13 @@ WALKS = {"place": (walk, write_views), "street": (walk_street, write_street)}
 """True cameras and the writer of the images of each kind of scene."""
 
 
-def write_scene(out: Path, scene: str, count: int, long_side: int, threads: int) -> None:
-    """Write the images of a walk; those that are there stay."""
+def write_scene(out: Path, scene: str, count: int, long_side: int, threads: int) -> Path:
+    """Write the images of a walk into a folder in ``out``, which is returned; those that are there stay."""
     if scene not in WALKS:
         raise UsageError(f"the scene is {' or '.join(WALKS)}; got {scene!r}")
-    WALKS[scene][1](out, count, size=(long_side, long_side * 3 // 4), threads=threads)
+    folder = out / f"{scene}-{long_side}"
+    WALKS[scene][1](folder, count, size=(long_side, long_side * 3 // 4), threads=threads)
+    return folder
 
 
 def growth_of_cost_study(
@@ -249,14 +243,14 @@ def growth_of_cost_study(
     set_: Sequence[str] = (),
 ) -> Iterator[Part]:
     """Measure what each stage costs by the number of images of one place or of a street."""
-    write_scene(out, scene, max(sizes), long_side, threads)
+    images = write_scene(out, scene, max(sizes), long_side, threads)
     head = [scene, f"long side {long_side} px", f"{threads} threads", f"{os.cpu_count()} cores", *set_]
     yield ", ".join(head)
     costs = []
     for count in sorted(sizes):
-        arguments = (out, count, threads, scene, until, list(set_))
+        arguments = (images, count, threads, scene, until, list(set_))
         costs.append(Cost(**call_apart(measure_cost, *arguments, cores=threads)[0]))
         yield cost_table(costs[-1:]) if len(sizes) > 1 else ""
         if colmap and not costs[-1].failure:
-            costs[-1] = replace(costs[-1], colmap=measure_colmap(out, count, threads, scene))
+            costs[-1] = replace(costs[-1], colmap=measure_colmap(images, count, threads, scene))
     yield cost_table(costs)

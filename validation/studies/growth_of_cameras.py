@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,9 @@ from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.runtime._run import stream
-from validation.metrics.cameras import TrueCameras, measure_cameras
+from validation.metrics.cameras import TrueCameras, measure_cameras, relative_centre_error
 from validation.scenes.many_tracks import Kind, make_tracks
-from validation.studies.measuring import call_apart
+from validation.studies.measuring import call_apart, peak_mb, reset_peak
 from validation.studies.runner import Part, text_table
 
 COLUMNS = ("projective", "selfcalibration", "metric")
@@ -47,11 +46,10 @@ def measure_growth(kind: Kind, views: int, core_views: int) -> dict[str, Any]:
     method = IncrementalProjective(core_views=core_views)
 
     def measured(stage: str, work: Any) -> Any:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        reset_peak()
         before, answer = time.process_time(), work(stream(0, stage))
         cost.cpu_s.append(time.process_time() - before)
-        status = Path("/proc/self/status").read_text(encoding="ascii")
-        cost.peak_mb.append(float(status.split("VmHWM:")[1].split()[0]) / 1024.0)
+        cost.peak_mb.append(peak_mb())
         return answer
 
     found = measured(
@@ -68,8 +66,7 @@ def measure_growth(kind: Kind, views: int, core_views: int) -> dict[str, Any]:
     K, R, C = (np.array([getattr(pose, name) for pose in set_.poses]) for name in "KRC")
     errors, n = measure_cameras(metric.reconstruction, TrueCameras(K, R, C)), metric.reconstruction.registered
     focal = metric.intrinsics[int(np.flatnonzero(n)[0])]["focal_px"]
-    extent = float(np.linalg.norm(C - C.mean(axis=0), axis=1).max() * 2.0)
-    centre = 100.0 * (errors.centre_error or 0.0) / extent
+    centre = 100.0 * relative_centre_error(errors, C)
     std = 100.0 * focal.std / focal.value
     fields = (int(n.sum()), bool(metric.trusted), errors.focal_error_pct, std, centre)
     return asdict(CameraCost(cost.cpu_s, cost.peak_mb, *fields))

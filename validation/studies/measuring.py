@@ -1,4 +1,4 @@
-"""Measure calls: in this process, in turn, or in a process of their own."""
+"""Measure calls in this process or in a process of their own."""
 
 from __future__ import annotations
 
@@ -24,6 +24,16 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float, float]:
     wall, cpu = time.perf_counter(), time.process_time()
     answer = work()
     return answer, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def peak_mb() -> float:
+    """Return the highest memory of this process (MB) since :func:`reset_peak`."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return float(status.split("VmHWM:")[1].split()[0]) / 1024.0
+
+
+def reset_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def call_apart(
