@@ -275,6 +275,20 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
     assert ["ablate", "thesis-fundamental", "-o", str(tmp_path / "all" / "thesis-fundamental")] in others
     assert others[-1] == ["report", "-o", str(tmp_path / "all" / "report")]
     assert len(others) == 1 + len(list(STUDIES.glob("*.toml")))
+    # A study that cannot run, or ends with an error, shows in the exit code and ends no other.
+    failures = [ZeroDivisionError("a fault"), UsageError("no images")]
+
+    def failing_study():
+        """Fail."""
+        yield "begun"
+        raise failures.pop()
+
+    monkeypatch.setattr(timing, "toy_study", failing_study)
+    monkeypatch.setitem(OF_PAGES, "toy", [[]])
+    for code in (2, 1):
+        others.clear()
+        assert run_studies(["all", "-o", str(tmp_path / f"failing-{code}")]) == code
+        assert others[-1][0] == "report"
 
 
 def test_studies_run_with_the_options_of_the_pages():

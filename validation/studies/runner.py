@@ -16,11 +16,13 @@ import inspect
 import json
 import sys
 import tempfile
+import traceback
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -82,6 +84,7 @@ OF_PAGES = {
         ["--scene", "street", "--sizes", "100", "1000"],
         ["--until", "model", "--sizes", "12", "48", "100"],
     ],
+    "harsh": [["--trials", "8"]],
     "main-job": [["--repeats", "3"]],
     "package": [["--steps", "build", "install", "imports", "typed", "quiet", "demo"]],
     "subsets": [["--trials", "25"]],
@@ -201,22 +204,30 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
 
 def run_all(out: Path) -> int:
     """Make every table of the documentation, each in a folder of its own: all studies with the options of
-    the pages, all ablations, and the report."""
+    the pages, all ablations, and the report. One that ends with an error does not end the others; the exit
+    code is the largest."""
     from validation.ablation.command import STUDIES
     from validation.command import main
 
-    codes = []
+    runs: dict[str, Callable[[], int]] = {}
     for name in MODULES:
         for number, options in enumerate(OF_PAGES.get(name, [[]])):
             folder = out / (f"{name}-{number + 1}" if number else name)
-            report_progress(f"study {name} {' '.join(options)}".rstrip())
-            codes.append(run_study(name, ["-o", str(folder), *options]))
+            words = f"study {name} {' '.join(options)}".rstrip()
+            runs[words] = partial(run_study, name, ["-o", str(folder), *options])
     for path in sorted(STUDIES.glob("*.toml")):
-        report_progress(f"ablation {path.stem}")
-        codes.append(main(["ablate", path.stem, "-o", str(out / path.stem)]))
-    report_progress("report")
-    codes.append(main(["report", "-o", str(out / "report")]))
-    return int(1 in codes)
+        runs[f"ablation {path.stem}"] = partial(main, ["ablate", path.stem, "-o", str(out / path.stem)])
+    runs["report"] = partial(main, ["report", "-o", str(out / "report")])
+    largest = 0
+    for words, run in runs.items():
+        report_progress(words)
+        try:
+            code = run()
+        except Exception:
+            traceback.print_exc()
+            code = 1
+        largest = max(largest, code)
+    return largest
 
 
 def load_study(name: str) -> StudyFunction:
