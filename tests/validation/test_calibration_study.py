@@ -13,6 +13,7 @@ from validation.metrics.intervals import IntervalScores, focal_errors_pct, holdi
 from validation.scenes.dinosaur import load_dinosaur
 from validation.scenes.real import Scene, load_real_scene
 from validation.scenes.zoomed import rezoom_scene
+from validation.studies import coverage
 from validation.studies.calibration_real import CameraRows, _pooled
 from validation.studies.coverage import one_camera
 from validation.studies.main_job import COLMAP, OURS
@@ -65,6 +66,11 @@ def test_a_value_that_all_views_share_counts_once():
     scores = IntervalScores(np.array([[np.nan] * 3, [1.0] * 3, [1.0] * 3]), np.array([np.nan, 0.1, 0.1]))
     assert one_camera(scores, "shared").z.shape == (1, 3)
     assert one_camera(scores, "per-image") is scores
+
+
+def test_without_a_trusted_result_no_coverage_is_reached(monkeypatch):
+    monkeypatch.setattr(coverage, "run_trial", lambda *_: None)
+    assert "missed" in [row.verdict for row in coverage.check_coverage("shared", range(3))]
 
 
 def test_cameras_that_err_together_make_a_share_as_unsure_as_scenes_do():

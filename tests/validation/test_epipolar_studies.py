@@ -1,5 +1,7 @@
 """The studies of chapter 5 in small: what they claim of the methods holds, and their tables are whole."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,9 @@ from validation.studies.epipolar_methods import (
     OWN,
     RAW,
     Method,
+    Result,
     Setting,
+    check_methods,
     make_trial,
     measure,
     run_methods,
@@ -83,6 +87,13 @@ def test_a_method_without_a_result_is_counted():
     assert (result.failures, result.trials) == (1, 1)
     assert np.isinf(result.rms_ratio)
     assert "1 none" in epipolar_methods.report([result])
+
+
+def test_a_trial_without_a_result_misses_the_bound():
+    setting = Setting(1.0, 20)
+    all_found = Result(DEFAULT, setting, False, 1.0, 0.95, 1.0, 0, 10)
+    for result, verdict in ((all_found, "reached"), (replace(all_found, failures=1), "missed")):
+        assert [row.verdict for row in check_methods(setting, [result])] == [verdict]
 
 
 def test_pairs_of_the_cube_share_more_than_a_face():

@@ -1,5 +1,7 @@
 """The study of rectification: rows for OpenCV's homographies too, and a verdict where one belongs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ pytest.importorskip("cv2")
 from tests.stereo.rectification_scenes import make_pair
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras, pair_of_fundamental
 from validation.references.opencv import opencv_calibrated, opencv_uncalibrated
+from validation.studies import rectification
 from validation.studies.rectification import BEST_F, METHODS, RealPair, check_scene, measure, seen_by_other
 
 
@@ -44,7 +47,7 @@ def test_the_table_has_every_method_and_judges_the_choice(pair):
     rows = {row.name: row for row in check_scene("synthetic", [pair])}
     assert set(rows["done, of 1 pair"].values) == set(METHODS)
     judged = [row for row in rows.values() if row.target is not None]
-    assert len(judged) == 4
+    assert len(judged) == 5
     assert all(row.judged == BEST_F and row.verdict == "reached" for row in judged)
     assert rows["targets reached, share of all"].values[BEST_F] == 1.0
     for name in METHODS:
@@ -52,3 +55,17 @@ def test_the_table_has_every_method_and_judges_the_choice(pair):
         assert measured is not None
         # The noise of two coordinates that differ.
         assert measured.dy_px == pytest.approx(0.14, abs=0.03)
+
+
+def test_a_refused_pair_and_rows_that_hold_no_match_are_no_success(pair, monkeypatch):
+    good = measure(pair, BEST_F)
+    assert good is not None
+    assert not good.polar
+    for made, name in (
+        (None, "done, of 1 pair"),
+        (replace(good, dy_px=np.nan), "RMS |dy| of inliers, worst"),
+    ):
+        monkeypatch.setattr(rectification, "measure", lambda *_, made=made: made)
+        rows = check_scene("synthetic", [pair])
+        assert {row.name: row.verdict for row in rows if row.target is not None}[name] == "missed"
+    assert {row.name: row.values for row in rows}["targets reached, share of all"][BEST_F] == 0.75

@@ -302,8 +302,22 @@ def test_missing_data_and_unknown_names_end_with_code_2(capsys, monkeypatch):
     monkeypatch.setenv("THESISRECON_DATA", "/nowhere")
     assert run_study("dinosaur") == 2
     assert "not on this machine" in capsys.readouterr().err
-    assert run_study("epipolar-methods", ["--methods", "nobody's"]) == 2
-    assert "choose from" in capsys.readouterr().err
+    for options in (["epipolar-methods", "--methods", "nobody's"], ["harsh", "--kinds", "nobody's"]):
+        assert run_studies(options) == 2
+        assert "choose from" in capsys.readouterr().err
+
+
+def test_records_differ_in_bytes_and_in_runs_that_one_of_them_lacks(tmp_path):
+    run = {"code": 0, "summary": {"/points": 3.0}, "files": {"points.ply": "ab"}, "stages": {"01": "cd"}}
+    other = run | {"files": {"points.ply": "ef"}}
+    files = []
+    for number, runs in enumerate(({"a": run}, {"a": run}, {"a": other}, {"b": run}, {"a": {}})):
+        files.append(tmp_path / f"{number}.json")
+        files[-1].write_text(json.dumps(runs))
+    first, same, changed, disjoint, empty = map(str, files)
+    assert run_study("record", ["--compare-with", first, same]) == 0
+    for differs in (changed, disjoint, empty):
+        assert run_study("record", ["--compare-with", first, differs]) == 1
 
 
 def test_a_call_in_a_process_of_its_own_returns_its_answer():

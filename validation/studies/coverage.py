@@ -97,7 +97,7 @@ def check_coverage(cameras: Cameras, numbers: Iterable[int]) -> list[Metric]:
     trusted = [part for part in found if part is not None and part[1].trusted]
     rows = Rows(f"synthetic, {cameras}", OURS)
     rows.add(f"calibrated of {len(found)}", float(sum(part is not None for part in found)))
-    rows.add(f"trusted of {len(found)}", float(len(trusted)))
+    rows.add(f"trusted of {len(found)}", float(len(trusted)), at_least=1.0)
     if not trusted:
         return rows
     scores = [part[0] for part in trusted]

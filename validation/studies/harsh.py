@@ -17,6 +17,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import UsageError
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from validation.metrics.intervals import LEVEL
 from validation.scenes.dinosaur import pairs_from_tracks
@@ -123,5 +124,7 @@ HEAD += ["off by more than 3 %", "and by more than the interval"]
 def harsh_study(trials: int = 20, workers: int = 1, kinds: Sequence[str] | None = None) -> Iterator[Part]:
     """Look for trusted answers with a wrong focal length outside its interval, on harsh synthetic sets."""
     chosen = [k for k in KINDS if kinds is None or any(word in k for word in kinds)]
+    if not chosen:
+        raise UsageError(f"no kind has one of these words; choose from {', '.join(KINDS)}")
     with ProcessPoolExecutor(workers) as pool:
         yield from _report((k, list(pool.map(partial(run_trial, k), range(trials)))) for k in chosen)

@@ -175,16 +175,16 @@ def compare(before: Path, after: Path) -> Iterator[tuple[str, bool]]:
     """Give a report of each run and whether it differs."""
     old, new = json.loads(before.read_text()), json.loads(after.read_text())
     for run in sorted(set(old) & set(new)):
-        a, b = old[run], new[run]
+        a, b = ({"files": {}, "stages": {}} | record[run] for record in (old, new))
         lines = [] if a.get("code") == b.get("code") else [f"exit code {a.get('code')} -> {b.get('code')}"]
         for kind in ("files", "stages"):
-            for name in sorted(set(a.get(kind, {})) | set(b.get(kind, {}))):
+            for name in sorted(set(a[kind]) | set(b[kind])):
                 if combined(a[kind].get(name, "")) != combined(b[kind].get(name, "")):
                     lines.append(f"{kind}: {name} differs")
         lines += summary_differences(a.get("summary", {}), b.get("summary", {}))
         yield "\n    ".join([f"{run}: {'' if lines else 'same bytes'}", *lines]), bool(lines)
     for run in sorted(set(old) ^ set(new)):
-        yield f"{run}: only in one record", False
+        yield f"{run}: only in one record", True
 
 
 def summary_differences(a: dict[str, float], b: dict[str, float]) -> list[str]:

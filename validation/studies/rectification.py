@@ -204,7 +204,8 @@ def check_scene(name: str, pairs: Sequence[RealPair]) -> list[Metric]:
     found = {method: [measure(pair, method) for pair in pairs] for method in METHODS}
     done = {method: [m for m in each if m is not None] for method, each in found.items()}
     rows = Rows(name, BEST_F)
-    rows.add(f"done, of {counted(len(pairs), 'pair')}", {k: float(len(v)) for k, v in done.items()})
+    count, numbers = len(pairs), {k: float(len(v)) for k, v in done.items()}
+    rows.add(f"done, of {counted(count, 'pair')}", numbers, at_least=float(count))
     rows.add("polar chosen", {k: float(sum(m.polar for m in done[k])) for k in (BEST_F, BEST)})
     for label, unit, number, target, small in QUANTITIES:
         for how, merge in (("median", np.median), ("worst", np.max if small else np.min)):
@@ -213,7 +214,7 @@ def check_scene(name: str, pairs: Sequence[RealPair]) -> list[Metric]:
             rows.append(Metric(name, f"{label}, {how}", unit, values, BEST_F, held, at_most=small))
     judged = [(number, target, small) for _, _, number, target, small in QUANTITIES if target is not None]
     shares = {
-        k: float(np.mean([[_reached(f(m), target, small) for f, target, small in judged] for m in v]))
+        k: float(np.mean([[_reached(m, f(m), target, small) for f, target, small in judged] for m in v]))
         for k, v in done.items()
         if v
     }
@@ -221,9 +222,11 @@ def check_scene(name: str, pairs: Sequence[RealPair]) -> list[Metric]:
     return rows
 
 
-def _reached(value: float, target: float | None, small: bool) -> bool:
-    # A midline through the epipole has no angle, so polar frames have none.
-    return target is None or not np.isfinite(value) or (value <= target if small else value >= target)
+def _reached(measured: Measured, value: float, target: float, small: bool) -> bool:
+    if not np.isfinite(value):
+        # A midline through the epipole has no angle, so polar frames have none.
+        return measured.polar
+    return value <= target if small else value >= target
 
 
 def _merged(merge: Callable[[F64], float], values: list[float]) -> float | None:

@@ -87,9 +87,11 @@ OF_PAGES = {
     "harsh": [["--trials", "8"]],
     "main-job": [["--repeats", "3"]],
     "package": [["--steps", "build", "install", "imports", "typed", "quiet", "demo"]],
+    "record": [],
     "subsets": [["--trials", "25"]],
 }
-"""Options of the studies that the documentation shows with other ones than their defaults, for each run."""
+"""Options of the studies that the documentation shows with other ones than their defaults, for each run; a
+record is of one machine and has no table."""
 CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 """Folder that keeps SIFT matches of image pairs between studies."""
 HELP = {
