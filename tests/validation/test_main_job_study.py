@@ -1,11 +1,12 @@
 """Rows and verdicts of the study of whole reconstructions."""
 
-from dataclasses import replace
-
 import pytest
 
 from tests.validation.test_metrics import V, _reconstruction, _truth
+from validation.harness.gates import read_gates
 from validation.metrics.record import Metric, markdown_table
+from validation.scenes.real import Scene
+from validation.studies import main_job
 from validation.studies.main_job import COLMAP, OURS, Outcome, check_reconstruction
 
 
@@ -38,15 +39,32 @@ def test_a_failure_misses_its_targets_and_breaks_nothing():
     assert "| focal error, % | - |" in markdown_table(list(rows.values()))
 
 
-def test_kermit_may_miss_cameras_only_with_reasons():
-    ours = Outcome(_reconstruction(_truth()), 3.0, 100.0, 5.0)
-    few = {f"{n}.jpg": "too few points in common" for n in range(11 - V)}
-    name = "cameras registered of 11"
-    silent = check_reconstruction("kermit", 11, None, {OURS: ours})
-    spoken = check_reconstruction("kermit", 11, None, {OURS: replace(ours, reasons=few)})
-    assert {row.name: row.verdict for row in silent}[name] == "missed"
-    assert {row.name: row.verdict for row in spoken}[name] == "reached"
-    assert {row.name: row.note for row in spoken}[name] == "5 missing, each with its reason"
+def test_the_bounds_are_the_gates_of_the_report_whatever_reasons_are_given():
+    reasons = {f"{n}.jpg": "too few points in common" for n in range(11 - V)}
+    ours = Outcome(_reconstruction(_truth()), 3.0, 100.0, 5.0, reasons=reasons)
+    rows = {row.name: row for row in check_reconstruction("kermit", 11, None, {OURS: ours})}
+    assert rows["cameras registered of 11"].target == 9.0
+    assert rows["cameras registered of 11"].verdict == "missed"
+    rows = _rows("fountain-P11", {OURS: ours})
+    for name, gate in (("focal error", "focal-error"), ("mean camera-centre error", "centre-error")):
+        assert rows[name].target == read_gates()[f"cameras/fountain-P11/{gate}"].limit
+    assert all(
+        row.target is None for name, row in _rows("a set", {OURS: ours}).items() if "claims" not in name
+    )
+
+
+def test_a_run_that_failed_is_not_hidden_by_one_that_did_not(tmp_path, monkeypatch):
+    model = _reconstruction(_truth())
+    for failing in ([False, True], [True, False]):
+        runs = [
+            Outcome(None if fails else model, 9.0 - fails, 1.0, 1.0, failure="no" * fails)
+            for fails in failing
+        ]
+        left = {method: list(runs) for method in main_job.METHODS}
+        monkeypatch.setattr(main_job, "run_method", lambda method, *_, left=left, **__: left[method].pop())
+        scene = Scene("a set", tuple(tmp_path / f"{n}.png" for n in range(V)))
+        _, outcomes = main_job.measure_scene(scene, tmp_path, threads=1, repeats=2, environment={})
+        assert all(outcome.failure == "no" for outcome in outcomes.values())
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 GATES_FILE = Path(__file__).resolve().parents[1] / "gates.toml"
@@ -23,6 +24,17 @@ class Gate:
         if value is None or value != value:
             return False
         return value <= self.limit if self.at_most else value >= self.limit
+
+
+def camera_limit(scene: str, name: str) -> float | None:
+    """Return the limit of a number of the stage "cameras", None where nothing is promised."""
+    gate = _shipped_gates().get(f"cameras/{scene}/{name}")
+    return None if gate is None else gate.limit
+
+
+@cache
+def _shipped_gates() -> dict[str, Gate]:
+    return read_gates()
 
 
 def read_gates(path: Path = GATES_FILE) -> dict[str, Gate]:

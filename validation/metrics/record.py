@@ -25,7 +25,6 @@ class Metric:
     judged: str
     target: float | None = None
     at_most: bool = True
-    note: str = ""
     definition: str = ""
     ranked: bool = True
 
@@ -50,8 +49,7 @@ def markdown_table(metrics: list[Metric]) -> str:
             "" if metric.target is None else f"{'<=' if metric.at_most else '>='} {number(metric.target)}"
         )
         name = f"{metric.name}, {metric.unit}" if metric.unit else metric.name
-        verdict = f"{metric.verdict} ({metric.note})" if metric.note else metric.verdict
-        lines.append(f"| {name} | {numbers} | {target} | {verdict} |")
+        lines.append(f"| {name} | {numbers} | {target} | {metric.verdict} |")
     return "\n".join(lines)
 
 

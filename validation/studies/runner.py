@@ -322,12 +322,11 @@ class Rows(list[Metric]):
         unit: str = "",
         at_most: float | None = None,
         at_least: float | None = None,
-        note: str = "",
     ) -> None:
         """Append one row; a plain number belongs to the judged method."""
         given = values if isinstance(values, typing.Mapping) else {self.judged: float(values)}
         bound = at_most if at_least is None else at_least
-        self.append(Metric(self.scene, name, unit, given, self.judged, bound, at_least is None, note))
+        self.append(Metric(self.scene, name, unit, given, self.judged, bound, at_least is None))
 
     def each(
         self,
