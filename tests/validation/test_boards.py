@@ -32,7 +32,10 @@ def test_a_calibration_finds_the_camera_that_photographed(way):
     corners = np.array([board_corners(picture, CORNERS) for picture in board_images(way, board)])
     found = calibrate_from_corners(board.X, list(corners), SIZE)
     reported = {"corners": corners, "K": found.K, "k1": np.array(found.k1), "std": found.std}
-    numbers = {row.name.split(": ")[1]: row.values[OURS] for row in _metrics("boards", way, board, reported)}
+    rows = _metrics("boards", way, board, reported)
+    # An error of OpenCV's beside its standard deviation is no comparison with us.
+    assert not any(row.ranked for row in rows)
+    numbers = {row.name.split(": ")[1]: row.values[OURS] for row in rows}
     limits = {"corners": 0.02, "focal length": 0.1, "principal point": 0.7, "distortion": 3e-3}
     for name, limit in limits.items():
         value = numbers[name]

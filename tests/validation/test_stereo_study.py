@@ -6,6 +6,8 @@ import pytest
 from tests.synthetic import texture
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
+from validation.harness.records import ReportOptions, Task
+from validation.harness.stages import disparity
 from validation.metrics.depth import bad_pixels
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
 
@@ -56,3 +58,26 @@ def test_pixels_hidden_by_the_square_or_beyond_the_image_are_not_judged():
     assert not judged[20:40, 36:40].any()
     assert judged[20:40, 40:60].all()
     assert judged[:20, 5:].all()
+
+
+def test_opencv_is_timed_on_the_images_as_they_are(tmp_path, monkeypatch):
+    calls = []
+
+    class Recorded:
+        def __init__(self, mode, widened):
+            self.widened = widened
+
+        def match(self, left, right, disparities):
+            calls.append(self.widened)
+            return np.full(left.shape[:2], float(self.widened), np.float32)
+
+    monkeypatch.setattr(disparity, "OpenCVSemiGlobal", Recorded)
+    monkeypatch.setattr(disparity, "one_thread", lambda: None)
+    monkeypatch.setattr(disparity, "load_stereo_pair", lambda _: small_pair())
+    options = ReportOptions(tmp_path, ("small",), ("disparity",), quick=True)
+    place = options.place("disparity", "small", disparity.HH)
+    place.mkdir(parents=True)
+    disparity.DisparityStage().run(Task("disparity", "small", disparity.HH), options)
+    assert calls == [True, False]
+    with np.load(place / "disparity.npz") as found:
+        assert found["disparity"].all()

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.errors import counted
 from validation.harness.results import Results, Row
 from validation.metrics.record import number
 
@@ -20,13 +21,18 @@ DEFINITION = (
 
 def cost_ratio(row: Row) -> float | None:
     """Return ours over the best reference, inverted where more is better; None where neither side is."""
-    others = [v for name, v in row.reference.items() if v is not None and not name.startswith("ours")]
-    if row.value is None or not others or not row.ranked:
+    best = _best_reference(row)
+    if row.value is None or best is None:
         return None
-    more_is_better = row.direction == "at least"
-    best = max(others) if more_is_better else min(others)
-    over, under = (best, row.value) if more_is_better else (row.value, best)
+    over, under = (best, row.value) if row.direction == "at least" else (row.value, best)
     return over / under if over > 0.0 and under > 0.0 else None
+
+
+def _best_reference(row: Row) -> float | None:
+    others = [v for name, v in row.reference.items() if v is not None and not name.startswith("ours")]
+    if not others or not row.ranked:
+        return None
+    return max(others) if row.direction == "at least" else min(others)
 
 
 def overview(results: Results, earlier: Results | None) -> dict[str, Any]:
@@ -51,6 +57,9 @@ def overview(results: Results, earlier: Results | None) -> dict[str, Any]:
     better = sum(mean < 1.0 for mean in means.values())
     where = f"{better} of {len(means)} combinations of stage and scene"
     notes = [f"In {where} we are better than the best reference (geometric mean)."]
+    lacking = sum(row.value is None and _best_reference(row) is not None for row in results.rows)
+    if lacking:
+        notes.append(f"{counted(lacking, 'number')} of a reference without one of ours: not in the plot.")
     return {
         "id": "overview",
         "title": "Ours over the best reference",

@@ -41,7 +41,8 @@ class DisparityStage(Stage):
     title = "Disparities"
     definition = (
         "Rectified pairs with dense truth; the same parameters for all pairs, one thread each. OpenCV's "
-        "semi-global matching has block 3, P1 = 216, P2 = 864, and widened images, to see every column."
+        "semi-global matching has block 3, P1 = 216, P2 = 864, and widened images, to see every column; "
+        "timed are the images as they are."
     )
 
     scenes = STEREO_PAIRS
@@ -52,11 +53,12 @@ class DisparityStage(Stage):
     def run(self, task: Task, options: ReportOptions) -> None:
         pair = _pair(task.scene)
         runs = 1 if options.quick else 3
-        _match(task.method, pair)  # compiles
+        disparity = _match(task.method, pair)  # compiles
         seconds = []
         for _ in range(runs):
             start = time.process_time()
-            disparity = _match(task.method, pair)
+            # What the columns at the left border cost is not OpenCV's.
+            _match(task.method, pair, widened=False)
             seconds.append(time.process_time() - start)
         place = options.place(task.stage, task.scene, task.method)
         np.savez(place / "disparity.npz", disparity=disparity, seconds=min(seconds))
@@ -112,12 +114,12 @@ def _pair(scene: str) -> StereoPair:
     return pair
 
 
-def _match(method: str, pair: StereoPair) -> F32:
+def _match(method: str, pair: StereoPair, *, widened: bool = True) -> F32:
     if method in MATCHERS:
         limits = (0, pair.disparities - 1)
         return MATCHERS[method].match(pair.left, pair.right, disparity_range=limits).disparity
     one_thread()
-    return OpenCVSemiGlobal(method).match(pair.left, pair.right, pair.disparities)
+    return OpenCVSemiGlobal(method, widened).match(pair.left, pair.right, pair.disparities)
 
 
 def _picture(pair: StereoPair, maps: Mapping[str, F32], names: Sequence[str]) -> U8:
