@@ -43,6 +43,7 @@ from validation.studies.runner import (
 )
 from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, solve, table_row, take_views
 from validation.studies.timing import ratio_table, ratios_to_ours
+from validation.studies.wide_steps import WideResult, check_step
 
 
 def test_the_exponent_is_that_of_a_power():
@@ -324,6 +325,16 @@ def test_a_call_in_a_process_of_its_own_returns_its_answer():
     assert call_apart(exponent, [1.0, 10.0], [1.0, 100.0])[0] == pytest.approx(2.0)
     with pytest.raises(RuntimeError, match=r"ZeroDivisionError|ValueError"):
         call_apart(exponent, [], [])
+
+
+def test_wide_steps_are_counted_without_our_front_end_too():
+    view = true_pairs(make_scene(views=2, points=100))[0]
+    found = [WideResult(None, view, error_rel) for error_rel in (0.0, 0.1)]
+    for methods, verdict in (({"SIFT": found}, "reported"), ({"ours": found, "SIFT": found}, "missed")):
+        pairs, wrong = check_step("a step", methods)
+        assert pairs.name == "pairs found, of 2"
+        assert wrong.values == dict.fromkeys(methods, 1.0)
+        assert wrong.verdict == verdict
 
 
 def test_lens_errors_of_facades_are_a_tenth_of_a_pixel_and_vanish_at_the_principal_point():

@@ -67,11 +67,10 @@ def relate(config: PipelineConfig, pair: WidePair) -> WideResult:
 
 def check_step(step: WideStep, by: dict[str, list[WideResult]]) -> list[Metric]:
     """Pairs found and wrong, and the verified matches of those found."""
-    rows = Rows(str(step), OURS)
-    rows.add(
-        f"pairs found, of {len(by[OURS])}", {n: float(sum(r.found for r in found)) for n, found in by.items()}
-    )
-    rows.add("wrong", {n: float(sum(r.wrong for r in found)) for n, found in by.items()}, at_most=0.0)
+    rows, pairs = Rows(str(step), OURS), max(map(len, by.values()))
+    rows.add(f"pairs found, of {pairs}", {n: float(sum(r.found for r in found)) for n, found in by.items()})
+    wrong = {n: float(sum(r.wrong for r in found)) for n, found in by.items()}
+    rows.add("wrong", wrong, at_most=0.0 if OURS in by else None)
     return rows
 
 

@@ -212,9 +212,10 @@ def _pictures(
 
 def _true_map(view: int, shape: Sequence[int]) -> F32:
     """Return the true depth at the samples nearest to the pixels of a map of this shape."""
-    true, _ = load_fixture_depth(view)
+    true, stride = load_fixture_depth(view)
+    # Sample k is the pixel stride * k of the image.
     y, x = (
-        np.clip(np.rint((np.arange(n) + 0.5) * m / n - 0.5), 0, m - 1).astype(np.int64)
+        np.clip(np.rint((np.arange(n) + 0.5) * m / n - 0.5 / stride), 0, m - 1).astype(np.int64)
         for n, m in zip(shape, true.shape, strict=True)
     )
     return np.asarray(true[np.ix_(y, x)], dtype=np.float32)

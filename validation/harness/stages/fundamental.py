@@ -117,7 +117,8 @@ def _metrics(
     counts = np.array([len(pair.xy1) for pair in pairs])[:, None]
     inliers = each(answers, lambda a: 100.0 * np.mean(a["inliers"] / counts))
     spent = each(answers, lambda a: 1e3 * np.median(a["seconds"]))
-    rank = each(answers, _third_singular_value).get(MINIMAL)
+    minimal = answers.get(MINIMAL)
+    rank = None if minimal is None else _third_singular_value(minimal)
     rank_words = "largest third singular value of F over the second: F has rank 2"
     rows = [
         row(scene, "median error", "px", median, ERROR),
@@ -136,9 +137,10 @@ def _metrics(
 
 
 def _third_singular_value(answers: Answers) -> float:
+    """Return the largest over all runs with an F, NaN without any."""
     F = answers["F"]
     s = np.linalg.svd(F[np.isfinite(F).all(axis=(2, 3))], compute_uv=False)
-    return float((s[:, 2] / s[:, 1]).max())
+    return float((s[:, 2] / s[:, 1]).max()) if len(s) else float("nan")
 
 
 def _epipole_angles(answers: Answers, pairs: list[RealPair]) -> F64:

@@ -1,0 +1,32 @@
+"""What the judgements of the stages make of answers that are incomplete."""
+
+import numpy as np
+
+from validation.harness.stages import depth
+from validation.harness.stages.fundamental import MINIMAL, OURS, VARIANTS, _metrics
+from validation.scenes.real_pairs import RealPair
+
+
+def test_a_method_without_any_fundamental_matrix_has_the_largest_errors_and_no_rank():
+    xy = np.random.default_rng(0).uniform(0.0, 500.0, (20, 2))
+    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    pairs = [RealPair("a pair", xy, xy, truth=np.hstack([xy, xy]), F=F)]
+    found = {"F": F[None, None], "inliers": np.full((1, 1), 20.0), "seconds": np.ones((1, 1))}
+    nothing = found | {"F": np.full((1, 1, 3, 3), np.nan), "inliers": np.zeros((1, 1))}
+    answers = dict.fromkeys((OURS, *VARIANTS), found) | {"COLMAP": nothing, MINIMAL: nothing}
+    errors = {name: np.array([[99.0 if a is nothing else 0.0]]) for name, a in answers.items()}
+    rows = {row.name: row for row in _metrics("a scene", pairs, answers, errors)}
+    assert rows["failed"].values == {name: 100.0 * (a is nothing) for name, a in answers.items()}
+    assert rows["epipole angle"].values["COLMAP"] == 90.0
+    rank = rows[f"{MINIMAL}: rank"].values[OURS]
+    assert rank is not None
+    assert np.isnan(rank)
+
+
+def test_the_true_map_is_that_of_the_pixels_of_the_image(monkeypatch):
+    true = np.add.outer(100.0 * np.arange(3), np.arange(4.0))
+    monkeypatch.setattr(depth, "load_fixture_depth", lambda _: (true, 3))
+    whole = depth._true_map(0, (9, 12))
+    # Sample k is pixel 3 k, so that pixels 3 k - 1 to 3 k + 1 are nearest to it.
+    assert whole[0].tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3]
+    assert (whole[:, 0] / 100.0).tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 2]
