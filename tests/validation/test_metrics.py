@@ -18,7 +18,8 @@ from validation.metrics.cameras import (
     rotation_errors_deg,
 )
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
-from validation.metrics.pictures import psnr_db, ssim
+from validation.metrics.pictures import picture_metrics, psnr_db, ssim
+from validation.metrics.record import number
 from validation.studies.coverage import named, run_trial
 
 
@@ -32,6 +33,20 @@ def test_psnr_is_that_of_the_mean_square():
     where[0] = True
     assert psnr_db(wrong, truth, where=where) == pytest.approx(20.0)
     assert psnr_db(wrong, truth) == pytest.approx(20.0 + 10.0 * np.log10(4.0))
+
+
+def test_of_two_pictures_the_one_with_more_decibels_is_better():
+    rng = np.random.default_rng(1)
+    truth = rng.integers(0, 256, (24, 30, 3), dtype=np.uint8)
+    assert not any(row.at_most for row in picture_metrics("a view", {"one": truth[::-1]}, truth))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "-"), (np.nan, "-"), (np.inf, "inf"), (12345, "12345"), (1553.4, "1553"), (0.03384, "0.0338")],
+)
+def test_numbers_have_three_digits_and_thousands_all(value, text):
+    assert number(value) == text
 
 
 def test_similarity_of_structure_is_the_formula_of_windows():

@@ -88,7 +88,7 @@ def _own_variant(word: str, fields: Mapping[str, Any], stage: str, folder: Path)
 
 
 def _check_variant(stage: str, value: Any) -> None:
-    """Return whether an object is a dataclass with the methods of its stage."""
+    """Raise :class:`UsageError` unless an object is a dataclass with the methods of its stage."""
     if not _is_object(value):
         raise UsageError(f"{stage} takes a variant: a kind, a table or a frozen dataclass; got {value!r}")
     wanted = typing.get_type_hints(PipelineConfig)[stage]

@@ -27,15 +27,15 @@ from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode
 from validation.ablation.tasks import Reconstruction
 
 ROOT = Path(__file__).resolve().parents[1]
-_RUN_BY_ROWS = ("scenes", "metrics", "references", "checks", "ablation/tasks")
+RUN_BY_ROWS = ("scenes", "metrics", "references", "harness", "studies", "ablation/tasks")
+"""Folders of the code that the rows run, without that of the library."""
 _VERSIONS = ("numpy", "scipy", "numba")
 Levels = Mapping[str, str]
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant or a condition: the level of every axis, and the changes
-    it changes."""
+    """A variant or a condition: the level of every axis, and its changes of configuration and task."""
 
     name: str
     levels: Levels
@@ -318,7 +318,7 @@ def _own_code(subject: Any) -> str:
 def versions() -> dict[str, str]:
     """Return the installed versions and a key of the code that rows run."""
     content = hashlib.sha256(package_key().encode())
-    for root in (ROOT / part for part in _RUN_BY_ROWS):
+    for root in (ROOT / part for part in RUN_BY_ROWS):
         for path in sorted(root.rglob("*.py")):
             content.update(f"{path.relative_to(root)}".encode() + path.read_bytes())
     return {

@@ -15,6 +15,7 @@ from thesisrecon.io._files import write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.run import Row
 from validation.ablation.study import Measure
+from validation.metrics.record import number
 from validation.stamp import stamp
 from validation.studies.runner import text_table
 
@@ -168,12 +169,3 @@ def comparison_text(found: Comparison | None) -> str:
     if math.isfinite(low) and high > low:
         text += f" [{number(low)}, {number(high)}] {found.interval.count} {found.interval.sample}"
     return f"**{text}**" if found.verdict in ("better", "worse") else text
-
-
-def number(value: float | None) -> str:
-    """Three significant digits, whole numbers in full, "-" for none."""
-    if value is None or math.isnan(value):
-        return "-"
-    if math.isfinite(value) and float(value).is_integer() and abs(value) < 1e6:
-        return f"{int(value)}"
-    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"

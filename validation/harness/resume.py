@@ -82,7 +82,7 @@ def _take_folders(run: Path, options: ReportOptions, task: Task) -> None:
 def _take_needed(
     other: ReportOptions, options: ReportOptions, task: Task, stages: Mapping[str, Stage]
 ) -> None:
-    """Return the inputs of a task from stages that are not part of this run."""
+    """Copy the inputs of a task from stages that are not part of this run."""
     for stage, method in stages[task.stage].needs(task.method):
         place = other.place(stage, task.scene, method)
         if stage not in options.stages and place.is_dir():

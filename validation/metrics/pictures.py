@@ -33,6 +33,6 @@ def picture_metrics(scene: str, pictures: Mapping[str, U8], wanted: U8) -> list[
 
     def row(name: str, unit: str, measure: Callable[[U8, U8], float]) -> Metric:
         values: dict[str, float | None] = {n: measure(p, wanted) for n, p in pictures.items()}
-        return Metric(scene, name, unit, values, next(iter(pictures)))
+        return Metric(scene, name, unit, values, next(iter(pictures)), at_most=False)
 
     return [row("PSNR", "dB", psnr_db), row("SSIM", "", ssim)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -55,6 +56,8 @@ def markdown_table(metrics: list[Metric]) -> str:
 
 def number(value: float | None) -> str:
     """Return three significant digits, whole numbers in full, "-" for none."""
-    if value is None:
+    if value is None or math.isnan(value):
         return "-"
-    return str(int(value)) if float(value).is_integer() and abs(value) < 1e9 else f"{value:.3g}"
+    if abs(value) < 1e9 and float(value).is_integer():
+        return str(int(value))
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"

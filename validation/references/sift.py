@@ -13,6 +13,8 @@ from thesisrecon.config import EstimateFundamental, PipelineConfig
 from thesisrecon.records import Features, Image, Matches
 from validation.references.libraries import cv2
 
+SETTINGS = {"enable_precise_upscale": True}
+"""OpenCV's defaults otherwise. Without this one, positions are shifted by a quarter of a pixel."""
 ROWS = 512
 """Descriptors whose distances to all others are held at once."""
 
@@ -39,9 +41,8 @@ def _detect(pixels: bytes, shape: tuple[int, ...]) -> SiftKeypoints:
 
 
 def compute_sift(grey: U8) -> SiftKeypoints:
-    """SIFT of a grey image (H, W) with OpenCV's defaults."""
-    # Without this, positions are shifted by a quarter of a pixel.
-    sift = cv2.SIFT.create(enable_precise_upscale=True)
+    """SIFT of a grey image (H, W) with :data:`SETTINGS`."""
+    sift = cv2.SIFT.create(**SETTINGS)
     keypoints, descriptors = sift.detectAndCompute(grey, None)
     return SiftKeypoints(
         np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2),
@@ -155,7 +156,7 @@ class AffineSift(SiftRatioTest):
 
     def prepare(self, image: Image, features: Features) -> SiftKeypoints:  # noqa: ARG002
         """The keypoints of all simulated views."""
-        sift = cv2.SIFT.create(AFFINE_KEYPOINTS, enable_precise_upscale=True)
+        sift = cv2.SIFT.create(AFFINE_KEYPOINTS, **SETTINGS)
         keypoints, descriptors = cv2.AffineFeature.create(sift).detectAndCompute(grey_of(image), None)
         size = np.array([k.size for k in keypoints], dtype=np.float32)
         xy = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)

@@ -5,6 +5,7 @@ SIFT matches are OpenCV's and cached in a folder.
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io._files import write_atomically
-from validation.references.sift import SiftKeypoints, detect_sift, match_sift
+from validation.references.sift import SETTINGS, SiftKeypoints, detect_sift, match_sift
 from validation.scenes.real import Scene, data_root
 
 HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8
@@ -45,9 +46,11 @@ class RealPair:
 
 def match_images(paths: tuple[Path, Path], cache: Path, *, ratio: float, mutual: bool) -> tuple[F64, F64]:
     """OpenCV's SIFT matches (N, 2), (N, 2) with the nearest descriptor below ``ratio`` times the second;
-    with ``mutual`` each must be the other's nearest."""
-    name = "-".join([paths[0].parent.parent.name, *(f"{p.parent.name}-{p.stem}" for p in paths)])
-    kept = cache / f"{name}-{ratio:g}-{'mutual' if mutual else 'one-way'}.npy"
+    with ``mutual`` each must be the other's nearest. The ``cache`` is of the contents of the images."""
+    content = hashlib.sha256(repr((SETTINGS, ratio, mutual)).encode())
+    for path in paths:
+        content.update(path.read_bytes())
+    kept = cache / f"{paths[0].stem}-{paths[1].stem}-{content.hexdigest()[:24]}.npy"
     if kept.is_file():
         found = np.load(kept)
         return found[:, :2].copy(), found[:, 2:].copy()

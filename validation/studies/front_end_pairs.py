@@ -116,7 +116,7 @@ def measure_pairs(
     configs = front_ends()
     by = {name: PreparedViews(configs[name], images) for name in names}
     for gap in gaps:
-        for i, pair in enumerate(islice(camera_pairs(load_real_scene(scene_name), cache, (gap,)), most)):
+        for i, pair in enumerate(islice(camera_pairs(scene, cache, (gap,)), most)):
             assert pair.truth is not None
             views = {name: prepared.relate(i, i + gap) for name, prepared in by.items()}
             related = {n: Related(v, rms_epipolar_distance(v.F, pair.truth)) for n, v in views.items()}

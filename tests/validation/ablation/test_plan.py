@@ -1,5 +1,6 @@
 """What a study says of itself before anything runs."""
 
+import ast
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from validation.ablation import Measure, Study
 from validation.ablation.command import STUDIES, plan_words
-from validation.ablation.plan import plan_study, versions
+from validation.ablation.plan import ROOT, RUN_BY_ROWS, plan_study, versions
 from validation.ablation.run import parts_of
 from validation.ablation.toml import read_study, study_from_table
 
@@ -108,6 +109,16 @@ def test_rows_are_named_by_setting_scene_seed_and_versions(monkeypatch):
     assert len(same) == 2, "a study that grows keeps its rows"
     monkeypatch.setattr("validation.ablation.plan.versions", lambda: {**versions(), "numpy": "0"})
     assert not {r.key for r in plan_study(study).rows} & set(keys.values())
+
+
+def test_the_code_that_rows_run_names_them():
+    assert all((ROOT / part).is_dir() for part in RUN_BY_ROWS)
+    used = set()
+    for path in (ROOT / "ablation" / "tasks").glob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        used |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    own = {module.split(".")[1] for module in used if module.startswith("validation.")}
+    assert own <= {part.split("/")[0] for part in RUN_BY_ROWS}
 
 
 def test_a_function_that_declares_its_metrics_is_a_task():

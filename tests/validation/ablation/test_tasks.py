@@ -38,6 +38,14 @@ def test_exact_points_have_an_exact_fundamental_matrix():
         assert "over_bound" not in found, "without noise there is no bound"
 
 
+def test_pairs_without_a_fundamental_matrix_have_no_direction_of_epipoles(monkeypatch):
+    answers = iter([None, None, np.ones((3, 3))])
+    monkeypatch.setattr(FundamentalOfCube, "_fundamental", lambda *_: next(answers))
+    found = FundamentalOfCube(noise_px=0.5, pairs=3).run(CONFIG, "cube", 0, NOWHERE)
+    assert found["epipole_deg"] == 90.0
+    assert found["distance_px"] == np.inf
+
+
 def test_wrong_matches_hurt_estimators_without_outlier_tests():
     believing, doubting = (
         FundamentalOfCube(method=method, noise_px=0.5, outliers=0.3, pairs=3).run(CONFIG, "cube", 1, NOWHERE)

@@ -1,8 +1,10 @@
 """Conventions between our arrays and OpenCV's, at their border."""
 
 import numpy as np
+import PIL.Image
 import pytest
 
+from tests.synthetic import texture
 from tests.validation.references.conftest import Looked, skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import Image
@@ -16,6 +18,7 @@ from validation.references.opencv import (
     warp_perspective,
 )
 from validation.references.triangulation import opencv_linear, opencv_polynomial
+from validation.scenes.real_pairs import match_images
 
 skip_without("cv2")
 
@@ -33,6 +36,23 @@ def spot(sigma):
 def test_points_of_world_to_camera_matrices_are_where_they_were(solve, looked):
     assert callable(solve)
     np.testing.assert_allclose(dehomogenize(solve(looked.P, looked.xy)), looked.X, atol=1e-6)
+
+
+def test_matches_in_the_cache_are_those_of_these_images(tmp_path):
+    found = []
+    for number in range(2):
+        paths = tuple(tmp_path / f"{number}" / "images" / f"{side}.png" for side in "ab")
+        paths[0].parent.mkdir(parents=True)
+        for k, path in enumerate(paths):
+            grey = texture(160, 200, 5 * number)[:, 10 * k : 150 + 10 * k]
+            PIL.Image.fromarray(grey.astype(np.uint8)).save(path)
+        found += [match_images(paths, tmp_path / "cache", ratio=0.8, mutual=True)[0] for _ in range(2)]
+    first, again, other, _ = found
+    assert len(first) > 10
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    one_way, _ = match_images(paths, tmp_path / "cache", ratio=0.8, mutual=False)
+    assert len(one_way) >= len(other)
 
 
 def test_the_middle_of_a_pixel_is_a_whole_number():

@@ -22,6 +22,8 @@ from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHO
 
 BY_METHOD = {m.name: m for m in METHODS}
 OF_CONFIG = "epipolar of the configuration"
+NO_DIRECTION_DEG = 90.0
+"""Error of an epipole without F, the largest that a direction of either sign can have."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class FundamentalOfCube(Task):
             " to their epipolar lines",
         ),
         Measure("over_bound", "", "less", True, "the same over the least possible, RMS over the pairs"),
-        Measure("epipole_deg", "deg", "less", True, "median direction error of the worse epipole"),
+        Measure("epipole_deg", "deg", "less", True, "median error of the worse epipole, 90 without F"),
         Measure("within_pct", "%", "more", False, "share of the pairs whose distance is below 1 px"),
     )  # fmt: skip
 
@@ -77,9 +79,10 @@ class FundamentalOfCube(Task):
             raise StageFailure("no pair has an F")
         bound = np.array([self._bound(_pairs()[k]) for k in chosen])
         distance = np.where(np.isnan(distance), np.inf, distance)
+        angle = np.where(np.isnan(angle), NO_DIRECTION_DEG, angle)
         numbers = {
             "distance_px": float(np.median(distance)),
-            "epipole_deg": float(np.nanmedian(angle)),
+            "epipole_deg": float(np.median(angle)),
             "within_pct": 100.0 * float(np.mean(distance < 1.0)),
         }
         if self.noise_px > 0.0:

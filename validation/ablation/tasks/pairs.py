@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,10 +21,10 @@ from validation.scenes.many_views import load_yard, yard_number
 from validation.scenes.real import Scene, load_fixture_scene, load_real_scene
 from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs
 from validation.studies.front_end_pairs import MAX_SIZE_PX, Related
+from validation.studies.runner import CACHE
 
 _COURTYARD = "courtyard"
 _SCENES = (*SCENES_WITH_CAMERAS, _COURTYARD)
-CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 
 
 @dataclass(frozen=True)
