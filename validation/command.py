@@ -101,6 +101,8 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
         )
     if parsed.methods and parsed.resume is None:
         raise ValueError("--methods needs --resume: name the folder of the earlier run")
+    if parsed.resume is not None and parsed.resume.resolve() == parsed.out.resolve():
+        raise ValueError("--resume names another folder than --out, whose earlier results are removed")
     if parsed.threads < 1 or parsed.time_limit <= 0:
         raise ValueError("--threads and --time-limit must be positive")
     if parsed.max_side and parsed.max_side < MIN_SIDE_PX:

@@ -24,21 +24,28 @@ ALIKE = ("quick", "gates_only", "seed", "side_px")
 """Options that affect the results of a task."""
 
 
-def take_over(
-    options: ReportOptions, tasks: Sequence[Task], stages: Mapping[str, Stage]
-) -> dict[Task, Outcome]:
-    """Return the outcomes of tasks that need not run again; their files are copied to this run.
+def earlier_run(options: ReportOptions) -> ReportOptions | None:
+    """Return the options of the run to start from, None if there is none to start from.
 
-    Raises ``ValueError`` if the other folder holds no run, or one with different options.
+    Raises ``ValueError`` if the folder holds no run, or one with different options.
     """
     if not options.resume:
-        return {}
+        return None
     other = _options_of(Path(options.resume))
     different = [name for name in ALIKE if getattr(other, name) != getattr(options, name)]
+    moved = [s for s, folder in options.folders.items() if other.folders.get(s, folder) != folder]
+    different += [f"folder of the scene {scene}" for scene in moved]
     if different:
         raise ValueError(
             f"{options.resume} is a run with another {', '.join(different)}: use a run with the same options"
         )
+    return other
+
+
+def take_over(
+    other: ReportOptions, options: ReportOptions, tasks: Sequence[Task], stages: Mapping[str, Stage]
+) -> dict[Task, Outcome]:
+    """Return the outcomes of tasks that need not run again; their files are copied from the ``other`` run."""
     known = {}
     for task in tasks:
         if _runs_again(task, options):

@@ -20,7 +20,7 @@ from thesisrecon.io._files import write_text
 from validation.harness.forks import Template
 from validation.harness.process import Process, failure_of, last_words, own_cores
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
-from validation.harness.resume import OURS, take_over
+from validation.harness.resume import OURS, earlier_run, take_over
 from validation.harness.worker import JUDGEMENT, OUTCOMES
 from validation.metrics.record import Metric
 
@@ -46,12 +46,13 @@ def run_tasks(
     options: ReportOptions, stages: Mapping[str, Stage], report: Reporter
 ) -> dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]:
     """Return the judgement and outcomes of each (stage, scene); failures do not stop other tasks."""
+    earlier = earlier_run(options)
     shutil.rmtree(options.out / "data", ignore_errors=True)
     options.out.mkdir(parents=True, exist_ok=True)
     write_text(options.out / "options.json", json.dumps(options.to_json()))
     tasks = tasks_of(options, stages)
     place_of = {task: n for n, task in enumerate(tasks)}
-    ended = take_over(options, tasks, stages)
+    ended = {} if earlier is None else take_over(earlier, options, tasks, stages)
     behind = tasks_behind(tasks, stages)
     # Start long chains first to finish early.
     waiting = sorted((task for task in tasks if task not in ended), key=lambda task: -behind[task])

@@ -166,6 +166,7 @@ def test_no_gate_without_its_reason(tmp_path):
         (["report", "-o", "OUT", "--images", "nowhere"], "the folder of images nowhere does not exist"),
         (["check", "-o", "OUT", "--threads", "0"], "must be positive"),
         (["report", "-o", "OUT", "--max-side", "10"], "--max-side must be at least 64 px"),
+        (["report", "-o", "OUT", "--resume", "OUT"], "another folder than --out"),
     ],
 )
 def test_wrong_options_are_named(arguments, words, tmp_path, capsys):
@@ -196,12 +197,15 @@ def test_a_run_starts_from_the_references_of_a_like_one(tmp_path):
     assert outcomes["good"].place == second.place("toy", "yard", "good")
 
 
-@pytest.mark.parametrize("change", [{"seed": 1}, {"quick": True}, None])
+@pytest.mark.parametrize("change", [{"seed": 1}, {"quick": True}, {"folders": {"yard": "/other/yard"}}, None])
 def test_a_run_starts_from_no_unlike_one(change, tmp_path):
     options = dataclasses.replace(toy_options(tmp_path / "now", quick=False), resume=str(tmp_path / "before"))
+    options = dataclasses.replace(options, folders={"yard": "/one/yard"})
+    (options.out / "data").mkdir(parents=True)
     if change is not None:
         before = dataclasses.replace(options, **change)
         (tmp_path / "before").mkdir()
         (tmp_path / "before" / "options.json").write_text(json.dumps(before.to_json()), encoding="utf-8")
     with pytest.raises(ValueError, match="use a run with the same options" if change else "holds no run"):
         run_tasks(options, STAGES, lambda _: None)
+    assert (options.out / "data").is_dir(), "results of a run that is there are kept"

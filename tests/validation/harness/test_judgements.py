@@ -2,7 +2,9 @@
 
 import numpy as np
 
+from thesisrecon.records import Image
 from validation.harness.stages import depth
+from validation.harness.stages.features import in_original_pixels
 from validation.harness.stages.fundamental import MINIMAL, OURS, VARIANTS, _metrics
 from validation.scenes.real_pairs import RealPair
 
@@ -30,3 +32,15 @@ def test_the_true_map_is_that_of_the_pixels_of_the_image(monkeypatch):
     # Sample k is pixel 3 k, so that pixels 3 k - 1 to 3 k + 1 are nearest to it.
     assert whole[0].tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3]
     assert (whole[:, 0] / 100.0).tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 2]
+
+
+def test_matrices_of_reduced_images_are_judged_in_original_pixels():
+    rng = np.random.default_rng(0)
+    F, xy = rng.normal(size=(3, 3)), rng.uniform(0.0, 300.0, (2, 5, 2))
+    images = [Image("", np.zeros((30, 40, 3), np.uint8), size) for size in ((80, 60), (120, 90))]
+    original = [(x + 0.5) / image.scale - 0.5 for x, image in zip(xy, images, strict=True)]
+    here, there = (np.column_stack([x, np.ones(5)]) for x in xy)
+    first, second = (np.column_stack([x, np.ones(5)]) for x in original)
+    expected = np.einsum("na,ab,nb->n", there, F, here)
+    found = np.einsum("na,ab,nb->n", second, in_original_pixels(F, *images), first)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

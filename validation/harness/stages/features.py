@@ -102,15 +102,21 @@ def _corners(method: str, image: Image) -> F64:
 
 
 def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> dict[str, Any]:
-    """Return F, number of inliers and sigma of every pair."""
+    """Return F in original pixels, number of inliers and sigma of every pair."""
     prepared = PreparedViews(front_ends()[FRONT_ENDS[method]], images)
     arrays: dict[str, Any] = {}
     for gap in _gaps(options):
         views = [prepared.relate(i, i + gap, options.seed) for i in range(len(images) - gap)]
-        arrays[f"F{gap}"] = np.array([view.F for view in views])
+        arrays[f"F{gap}"] = np.array([in_original_pixels(v.F, images[v.i], images[v.j]) for v in views])
         arrays[f"inliers{gap}"] = np.array([view.inliers for view in views])
         arrays[f"sigma{gap}"] = np.array([view.sigma_px for view in views])
     return arrays
+
+
+def in_original_pixels(F: F64, first: Image, second: Image) -> F64:
+    """Return the F (3, 3) of original pixels from that of two images at working size."""
+    here, there = (np.linalg.inv(image.original_from_working) for image in (first, second))
+    return np.asarray(there.T @ F @ here)
 
 
 def _match_metrics(
