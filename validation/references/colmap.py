@@ -202,11 +202,10 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--refine-principal-point", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--pairs", type=Path, help="file with two names of images in each line")
     parsed = parser.parse_args()
     refine = parsed.refine_principal_point
     reconstruct_with_pycolmap(
-        parsed.images, parsed.out, refine_principal_point=refine, threads=parsed.threads, pairs=parsed.pairs
+        parsed.images, parsed.out, refine_principal_point=refine, threads=parsed.threads
     )
 
 
