@@ -31,6 +31,7 @@ from validation.metrics.record import Metric
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 from validation.scenes.critical import Sequence as SyntheticSequence
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur
+from validation.studies.coverage import MODES, Cameras
 from validation.studies.runner import Part, Rows, pick, report_progress, text_table
 
 OURS = "ours"
@@ -126,8 +127,8 @@ def check_motion(
     return rows, [motion.value, kind, focal, *shares, names]
 
 
-def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: str = "shared") -> IdentifiabilityReport:
-    options = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
+def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: Cameras = "shared") -> IdentifiabilityReport:
+    options = IntrinsicsOptions(cameras=cameras)
     answer = HypothesesAndRefinement().calibrate(
         reconstruction, prior=prior_for(reconstruction, options), rng=np.random.default_rng(0)
     )
@@ -177,7 +178,7 @@ def critical_motions_study(
     yield text_table(HEAD, lines)
     yield from judged
     dinosaur = load_dinosaur()
-    for cameras in ("shared", "per-image"):
+    for cameras in MODES:
         if dinosaur is None:
             break
         report = dinosaur_verdict(published_reconstruction(dinosaur), cameras=cameras)

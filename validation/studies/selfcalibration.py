@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified import Stratified
 from validation.scenes.real import REAL_SCENES
+from validation.studies.coverage import Cameras
 from validation.studies.runner import Part, scenes_here, text_table
 
 PLANES: Mapping[str, CheiralitySearch | ModulusConstraint | ParallelLines] = {
@@ -56,11 +56,10 @@ class Row:
 
 
 def measure_stratified(
-    projective: Reconstruction, images: Sequence[Image], K: F64, *, cameras: str = "shared"
+    projective: Reconstruction, images: Sequence[Image], K: F64, *, cameras: Cameras = "shared"
 ) -> Iterator[Row]:
     """Run every stratified method on one set, against K (V, 3, 3) at working size."""
-    options = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
-    prior = prior_for(projective, options)
+    prior = prior_for(projective, IntrinsicsOptions(cameras=cameras))
     views = np.flatnonzero(projective.registered)
     for plane_name, plane in PLANES.items():
         for k_name, k_method in K_METHODS.items():
@@ -93,7 +92,7 @@ def stratified_table(name: str, rows: Sequence[Row]) -> str:
 def stratified_study(
     out: Path,
     scenes: Sequence[str] = ("courtyard", *REAL_SCENES),
-    cameras: Literal["shared", "per-image"] = "shared",
+    cameras: Cameras = "shared",
 ) -> Iterator[Part]:
     """Compare the stratified methods alone on real images.
 
