@@ -16,8 +16,8 @@ from validation.scenes.zoomed import rezoom_scene
 from validation.studies import coverage
 from validation.studies.calibration_real import CameraRows, _pooled
 from validation.studies.coverage import one_camera
+from validation.studies.dinosaur import compare, to_metrics
 from validation.studies.main_job import COLMAP, OURS
-from validation.studies.projective import compare, to_metrics
 
 
 def rows_of(models):

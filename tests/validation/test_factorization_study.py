@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from validation.scenes.rigs import cube_rig, noisy_tracks, projective_from_truth
-from validation.studies.projective import (
+from validation.studies.factorization import (
     AFFINE,
     GROWN,
     ITERATED,

@@ -1,10 +1,7 @@
-"""Chapter 6: factorisation and a real turntable.
+"""Chapter 6: factorisation beside incremental reconstruction.
 
-``factorization``: distance of a core of views from the truth after each start of chapter 6, before and after
-bundle adjustment, by noise; cameras, residuals and time of both methods on real images (matched once in OUT).
-``dinosaur``: our cameras and the published ones are measured alike. Every track is triangulated from all its
-observations with one robust loss, for the cameras as given and after a projective bundle adjustment with that
-loss. An observation is right if either set of cameras explains it, so rejecting observations gains nothing.
+Distance of a core of views from the truth after each start of chapter 6, before and after bundle adjustment,
+by noise; cameras, residuals and time of both methods on real images (matched once in OUT).
 """
 
 from __future__ import annotations
@@ -17,20 +14,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import F64
 from thesisrecon.config import ProjectiveReconstructor
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.projective.factorization import Factorization, depths_from_fundamentals, factorize
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
-from thesisrecon.runtime._run import stream
 from validation.metrics.record import Metric
-from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks
+from validation.scenes.dinosaur import pairs_from_tracks
 from validation.scenes.real import Scene
 from validation.scenes.rigs import noisy_tracks
 from validation.scenes.transforms import random_transform
@@ -201,117 +195,9 @@ def residual_rms_px(model: Reconstruction) -> float:
     return float(np.sqrt(np.mean(np.sum((xh[:, :2] / xh[:, 2:] - t.xy[k]) ** 2, axis=1))))
 
 
-OURS, PUBLISHED = "thesisrecon", "published cameras"
-# ---------------------------------------------------------------- the dinosaur
-
-LOSS_PX, WRONG_PX = 1.0, 3.0
-ADJUSTMENT_STEPS = 50
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """Distances ``px`` (K,) of all observations, NaN without a camera, and their robust cost."""
-
-    px: F64
-    cost: float
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Residuals of our and of the published cameras, before and after bundle adjustment."""
-
-    reconstruction: Reconstruction
-    seconds: float
-    ours: Residuals
-    ours_adjusted: Residuals
-    published: Residuals
-    published_adjusted: Residuals
-
-    @property
-    def right(self) -> B8:
-        """Observations (K,) that either set of cameras explains within ``WRONG_PX``."""
-        return np.fmin(self.ours.px, self.published.px) < WRONG_PX
-
-    def rms_px(self, residuals: Residuals, *, all_observations: bool = False) -> float:
-        d = np.minimum(residuals.px, WRONG_PX) if all_observations else residuals.px[self.right]
-        return float(np.sqrt(np.mean(d**2)))
-
-
-def judge_cameras(P: F64, registered: B8, tracks: Tracks) -> tuple[F64, Residuals]:
-    """Triangulate all tracks from cameras P (V, 3, 4); return points (N, 4) and residuals."""
-    k = registered[tracks.view_index]
-    view, point, xy = tracks.view_index[k], tracks.point_index[k], tracks.xy[k]
-    X = triangulate_observations(P, view, point, xy, tracks.n_points)
-    X = refine_points(P, X, view, point, xy, loss_px=LOSS_PX, iterations=30)
-    known = (np.abs(X).sum(axis=1) > 0)[point]
-    xh = np.einsum("kab,kb->ka", P[view[known]], X[point[known]])
-    px = np.full(len(tracks.xy), np.nan)
-    px[np.flatnonzero(k)[known]] = np.linalg.norm(xh[:, :2] / xh[:, 2:] - xy[known], axis=1)
-    d = px[np.isfinite(px)]
-    return X, Residuals(px, float(np.sum(np.where(d < LOSS_PX, d**2 / 2, LOSS_PX * (d - LOSS_PX / 2)))))
-
-
-def judge_adjusted(P: F64, registered: B8, tracks: Tracks) -> tuple[Residuals, Residuals]:
-    X, before = judge_cameras(P, registered, tracks)
-    k = np.isfinite(before.px)
-    result = refine_projective_bundle(
-        P, X, Observations(tracks.view_index[k], tracks.point_index[k], tracks.xy[k]),
-        loss_px=LOSS_PX, max_iterations=ADJUSTMENT_STEPS,
-    )  # fmt: skip
-    return before, judge_cameras(result.P, registered, tracks)[1]
-
-
-def compare(dinosaur: Dinosaur, *, seed: int = 0) -> Comparison:
-    tracks = dinosaur.tracks
-    pairs = pairs_from_tracks(tracks, seed=seed)
-    start = time.perf_counter()
-    found = IncrementalProjective().reconstruct(
-        tracks, pairs, dinosaur.sizes, rng=stream(seed, "projective", 0)
-    )
-    seconds = time.perf_counter() - start
-    ours, ours_adjusted = judge_adjusted(found.P, found.registered, tracks)
-    everywhere = np.ones(len(dinosaur.P), dtype=bool)
-    published, published_adjusted = judge_adjusted(dinosaur.P, everywhere, tracks)
-    return Comparison(found, seconds, ours, ours_adjusted, published, published_adjusted)
-
-
-def to_metrics(found: Comparison) -> list[Metric]:
-    """Return the table: all 36 cameras, and an RMS not above that of the published ones."""
-    n = len(found.reconstruction.registered)
-    registered = {OURS: float(found.reconstruction.registered.sum()), PUBLISHED: float(n)}
-    rows = Rows("dinosaur", OURS)
-    rows.add("cameras", registered, at_least=float(n))
-    # Two descents into one flat valley differ in the fourth digit.
-    for name, ours, published, slack in (
-        ("as they are", found.ours, found.published, 1.0),
-        ("after bundle adjustment", found.ours_adjusted, found.published_adjusted, 1.001),
-    ):
-        for label, everything in (("right observations", False), ("all, at most 3 px each", True)):
-            rms = {
-                method: found.rms_px(residuals, all_observations=everything)
-                for method, residuals in ((OURS, ours), (PUBLISHED, published))
-            }
-            rows.add(f"RMS, {label}, {name}", rms, "px", at_most=slack * rms[PUBLISHED])
-        cost = {OURS: ours.cost, PUBLISHED: published.cost}
-        rows.add(f"robust cost, {name}", cost, "px^2", at_most=slack * published.cost)
-    rows.add(f"observations used of {len(found.ours.px)}", found.reconstruction.inlier.sum())
-    rows.add("time", found.seconds, "s")
-    return rows
-
-
-# ---------------------------------------------------------------- the studies
-
-
 def factorization_study(out: Path, trials: int = 30, scenes: Sequence[str] = SCENES) -> Iterator[Part]:
     """Compare factorisation with incremental reconstruction, on synthetic rigs and on real images."""
     for sigma_px in NOISES_PX:
         yield check_noise(sigma_px, trials)
     for scene in scenes_here(scenes):
         yield check_images(scene, out / scene.name)
-
-
-def dinosaur_study(seed: int = 0) -> Iterator[Part]:
-    """Compare 36 turntable cameras from given tracks with the published ones."""
-    dinosaur = load_dinosaur()
-    if dinosaur is not None:
-        yield to_metrics(compare(dinosaur, seed=seed))
