@@ -16,8 +16,8 @@ from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres import CeresOptions, bundle_adjuster, colmap_model
 from validation.references.fundamental import SOLVERS
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
-from validation.scenes.streets import SIZE, make_walk
 from validation.scenes.two_views import make_two_views
+from validation.scenes.walks import SIZE, make_walk
 
 MATCHES, SIGMA_PX, FRAME = 1000, 0.5, (1280.0, 960.0)
 POINTS = 2000

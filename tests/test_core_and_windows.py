@@ -16,7 +16,7 @@ from thesisrecon.projective._track_selection import select_core
 from thesisrecon.projective.incremental import OUTSIDE_CORE, IncrementalProjective
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from validation.scenes.streets import SIZE, make_walk
+from validation.scenes.walks import SIZE, make_walk
 
 
 def street(views):

@@ -20,7 +20,7 @@ from thesisrecon.numerics._noise import huber
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting, sort_observations
 from thesisrecon.numerics._schur import BundleSystem, build_layout
 from thesisrecon.numerics._small_solvers import floored_diagonal
-from validation.scenes.streets import make_walk
+from validation.scenes.walks import make_walk
 
 
 def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):

@@ -19,7 +19,7 @@ from validation.harness.stages.cameras import our_model
 from validation.metrics.record import Metric
 from validation.references.ceres import CeresOptions, ceres_covariances, refine_with_ceres
 from validation.scenes.pose import off_the_truth
-from validation.scenes.streets import SIZE, make_walk
+from validation.scenes.walks import SIZE, make_walk
 
 CERES = "Ceres"
 STREET = "street"
