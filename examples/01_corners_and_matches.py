@@ -2,10 +2,10 @@ r"""
 1. Corners and matches
 ======================
 
-A reconstruction begins with points that can be found again in other images (chapter 4 of the thesis). Along
-an edge a patch looks like its neighbours, so its position along the edge is lost: the aperture problem. At a
+A reconstruction begins with points that can be found again in other images (chapter 4 of the thesis). A patch
+on an edge looks like its neighbours along the edge, so it cannot be located: the aperture problem. At a
 :term:`corner` the image changes in every direction. With the gradient :math:`(I_x, I_y)` and a Gaussian
-window :math:`w`, the change of a patch under a small shift :math:`d` is :math:`d^\top M d` (4.2.1),
+window :math:`w`, the change of a patch under a small shift :math:`d` is about :math:`d^\top M d` (4.2.1),
 
 .. math:: M = \sum w \begin{pmatrix} I_x^2 & I_x I_y \\ I_x I_y & I_y^2 \end{pmatrix}, \quad
    R = \det M / \operatorname{tr} M.
@@ -44,7 +44,7 @@ for axis, title in zip(axes, titles, strict=True):
 
 # %%
 # Corners of two images are compared by the correlation of their patches (4.2.2). Many patches look alike, so
-# a :term:`match` must also agree with its neighbours, which move alike (4.1). The default method grows
+# a :term:`match` must also agree with its neighbours, which should move alike (4.1). The default method grows
 # matches around reliable ones. *Verified* matches obey one epipolar geometry, the subject of the next page.
 
 pair = thesisrecon.match_pair(*paths)

@@ -9,8 +9,9 @@ all these lines, the :term:`fundamental matrix` (3.34; HZ 9.2):
 
 .. math:: x_2^\top F\, x_1 = 0, \qquad l_2 = F x_1, \qquad \det F = 0.
 
-They meet in the :term:`epipole`, the image of the other camera. :math:`F` has nine entries, no scale and rank
-2: seven degrees of freedom. Seven matches determine it (5.2), more make it precise; no calibration is needed.
+The lines meet in the :term:`epipole`, the image of the other camera's centre. :math:`F` has nine entries, no
+scale and rank 2: seven degrees of freedom. Seven matches determine it up to three solutions (5.2), more make
+it unique and precise. No calibration is needed.
 """
 
 from pathlib import Path
@@ -32,11 +33,10 @@ for axis, image in zip(axes, images, strict=True):
     axis.set(xticks=[], yticks=[])
 
 # %%
-# How precise is :math:`F`? With the noise :math:`\sigma` no unbiased estimate can bring the RMS distance of
-# exact points to their epipolar lines below about :math:`\sigma\sqrt{14/n}` (the :term:`bound` of Cramer and
-# Rao): 7 parameters, one equation per match, and in each distance the noise of both images,
-# :math:`2\sigma^2`. The eight-point method (5.1) solves linear equations; the :term:`gold standard` minimises
-# the distances to the nearest exact matches (HZ 11.4.1). The bound holds for many matches.
+# How precise is :math:`F`? Each distance has the noise of both images, a variance of :math:`2\sigma^2`, and a
+# fit of 7 parameters to :math:`n` of them has 7/n of it on average. No unbiased estimate can bring the RMS
+# distance of exact points below about :math:`\sigma\sqrt{14/n}` (:term:`bound`; for many matches). The
+# eight-point method (5.1) is linear; the :term:`gold standard` minimises distances in the images (HZ 11.4.1).
 
 cube = np.load(folder.parent / "cube" / "cube.npz")
 exact = cube["xy"][[13, 22]][:, np.isfinite(cube["xy"][[13, 22]]).all(axis=(0, 2))]

@@ -5,13 +5,13 @@ r"""
 In :term:`homogeneous coordinates`, equal up to scale, a camera maps a point :math:`X = (X, Y, Z, 1)^\top` to
 a pixel :math:`x \simeq P X` with a 3 x 4 matrix :math:`P = K\,[R \; t]`: :math:`R` and :math:`t` turn world
 coordinates into those of the camera, :math:`K` holds the focal length and the :term:`principal point`.
-Matches leave one invertible 4 x 4 matrix :math:`G` open, because :math:`P X = (P G^{-1}) (G X)`: both have
-the same images (section 3.3; HZ 10.2). Such a *projective* reconstruction keeps lines, but parallel lines may
-meet. It is *affine* once the :term:`plane at infinity`, where they meet, is found and moved to :math:`(0, 0,
-0, 1)` (3.4.3), and *metric* once the :term:`absolute conic` on that plane is found too (3.4.4): angles and
-ratios of lengths are then true, only the scale is unknown. Below a grid on the cube is triangulated in each
-frame (6.3). Residuals and cross-ratios stay; from the affine frame on the two halves of an edge are equal; in
-the metric frame angles are right.
+Because :math:`P X = (P G^{-1}) (G X)` for any invertible 4 x 4 matrix :math:`G`, images cannot determine
+:math:`G` (section 3.3; HZ 10.2). Such a *projective* reconstruction keeps straight lines, but parallel lines
+may meet. It becomes *affine* when the :term:`plane at infinity`, where they meet, is found and moved to
+:math:`(0, 0, 0, 1)` (3.4.3), and *metric* when the :term:`absolute conic` on it is found too (3.4.4): angles
+and ratios of lengths are then true. Below, a grid on the cube is triangulated in each frame (6.3). Residuals
+and :term:`cross-ratios <cross-ratio>` are the same in all three, the two halves of an edge are equal in the
+affine and the metric frame, and angles are right in the metric frame.
 """
 
 from pathlib import Path

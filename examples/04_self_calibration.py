@@ -3,16 +3,16 @@ r"""
 ==================================
 
 Which 4 x 4 matrix makes the reconstruction :term:`metric <metric stratum>`? The :term:`absolute conic` lies
-on the plane at infinity; where a camera sees it depends on its calibration alone, not on its position. Its
+on the plane at infinity, and its image depends on the calibration alone, not on the pose of the camera. Its
 dual, the absolute dual quadric :math:`\Omega^*` (4 x 4, symmetric, rank 3, null vector :math:`\Pi_\infty`),
-is seen as (3.14; HZ 19.3)
+has the image (3.14; HZ 19.3)
 
 .. math:: P_i\, \Omega^* P_i^\top \simeq \omega_i^* = K_i K_i^\top, \quad
    K = \begin{pmatrix} f & 0 & u \\ 0 & f & v \\ 0 & 0 & 1 \end{pmatrix},
 
-with the focal length :math:`f` and the :term:`principal point` :math:`(u, v)`, so square pixels, or one
-camera for all images, are equations for :math:`\Omega^*`. All methods below get one projective reconstruction
-and know only that: one camera, square pixels, principal point near the centre.
+with the focal length :math:`f` and the :term:`principal point` :math:`(u, v)`. So all that is known of
+:math:`K` gives equations for :math:`\Omega^*`. All methods below get one projective reconstruction and the
+same knowledge: one camera, square pixels, a principal point near the centre.
 """
 
 from pathlib import Path
@@ -30,11 +30,11 @@ run = thesisrecon.reconstruct_from_tracks(noisy, [(800, 600)] * len(views))
 # %%
 # - **linear-quadric**: linear equations for :math:`\Omega^*`; biased for lenses other than 60 mm.
 # - **nonlinear-quadric**: the nearest :math:`K K^\top` to all :math:`P_i \Omega^* P_i^\top`.
-# - **kruppa-equations** (:term:`Kruppa equations`): from F alone: :math:`F \omega^* F^\top \simeq [e]_\times
-#   \omega^* [e]_\times^\top`.
-# - **modulus-constraint**: first :math:`\Pi_\infty`, where two images of one camera are related by a matrix
-#   similar to a rotation: eigenvalues of one modulus, a quartic equation in :math:`\Pi_\infty` per pair.
-# - **cheirality-search**: first :math:`\Pi_\infty`, within the bounds of having all points on one side.
+# - **kruppa-equations**: from F and its :term:`epipole` e in image 2 alone (:term:`Kruppa equations`),
+#   :math:`F \omega^* F^\top \simeq [e]_\times \omega^* [e]_\times^\top`.
+# - **modulus-constraint**: first :math:`\Pi_\infty`. It maps image to image by a matrix that is similar to a
+#   rotation, with eigenvalues of one modulus: a quartic equation in :math:`\Pi_\infty` for each pair.
+# - **cheirality-search**: first :math:`\Pi_\infty`, which must have all points and cameras on one side.
 # - **hypotheses-and-refinement**: the default: many starts, one criterion, the principal point still fixed.
 # - **metric stage**: :term:`bundle adjustment`, which minimises distances in the images.
 #

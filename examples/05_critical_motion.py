@@ -2,17 +2,17 @@ r"""
 5. A critical motion and how it is named
 ========================================
 
-Some motions leave the calibration open, whatever the method. A camera with the calibration :math:`K`, the
-rotation :math:`R` and the centre :math:`C` has the matrix :math:`P = K R\,[I \; {-C}]`. Let it translate,
-with :math:`R = I`. Then for any other calibration :math:`K'`, with the affine map :math:`A = K'^{-1} K`,
+After some motions no method can find the calibration. A camera with the calibration :math:`K`, the rotation
+:math:`R` and the centre :math:`C` has the matrix :math:`P = K R\,[I \; {-C}]`. If it only translates,
+:math:`R = I`, then for any other calibration :math:`K'`, with the affine map :math:`A = K'^{-1} K`,
 
 .. math:: K\,(X - C_i) = K' (A X - A C_i):
 
 a camera :math:`K'` that translates through the sheared or stretched scene :math:`A X` has the same images. If
-a photographer walks sideways without turning, depth and focal length stay open: a :term:`critical motion`
-(Sturm 1997; HZ 19.3.5, 19.5.3). Others are turntables (HZ 19.9) and rotations about the optical axis.
+a photographer walks sideways without turning, depth and focal length are undetermined: a :term:`critical
+motion` (Sturm 1997; HZ 19.3.5, 19.5.3). Others are turntables (HZ 19.9) and rotations about the optical axis.
 
-Below the focal length is fixed at wrong values and all else is adjusted to images with noise of 0.5 px. If
+Below, the focal length is fixed at wrong values, and all else is adjusted to images with noise of 0.5 px. If
 the RMS residual does not rise, the images do not contradict them. The library names the motion and advises.
 """
 

@@ -5,14 +5,14 @@ r"""
 :term:`Bundle adjustment <bundle adjustment>` (6.7; HZ 18.1) moves all cameras and points together until the
 images are explained best,
 
-.. math:: \min \sum_{ij} \rho\!\left( \| x_{ij} - \pi(P_i, X_j) \|^2 / \sigma^2 \right),
+.. math:: \min \sum_{ij} \| x_{ij} - \hat x_{ij} \|^2, \qquad \hat x_{ij} \simeq P_i X_j,
 
-the maximum likelihood estimate for normal noise. It also says how precise it is: with the Jacobian :math:`J`
-the covariance of the unknowns is :math:`\Sigma = \sigma^2 (J^\top J)^+` (HZ 5.2), the pseudo-inverse, because
-:math:`J^\top J` is singular: seven directions, the frame and the scale of the world (the :term:`gauge`),
+the maximum likelihood estimate for normal noise, and its precision is known. With the derivatives :math:`J`
+of the residuals by the unknowns, the :term:`covariance` of these is :math:`\Sigma = \sigma^2 (J^\top J)^+`
+(HZ 5.2): the pseudo-inverse, because the frame and the scale of the world (the :term:`gauge`, seven numbers)
 change no image. An interval of :math:`\pm 1.96` :term:`standard deviations <standard deviation>` should
 contain the truth in 95 of 100 cases. With :math:`N` observed coordinates and :math:`d` unknowns (without the
-seven: -7 in the code) the residuals should be :math:`\sigma\sqrt{1 - d/N}`, less than the noise (HZ result
+seven: -7 in the code) the RMS residual should be :math:`\sigma\sqrt{1 - d/N}`, less than the noise (HZ result
 5.2). Both are tested in 100 trials with new noise. Left: the focal lengths with intervals, sorted. Right: the
 principal points and the ellipse predicted for 95 % of them (mean covariance, :math:`\chi^2 = 5.99`).
 """

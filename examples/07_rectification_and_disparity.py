@@ -32,10 +32,10 @@ for axis, image in zip(axes, (left, right), strict=True):
     axis.hlines(range(40, len(image), 80), 0, image.shape[1] - 1, "yellow", linewidth=0.8)
 
 # %%
-# Matching each row by itself gives streaks, so the disparities of neighbouring pixels are tied. The thesis
-# uses dynamic programming: for each row the most likely sequence of matches and occlusions in one order (Cox
-# et al. 1996). The default sums such paths over several directions (semi-global matching) and leaves pixels
-# unknown where the two directions of matching disagree. Both are compared with the true disparities.
+# Pixel by pixel there are too many false matches, so neighbouring pixels are matched together. The thesis
+# uses dynamic programming: the most likely sequence of matches and occlusions of a row, in one order (Cox et
+# al. 1996). The default sums the costs of such paths in several directions (semi-global matching). Pixels are
+# unknown where left to right and right to left disagree. Both are compared with the true disparities.
 
 depth = np.asarray(Image.open(folder / "depth" / "0010.png")) * 0.00025
 cameras = thesisrecon.read_cameras(folder / "cameras.json")

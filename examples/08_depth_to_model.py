@@ -4,10 +4,10 @@ r"""
 
 With calibrated cameras a disparity becomes a depth, and each image gets a :term:`depth map` (section 2.6):
 for every pixel :math:`x` the depth :math:`Z` along the optical axis, so that
-:math:`X = C + Z R^\top K^{-1} x` lies on the surface. Several neighbours are matched, their depths are
-combined, each pixel is refined with a small plane through its surface point, and depths that no other view
-confirms are removed. The cameras here are the true ones of the courtyard, so that errors of depth are not
-mixed with those of the cameras; ``thesisrecon.load(out).cameras`` gives estimated ones.
+:math:`X = C + Z R^\top K^{-1} x` lies on the surface. Several neighbouring images are matched and their
+depths combined, each pixel is refined with a small plane through its surface point, and depths that no other
+view confirms are removed. The cameras here are the true ones of the courtyard, so that all errors are those
+of the depths; ``thesisrecon.load(out).cameras`` gives estimated ones.
 """
 
 from pathlib import Path
@@ -39,11 +39,10 @@ print(f"{known:.0%} of the pixels have a depth; median error {median:.2f} %")
 print(f"{within:.1%} of them within 1 %")
 
 # %%
-# The maps are fused to one surface in a grid of signed distances: each map votes how far a grid point is in
-# front of or behind its surface, and the triangles of the zero level become the mesh. Each part of the mesh
-# takes its texture from the image that shows it best. The model can then be rendered from anywhere: below
-# from the camera of an image that was not used, beside that image, and from a point above. What no camera saw
-# stays empty.
+# The maps are fused to one surface in a grid of signed distances: each map says how far a grid point is in
+# front of or behind its surface, and the mesh is where the average distance is zero. Its texture is blended
+# from the images that show it. The model can then be rendered from anywhere: below from the camera of an
+# image that was not used, beside that image, and from a point above. Parts that no camera saw stay empty.
 
 mesh = thesisrecon.texture(thesisrecon.fuse_depth_maps(maps), paths, cameras, max_size=512)
 unused = all_cameras["0007.jpg"].scaled(0.5)

@@ -4,8 +4,8 @@ r"""
 
 Two images and their dense matches are enough for new views; no surface is built (chapter 1 of the thesis).
 *Interpolation* (Seitz and Dyer 1995): if both images are rectified, a pixel at :math:`x` with disparity
-:math:`d` moves to :math:`x - s d`. This is exactly what a camera :math:`P_s = (1 - s) P_0 + s P_1` on the
-baseline sees, as the rectified cameras are parallel. Finally the view is mapped back.
+:math:`d` moves to :math:`x - s d`. Because the rectified cameras are parallel, this is exactly the image in
+the camera :math:`P_s = (1 - s) P_0 + s P_1` on the :term:`baseline`. Finally the rectification is undone.
 """
 
 from pathlib import Path
@@ -30,16 +30,16 @@ for axis, s in zip(axes, (0.0, 0.5, 1.0), strict=True):
     axis.set(title=f"s = {s:g}" + ("" if s % 1 else " (image)"), xticks=[], yticks=[])
 
 # %%
-# *The trilinear tensor* (:term:`trifocal tensor`) leaves the :term:`baseline` (Avidan and Shashua 1997). For
-# cameras :math:`[I \; 0]`, :math:`[a \; a_4]` and :math:`[b \; b_4]` the coordinates of a point in three
-# images are tied by (HZ 15.1)
+# The *trilinear tensor* (:term:`trifocal tensor`) gives views off the baseline (Avidan and Shashua 1997). It
+# relates the pixels of a point in the cameras :math:`[I \; 0]`, :math:`[a \; a_4]` and :math:`[b \; b_4]`
+# (HZ 15.1; indices that occur twice are summed):
 #
 # .. math:: T_i^{jk} = a_i^j b_4^k - a_4^j b_i^k, \qquad {x''}^k = x^i\, l'_j\, T_i^{jk},
 #
-# with any line :math:`l'` through :math:`x'`: the third image follows from the other two. Two images alone
-# give the seed :math:`b = a`; a motion :math:`(R, t)` of the third camera turns it into :math:`{T'}_i^{jk} =
-# R^k_l T_i^{jl} + t^k a_i^j`. Here the virtual camera is moved to where image 0006 was really taken, which
-# shows what is wrong, and then up and back.
+# with any line :math:`l'` through :math:`x'` but the epipolar line: the third image follows from the other
+# two. Two images alone give the seed :math:`b = a`; a motion :math:`(R, t)` of the third camera turns it into
+# :math:`{T'}_i^{jk} = R^k_l T_i^{jl} + t^k a_i^j`. Here the virtual camera is moved to where image 0006 was
+# really taken, so that the errors can be seen, and then up and back.
 
 cameras = thesisrecon.read_cameras(folder / "cameras.json")
 one, two, three = (cameras[name].scaled(0.5) for name in names)

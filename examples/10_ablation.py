@@ -2,11 +2,11 @@ r"""
 10. Which part of the method matters? An ablation
 =================================================
 
-A method has many parts, and each must earn its place: replace one, keep the rest, and compare on the same
-data. Errors vary from :term:`draw` to draw, so an honest comparison gives all variants the same draws, many
-of them, and reports the mean ratio of the errors with a 95 % interval. Only an interval without 1 shows a
-difference. Here the fundamental matrix (chapter 5) of pairs of the cube is estimated from matches with 0.5 px
-of noise, 30 % of them wrong. The error is the RMS distance of exact points to their epipolar lines.
+To know whether a part of a method is needed, replace it, keep the rest, and compare on the same data: an
+ablation. Errors vary from :term:`draw` to draw, so all variants get the same draws, many of them, and the
+mean ratio of their errors is reported with a 95 % interval. Only an interval without 1 shows a difference.
+Here the fundamental matrix (chapter 5) of pairs of the cube is estimated from matches with 0.5 px of noise,
+30 % of them wrong. The error is the RMS distance of exact points to their epipolar lines.
 
 The variants: another threshold; the search of the thesis (Algorithm 2: random samples of seven matches, the
 largest set of :term:`inliers <inlier>` wins); least median of squares, which needs no threshold; and, as an
@@ -45,8 +45,8 @@ with TemporaryDirectory() as folder:
 print(report)
 
 # %%
-# The same as a picture, with a logarithmic scale. Without a search, the wrong matches ruin the result: a
-# least squares estimate has no resistance to them. Studies of whole stages run from files:
+# The same as a picture, with a logarithmic scale. Without a search, the wrong matches spoil the result, since
+# a least-squares estimate uses all of them. Studies of whole stages run from files:
 # ``python -m validation ablate``.
 
 figure, axis = plt.subplots(figsize=(9, 3.2), layout="constrained")

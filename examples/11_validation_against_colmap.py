@@ -6,7 +6,7 @@ Is the result right, and how does it compare with the best programs? Six images 
 reconstructed by this library and by COLMAP (the package ``pycolmap``, which the extras ``docs`` and
 ``validation`` install; without it its bars are missing). Neither gets any calibration: no EXIF, no focal
 length. The models are compared with the truth after the :term:`similarity` that aligns the camera centres
-best: images determine no world frame (3.4.4).
+best, because images determine no world frame (3.4.4).
 """
 
 from pathlib import Path
