@@ -237,8 +237,8 @@ def cell(text: str) -> str:
 
 HEAD = """# When a run fails or warns
 
-This page is made from the code, so it holds every message; "…" stands for a value. Look for a few
-words of yours.
+This page is made from the code, so it holds every message; "…" stands for a value. Search it for a
+few words of your message.
 
 A run ends in one of four ways:
 
@@ -248,15 +248,15 @@ A run ends in one of four ways:
   the last stage that finished, and the message says what was measured and what to do. In Python it is a
   {py:class}`~thesisrecon.StageFailure` with `reason`, `evidence` and `advice`.
 - Wrong options or settings, exit code 2 ({py:class}`~thesisrecon.UsageError`): the message names the rule and
-  the way out; nothing was computed.
+  what to do; nothing was computed.
 
-Most failures are of the images: too little overlap, no sideways motion, or one of the {term}`critical motions
-<critical motion>` of [how to take good images](photographing.md).
+Most failures are caused by the images: too little overlap, no sideways motion, or one of the {term}`critical
+motions <critical motion>` of [how to take good images](photographing.md).
 
 **Why one image is missing**: see `report.html`, table "Images", or in Python `result.refused` (name ->
 reason). An image is *left out* if it cannot be read or used at all ([reasons](#images-that-are-left-out)),
 and *not registered* if it was read but has no camera in the model
-([reasons](#images-that-are-not-registered)). The rest of the model is not affected by it.
+([reasons](#images-that-are-not-registered)). This does not affect the rest of the model.
 
 ## Warnings and failed checks
 """
