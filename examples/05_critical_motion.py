@@ -8,9 +8,9 @@ After some motions no method can find the calibration. A camera with the calibra
 
 .. math:: K\,(X - C_i) = K' (A X - A C_i):
 
-a camera :math:`K'` that translates through the sheared or stretched scene :math:`A X` has the same images. If
-a photographer walks sideways without turning, depth and focal length are undetermined: a :term:`critical
-motion` (Sturm 1997; HZ 19.3.5, 19.5.3). Others are turntables (HZ 19.9) and rotations about the optical axis.
+a camera :math:`K'` that translates through the sheared or stretched scene :math:`A X` has the same images. So
+a translation leaves depth and focal length undetermined: a :term:`critical motion` (Sturm 1997; HZ 19.3.5,
+19.5.3). Others are rotations about the optical axis, and turntables (HZ 19.9) unless pixels are square.
 
 Below, the focal length is fixed at wrong values, and all else is adjusted to images with noise of 0.5 px. If
 the RMS residual does not rise, the images do not contradict them. The library names the motion and advises.
