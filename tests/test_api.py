@@ -20,6 +20,7 @@ from thesisrecon.geometry.camera_matrix import compose_camera, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import epipolar_lines, fundamental_from_cameras, plane_homography
 from thesisrecon.intrinsics import IntrinsicsOptions
+from thesisrecon.io._images import read_image
 from thesisrecon.records import Image, TexturedMesh, Tracks
 from thesisrecon.report._data import point_colors
 from thesisrecon.runtime._run import stream
@@ -50,6 +51,28 @@ def test_two_photographs_give_verified_matches_and_f():
     assert np.median(distance) < 0.5
     again = thesisrecon.match_pair(str(paths[0]), str(paths[1]), config=config)
     np.testing.assert_array_equal(again.xy2, pair.xy2)
+
+
+def test_matches_of_files_and_arrays_are_pixels_of_these_and_those_of_records_of_the_records():
+    paths = sorted(COURTYARD.iterdir())[:2]
+    config = PipelineConfig(images=ImageOptions(max_size_px=512))
+    cameras = list(thesisrecon.read_cameras(COURTYARD.parent / "cameras.json").values())[:2]
+    records = [read_image(path, max_size_px=512).images[0] for path in paths]
+    half = thesisrecon.match_pair(*records, config=config)
+    whole = thesisrecon.match_pair(*paths, config=config)
+    mixed = thesisrecon.match_pair(records[0], np.asarray(PIL.Image.open(paths[1])), config=config)
+    assert half.xy1.max() < 512 < whole.xy1.max()
+    for found, one, two in ((whole, 2, 2), (half, 1, 1), (mixed, 1, 2)):
+        np.testing.assert_allclose(found.xy1, (half.xy1 + 0.5) * one - 0.5)
+        np.testing.assert_allclose(found.xy2, (half.xy2 + 0.5) * two - 0.5)
+        np.testing.assert_allclose(found.sigma_px, half.sigma_px * np.sqrt((one**2 + two**2) / 2))
+        np.testing.assert_allclose(found.affine, half.affine * two / one)
+        P = [camera.scaled(scale / 2).P for camera, scale in zip(cameras, (one, two), strict=True)]
+        X = thesisrecon.triangulate(np.array(P), np.array([found.xy1, found.xy2]))
+        exact = [dehomogenize(X @ p.T) for p in P]
+        lines = thesisrecon.epipolar_lines(found.F, exact[0])
+        distance = np.abs(np.sum(homogenize(exact[1]) * lines, axis=1))
+        assert np.median(distance) < 0.3 * two
 
 
 def test_photographs_that_cannot_be_read_or_matched_are_failures(tmp_path):
