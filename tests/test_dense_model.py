@@ -13,6 +13,7 @@ from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon import Camera, Reconstruction, StageFailure, depth_maps, fuse_depth_maps, texture, write_mesh
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.sparse_model import SparseModel, SparseView
 from thesisrecon.surface.model import SurfaceModel
 from validation.scenes.real import load_fixture_depth
 
@@ -108,6 +109,33 @@ def test_a_texture_is_made_of_images_of_the_requested_size(monkeypatch, max_size
     mesh = thesisrecon.TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))
     texture(mesh, [image], [camera], max_size=max_size)
     assert given[0].rgb.shape[1] == side
+
+
+def test_images_with_cameras_of_a_colmap_model_are_used_as_stored(tmp_path, monkeypatch):
+    """A half turn by EXIF keeps the size of an image: only the camera tells which pixels are meant."""
+    given = []
+
+    def color(self, surface, views, *, threads=1):  # noqa: ARG001
+        given.extend(views)
+
+    monkeypatch.setattr(SurfaceModel, "color", color)
+    pixels = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 3
+    (tmp_path / "images").mkdir()
+    PIL.Image.fromarray(pixels).save(tmp_path / "images" / "a.png", exif=exif)
+    K = np.array([[100.0, 0, 59.5], [0, 100, 44.5], [0, 0, 1]])
+    upright = Camera(K, np.eye(3), np.zeros(3), (120, 90))
+    view = SparseView("a.png", upright.R, upright.t, K, upright.size, np.zeros(3))
+    thesisrecon.export(SparseModel([view]), tmp_path / "colmap", to="colmap")
+    mesh = thesisrecon.TexturedMesh(np.eye(3), np.array([[0, 1, 2]]))
+    of_colmap = thesisrecon.read_cameras(tmp_path / "colmap")
+    for cameras, expected in ((of_colmap, pixels), ({"a.png": upright}, pixels[::-1, ::-1])):
+        texture(mesh, tmp_path / "images", cameras)
+        np.testing.assert_array_equal(given.pop().rgb, expected)
+    turned = {"a.png": of_colmap["a.png"].scaled(0.5)}
+    with pytest.raises(ValueError, match="without EXIF rotation, as in COLMAP"):
+        texture(mesh, tmp_path / "images", turned)
 
 
 def test_the_example_makes_a_glb_of_the_courtyard(tmp_path, monkeypatch):

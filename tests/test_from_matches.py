@@ -254,6 +254,9 @@ def test_images_of_colmap_are_used_as_stored(tmp_path, from_rows, orientation):
         name: read_model(tmp_path / name).as_stored for name in ("own", "own/sparse/0", "out", "out/sparse/0")
     }
     assert reports == {"own": False, "own/sparse/0": False, "out": True, "out/sparse/0": True}
+    for cameras in (result.cameras, thesisrecon.load(tmp_path / "out").cameras):
+        assert cameras["7.jpg"].as_stored
+    assert not from_rows.cameras[0].as_stored
     again = {"images": tmp_path / "images", "until": "metric"}
     assert (reconstruct_from_colmap(tmp_path / "out", **again).images[0].rgb[100].argmax(axis=1) == 0).all()
     exported = (

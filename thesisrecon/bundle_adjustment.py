@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -185,7 +185,9 @@ def bundle_adjust(
     K, std = fit.cameras.K, np.sqrt(np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2))
     rows = fit.cameras.intrinsics
     refined = tuple(
-        Camera(K[i], fit.cameras.R[i], fit.cameras.t[i], view.size, rows[i, 5:], _by_name(std[i]))
+        replace(
+            view, K=K[i], R=fit.cameras.R[i], t=fit.cameras.t[i], distortion=rows[i, 5:], std=_by_name(std[i])
+        )
         for i, view in enumerate(views)
     )
     return BundleAdjustment(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,8 @@ class Camera:
     std : mapping of str to float, optional
         Standard deviations of estimated intrinsics: "focal_px", "aspect", "skew_px", "principal_x_px",
         "principal_y_px", "k1", "k2", "k3" (0: as assumed). None: unknown.
+    as_stored : bool
+        Whether the pixels are those of the image file as stored, as in COLMAP, and not after EXIF rotation.
 
     Raises
     ------
@@ -61,6 +63,7 @@ class Camera:
     size: tuple[int, int]
     distortion: F64 | None = None
     std: Mapping[str, float] | None = None
+    as_stored: bool = False
 
     def __post_init__(self) -> None:
         fields = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("K", "R", "t")}
@@ -173,7 +176,7 @@ class Camera:
         width, height = (max(1, round(side * factor)) for side in self.size)
         S = np.diag([width / self.size[0], height / self.size[1], 1.0])
         S[:2, 2] = (np.diag(S)[:2] - 1.0) / 2.0
-        return Camera(S @ self.K, self.R, self.t, (width, height), self.distortion)
+        return replace(self, K=S @ self.K, size=(width, height), std=None)
 
     @property
     def _coefficients(self) -> F64:

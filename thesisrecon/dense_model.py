@@ -15,7 +15,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients
-from thesisrecon.io._images import list_images, read_image
+from thesisrecon.io._images import list_images, read_image, rotation_words
 from thesisrecon.pipeline._image_pair import ImageInput
 from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks
 from thesisrecon.stereo._resampling import pinhole_view
@@ -43,8 +43,9 @@ def depth_maps(
     images : path or sequence of paths or ndarray (H, W) or (H, W, 3) uint8
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
-        Their cameras in pixels of the images after EXIF rotation (arrays with ``sizes``). If a
-        reconstruction has points with observations, these give the depth range and the neighbours.
+        Their cameras in pixels of the images (arrays with ``sizes``), after EXIF rotation unless they are
+        ``as_stored``. If a reconstruction has points with observations, these give the depth range and the
+        neighbours. Of a run from COLMAP's matches or tracks give ``result.cameras``.
     sizes : array_like (V, 2) or (2,), optional
         Image width and height, for plain arrays.
     depth_range : array_like (2,) or (V, 2), optional
@@ -230,18 +231,18 @@ def _scene(
         # Images that were not registered have no camera.
         images = [path for path in files if isinstance(cameras, Mapping) and path.name in cameras] or files
     listed = list(images)
-    read = [read_image(one, max_size_px=max_size).images[0] for one in listed]
-    names = [
-        Path(one).name if isinstance(one, str | Path) else image.name
-        for one, image in zip(listed, read, strict=True)
-    ]
+    names = [_name_of(n, image) for n, image in enumerate(listed)]
     views = as_cameras(caller, cameras, sizes, names)
-    if len(views) != len(read):
-        raise ValueError(f"{caller} needs a camera per image; got {len(views)} and {len(read)}")
+    if len(views) != len(names):
+        raise ValueError(f"{caller} needs a camera per image; got {len(views)} and {len(names)}")
+    read = [
+        read_image(one, max_size_px=max_size, as_stored=view.as_stored).images[0]
+        for one, view in zip(listed, views, strict=True)
+    ]
     for name, image, view in zip(names, read, views, strict=True):
         if image.original_size != view.size:
             what = f"image {name} has (width, height) {image.original_size}, its camera is for {view.size}"
-            rule = "cameras in pixels of the images after EXIF rotation, or Camera.scaled(...)"
+            rule = f"cameras in pixels of the images {rotation_words(view.as_stored)}, or Camera.scaled(...)"
             raise ValueError(f"{what}; give {rule}")
     scaled = [_scaled(view, image.scale, image.size) for view, image in zip(views, read, strict=True)]
     model = _model(scaled)
@@ -251,6 +252,12 @@ def _scene(
         tracks = Tracks(number[t.view_index[kept]], t.point_index[kept], t.xy[kept], len(read), t.n_points)
         model = replace(model, X=cameras.X, valid=cameras.valid, inlier=cameras.inlier[kept], tracks=tracks)
     return read, model
+
+
+def _name_of(number: int, image: ImageInput) -> str:
+    if isinstance(image, str | Path):
+        return Path(image).name
+    return image.name if isinstance(image, Image) else f"image-{number}"
 
 
 def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:

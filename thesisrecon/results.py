@@ -89,8 +89,8 @@ def _number_of(image: str | int, images: tuple[Image, ...]) -> int:
 class Cameras(Mapping[str, Camera]):
     """The registered cameras by image name, or by the number of the image among all that were read."""
 
-    def __init__(self, images: tuple[Image, ...], metric: MetricResult) -> None:
-        self._images, self._metric = images, metric
+    def __init__(self, images: tuple[Image, ...], metric: MetricResult, *, as_stored: bool) -> None:
+        self._images, self._metric, self._as_stored = images, metric, as_stored
 
     def __getitem__(self, image: str | int) -> Camera:
         i = _number_of(image, self._images)
@@ -103,7 +103,8 @@ class Cameras(Mapping[str, Camera]):
         Rt = np.linalg.solve(r.K[i], r.P[i])
         std = {name: in_original_pixels(name, value, one.scale).std for name, value in intrinsics.items()}
         K = one.original_from_working @ r.K[i]
-        return Camera(K, Rt[:, :3], Rt[:, 3], one.original_size, r.distortion[i], std)
+        lens = r.distortion[i]
+        return Camera(K, Rt[:, :3], Rt[:, 3], one.original_size, lens, std, as_stored=self._as_stored)
 
     def __iter__(self) -> Iterator[str]:
         registered = self._metric.reconstruction.registered
@@ -195,7 +196,8 @@ class RunResult:
     @property
     def cameras(self) -> Cameras:
         """Registered cameras by image name or number, in original pixels, with standard deviations."""
-        return Cameras(self.images, self._metric_result("cameras"))
+        as_stored = self.summary.get("as_stored") is True
+        return Cameras(self.images, self._metric_result("cameras"), as_stored=as_stored)
 
     @property
     def points(self) -> F64:

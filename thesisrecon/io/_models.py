@@ -97,7 +97,8 @@ def read_cameras(path: str | Path) -> dict[str, Camera]:
     Returns
     -------
     dict of str to Camera
-        In pixels of the original images, (0, 0) = centre of the top-left pixel.
+        In pixels of the original images, (0, 0) = centre of the top-left pixel; ``as_stored`` of COLMAP
+        models and of runs from COLMAP's matches or tracks.
 
     Raises
     ------
@@ -116,14 +117,15 @@ def read_cameras(path: str | Path) -> dict[str, Camera]:
     path = Path(path)
     if not path.exists():
         raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
-    cameras = {}
-    for view in read_model(path).views:
+    cameras, model = {}, read_model(path)
+    for view in model.views:
         if view.K is None or view.size is None:
             raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
         if view.distortion is None:
             advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
             raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
-        cameras[view.name] = Camera(view.K, view.R, view.t, view.size, view.distortion)
+        camera = Camera(view.K, view.R, view.t, view.size, view.distortion, as_stored=model.as_stored)
+        cameras[view.name] = camera
     return cameras
 
 
