@@ -230,11 +230,10 @@ def _problem(
 
 def _of_reconstruction(r: Reconstruction) -> tuple[F64, Observations]:
     """Valid points, and the inlier observations in registered views."""
-    tracks = r.tracks
-    kept = r.inlier & r.registered[tracks.view_index] & r.valid[tracks.point_index]
+    tracks, used = r.tracks, r.used
     view, point = np.cumsum(r.registered) - 1, np.cumsum(r.valid) - 1
     X = r.X[r.valid]
-    observed = Observations(view[tracks.view_index[kept]], point[tracks.point_index[kept]], tracks.xy[kept])
+    observed = Observations(view[tracks.view_index[used]], point[tracks.point_index[used]], tracks.xy[used])
     return np.asarray(X[:, :3] / X[:, 3:]), observed
 
 

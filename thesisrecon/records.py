@@ -250,6 +250,12 @@ class Reconstruction:
     distortion: F64 | None = None
 
     @property
+    def used(self) -> B8:
+        """(K,) inliers among the observations of valid points in registered views."""
+        view, point = self.tracks.view_index, self.tracks.point_index
+        return self.inlier & self.registered[view] & self.valid[point]
+
+    @property
     def common_points(self) -> F64:
         """(V, V) number of points with an inlier in both views."""
         t, keep = self.tracks, self.inlier

@@ -239,10 +239,10 @@ class RunResult:
         """
         r = self._metric_result("observations").reconstruction
         i = _number_of(image, self.images)
-        view, point = r.tracks.view_index, r.tracks.point_index
-        used = r.inlier & r.registered[view] & r.valid[point] & (view == i)
+        seen = r.used & (r.tracks.view_index == i)
         row = np.cumsum(r.valid) - 1
-        return SeenPoints((r.tracks.xy[used] + 0.5) / self.images[i].scale - 0.5, row[point[used]])
+        xy = (r.tracks.xy[seen] + 0.5) / self.images[i].scale - 0.5
+        return SeenPoints(xy, row[r.tracks.point_index[seen]])
 
     def save(self, folder: str | Path) -> None:
         """Write ``cameras.json``, ``points.ply``, ``sparse/0``, ``model.glb`` and ``summary.json``.

@@ -14,12 +14,7 @@ from tests.report import synthetic
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.records import IntrinsicInterval, TexturedMesh
-from thesisrecon.report._data import (
-    ReportData,
-    reprojection_distances,
-    summarize_distances,
-    used_observations,
-)
+from thesisrecon.report._data import ReportData, reprojection_distances, summarize_distances
 from thesisrecon.report._figures import _BINS, _common_limit_px, _histogram_shares
 from thesisrecon.report._page import render_report, strip_page
 
@@ -286,7 +281,7 @@ def test_the_residuals_are_the_noise_that_was_added():
     reconstruction = data.metric.reconstruction
     distances = reprojection_distances(reconstruction)
     assert len(distances[-1]) == 0  # the last view is not registered
-    assert sum(map(len, distances)) == len(used_observations(reconstruction))
+    assert sum(map(len, distances)) == reconstruction.used.sum()
     summary = summarize_distances(np.concatenate(distances))
     # Two independent coordinates make a Rayleigh distribution: RMS sqrt(2) sigma, median sigma sqrt(2 ln 2).
     assert summary.rms_px == pytest.approx(np.sqrt(2) * synthetic.NOISE_PX, rel=0.03)
@@ -300,11 +295,11 @@ def test_only_inliers_of_registered_views_and_valid_points_count():
     data = synthetic.made_up_run(points=200)
     before = data.metric.reconstruction
     after = replace(before, valid=np.arange(200) < 100)
-    used = used_observations(after)
+    used = np.flatnonzero(after.used)
     assert before.inlier[used].all()
     assert before.registered[before.tracks.view_index[used]].all()
     assert (before.tracks.point_index[used] < 100).all()
-    assert len(used_observations(replace(before, inlier=np.zeros_like(before.inlier)))) == 0
+    assert not replace(before, inlier=np.zeros_like(before.inlier)).used.any()
 
 
 def test_histogram_holds_every_distance():

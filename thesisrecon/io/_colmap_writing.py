@@ -55,7 +55,7 @@ def write_colmap_model(
     if skewed.any():
         return int(skewed.sum())
     view, point = r.tracks.view_index, r.tracks.point_index
-    kept = r.inlier & r.registered[view] & r.valid[point]
+    kept = r.used
     kept &= np.bincount(point[kept], minlength=len(r.X))[point] >= 2
     view, point, xy = view[kept], point[kept], r.tracks.xy[kept]
     posed, distance = dict[int, _PosedImage](), np.zeros(len(view))

@@ -87,16 +87,9 @@ class ResidualSummary:
     q95_px: float
 
 
-def used_observations(reconstruction: Reconstruction) -> I64:
-    """Numbers (U,) of the inliers of registered views and valid points."""
-    r, tracks = reconstruction, reconstruction.tracks
-    used = r.inlier & r.registered[tracks.view_index] & r.valid[tracks.point_index]
-    return np.flatnonzero(used).astype(np.int64)
-
-
 def reprojection_distances(reconstruction: Reconstruction) -> list[F64]:
     """Residual lengths |observed - reprojected| (px) per view, empty if it is not registered."""
-    used = used_observations(reconstruction)
+    used = np.flatnonzero(reconstruction.used)
     views = reconstruction.tracks.view_index[used]
     return [_distances_in_view(reconstruction, i, used[views == i]) for i in range(len(reconstruction.P))]
 
@@ -145,7 +138,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "images": len(result.images) + len(result.unread),
         "registered": int(best.registered.sum()) if best is not None else 0,
         "points": int(best.valid.sum()) if best is not None else 0,
-        "observations": len(used_observations(best)) if best is not None else 0,
+        "observations": int(best.used.sum()) if best is not None else 0,
         "reprojection_rms_px": _rms(everything),
         "reprojection_median_px": _median(everything),
         "reprojection_median_working_px": _median(np.concatenate([np.zeros(0), *working])),
@@ -240,8 +233,7 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
 
 def point_colors(reconstruction: Reconstruction, images: tuple[Image, ...]) -> NDArray[np.uint8]:
     """Average colours (N, 3) of the observations of each point; mid-grey without observations."""
-    used = used_observations(reconstruction)
-    tracks = reconstruction.tracks
+    tracks, used = reconstruction.tracks, reconstruction.used
     view, point = tracks.view_index[used], tracks.point_index[used]
     xy, colors = np.rint(tracks.xy[used]).astype(np.int64), np.zeros((len(view), 3))
     for image, rows in zip(images, rows_of_views(view, len(images)), strict=True):

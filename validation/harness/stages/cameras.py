@@ -169,7 +169,7 @@ def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
         return []
     projective = _last_record(outcome, "projective")
     t, P, X = projective.tracks, projective.P, projective.X
-    seen = projective.inlier & projective.registered[t.view_index] & projective.valid[t.point_index]
+    seen = projective.used
     x = np.einsum("kab,kb->ka", P[t.view_index[seen]], X[t.point_index[seen]])
     residual = float(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[seen], axis=1)))
     words = f"{REPROJECTION}, by the projective model"
