@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,10 @@ from thesisrecon.arrays import I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import image_without_pixels
-from thesisrecon.pipeline._matching_stages import FEWER, FINAL, of_all_corners
+from thesisrecon.pipeline._matching_stages import final_pairs
 from thesisrecon.pipeline._outputs import with_image_names
 from thesisrecon.pipeline._stages import best_result
-from thesisrecon.records import Features, Image, TwoView
+from thesisrecon.records import Image
 from thesisrecon.results import SUMMARY, RunResult
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, ChangedRecord, StageFolder
@@ -81,7 +81,7 @@ def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) ->
         images=tuple(_image(view, size) for view, size in zip(views, sizes, strict=True)),
         unread=unread,
         features=features,
-        pairs=_final_pairs(stages["matches"], features, share),
+        pairs=final_pairs(stages["matches"], features, share),
         groups=np.array([view["camera"] for view in views], dtype=np.int64),
         settings=run["settings"],
         pair_choice=stages["pairs"].get("choice"),
@@ -115,20 +115,6 @@ def _records(folder: Path) -> dict[str, Any]:
     stage = StageFolder(folder)
     found = {item: stage.load(item, key) for item, key in sorted(_keys(folder).items())}
     return {item: record for item, record in found.items() if record is not None}
-
-
-def _final_pairs(stored: dict[str, Any], features: Sequence[Features], share: float) -> tuple[TwoView, ...]:
-    """The pairs of the run: all that are stored, or those of the list of the final ones."""
-    if FINAL not in stored:
-        return tuple(stored.values())
-    final = stored[FINAL]
-    fewer = [item for item in final["items"] if item.endswith(FEWER)]
-    stored |= zip(fewer, of_all_corners([stored[item] for item in fewer], features, share), strict=True)
-    stored |= {
-        item: replace(stored[item], accepted=False, reason=reason)
-        for item, reason in final["rejected"].items()
-    }
-    return tuple(stored[item] for item in final["items"])
 
 
 def _working_size(view: Mapping[str, Any]) -> I64:

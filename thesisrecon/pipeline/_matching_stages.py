@@ -109,7 +109,7 @@ def _matched_in_turn(
         return _matched(state, pairs, "", state.prepared_views), [""] * len(pairs)
     prepare = partial(_prepare_share, matching)
     found = _matched(state, pairs, FEWER, lambda: PreparedViews(prepare, state.given()))
-    found, kinds = of_all_corners(found, features, matching.many_share), [FEWER] * len(pairs)
+    found, kinds = _of_all_corners(found, features, matching.many_share), [FEWER] * len(pairs)
     kept = reject_repeated_structure(found, len(features))
     long = has_narrow_cut(tracks_of_corners([found.xy for found in features], kept))
     again = [n for n, pair in enumerate(found) if long or not pair.accepted or pair.inliers < MIN_VERIFIED]
@@ -120,7 +120,7 @@ def _matched_in_turn(
     return found, kinds
 
 
-def of_all_corners(pairs: Sequence[TwoView], features: Sequence[Features], share: float) -> list[TwoView]:
+def _of_all_corners(pairs: Sequence[TwoView], features: Sequence[Features], share: float) -> list[TwoView]:
     """Pairs matched with part of the corners, with indices into all corners."""
     rows = [strongest_corners(f, share) for f in features]
     return [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in pairs]
@@ -178,6 +178,24 @@ def finish_matches(
     }
     metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
     run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
+
+
+def final_pairs(
+    records: Mapping[str, Any], features: Sequence[Features], share: float
+) -> tuple[TwoView, ...]:
+    """The pairs that :func:`finish_matches` reported, from the records of the stage.
+
+    ``share`` is the share of the corners that pairs of many images are matched by first.
+    """
+    if FINAL not in records:
+        return tuple(records.values())
+    final = records[FINAL]
+    fewer = [item for item in final["items"] if item.endswith(FEWER)]
+    whole = _of_all_corners([records[item] for item in fewer], features, share)
+    pairs = {item: records[item] for item in final["items"]} | dict(zip(fewer, whole, strict=True))
+    for item, reason in final["rejected"].items():
+        pairs[item] = replace(pairs[item], accepted=False, reason=reason)
+    return tuple(pairs.values())
 
 
 def _item(i: int, j: int, kind: str) -> str:
