@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cache
@@ -25,6 +25,7 @@ from thesisrecon.errors import UsageError, in_words, unknown_word
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
+from thesisrecon.matching._prepared import EstimateFundamental
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, MapAll, OverlapEstimate, SequenceWindow
 from thesisrecon.matching.strength import StrengthOfMatch
@@ -62,8 +63,6 @@ from thesisrecon.surface.model import SurfaceModel
 
 PRECISE_SIGMAS = 2.5
 """Inlier gate of the default estimator: tracks are built from precise matches only."""
-
-EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
 
 # Stage -> word in text -> class. A new method is one line here.
 KINDS: Mapping[str, Mapping[str, type[Any]]] = {

@@ -58,6 +58,9 @@ MAX_WAIT_S = 60.0
 COMPILER_SETTINGS = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VECTORIZE")
 """Settings of numba that change the machine code."""
 
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+"""Fast mathematics of kernels: sums may be reordered. To assume no NaN would remove checks of bounds."""
+
 PACKAGE = Path(__file__).parent
 LIST = PACKAGE / "kernels.txt"
 """Kernels that a run calls from Python, with the types of their arguments; see `runtime._precompilation`."""

@@ -11,10 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import empty, kernel, zeros
-
-# Sums may be reordered; the flag "nnan" would remove the bounds checks.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
+from thesisrecon.kernels import FAST, empty, kernel, zeros
 
 
 @kernel(fastmath=FAST)

@@ -12,9 +12,8 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import copy_to, empty, kernel, zeros
+from thesisrecon.kernels import FAST, copy_to, empty, kernel, zeros
 from thesisrecon.matching._prepared import (
-    FAST,
     SAMPLES,
     SIDE,
     PreparedImage,

@@ -16,11 +16,9 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.geometry._image_filters import halve, resample
-from thesisrecon.kernels import empty, kernel, zeros
+from thesisrecon.kernels import FAST, empty, kernel, zeros
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, Seeds
 
-# Sums may be reordered; assuming no NaN would break the bounds checks.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
 SIDE = 15
 SAMPLES = SIDE * SIDE
 PYRAMID_LEVELS = 4

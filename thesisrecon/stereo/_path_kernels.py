@@ -118,19 +118,13 @@ def _add(values: U8, total: U8) -> None:
 
 
 @kernel
-def _copy(source: U8, out: U8) -> None:
-    for x in range(len(out)):
-        out[x] = source[x]
-
-
-@kernel
 def _shifted(p2: U8, shift: int, out: U8) -> None:
     """Shift a row of penalties by ``shift`` columns, zeros outside."""
     width = len(p2)
     a, b = min(max(0, shift), width), max(width + min(0, shift), 0)
     out[:a], out[b:] = 0, 0
     if b > a:
-        _copy(p2[a - shift : b - shift], out[a:b])
+        copy_to(out[a:b], p2[a - shift : b - shift])
 
 
 @kernel
@@ -217,7 +211,7 @@ def _transpose_rows(source: U8, out: U8) -> None:
         for start in range(0, width, TILE):
             size = min(TILE, width - start)
             for y in range(rows):
-                _copy(source[y, q, start : start + size], bytes_of[y, :size])
+                copy_to(bytes_of[y, :size], source[y, q, start : start + size])
             for x in range(0, size, 8):
                 for y in range(0, rows, 8):
                     _store(_transposed(_load(tile, y, x >> 3)), plane, start + x, y >> 3)
@@ -238,7 +232,7 @@ def _transpose_back(source: U8, out: U8) -> None:
                 for y in range(0, rows, 8):
                     _store(_transposed(_load(plane, start + x, y >> 3)), tile, y, x >> 3)
             for y in range(rows):
-                _copy(bytes_of[y, :size], out[y, q, start : start + size])
+                copy_to(out[y, q, start : start + size], bytes_of[y, :size])
 
 
 def scratch_size(height: int, disparities: int, width: int) -> int:

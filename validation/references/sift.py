@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F32, F64, I64, U8
-from thesisrecon.config import EstimateFundamental, PipelineConfig
+from thesisrecon.config import PipelineConfig
+from thesisrecon.matching._prepared import EstimateFundamental
 from thesisrecon.records import Features, Image, Matches
 from validation.references.libraries import cv2
 
