@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import require_calibration, require_finite, require_shapes
+from thesisrecon.geometry._conditioning import (
+    require_calibration,
+    require_finite,
+    require_shapes,
+    resizing_transform,
+)
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, project_camera, undistort
 
 _ORTHOGONAL = 2e-4
@@ -174,8 +179,7 @@ class Camera:
         if not 0.0 < factor < math.inf:
             raise ValueError(f"Camera.scaled needs a finite factor above 0; got {factor}")
         width, height = (max(1, round(side * factor)) for side in self.size)
-        S = np.diag([width / self.size[0], height / self.size[1], 1.0])
-        S[:2, 2] = (np.diag(S)[:2] - 1.0) / 2.0
+        S = resizing_transform(np.divide((width, height), self.size))
         return replace(self, K=S @ self.K, size=(width, height), std=None)
 
     @property

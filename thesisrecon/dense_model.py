@@ -14,6 +14,7 @@ from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.errors import StageFailure, UsageError, counted
+from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients
 from thesisrecon.io._images import list_images, read_image, rotation_words
 from thesisrecon.pipeline._image_pair import ImageInput
@@ -262,8 +263,7 @@ def _name_of(number: int, image: ImageInput) -> str:
 
 def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
     """The camera of an image reduced by one scale along both axes."""
-    S = np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
-    return Camera(S @ camera.K, camera.R, camera.t, size, camera.distortion)
+    return replace(camera, K=resizing_transform(scale) @ camera.K, size=size)
 
 
 def _model(views: Sequence[Camera]) -> Reconstruction:

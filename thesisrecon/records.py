@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, I64, Stratum
+from thesisrecon.geometry._conditioning import resizing_transform
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,7 @@ class Image:
     @property
     def original_from_working(self) -> F64:
         """Transform of homogeneous pixels (3, 3), (x + 0.5) / scale - 0.5."""
-        offset = 0.5 / self.scale - 0.5
-        return np.array([[1 / self.scale, 0.0, offset], [0.0, 1 / self.scale, offset], [0.0, 0.0, 1.0]])
+        return resizing_transform(1 / self.scale)
 
     @property
     def gray(self) -> F32:

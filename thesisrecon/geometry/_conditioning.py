@@ -84,6 +84,13 @@ def pixel_from_unit(sizes: NDArray[np.int64]) -> F64:
     return T
 
 
+def resizing_transform(scale: float | F64) -> F64:
+    """Transform (3, 3) to the pixels of an image resized by s, one or (2,) for x and y: (x + 0.5) s - 0.5."""
+    T: F64 = np.diag(np.append(np.broadcast_to(scale, 2), 1.0))
+    T[:2, 2] = 0.5 * T.diagonal()[:2] - 0.5
+    return T
+
+
 def pixel_conditioning(xy: F64) -> F64:
     """Isotropic transform of the pixels' bounding box to centre 0 and half-diagonal 1."""
     if len(xy) == 0:

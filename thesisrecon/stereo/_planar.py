@@ -14,6 +14,7 @@ import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.stereo._epipolar_pair import (
@@ -49,8 +50,7 @@ class PlanarRectification(Rectification):
 
     def reduced(self, scale: float) -> PlanarRectification:
         width, height = (max(2, int(np.ceil(scale * side))) for side in self.size)
-        move = np.full((2, 2), 0.5 * scale - 0.5)
-        return PlanarRectification(scale_and_shift(scale, move) @ self.H, (width, height))
+        return PlanarRectification(resizing_transform(scale) @ self.H, (width, height))
 
     def _original(self, side: int, xy: F64) -> F64:
         return _moved(np.asarray(np.linalg.inv(self.H[side])), xy)

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry._image_filters import cubic_weights
 from thesisrecon.geometry.camera_matrix import distort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -246,9 +247,7 @@ def _pinhole_camera(
         raise ValueError(f"image {image.name} must be {reconstruction.sizes[view]} px; got {image.size}")
     shrink = min(1.0, max_side / max(image.size))
     size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
-    sx, sy = np.array(size) / np.array(image.size)
-    # (x + 0.5) s - 0.5 along either side.
-    S = np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
+    S = resizing_transform(np.divide(size, image.size))
     P = reconstruction.P[view]
     P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
     return P, S @ K[view], size

@@ -14,6 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry._image_filters import resample, smooth
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.records import PinholeView, TexturedMesh
@@ -119,9 +120,7 @@ class TextureAtlas:
 def _scaling(size: tuple[int, int], scale: float) -> tuple[F64, tuple[int, int]]:
     """Matrix (3, 3) from pixels of an image to those of the reduced one, and its (width, height)."""
     width, height = (max(1, round(scale * n)) for n in size)
-    S = np.diag([width / size[0], height / size[1], 1.0])
-    S[:2, 2] = (np.diag(S)[:2] - 1.0) / 2.0
-    return S, (width, height)
+    return resizing_transform(np.divide((width, height), size)), (width, height)
 
 
 def _reduced_camera(P: F64, size: tuple[int, int], scale: float) -> Camera:
