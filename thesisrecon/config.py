@@ -25,9 +25,9 @@ from thesisrecon.errors import UsageError, in_words, unknown_word
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
-from thesisrecon.matching._prepared import EstimateFundamental
+from thesisrecon.matching._prepared import EstimateFundamental, MapAll
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, MapAll, OverlapEstimate, SequenceWindow
+from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement

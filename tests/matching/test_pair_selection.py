@@ -16,6 +16,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching import pair_selection
+from thesisrecon.matching._bag_of_words import word_weights
 from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.matching.pair_selection import (
     AllPairs,
@@ -29,7 +30,6 @@ from thesisrecon.matching.pair_selection import (
     _pair_array,
     _ranks,
     _subset_seeds,
-    _word_weights,
     pairs_to_connect,
 )
 from thesisrecon.records import Features, TwoView
@@ -239,7 +239,7 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
 
 def test_photographs_of_one_wall_use_the_same_words(windows):
     sketches = [_subset_seeds(f.seeds, rotated=False) for f in windows.features if f.seeds]
-    words = _word_weights(
+    words = word_weights(
         [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
     )
     alike = (words @ words.T).toarray()
@@ -262,7 +262,7 @@ def test_views_of_places_with_the_same_windows_are_told_apart_by_the_rest():
     for _ in range(60):
         own = rng.normal(size=(10, 32))
         images += [unit(np.concatenate([windows, own]) + 0.1 * rng.normal(size=(100, 32))) for _ in range(2)]
-    words = _word_weights(images, 1024, map_all=one_by_one, rng=np.random.default_rng(0))
+    words = word_weights(images, 1024, map_all=one_by_one, rng=np.random.default_rng(0))
     pairs = as_set(_most_similar(words, 1))
     assert sum((2 * place, 2 * place + 1) in pairs for place in range(60)) > 55
 

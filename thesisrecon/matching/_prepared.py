@@ -7,7 +7,7 @@ width of each; a pixel of level k spans ``base * 2^k`` pixels of the image.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -212,6 +212,8 @@ def _cells(xy: F64, size: tuple[int, int], cell_px: float) -> tuple[I64, I64, I6
 
 
 EstimateFundamental = Callable[[F64, F64, np.random.Generator], FundamentalFit]
+MapAll = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
+"""Apply a function to each item, possibly in several threads, and return the results in order."""
 
 
 def empty_matches(pair: tuple[int, int]) -> Matches:

@@ -1,16 +1,13 @@
 """Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap.
 
-Overlap is estimated by a geometric test of small patch sets and by bag-of-words similarity, after J. Sivic
-and A. Zisserman, "Video Google: a text retrieval approach to object matching in videos", ICCV 2003, with a
-vocabulary made from the images themselves.
+Overlap is estimated by a geometric test of small patch sets and by bag-of-words similarity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import scipy
@@ -18,13 +15,13 @@ import scipy
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.kernels import kernel
+from thesisrecon.matching._bag_of_words import word_weights
+from thesisrecon.matching._prepared import MapAll
 from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.records import Features, PairChoice, Seeds, TwoView
 
 # ruff: noqa: ARG002 (all selectors have the same arguments)
 
-MapAll = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
-"""Apply a function to each item, possibly in several threads, and return the results in order."""
 # Minimum correlation of two patches of the same surface: half of the variance in common.
 MIN_CORRELATION = 0.5
 # Maximum ratio of the distances to the best and to the second best patch.
@@ -39,8 +36,6 @@ DECIDED = 6.0
 MIN_LOG10 = -300.0
 # Seeds of each scale that represent an image, upright and rotated.
 PER_SCALE = 200
-SAMPLES_PER_WORD = 8
-ROUNDS = 4
 ROWS_AT_ONCE = 4096
 
 
@@ -206,7 +201,7 @@ class OverlapEstimate:
             words, compared = scipy.sparse.csr_array((n, 1)), _pair_array(combinations(range(n), 2))
         else:
             kinds = [[subset[kind].patches for subset in subsets] for kind in (0, 1)]
-            weights = [_word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds]
+            weights = [word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds]
             words = scipy.sparse.hstack(weights, format="csr")
             compared = _most_similar(words, self.shortlist)
         evidence = np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), compared.tolist()))
@@ -380,75 +375,6 @@ def _match_subsets(a: _FeatureSubset, b: _FeatureSubset) -> tuple[I64, I64]:
     one, value = one[distinct], value[distinct]
     one = one[np.argsort(-value, kind="stable")[:MAX_MATCHES]]
     return one, index[one]
-
-
-def _word_weights(
-    patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator
-) -> scipy.sparse.csr_array:
-    """Weighted word counts (N, W) of images with unit patches (S, D); products of the rows are cosines.
-
-    A word is weighted by how few images contain it, and square roots of the counts limit the effect of
-    repeated structure. The vocabulary must be large: if each image contains most words, all images are
-    similar. The transpose is the inverted file: the images of each word.
-    """
-    everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
-    if not len(everything):
-        return scipy.sparse.csr_array((len(patches), 1))
-    words = min(words, len(everything) // SAMPLES_PER_WORD)
-    vocabulary = _vocabulary(everything, words, map_all=map_all, rng=rng)
-    found = map_all(lambda given: np.unique(_words_of(given, vocabulary), return_counts=True), patches)
-    image = np.repeat(np.arange(len(patches)), [len(word) for word, _ in found])
-    word, count = (np.concatenate([part[k] for part in found]) for k in (0, 1))
-    used = np.bincount(word)
-    weight = np.sqrt(count) * np.log(len(patches) / used[word])
-    weight /= np.sqrt(np.maximum(np.bincount(image, weight**2), 1e-24))[image]
-    return scipy.sparse.csr_array((weight, (image, word)), (len(patches), vocabulary[1][:, :, 0].size))
-
-
-_Vocabulary = tuple[F32, F32]
-"""Unit centres (B, D) of branches, and of the words (B, B, D) of each."""
-
-
-def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Generator) -> _Vocabulary:
-    """A tree of two levels with about ``words`` words (D. Nister and H. Stewenius, CVPR 2006)."""
-    branches = max(int(np.sqrt(words)), 1)
-    sample = patches[rng.permutation(len(patches))[: SAMPLES_PER_WORD * branches**2]]
-    top = _centres(sample, branches)
-    branch = np.argmax(sample @ top.T, axis=1)
-    leaves = np.repeat(top[:, None], branches, axis=1)
-    inside = [sample[branch == b] for b in range(branches)]
-    used = [b for b in range(branches) if len(inside[b])]
-    found = map_all(lambda b: _centres(inside[b], branches), used)
-    for b, centres in zip(used, found, strict=True):
-        leaves[b, : len(centres)] = centres
-    return top, leaves
-
-
-def _centres(sample: F32, count: int) -> F32:
-    """Centres (at most ``count``, D) of spherical k-means, initialised by the first rows."""
-    centres = sample[:count]
-    for _ in range(ROUNDS):
-        nearest = np.argmax(sample @ centres.T, axis=1)
-        order = np.argsort(nearest, kind="stable")
-        found, start = np.unique(nearest[order], return_index=True)
-        sums = centres.copy()
-        sums[found] = np.add.reduceat(sample[order], start, axis=0)
-        centres = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.float32(1e-6))
-    return centres
-
-
-def _words_of(patches: F32, vocabulary: _Vocabulary) -> I64:
-    """Word (S,) of each patch: the best of its best branch."""
-    top, leaves = vocabulary
-    if not len(patches):
-        return np.empty(0, np.int64)
-    branch = np.argmax(patches @ top.T, axis=1)
-    order = np.argsort(branch, kind="stable")
-    found, start = np.unique(branch[order], return_index=True)
-    word = np.empty(len(patches), np.int64)
-    for b, rows in zip(found, np.split(order, start[1:]), strict=True):
-        word[rows] = b * len(top) + np.argmax(patches[rows] @ leaves[b].T, axis=1)
-    return word
 
 
 def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:

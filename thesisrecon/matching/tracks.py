@@ -14,8 +14,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
-from thesisrecon.matching._prepared import PreparedImage
-from thesisrecon.matching.pair_selection import MapAll
+from thesisrecon.matching._prepared import MapAll, PreparedImage
 from thesisrecon.numerics._observations import cached_pair_order
 from thesisrecon.records import Matches, Tracks, TwoView
 
