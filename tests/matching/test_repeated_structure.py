@@ -1,6 +1,6 @@
 import numpy as np
 
-from thesisrecon.matching._repeated_structure import MANY_VIEWS, reject_repeated_structure
+from thesisrecon.matching._repeated_structure import FEW_VIEWS, reject_repeated_structure
 from thesisrecon.records import TwoView
 
 NONE = np.zeros(0, np.int64)
@@ -43,6 +43,6 @@ def test_groups_without_a_strong_pair_between_them_stay_connected():
 
 
 def test_small_sets_and_rejected_pairs_are_left_alone():
-    pairs = [*street(MANY_VIEWS), pair(2, 30, 60), pair(1, 20, 0, accepted=False)]
-    assert reject_repeated_structure(pairs, MANY_VIEWS) == pairs
+    pairs = [*street(FEW_VIEWS), pair(2, 30, 60), pair(1, 20, 0, accepted=False)]
+    assert reject_repeated_structure(pairs, FEW_VIEWS) == pairs
     assert reject_repeated_structure([], 100) == []

@@ -11,7 +11,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.records import TwoView
 
-MANY_VIEWS = 40
+FEW_VIEWS = 40
 """Up to this number of views no pair is rejected: few pairs are redundant then."""
 STRONG = 0.1
 """A pair is strong if it has this fraction of the matches, or common points, of the best pair of one of its
@@ -28,7 +28,7 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
     groups that no strong pair connects stay, because nothing else relates these groups.
     """
     accepted = [pair for pair in pairs if pair.accepted]
-    if n_views <= MANY_VIEWS or not accepted:
+    if n_views <= FEW_VIEWS or not accepted:
         return list(pairs)
     i, j, count = np.array([(pair.i, pair.j, pair.inliers) for pair in accepted]).T
     strong = strong_pairs(i, j, count, n_views)
