@@ -232,20 +232,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     least = max(MIN_GAIN * agreeing, expected + 2.0 * np.sqrt(expected) + 1.0)
     different = [m for m in models if m.gained >= least and m.differs(relevant_px * frame.scale)]
     other = min(different, key=lambda m: m.margin, default=None)
-    off = f"{agreeing:.0f} of {tried:.0f} matches off the dominant plane agree with F"
-    reasons = []
-    if false_alarms > MAX_CHANCE:
-        reasons.append(f"{off}, no more than expected by chance")
-    if contradicted > MAX_CONTRADICTED * agreeing:
-        reasons.append(
-            f"{off}, but {contradicted:.0f} of them lie among matches of the plane, as matches "
-            "between repeated structures do"
-        )
-    if other is not None and other.margin < MIN_MARGIN:
-        reasons.append(
-            f"another F explains {other.gained:.0f} matches that this F does not explain, and "
-            f"misses {other.lost:.0f} of its inliers"
-        )
+    reasons = _reasons(agreeing, tried, contradicted, false_alarms, other)
     # Few matches estimate their own noise: Student's quantile instead of the normal one.
     allowed_px = error_px * student_factor(max(int(fit.inliers.sum()) - 7, 1))
     if not allowed_px <= relevant_px:
@@ -260,6 +247,27 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
         competing_model=frame.matrix_in_pixels(other.f) if other is not None else None,
         expected_error_px=error_px,
     )
+
+
+def _reasons(
+    agreeing: float, tried: float, contradicted: float, false_alarms: float, other: _CompetingModel | None
+) -> list[str]:
+    """A sentence each if the matches off the plane, or another F, leave F undetermined."""
+    off = f"{agreeing:.0f} of {tried:.0f} matches off the dominant plane agree with F"
+    found = []
+    if false_alarms > MAX_CHANCE:
+        found.append(f"{off}, no more than expected by chance")
+    if contradicted > MAX_CONTRADICTED * agreeing:
+        found.append(
+            f"{off}, but {contradicted:.0f} of them lie among matches of the plane, as matches "
+            "between repeated structures do"
+        )
+    if other is not None and other.margin < MIN_MARGIN:
+        found.append(
+            f"another F explains {other.gained:.0f} matches that this F does not explain, and "
+            f"misses {other.lost:.0f} of its inliers"
+        )
+    return found
 
 
 def _contradicted_fraction(points: F64, weights: F64, h: F64, off: B8, near: float) -> float:
