@@ -20,7 +20,7 @@ from thesisrecon.io._images import list_images, read_image, rotation_words
 from thesisrecon.pipeline._image_pair import ImageInput
 from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks
 from thesisrecon.stereo._resampling import pinhole_view
-from thesisrecon.stereo.depth import MultiViewScene
+from thesisrecon.stereo.depth import MultiViewScene, keep_depths
 from thesisrecon.surface.model import SurfaceModel
 
 ImagesInput = str | Path | Sequence[ImageInput]
@@ -101,7 +101,8 @@ def depth_maps(
         raise StageFailure("no depth was found", rule, advice)
     maps = list(confirmed_depth_maps(dense, scene, threads=threads).values())
     if limits is not None:
-        maps = [_within(one, limits[one.view]) for one in maps]
+        near, far = limits.T
+        maps = [keep_depths(m, (m.depth >= near[m.view]) & (m.depth <= far[m.view])) for m in maps]
     if not any(np.isfinite(one.depth).any() for one in maps):
         evidence = f"none of {counted(len(maps), 'view')} agrees with another on any surface"
         raise StageFailure("no depth was found", evidence, "check the cameras, or give a wider depth_range")
@@ -288,12 +289,6 @@ def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
     if not (np.isfinite(limits).all() and (limits[:, 0] > 0.0).all() and (limits[:, 1] > limits[:, 0]).all()):
         raise ValueError(f"depth_range needs 0 < nearest < farthest, both finite; got {depth_range}")
     return limits
-
-
-def _within(one: DepthMap, limits: F64) -> DepthMap:
-    keep = (one.depth >= limits[0]) & (one.depth <= limits[1])
-    depth, std = (np.where(keep, part, np.float32(np.nan)) for part in (one.depth, one.std))
-    return replace(one, depth=depth, std=std, views=np.where(keep, one.views, np.uint8(0)))
 
 
 def _plain(number: int, depth: F32 | F64, camera: Camera) -> DepthMap:

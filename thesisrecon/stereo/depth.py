@@ -149,12 +149,12 @@ def _confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap
     std = depth_map.std * rho * rho
     surface_continuation(rho, std, keep.astype(np.uint8), RADIUS, ALIKE, GATE, joins)
     keep |= (contradict == 0) & (joins > 0)
-    return _without_small_regions(_kept(replace(depth_map, views=np.maximum(agree, 1)), keep))
+    return _without_small_regions(keep_depths(replace(depth_map, views=np.maximum(agree, 1)), keep))
 
 
 def _without_small_regions(depth_map: DepthMap) -> DepthMap:
     least = MIN_REGION_RATIO * depth_map.depth.size
-    return _kept(depth_map, _region_sizes(depth_map.depth, STEP) >= least)
+    return keep_depths(depth_map, _region_sizes(depth_map.depth, STEP) >= least)
 
 
 def _transfer(P: F64, P_other: F64) -> F64:
@@ -179,7 +179,20 @@ def _region_sizes(depth: F32, step: float) -> F64:
     return np.where(np.isfinite(depth), sizes, 0.0)
 
 
-def _kept(depth_map: DepthMap, keep: B8) -> DepthMap:
+def keep_depths(depth_map: DepthMap, keep: B8) -> DepthMap:
+    """Return the depth map with unknown depths outside a mask.
+
+    Parameters
+    ----------
+    depth_map : DepthMap
+        Depths of a view.
+    keep : ndarray (H, W) of bool
+        The pixels whose depths remain.
+
+    Returns
+    -------
+    DepthMap
+    """
     depth, std = (np.where(keep, part, np.float32(np.nan)) for part in (depth_map.depth, depth_map.std))
     return replace(depth_map, depth=depth, std=std, views=np.where(keep, depth_map.views, np.uint8(0)))
 
