@@ -31,6 +31,7 @@ from thesisrecon.epipolar._planes import (
 from thesisrecon.epipolar._refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.geometry._homography import homography_sampson_residuals
+from thesisrecon.geometry._metric_frame import nearest_rotation
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
@@ -102,9 +103,7 @@ def _rotation_test(H: F64, xy1: F64, xy2: F64) -> float:
 def _start(H: F64, f: float) -> F64:
     """Parameters of the rotation nearest to K^-1 H K for a focal length and a central principal point."""
     A = H * np.array([[1.0, 1.0, 1.0 / f], [1.0, 1.0, 1.0 / f], [f, f, 1.0]])
-    A = A * np.sign(np.linalg.det(A))
-    U, _, Vt = np.linalg.svd(A)
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(A * np.sign(np.linalg.det(A)))
     return np.array([np.log(f), 0.0, 0.0, *scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()])
 
 

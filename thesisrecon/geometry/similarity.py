@@ -8,6 +8,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry._conditioning import require_finite, require_shapes
+from thesisrecon.geometry._metric_frame import nearest_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +109,7 @@ def rotation_errors_deg(R: F64, R_true: F64) -> F64:
     >>> rotation_errors_deg(R, R @ np.diag([-1.0, -1.0, 1.0])).round(9).tolist()
     [0.0, 0.0]
     """
-    U, _, Vt = np.linalg.svd(np.einsum("vji,vjk->ik", R_true, R))
-    common = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    common = nearest_rotation(np.einsum("vji,vjk->ik", R_true, R))
     difference = np.einsum("vij,jk,vlk->vil", R_true, common, R)
     # The chord keeps its digits at small angles, where arccos of the trace loses half of them.
     chord = np.linalg.norm(difference - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry._metric_frame import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -263,27 +264,18 @@ def upgraded_model(
     3 C C' / tr(C C') - I) are left out.
     """
     views = np.flatnonzero(reconstruction.registered)
-    P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)
-    Q = np.linalg.inv(upgrade.K[views]) @ P
-    Q *= np.where(np.linalg.det(Q[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
-    U, S, Vt = np.linalg.svd(Q[:, :, :3])
-    scale = S.mean(axis=1)
+    H = upgrade.metric_from_projective
+    rotations, translations, S = upgrade_cameras(reconstruction.P[views], upgrade.K[views], H)
     off = np.sqrt(np.sum((3.0 * S**2 / np.sum(S**2, axis=1, keepdims=True) - 1.0) ** 2, axis=1))
     good = off < max_rotation_residual
     if good.sum() < 3:
         return None
     n = len(reconstruction.P)
     R, t = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
-    R[views], t[views] = U @ Vt, Q[:, :, 3] / scale[:, None]
+    R[views], t[views] = rotations, translations
     registered = np.zeros(n, dtype=bool)
     registered[views[good]] = True
-    Xm = reconstruction.X @ upgrade.metric_from_projective.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        X = Xm[:, :3] / Xm[:, 3:]
-    finite = reconstruction.valid & np.isfinite(X).all(axis=1)
-    X = np.where(finite[:, None], X, 0.0)
-    # The scale of the frame is free: set the median distance of the points to 1.
-    spread = float(np.median(np.linalg.norm(X[finite] - np.median(X[finite], axis=0), axis=1)))
+    X, finite, spread = upgrade_points(reconstruction.X, reconstruction.valid, H)
     group, shared = camera_rows(prior)
     rows = _intrinsics(upgrade.K, reconstruction.registered, reconstruction.sizes, prior)
     cameras = MetricCameras(R, t / spread, rows[np.unique(group, return_index=True)[1]], group, shared)

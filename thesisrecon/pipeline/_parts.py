@@ -16,6 +16,7 @@ from thesisrecon._code_digest import code_digest
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry._metric_frame import nearest_rotation
 from thesisrecon.geometry.camera_matrix import project_camera
 from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -322,8 +323,7 @@ def _similarity_of_cameras(Ra: F64, Ca: F64, Rb: F64, Cb: F64) -> Similarity:
     """
     use = np.ones(len(Ra), dtype=bool)
     for _ in range(ROUNDS):
-        U, _, Vt = np.linalg.svd(np.einsum("nji,njk->ik", Ra[use], Rb[use]))
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = nearest_rotation(np.einsum("nji,njk->ik", Ra[use], Rb[use]))
         a, b = Ca - np.median(Ca[use], axis=0), (Cb - np.median(Cb[use], axis=0)) @ R.T
         scale = float(
             np.median(np.linalg.norm(a[use], axis=1)) / max(np.median(np.linalg.norm(b[use], axis=1)), 1e-12)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry._metric_frame import upgrade_cameras, upgrade_points
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras
@@ -290,20 +291,12 @@ def _subsample(point: I64) -> I64:
 
 def _metric_frame(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) -> tuple[F64, F64, F64, B8]:
     """Return R and t of the upgraded views, points (N, 3), and which points are finite."""
-    P = reconstruction.P[views] @ np.linalg.inv(upgrade.metric_from_projective)
-    Q = np.linalg.inv(upgrade.K[views]) @ P
-    Q *= np.where(np.linalg.det(Q[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
-    U, S, Vt = np.linalg.svd(Q[:, :, :3])
-    Xm = reconstruction.X @ upgrade.metric_from_projective.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        X = Xm[:, :3] / Xm[:, 3:]
-    usable = reconstruction.valid & np.isfinite(X).all(axis=1)
-    X = np.where(usable[:, None], X, 0.0)
-    spread = float(np.median(np.linalg.norm(X[usable] - np.median(X[usable], axis=0), axis=1)))
+    H = upgrade.metric_from_projective
+    R, t, _ = upgrade_cameras(reconstruction.P[views], upgrade.K[views], H)
+    X, usable, spread = upgrade_points(reconstruction.X, reconstruction.valid, H)
     # A very distant point has no information on the focal length and dominates the conditioning.
     usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
-    t = Q[:, :, 3] / S.mean(axis=1)[:, None]
-    return U @ Vt, t / spread, X / spread, usable
+    return R, t / spread, X / spread, usable
 
 
 def _report(
