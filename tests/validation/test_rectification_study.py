@@ -9,9 +9,18 @@ pytest.importorskip("cv2")
 
 from tests.stereo.rectification_scenes import make_pair
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras, pair_of_fundamental
+from thesisrecon.stereo._planar import PlanarRectification
 from validation.references.opencv import opencv_calibrated, opencv_uncalibrated
 from validation.studies import rectification
-from validation.studies.rectification import BEST_F, METHODS, RealPair, check_scene, measure, seen_by_other
+from validation.studies.rectification import (
+    BEST_F,
+    METHODS,
+    OPENCV,
+    RealPair,
+    check_scene,
+    measure,
+    seen_by_other,
+)
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +64,16 @@ def test_the_table_has_every_method_and_judges_the_choice(pair):
         assert measured is not None
         # The noise of two coordinates that differ.
         assert measured.dy_px == pytest.approx(0.14, abs=0.03)
+
+
+def test_a_frame_beside_all_matches_has_no_rows_and_ends_no_table(pair, monkeypatch):
+    whole = opencv_calibrated(*pair.metric.cameras, pair.metric.pencil.sizes[0])
+    beside = PlanarRectification(np.array([[1.0, 0, 5e3], [0, 1, 0], [0, 0, 1]]) @ whole.H, whole.size)
+    monkeypatch.setitem(METHODS, OPENCV, (True, lambda _: beside))
+    rows = {(row.name, row.unit): row for row in check_scene("synthetic", [pair])}
+    assert rows["RMS |dy| of inliers, worst", "px of the image"].values[OPENCV] is None
+    assert rows["kept of the common region, worst", ""].values[OPENCV] == 0.0
+    assert rows["targets reached, share of all", ""].values[OPENCV] < 1.0
 
 
 def test_a_refused_pair_and_rows_that_hold_no_match_are_no_success(pair, monkeypatch):

@@ -157,9 +157,14 @@ def measure(pair: RealPair, name: str) -> Measured | None:
 
 
 def _dy_and_range(rectified: Rectification, pair: EpipolarPair) -> tuple[float, float]:
-    """RMS of y1 - y2 and disparity range (1 to 99 % quantile) of the matches in pixels of the frame."""
+    """RMS of y1 - y2 and disparity range (1 to 99 % quantile) of the matches in pixels of the frame.
+
+    NaN if the frame shows none of them.
+    """
     left, right = (rectified.rectified_from_original(s, xy) for s, xy in enumerate(pair.matches))
     d, dy = (left - right)[np.isfinite(left + right).all(axis=1)].T
+    if not len(d):
+        return float("nan"), float("nan")
     return float(np.sqrt(np.mean(dy**2))), float(np.ptp(np.quantile(d, [0.01, 0.99])))
 
 
