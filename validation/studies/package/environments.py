@@ -74,7 +74,7 @@ def captured(
     return subprocess.run(words, cwd=folder, env=environment, check=check, capture_output=True, text=True)
 
 
-TOOLS = ("pytest>=8.2", "hypothesis>=6.100", "pytest-benchmark>=4.0")
+TOOLS = ("pytest>=8.2", "hypothesis>=6.100", "pytest-benchmark>=4.0", "numpydoc>=1.8")
 QUICK = ("-m", "not (real or slow or references or browser)")
 
 
