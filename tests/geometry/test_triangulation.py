@@ -376,6 +376,20 @@ def test_orientation_makes_every_depth_positive():
     assert (w > 0).all() or (w < 0).all()
 
 
+def test_orientation_reaches_the_end_of_a_long_row_of_views():
+    rng = np.random.default_rng(0)
+    first = np.repeat(np.arange(78), 10)
+    X = np.column_stack([first + rng.uniform(0.0, 2.0, 780), rng.uniform(-1.0, 1.0, 780), np.full(780, 5.0)])
+    X = np.column_stack([X, np.ones(780)]) * rng.choice([-1.0, 1.0], (780, 1))
+    P = np.stack([np.column_stack([np.eye(3), [-v, 0.0, 0.0]]) for v in range(80)])
+    P *= rng.choice([-1.0, 1.0], (80, 1, 1))
+    view, point = (first[:, None] + np.arange(3)).ravel(), np.repeat(np.arange(780), 3)
+    views, points, share = orient_signs(P, X, view, point)
+    w = np.einsum("kj,kj->k", P[view, 2] * views[view, None], X[point] * points[point, None])
+    assert share == 1.0
+    assert (w > 0.0).all()
+
+
 def test_undistortion_inverts_distortion():
     xy = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
     np.testing.assert_allclose(distort(xy, np.array([0.15])), distort(xy, 0.15), rtol=1e-15)

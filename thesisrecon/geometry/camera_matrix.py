@@ -333,7 +333,8 @@ def orient_signs(P: F64, X: F64, view: I64, point: I64) -> tuple[F64, F64, float
     if len(view) == 0:
         return np.ones(len(P)), np.ones(len(X)), 1.0
     views[np.bincount(view, minlength=len(P)).argmax()] = 1.0
-    for _ in range(20):
+    # Each pass reaches at least one more view of a chain.
+    for _ in range(len(P) + 20):
         points = np.sign(np.bincount(point, w * views[view], minlength=len(X)))
         votes = np.sign(np.bincount(view, w * points[point], minlength=len(P)))
         if np.array_equal(votes, views):
