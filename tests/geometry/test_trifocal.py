@@ -66,6 +66,15 @@ def test_tensor_is_the_same_in_every_projective_frame(rng):
 
 
 @holds_for_every()
+def test_cameras_with_one_centre_have_no_tensor(rng):
+    centre = rng.normal(size=3)
+    P = rng.normal(size=(3, 3, 3)) @ np.column_stack([np.eye(3), -centre])
+    assert not three_view.tensor_from_cameras(*P).any()
+    P[2] = rng.normal(size=(3, 3)) @ np.column_stack([np.eye(3), -centre - 1e-6])
+    assert np.linalg.norm(three_view.tensor_from_cameras(*P)) == pytest.approx(1.0)
+
+
+@holds_for_every()
 def test_trifocal_constraint_of_points(rng):
     P = three_cameras(rng)
     X = homogenize(rng.uniform(-1.5, 1.5, (6, 3)))

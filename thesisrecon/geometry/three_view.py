@@ -11,6 +11,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry._conditioning import checked_unit, require_finite, unit_norm, unit_tensor
+from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 
@@ -35,7 +36,11 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
         T of unit norm; zero if all three centres coincide.
     """
     P1, P2, P3 = (checked_unit(P, "tensor_from_cameras") for P in (P1, P2, P3))
-    T = np.empty((3, 3, 3))
+    T, centre = np.zeros((3, 3, 3)), camera_centre(P1)
+    # The determinants of one centre are rounding errors.
+    least = 1e-12 * float(np.linalg.norm(centre))
+    if all(np.linalg.norm(P @ centre) <= least * np.linalg.norm(P[:, :3]) for P in (P2, P3)):
+        return T
     for i in range(3):
         rows = np.empty((3, 3, 4, 4))
         rows[:, :, :2] = np.delete(P1, i, axis=0)
