@@ -150,8 +150,8 @@ def estimate_trifocal(
             f"found {n} points and {m} lines; 7 points, 13 lines or a mixture are needed",
             "use images with more overlap",
         )
-    equations = _tensor_equations(points, segments)
     try:
+        equations = _tensor_equations(points, segments)
         T = _minimize_algebraic_error(equations, equations.solve())
     except ValueError as error:
         raise StageFailure(UNDETERMINED, "they are in a degenerate configuration", REMEDY) from error
