@@ -9,6 +9,8 @@ from thesisrecon.arrays import F64
 
 _TRIANGULAR = 1e-9
 """Largest deviation of K from upper triangular with K33 = 1, by rounding."""
+_MAX_CONDITION = 1e8
+"""Largest condition number of a whitening transform with unit columns; of georeferenced points up to 1e7."""
 
 
 def checked_inverse(G: F64, caller: str) -> F64:
@@ -114,9 +116,9 @@ def scene_frame(X: F64) -> tuple[F64, float]:
 def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
     """M for which the unit vectors x = M X / |M X| have sum x x' proportional to I (Tyler, Ann. Stat. 1987).
 
-    Every point counts as a direction, so neither homogeneous scales nor a few far points matter. Directions
-    without extent are stretched by at most 1e6. det M > 0, which keeps orientations; I for fewer than 4
-    points.
+    Every point counts as a direction, so neither homogeneous scales nor a few far points matter. Points of a
+    plane are not stretched until their rounding errors fill space: M keeps an inverse of eight digits. det M
+    > 0, which keeps orientations; I for fewer than 4 points.
     """
     M = np.eye(4)
     norms = np.linalg.norm(X, axis=1)
@@ -130,6 +132,11 @@ def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
         stretch = 1.0 / np.sqrt(np.maximum(4.0 * values, 1e-12))
         M = (vectors * stretch) @ vectors.T @ M
         M /= np.linalg.norm(M)
+        # The scale of a column costs no digits of the inverse.
+        column = np.linalg.norm(M, axis=0)
+        U, s, Vt = np.linalg.svd(M / column)
+        if s[0] > _MAX_CONDITION * s[3]:
+            M = (U * np.maximum(s, s[0] / _MAX_CONDITION)) @ Vt * column
     return M
 
 
