@@ -165,6 +165,12 @@ def test_a_reconstruction_of_arrays_has_their_cameras_and_points():
     refuses(ValueError, r"sizes are \(width, height\)", build, scene.P, sizes=scene.sizes[:, ::-1], xy=xy)
     refuses(ValueError, "needs P, or K, R and t", build, scene.K, scene.R, sizes=scene.sizes)
     refuses(ValueError, r"sizes \(V, 2\) or \(2,\)", build, scene.P, sizes=scene.sizes[:3])
+    for K, R, words in (
+        (scene.K[0].T, scene.R, "K upper triangular"),
+        (scene.K[0], 2.0 * scene.R, "needs a rotation R; R'R deviates"),
+        (scene.K[0], -scene.R, "got a reflection"),
+    ):
+        refuses(ValueError, words, build, K, R, scene.t, sizes=scene.sizes)
 
 
 def test_cameras_without_points_are_identifiable_in_any_frame():

@@ -69,7 +69,8 @@ def test_lists_are_converted():
         ({"distortion": np.array([np.inf])}, "finite"),
         ({"K": K.T}, "upper triangular"), ({"K": -K}, "positive focal lengths"),
         ({"K": 2.0 * K}, "K33 = 1"), ({"R": 1.001 * np.eye(3)}, r"needs a rotation R; .* 0\.002"),
-        ({"R": np.zeros((3, 3))}, "needs a rotation R"), ({"size": (640.0, 480.0)}, "whole numbers"),
+        ({"R": np.zeros((3, 3))}, "needs a rotation R"), ({"R": np.diag([1.0, 1, -1])}, "got a reflection"),
+        ({"size": (640.0, 480.0)}, "whole numbers"),
         ({"size": (640,)}, "whole numbers"), ({"size": (640, 0)}, "at least 1 x 1"),
     ],
 )  # fmt: skip

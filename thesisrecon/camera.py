@@ -13,13 +13,11 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry._conditioning import (
     require_calibration,
     require_finite,
+    require_rotations,
     require_shapes,
     resizing_transform,
 )
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, project_camera, undistort
-
-_ORTHOGONAL = 2e-4
-"""Largest deviation of R'R from the identity; four printed digits leave at most 2 sqrt(3) 5e-5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +45,7 @@ class Camera:
     ------
     ValueError
         If a shape is wrong, a number is not finite, K is not upper triangular with positive focal lengths and
-        K33 = 1, R is not orthogonal, or the size is not whole numbers of at least 1.
+        K33 = 1, R is not a rotation, or the size is not whole numbers of at least 1.
 
     Examples
     --------
@@ -79,9 +77,7 @@ class Camera:
             require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
         require_finite("Camera", *fields.values())
         require_calibration("Camera", K)
-        apart = np.abs(R.T @ R - np.eye(3)).max()
-        if not apart <= _ORTHOGONAL:
-            raise ValueError(f"Camera needs a rotation R; R'R deviates from the identity by {apart:.2g}")
+        require_rotations("Camera", R)
         try:
             width, height = (operator.index(side) for side in self.size)
         except (TypeError, ValueError):

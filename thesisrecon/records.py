@@ -284,8 +284,8 @@ class Reconstruction:
         Returns
         -------
         Reconstruction
-            All views registered; ``ValueError`` if the arrays do not fit together, or pixels lie far outside
-            their images.
+            All views registered; ``ValueError`` if the arrays do not fit together, K is no calibration matrix
+            or R no rotation as in :class:`thesisrecon.Camera`, or pixels lie far outside their images.
 
         Examples
         --------

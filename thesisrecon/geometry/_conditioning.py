@@ -9,6 +9,8 @@ from thesisrecon.arrays import F64
 
 _TRIANGULAR = 1e-9
 """Largest deviation of K from upper triangular with K33 = 1, by rounding."""
+_ORTHOGONAL = 2e-4
+"""Largest deviation of R'R from the identity; four printed digits leave at most 2 sqrt(3) 5e-5."""
 _MAX_CONDITION = 1e8
 """Largest condition number of a whitening transform with unit columns; of georeferenced points up to 1e7."""
 
@@ -63,6 +65,15 @@ def require_calibration(caller: str, K: F64) -> None:
     if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= _TRIANGULAR):
         needed = "K upper triangular with positive focal lengths and K33 = 1"
         raise ValueError(f"{caller} needs {needed}; got {K.round(6).tolist()}")
+
+
+def require_rotations(caller: str, R: F64) -> None:
+    """Raise ``ValueError`` if a matrix of R (..., 3, 3) is no rotation."""
+    apart = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(initial=0.0))
+    if not apart <= _ORTHOGONAL:
+        raise ValueError(f"{caller} needs a rotation R; R'R deviates from the identity by {apart:.2g}")
+    if not (np.linalg.det(R) > 0.0).all():
+        raise ValueError(f"{caller} needs a rotation R; got a reflection, det R = -1")
 
 
 def normalizing_transform(xy: F64) -> F64:

@@ -9,7 +9,12 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._conditioning import require_finite, require_shapes
+from thesisrecon.geometry._conditioning import (
+    require_calibration,
+    require_finite,
+    require_rotations,
+    require_shapes,
+)
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.triangulation import triangulate
@@ -48,6 +53,9 @@ def checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tupl
         K = np.broadcast_to(K, (len(R), 3, 3)) if K.ndim == 2 else K
         require_shapes(caller, K=(K, ("V", 3, 3)), R=(R, ("V", 3, 3)), t=(t, ("V", 3)))
         require_finite(caller, K, R, t)
+        for one in K:
+            require_calibration(caller, one)
+        require_rotations(caller, R)
         P = compose_camera(K, R, t)
     else:
         raise ValueError(f"{caller} needs P, or K, R and t of a metric frame; got {len(arrays)} arrays")
