@@ -15,9 +15,11 @@ from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
+from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
+from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations, _kruppa_cost, _kruppa_residuals, _Pairs
 from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
@@ -110,6 +112,48 @@ def test_all_intrinsics_of_a_constant_camera_are_found(method):
     free = prior_for(scene, stds=(np.inf, np.inf, np.inf))
     answer = method.calibrate(reconstruction, prior=free, rng=np.random.default_rng(0))
     np.testing.assert_allclose(answer.K[0], K, rtol=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [HypothesesAndRefinement(), *EXACT, Stratified(), Stratified(refine=False)],
+    ids=["hypotheses", "nonlinear quadric", "Kruppa", "stratified", "stratified alone"],
+)
+def test_a_known_skew_is_kept(method):
+    scene = make_scene(seed=2)
+    K = scene.K + 150.0 * np.outer([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    scene = replace(scene, K=K)
+    scene = replace(scene, tracks=reprojected(scene))
+    prior = prior_for(scene)
+    prior.mean[:, 2] = 150.0
+    answer = method.calibrate(
+        projective_reconstruction(scene, seed=2), prior=prior, rng=np.random.default_rng(0)
+    )
+    np.testing.assert_allclose(answer.K, scene.K, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [HypothesesAndRefinement(), *EXACT, Stratified(), Stratified(calibration=FixedPlaneQuadric())],
+    ids=["hypotheses", "nonlinear quadric", "Kruppa", "stratified", "fixed plane"],
+)
+@pytest.mark.parametrize("focal_std", [0.0, 0.02])
+def test_given_focals_are_kept_by_cameras_on_a_sphere(method, focal_std):
+    """Which agree with any focal length in the Kruppa equations."""
+    scene = make_scene(seed=1)
+    R = Rotation.from_euler("xyz", np.radians(np.random.default_rng(0).uniform(-25, 25, (6, 3)))).as_matrix()
+    t = -R @ scene.X.mean(axis=0) + [0.0, 0.0, 9.0]
+    scene = replace(scene, R=R, t=t, K=scene.K[:6])
+    xh = np.einsum("vij,nj->vni", scene.P, np.column_stack([scene.X, np.ones(len(scene.X))]))
+    sizes = np.tile([1536, 1024], (6, 1))
+    P = scene.P @ np.linalg.inv(np.random.default_rng(2).normal(size=(4, 4)))
+    reconstruction = Reconstruction.from_cameras(
+        P, sizes=sizes, xy=xh[..., :2] / xh[..., 2:], stratum="projective"
+    )
+    mean = np.tile([scene.K[0, 0, 0], 1.0, 0.0, *scene.K[0, :2, 2], 0.0], (6, 1))
+    prior = IntrinsicsPrior.unshared(mean, np.tile([focal_std, 0.0, 0.0, 0.0, 0.0, 0.0], (6, 1)))
+    answer = method.calibrate(reconstruction, prior=prior, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(answer.K, scene.K, rtol=1e-4)
 
 
 @pytest.mark.parametrize("method", [NonlinearQuadric(), KruppaEquations()], ids=name)

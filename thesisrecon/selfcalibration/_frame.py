@@ -269,6 +269,8 @@ def conic_constraints(frame: ReferenceFrame, prior: IntrinsicsPrior) -> ConicCon
     rows = frame.views
     unit = frame.pixel_from_unit[rows, 0, :1]
     std = np.column_stack([prior.std[rows, 2:5] / unit, prior.std[rows, 1] / prior.mean[rows, 1] / 2.0])
+    # Only without skew are w_12 = 0 and w_11 = w_22.
+    std[np.ix_(prior.mean[rows, 2] != 0.0, [0, 3])] = np.inf
     # A constant K in pixels is constant in unit-free coordinates only if all its views share these.
     known = np.where(prior.std[rows, :5] == 0.0, prior.mean[rows, :5], np.nan)
     shared, units = prior.shared[rows, :5], frame.pixel_from_unit[rows]

@@ -40,8 +40,9 @@ _MAX_OFFSET_STD = 0.02
 class HypothesesAndRefinement:
     """Self-calibration by hypotheses of all methods, a common refinement and a cheirality test.
 
-    The refinement estimates focal lengths only. If the other intrinsics are less well known than by a small
-    offset of the principal point, the best candidates are refined by the nonlinear quadric over all unknowns.
+    The refinement estimates focal lengths of cameras without skew. If the prior has a skew, or leaves more
+    undetermined than a small offset of the principal point, the best candidates are refined by the nonlinear
+    quadric over all unknown intrinsics.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ class HypothesesAndRefinement:
         theta, cost = refine_hypotheses(self.criterion, frame, theta)
         candidates = candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
         unknown = solver_unknowns(frame, prior)
-        if unknown.max_nonfocal_std > _MAX_OFFSET_STD:
+        if unknown.max_nonfocal_std > _MAX_OFFSET_STD or unknown.known[:, 2].any():
             candidates = self._with_all_intrinsics(frame, unknown, candidates)
         return select_candidate(
             frame, reconstruction, self.criterion, candidates,
