@@ -86,6 +86,8 @@ class FixedPlaneQuadric:
         """See `thesisrecon.selfcalibration.absolute_conic.LinearAbsoluteConic.calibrations`."""
         unknown, frame = scene.unknown, scene.frame
         H = _homographies(frame, plane)
+        if not len(unknown.std):
+            return np.asarray(unknown.calibrations(np.zeros((1, 0)))[0], dtype=np.float64)
         focals = np.log(np.geomspace(*self.focal_range, self.starts))
         starts = unknown.from_log_focals(np.repeat(focals[:, None], len(H), axis=1))
 

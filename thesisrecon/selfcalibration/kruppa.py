@@ -113,7 +113,7 @@ def _minimize_kruppa(
     """Minimize the residuals over all unknown intrinsics from a start (D,); return K (R, 3, 3), its std."""
 
     def residuals(batch: F64) -> F64:
-        r = _pair_residuals(pairs, unknown.calibrations(batch)).reshape(len(batch), -1)
+        r = _pair_residuals(pairs, unknown.calibrations(batch)).reshape(len(batch), 3 * len(pairs.i))
         return np.concatenate([r, _NOISE * unknown.prior_residuals(batch)], axis=1)
 
     found = minimize_residuals(
@@ -140,8 +140,8 @@ class KruppaEquations:
 
     One common focal length is scanned; the best minima are refined over all unknown intrinsics, and a plane
     at infinity is fitted to each. The candidate whose cameras are nearest to rotations is selected, because
-    few pairs leave false solutions without residual. Solutions that do not determine the focal length are
-    rejected: those near 0, and all of cameras on a sphere that look at its centre [1]_.
+    few pairs leave false solutions without residual. Solutions that do not determine a focal length that is
+    not given are rejected: those near 0, and all of cameras on a sphere that look at its centre [1]_.
 
     Parameters
     ----------
@@ -189,14 +189,15 @@ class KruppaEquations:
         return select_candidate(frame, reconstruction, self.criterion, candidates)
 
     def _solutions(self, pairs: _Pairs, unknown: SolverUnknowns, n: int) -> list[tuple[F64, F64, float]]:
-        """K (n, 3, 3), standard deviations and rms residual of minima that determine the focal."""
+        """K (n, 3, 3), standard deviations and rms residual of minima whose focal is determined or given."""
         found, weakest = [], np.inf
+        given = float(unknown.std[np.unique(unknown.index[unknown.index[:, 0] >= 0, 0])].max(initial=0.0))
         for log_f in self._scan(pairs, n):
             start = unknown.from_log_focals(np.full((1, n), log_f))[0]
             K, K_std = _minimize_kruppa(pairs, unknown, start, self.loss_scale)
             residual, focal_std = _residual_and_focal_std(pairs, K)
             weakest = min(weakest, focal_std)
-            if focal_std < _MAX_FOCAL_STD:
+            if min(focal_std, given) < _MAX_FOCAL_STD:
                 found.append((K, K_std, residual))
         if found:
             return sorted(found, key=lambda solution: solution[2])
