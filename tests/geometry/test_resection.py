@@ -83,6 +83,18 @@ def test_points_that_cannot_work_are_named():
     refuses(ValueError, "threshold_px must be positive", thesisrecon.resect, X, xy, threshold_px=-1.0)
 
 
+@pytest.mark.parametrize("threshold_px", [1.0, None])
+def test_mirrored_points_and_equal_pixels_have_no_camera(threshold_px):
+    X, xy = points(30, np.random.default_rng(0))
+    resect, failed = thesisrecon.resect, "no camera explains the points"
+    refuses(StageFailure, failed, resect, X * [1.0, 1.0, -1.0], xy, threshold_px=threshold_px)
+    for given in (None, K):
+        same = np.full_like(xy, 100.0)
+        refuses(StageFailure, failed, resect, X, same, given, threshold_px=threshold_px)
+    xy[:20] = 100.0
+    assert np.linalg.det(resect(X, xy, K, threshold_px=threshold_px).R) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("wrong", [2.0 * K, np.diag([900.0, 0.0, 1.0]), np.diag([-1.0, -1.0, 1.0]) @ K, K.T])
 def test_a_matrix_that_is_no_calibration_is_refused(wrong):
     X, xy = points(20, np.random.default_rng(0))

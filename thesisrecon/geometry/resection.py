@@ -83,7 +83,10 @@ def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
     good = np.isfinite(Y).all(axis=(1, 2)) & (u > 0)
     X, Y, sample = X[good], Y[good], sample[good]
     R = _triad(Y) @ _triad(X).swapaxes(1, 2)
-    return R, Y.mean(axis=1) - np.einsum("bij,bj->bi", R, X.mean(axis=1)), sample
+    t = Y.mean(axis=1) - np.einsum("bij,bj->bi", R, X.mean(axis=1))
+    # The triads of points on one line, as of equal rays, are no bases.
+    proper = np.linalg.det(R) > 0.5
+    return R[proper], t[proper], sample[proper]
 
 
 def _real_quartic_roots(c: F64) -> tuple[F64, I64]:

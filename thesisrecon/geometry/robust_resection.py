@@ -89,7 +89,8 @@ def resect(
         If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
         lengths and K33 = 1.
     StageFailure
-        If there are too few points or inliers, or all points lie in one plane and K is not given.
+        If there are too few points or inliers, all points lie in one plane and K is not given, or points are
+        behind the camera that fits them, as in left-handed coordinates.
 
     Examples
     --------
@@ -108,8 +109,10 @@ def resect(
         K = np.asarray(K, dtype=np.float64)
         require_calibration("resect", K)
     require_finite("resect", X, xy)
-    if threshold_px is not None and not threshold_px > 0.0:
-        raise ValueError(f"threshold_px must be positive, or None for no search; got {threshold_px}")
+    if threshold_px is not None and not 0.0 < threshold_px < np.inf:
+        raise ValueError(
+            f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
+        )
     needed, unknown = (6, 11) if K is None else (4, 6)
     if len(X) < needed:
         raise StageFailure("too few points for resection", f"{counted(len(X), 'point')}, {needed} are needed")
@@ -121,29 +124,34 @@ def resect(
             "",
             "add points off it" + (", or give the calibration matrix K" if K is None else ""),
         )
+    if not np.ptp(xy, axis=0).any():
+        raise _no_camera(f"all {len(xy)} pixels are equal")
     limit = threshold_px or _ANY_PX
     fit = _search(X, xy, K, limit, np.random.default_rng(seed))
     inliers = np.ones(len(X), dtype=bool) if fit.inliers.any() and threshold_px is None else fit.inliers
     for _ in range(_ROUNDS):
         if inliers.sum() < needed:
-            raise StageFailure(
-                "no camera explains the points",
-                f"{inliers.sum()} of {len(X)} agree with one, {needed} are needed",
-                "check that points and pixels correspond",
-            )
+            raise _no_camera(f"{inliers.sum()} of {len(X)} agree with one, {needed} are needed")
         fit = _refine(fit, X, xy, inliers, calibrated=K is not None)
-        distance = np.linalg.norm(project(fit.P, X) - xy, axis=1)
-        distance[depth(fit.P, homogenize(X)) <= 0.0] = np.inf
+        distance, front = np.linalg.norm(project(fit.P, X) - xy, axis=1), depth(fit.P, homogenize(X)) > 0.0
+        distance[~front] = np.inf
         used = inliers
         if threshold_px is None:
+            if not front.all():
+                raise _no_camera(f"{np.sum(~front)} of {len(X)} are behind the one that fits them best")
             break
         limit = max(next_inlier_limit(distance, used, limit, unknowns=unknown), _EXACT_PX)
-        inliers = distance <= limit
+        inliers = front & (distance <= limit)
         if np.array_equal(inliers, used):
             break
     left = (2 * int(used.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(distance[used] ** 2) / left)) if left > 0 else float("nan")
     return replace(fit, inliers=used, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
+
+
+def _no_camera(evidence: str) -> StageFailure:
+    advice = "check that points and pixels correspond, and that the points are in right-handed coordinates"
+    return StageFailure("no camera explains the points", evidence, advice)
 
 
 def _search(X: F64, xy: F64, K: F64 | None, threshold_px: float, rng: Generator) -> Resection:
