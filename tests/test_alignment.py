@@ -79,8 +79,9 @@ def test_too_few_and_collinear_positions_are_refused():
     few = {name: positions[name] for name in ("0.jpg", "1.jpg")}
     with pytest.raises(UsageError, match=r"at least 3 images; got 2; 'x.jpg' is not an image of the model"):
         align_to_positions(model, few | {"x.jpg": np.zeros(3)})
-    with pytest.raises(UsageError, match="three finite coordinates"):
-        align_to_positions(model, positions | {"0.jpg": [0.0, np.nan, 1.0]})
+    for wrong in ([0.0, np.nan, 1.0], [0.0, 1.0], 3.0, "0 1 2", None):
+        with pytest.raises(UsageError, match="three finite coordinates"):
+            align_to_positions(model, positions | {"0.jpg": wrong})
     line = [SparseView(f"{i}.jpg", np.eye(3), np.array([float(i), 0, 0])) for i in range(6)]
     with pytest.raises(UsageError, match="camera centres of the 6 images lie on one line"):
         align_to_positions(SparseModel(line), positions)

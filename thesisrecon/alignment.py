@@ -136,7 +136,10 @@ def align_to_positions(
         rest = f"; {unknown[0]!r} is not an image of the model" if unknown else ""
         raise UsageError(f"alignment needs the positions of at least 3 images; got {len(names)}{rest}")
     source = np.array([centres[name] for name in names])
-    target = np.array([np.asarray(positions[name], dtype=np.float64) for name in names])
+    try:
+        target = np.array([positions[name] for name in names], dtype=np.float64)
+    except (TypeError, ValueError):  # words, or lists of different lengths
+        target = np.full((len(names), 3), np.nan)
     if target.shape != (len(names), 3) or not np.isfinite(target).all():
         raise UsageError("alignment needs three finite coordinates of each position")
     for points, what in ((source, "camera centres"), (target, "positions")):
