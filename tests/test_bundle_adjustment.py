@@ -96,6 +96,19 @@ def test_the_prior_of_a_shared_value_is_about_the_mean_of_the_given_cameras():
     assert found[1].K[0, 0] == pytest.approx(found[0].K[0, 0], rel=1e-6)
 
 
+def test_a_view_without_observations_keeps_its_pose_without_certainty():
+    cameras, X, xy = _scene()
+    xy[3] = np.nan
+    found = bundle_adjust(cameras, X, xy)
+    np.testing.assert_array_equal(found.cameras[3].R, cameras[3].R)
+    np.testing.assert_array_equal(found.cameras[3].t, cameras[3].t)
+    for covariance in (found.pose_covariance, found.centre_covariance):
+        finite = np.isfinite(covariance).all(axis=(1, 2))
+        assert finite.tolist() == [True, True, True, False, True, True]
+        assert np.isinf(np.diag(covariance[3])).all()
+        assert not np.isnan(covariance).any()
+
+
 def test_wrong_matches_hardly_move_a_robust_adjustment():
     cameras, X, xy = _scene()
     xy[2, 5:20] += 90.0

@@ -50,7 +50,8 @@ class BundleAdjustment:
         Standard deviation of one image coordinate, estimated from the residuals; and 1/2 sum rho with the
         priors, in units of the noise that weighted the residuals (``sigma_px`` of :func:`bundle_adjust`).
     pose_covariance : ndarray (V, 6, 6)
-        Covariance of the motion x -> exp(w) x + d in each camera frame, (rotation vector w in rad, d).
+        Covariance of the motion x -> exp(w) x + d in each camera frame, (rotation vector w in rad, d);
+        infinite for views without observations.
     intrinsics_covariance : ndarray (V, 8, 8)
         In the order focal, aspect, skew, principal x and y, k1, k2, k3; zero where not free.
     point_covariance : ndarray (N, 3, 3)
@@ -69,8 +70,10 @@ class BundleAdjustment:
     @property
     def centre_covariance(self) -> F64:
         """Covariance of the camera centres (V, 3, 3)."""
-        R = np.array([camera.R for camera in self.cameras])
-        return np.asarray(np.swapaxes(R, 1, 2) @ self.pose_covariance[:, 3:, 3:] @ R)
+        R, translation = np.array([camera.R for camera in self.cameras]), self.pose_covariance[:, 3:, 3:]
+        seen = np.isfinite(translation).all(axis=(1, 2), keepdims=True)
+        moved = np.swapaxes(R, 1, 2) @ np.where(seen, translation, 0.0) @ R
+        return np.asarray(np.where(seen, moved, np.diag([np.inf] * 3)))
 
 
 def bundle_adjust(
@@ -122,7 +125,7 @@ def bundle_adjust(
     Returns
     -------
     BundleAdjustment
-        Cameras, points, residuals and covariances; views and points without observations are unchanged.
+        Cameras, points, residuals and covariances; poses and points without observations are unchanged.
 
     Raises
     ------
@@ -183,7 +186,8 @@ def bundle_adjust(
         residual = np.full(dense, np.nan)
         residual[observed.view_index, observed.point_index] = fit.residual_px
     K, std = fit.cameras.K, np.sqrt(np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2))
-    rows = fit.cameras.intrinsics
+    rows, unseen = fit.cameras.intrinsics, np.isin(np.arange(len(views)), observed.view_index, invert=True)
+    poses = np.where(unseen[:, None, None], np.diag([np.inf] * POSE_DOF), fit.pose_covariance)
     refined = tuple(
         replace(
             view, K=K[i], R=fit.cameras.R[i], t=fit.cameras.t[i], distortion=rows[i, 5:], std=_by_name(std[i])
@@ -191,7 +195,7 @@ def bundle_adjust(
         for i, view in enumerate(views)
     )
     return BundleAdjustment(
-        refined, fit.X, residual, fit.sigma_px, fit.cost, fit.pose_covariance, fit.intrinsics_covariance,
+        refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance,
         fit.point_covariance,
     )  # fmt: skip
 
