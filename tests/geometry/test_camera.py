@@ -108,3 +108,4 @@ def test_3_27_cheirality_is_a_sign_of_depth_that_no_scale_changes(rng):
     np.testing.assert_allclose(1.0 / matrix.cheirality(normal, unit), unit @ normal[2], rtol=1e-8)
     at_infinity = np.append(rng.normal(size=3), 0.0)[None]
     assert matrix.cheirality(P, at_infinity)[0] == 0.0
+    np.testing.assert_array_equal(matrix.cheirality(P.tolist(), X.tolist()), chi)

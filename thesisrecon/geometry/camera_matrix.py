@@ -275,7 +275,7 @@ def cheirality(P: F64, X: F64) -> F64:
 
     Parameters
     ----------
-    P, X : ndarray (3, 4) and (N, 4)
+    P, X : array_like (3, 4) and (N, 4)
         Camera and homogeneous points.
 
     Returns
@@ -288,6 +288,7 @@ def cheirality(P: F64, X: F64) -> F64:
     >>> cheirality(np.eye(3, 4), X).round(9).tolist()
     [0.5, -0.5]
     """
+    P, X = np.asarray(P, dtype=np.float64), np.asarray(X, dtype=np.float64)
     require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
     return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
 

@@ -96,7 +96,7 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 
     Parameters
     ----------
-    F, xy1 : ndarray (3, 3) and (N, 2)
+    F, xy1 : array_like (3, 3) and (N, 2)
         Fundamental matrix, or F' for the lines in image 1, and pixels.
 
     Returns
@@ -110,8 +110,13 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
     [[0.0, 1.0, 30.0]]
     """
+    F, xy1 = np.asarray(F, dtype=np.float64), np.asarray(xy1, dtype=np.float64)
     require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
-    return unit_normals(homogenize(xy1) @ F.T)
+    x = homogenize(xy1)
+    lines = x @ F.T
+    # At an epipole only rounding errors are left.
+    lines[np.linalg.norm(lines, axis=1) <= 1e-15 * np.linalg.norm(F) * np.linalg.norm(x, axis=1)] = 0.0
+    return unit_normals(lines)
 
 
 def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
