@@ -282,6 +282,18 @@ def test_points_observed_from_one_centre_are_zeros(method, sigma_px):
         assert (np.linalg.norm(project(P[0], found[1::2]) - xy[0, 1::2], axis=1) < 0.1 + 5.0 * sigma_px).all()
 
 
+@pytest.mark.parametrize("views", [2, 3, 5, 20, 60])
+def test_mid_points_of_parallel_rays_are_zeros(views):
+    rng = np.random.default_rng(0)
+    R = Rotation.from_rotvec(0.1 * rng.normal(size=(views, 3))).as_matrix()
+    P = compose_camera(K, R, rng.normal(size=(views, 3)))
+    far = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), np.ones(200), np.zeros(200)])
+    assert not triangulate(P, np.stack([project(p, far) for p in P]), method="midpoint").any()
+    far[:, 3] = 1e-5
+    found = triangulate(P, np.stack([project(p, far) for p in P]), method="midpoint")
+    np.testing.assert_allclose(found[:, :3], far[:, :3] / far[:, 3:], rtol=1e-3, atol=1.0)
+
+
 def test_observations_in_any_order_give_the_same_points():
     rng = np.random.default_rng(1)
     P, xy = several_views(rng, 1.0)

@@ -30,7 +30,8 @@ _AT_REST = 1e-6
 _ONE_CENTRE = 1e-12
 """Distance of two centres, over 1 plus that from the origin, below which they are equal to rounding."""
 _PARALLEL = 1e-14
-"""Determinant of the mid-point system below which rays are parallel: about 2 sin^2 of the angle of two."""
+"""Determinant of the mid-point system of two rays, about 2 sin^2 of their angle, below which they are parallel;
+it grows with the third power of their number."""
 
 
 @kernel
@@ -336,7 +337,8 @@ def _midpoint(P: F64, listed: _SortedPixels) -> F64:
     A, b = np.zeros((len(start) - 1, 3, 3)), np.zeros((len(start) - 1, 3, 1))
     np.add.at(A, point, np.eye(3) - d[:, :, None] * d[:, None])
     np.add.at(b, point, (r - np.sum(d * r, axis=1, keepdims=True) * d)[:, :, None])
-    good = (np.bincount(point[apart], minlength=len(A)) > 0) & (np.linalg.det(A) > _PARALLEL)
+    least = _PARALLEL * (np.diff(start) / 2.0) ** 3
+    good = (np.bincount(point[apart], minlength=len(A)) > 0) & (np.linalg.det(A) > least)
     X = np.zeros((len(start) - 1, 4))
     X[good] = homogenize(np.linalg.solve(A[good], b[good])[:, :, 0] + origin)
     return X
