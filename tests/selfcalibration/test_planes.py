@@ -9,6 +9,7 @@ from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CO
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._conditioning import pixel_from_unit
+from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion, _plane_box
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
@@ -174,3 +175,19 @@ def test_local_minima_are_no_worse_than_any_of_their_neighbours():
     expected.sort(key=lambda cell: score[cell])
     found = _local_minima(score)
     assert [tuple(np.array(np.unravel_index(k, score.shape)).tolist()) for k in found] == expected
+
+
+def test_copies_of_one_point_set_no_bounds():
+    scene = make_scene(seed=0)
+    X = np.tile([0.1, 0.2, 0.3, 1.0], (50, 1))
+    xh = np.einsum("vij,nj->vni", scene.P, X)
+    H = np.random.default_rng(0).normal(size=(4, 4))
+    one = Reconstruction.from_cameras(
+        scene.P @ np.linalg.inv(H), sizes=scene.sizes, X=X @ H.T, xy=xh[..., :2] / xh[..., 2:],
+        stratum="projective",
+    )  # fmt: skip
+    prior, rng = prior_for(scene, NOTHING_BUT_CONSTANT), np.random.default_rng(0)
+    with pytest.raises(StageFailure, match="found no plane at infinity"):
+        Stratified(CheiralitySearch()).calibrate(one, prior=prior, rng=rng)
+    found = Stratified(ModulusConstraint()).calibrate(one, prior=prior, rng=rng)
+    np.testing.assert_allclose(found.K, scene.K, rtol=1e-6, atol=1e-3)

@@ -89,9 +89,13 @@ class CheiralityRegion:
 
 
 def _polytope_of(X: F64, C: F64) -> Polytope | None:
-    """Return the polytope of oriented points (N, 4) and centres (R, 4) by linear programs; None if empty."""
+    """Return the polytope of oriented points (N, 4) and centres (R, 4) by linear programs.
+
+    None if it is empty, or if all points are one.
+    """
     v = _deepest_plane(np.concatenate([X, C]))
-    if v is None:
+    extent = np.linalg.svd(X, compute_uv=False)
+    if v is None or not extent[1] > 1e-12 * extent[0]:
         return None
     T = _quasi_affine_frame(X, v)
     rows = _unit_rows(np.concatenate([X, C]) @ T.T)
