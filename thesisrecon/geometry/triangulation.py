@@ -30,8 +30,8 @@ _AT_REST = 1e-6
 _ONE_CENTRE = 1e-12
 """Distance of two centres, over 1 plus that from the origin, below which they are equal to rounding."""
 _PARALLEL = 1e-14
-"""Determinant of the mid-point system of two rays below which they are parallel, about 2 sin^2 of their angle; it
-grows with the third power of the number of rays."""
+"""Determinant of the mid-point system of two rays, about 2 sin^2 of their angle, below which they are
+parallel; it grows with the third power of their number."""
 
 
 @kernel
