@@ -187,6 +187,10 @@ def test_a_nested_field_of_several_kinds_takes_a_word_or_a_table():
         ("intrinsics.focal_px=1000", "needs focal_std_rel"),
         ("intrinsics.exif=true", "needs focal_std_rel"), ("selfcalibration.focal_range=[1]", "list of 2"),
         ("selfcalibration.search=7", "takes a table"), ("images", "stage.field=value"),
+        ("projective.max_initial_pairs=0", "at least 1; got 0"),
+        ("projective.core_views=-3", "at least 0; got -3"),
+        ("selfcalibration.focal_steps=0", "at least 1; got 0"),
+        ("selfcalibration.max_refined=0", "at least 1; got 0"),
         ("=3", "stage.field=value"), ("images.=3", "stage.field=value"), ("images=3", "stage.field=value"),
     ],
 )  # fmt: skip

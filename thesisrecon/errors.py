@@ -44,6 +44,19 @@ def counted(number: int, noun: str, shown: str = "") -> str:
     return f"{shown or number} {noun}{ending}"
 
 
+def require_at_least(method: object, **least: float) -> None:
+    """Raise ``ValueError`` if a setting of a method is below its least value.
+
+    Parameters
+    ----------
+    method, **least : object, float
+        The method, and the least value of some of its fields.
+    """
+    for name, bound in least.items():
+        if getattr(method, name) < bound:
+            raise ValueError(f"{name} must be at least {bound}; got {getattr(method, name)}")
+
+
 def in_words(value: Any) -> str:
     """Return the ``repr`` of a value for a message, shortened.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import StageFailure, counted, require_at_least
 from thesisrecon.geometry.robust_resection import resect_projective
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.numerics._partial_bundle import refine_camera
@@ -119,6 +119,9 @@ class IncrementalProjective:
     local_bundle_views: int = 4
     max_initial_pairs: int = 3
     core_views: int = 40
+
+    def __post_init__(self) -> None:
+        require_at_least(self, points_per_view=1, max_initial_pairs=1, core_views=0)
 
     def reconstruct(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0

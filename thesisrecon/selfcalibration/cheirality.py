@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, require_at_least
 from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion, Polytope, distinct_planes
 from thesisrecon.selfcalibration._frame import (
@@ -44,6 +44,9 @@ class CheiralitySearch:
     max_candidates: int = 10
     refine_iterations: int = 15
     max_points: int = 2000
+
+    def __post_init__(self) -> None:
+        require_at_least(self, steps=1, max_candidates=1, refine_iterations=0, max_points=8)
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """Find candidate planes at infinity, best first.

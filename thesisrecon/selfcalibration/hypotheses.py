@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.errors import require_at_least
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
@@ -71,6 +72,9 @@ class HypothesesAndRefinement:
     min_in_front_ratio: float = 0.95
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
     search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
+
+    def __post_init__(self) -> None:
+        require_at_least(self, focal_steps=1, max_refined=1, max_candidates=1, max_full_refined=1)
 
     @as_stage_failure
     def calibrate(

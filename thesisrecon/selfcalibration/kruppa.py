@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import StageFailure, counted, require_at_least
 from thesisrecon.geometry._conditioning import pixel_from_unit, require_finite, require_shapes, unit_norm
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -167,6 +167,9 @@ class KruppaEquations:
     loss_scale: float = 0.02
     min_common_points: int = 20
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def __post_init__(self) -> None:
+        require_at_least(self, focal_steps=1, starts=1)
 
     @as_stage_failure
     def calibrate(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import StageFailure, counted, require_at_least
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion, distinct_planes
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene
 from thesisrecon.selfcalibration._refinement import minimize_batch
@@ -71,6 +71,9 @@ class ModulusConstraint:
     max_candidates: int = 21
     max_wrong_side_ratio: float = 0.02
     max_points: int = 2000
+
+    def __post_init__(self) -> None:
+        require_at_least(self, starts=1, max_candidates=1, max_points=8)
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; ``rng`` draws the starts."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from thesisrecon.errors import require_at_least
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
@@ -86,6 +87,9 @@ class NonlinearQuadric:
     starts: int = 5
     loss_scale: float = 0.05
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def __post_init__(self) -> None:
+        require_at_least(self, focal_steps=1, starts=1)
 
     @as_stage_failure
     def calibrate(

@@ -9,7 +9,7 @@ from typing import TypeVar, cast
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, require_at_least
 from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -56,6 +56,9 @@ class Stratified:
     max_candidates: int = 1
     min_in_front_ratio: float = 0.5
     criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    def __post_init__(self) -> None:
+        require_at_least(self, max_candidates=1)
 
     def with_images(self, images: Iterable[Image]) -> Stratified:
         """Return the same method with the images, if the plane is estimated from them.
