@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import zoom
+from scipy.ndimage import gaussian_filter, zoom
 
 from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_scene, texture
 from thesisrecon import match_pair
-from thesisrecon.config import preset
+from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
@@ -48,6 +48,20 @@ def test_an_image_of_32_pixels_is_rejected_with_the_required_size(name):
     left, right = stereo()
     with pytest.raises(StageFailure, match="32 x 32 pixels; the minimum is 64 x 64"):
         match_pair(left[:32, :32].copy(), right[:32, :32].copy(), config=preset(name))
+
+
+@pytest.mark.parametrize("growth", [True, False])
+def test_images_in_fog_have_seeds_but_no_corners_and_do_not_match(growth):
+    """All that is left in a faint and blurred image is seen at the coarser levels of the seeds only."""
+    haze = gaussian_filter(np.random.default_rng(0).normal(size=(620, 1040)), 20.0)
+    haze = gray(128.0 + 4.0 * haze / haze.std())
+    detector, matcher = MultiScaleCorners(), SeedsAndGrowth(growth=growth)
+    images = [photograph(part) for part in (haze[:600, :1000], haze[6:606, 20:1020])]
+    views = [matcher.prepare(image, detector.detect(image)) for image in images]
+    assert min(len(view.features.seeds.xy) for view in views) > 100
+    assert max(len(view.features.xy) for view in views) == 0
+    options = {"estimate_fundamental": PipelineConfig().epipolar.estimate, "rng": np.random.default_rng(0)}
+    assert len(matcher.match(*views, pair=(0, 1), **options).xy1) == 0
 
 
 @pytest.mark.parametrize(

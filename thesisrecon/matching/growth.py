@@ -370,6 +370,9 @@ class SeedsAndGrowth:
                 "seeds-and-growth matching needs features with seeds; set "
                 "features.kind=multi-scale-corners, or matching.kind=strength-of-match"
             )
+        # Faint and blurred images have seeds at the coarse levels only.
+        if not (len(features1.xy) and len(features2.xy)):
+            return empty_matches(pair)
         sets = seed_matches(features1, features2, pair, orientation=self.orientation, ratio=self.ratio)
         start = self._verified_seeds(sets, estimate_fundamental, rng)
         if start is None:
