@@ -112,6 +112,31 @@ def test_nothing_is_seen_where_nothing_is():
     assert render(needle, camera).valid.sum() <= 64
 
 
+@pytest.mark.parametrize("far", [1e9, np.inf, np.nan])
+def test_vertices_that_no_face_uses_have_no_effect(far):
+    camera, plain = Camera(K, np.eye(3), np.zeros(3), SIZE), wall()
+    more = replace(plain, vertices=np.vstack([plain.vertices, [[0.0, 0.0, far]]]))
+    np.testing.assert_array_equal(render(more, camera).depth, render(plain, camera).depth)
+
+
+def test_light_does_not_depend_on_the_origin():
+    """In metres of a map grid single precision has steps of half a metre."""
+    size = 30
+    x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-2.0, 2.0, size)]))
+    vertices = np.column_stack([x, y, 4.0 + 0.3 * np.sin(3.0 * x)])
+    at = np.arange(size * size).reshape(size, size)
+    corners = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
+    faces = np.concatenate([np.stack([corners[k].ravel() for k in face], 1) for face in ((0, 2, 1), (0, 3, 2))])
+    origin, lamp = np.array([5e5, 5e6, 100.0]), np.array([0.2, -0.3, 0.5])
+    seen = []
+    for shift in (np.zeros(3), origin):
+        camera = Camera(K, np.eye(3), -shift, SIZE)
+        shading = Shading(ambient=0.2, lights=(Light(position=tuple(lamp + shift)),))
+        seen.append(render(TexturedMesh(vertices + shift, faces), camera, shading=shading).color.astype(int))
+    assert np.ptp(seen[0]) > 100
+    assert np.abs(seen[0] - seen[1]).max() <= 1
+
+
 def test_a_shape_alone_is_grey():
     assert (render(wall(), Camera(K, np.eye(3), np.zeros(3), SIZE)).color == 200).all()
 
@@ -124,6 +149,10 @@ def test_wrong_calls_are_refused():
     with pytest.raises(ValueError, match="uv must be"):
         render(wall(uv=np.zeros((1, 3, 2)), texture=np.zeros((2, 2, 3), np.uint8)), camera)
     refuses(ValueError, "colors must be", render, wall(colors=np.zeros((1, 3), np.uint8)), camera)
+    hole = replace(wall(), vertices=np.where(np.arange(4)[:, None] == 2, np.nan, wall().vertices))
+    refuses(ValueError, "vertices of faces must be finite", render, hole, camera)
+    texture = {"texture": np.zeros((2, 2, 3), np.uint8)}
+    refuses(ValueError, "uv must be finite", render, wall(uv=np.full((2, 3, 2), np.nan), **texture), camera)
     refuses(ValueError, "either a direction or a position", Light)
 
 

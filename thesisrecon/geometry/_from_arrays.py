@@ -1,4 +1,4 @@
-"""Cameras, sizes, points and pixels as a user passes them, checked and in the shapes of the records."""
+"""Cameras, sizes, points, pixels and meshes as a user passes them, checked, in the shapes of the records."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thesisrecon.geometry._conditioning import (
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.triangulation import triangulate
-from thesisrecon.records import Reconstruction
+from thesisrecon.records import Reconstruction, TexturedMesh
 
 CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction
 """Cameras, (K, R, t), cameras by image name, or a metric reconstruction."""
@@ -143,3 +143,23 @@ def radial_coefficients(caller: str, views: Sequence[Camera]) -> F64:
             raise ValueError(f"{caller} takes distortion by k1, k2, k3; got {len(lens)} coefficients")
         row[: len(lens[:3])] = lens[:3]
     return table
+
+
+def require_mesh(caller: str, mesh: TexturedMesh) -> None:
+    """``ValueError`` unless it is a mesh whose faces, colours and texture coordinates fit its vertices.
+
+    Vertices that no face uses need not be finite.
+    """
+    if not isinstance(mesh, TexturedMesh):
+        given = f"got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
+        raise ValueError(f"{caller} needs a TexturedMesh; {given}")
+    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise ValueError(f"{caller}: the faces refer to vertices that do not exist")
+    if not np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all():
+        raise ValueError(f"{caller}: the vertices of faces must be finite")
+    if mesh.uv is not None and mesh.uv.shape != (len(mesh.faces), 3, 2):
+        raise ValueError(f"{caller}: uv must be ({len(mesh.faces)}, 3, 2); got {mesh.uv.shape}")
+    if mesh.uv is not None and not np.isfinite(mesh.uv).all():
+        raise ValueError(f"{caller}: uv must be finite")
+    if mesh.colors is not None and mesh.colors.shape != mesh.vertices.shape:
+        raise ValueError(f"{caller}: colors must be {mesh.vertices.shape}; got {mesh.colors.shape}")

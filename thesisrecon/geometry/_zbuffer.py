@@ -16,7 +16,7 @@ from thesisrecon.kernels import empty, kernel
 _SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
 _NEAR = 1e-6
-"""Nearest depth that is drawn, relative to the depth of the farthest vertex."""
+"""Nearest depth that is drawn, relative to the depth of the farthest corner of a face."""
 
 
 @kernel
@@ -178,9 +178,11 @@ def image_corners(vertices: F64, faces: I64, camera: Camera) -> tuple[F64, float
     """Image points K (R X + t) (M, 3, 3) of the corners of faces, and the nearest depth that is drawn."""
     if not camera.is_pinhole:
         raise ValueError("Rendering needs a camera without distortion: undistort the image first")
-    seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
-    near = _NEAR * max(float(np.abs(seen[:, 2]).max(initial=0.0)), 1e-300)
-    return np.ascontiguousarray(seen[faces]), near
+    # Vertices that no face uses may not be finite.
+    with np.errstate(invalid="ignore"):
+        seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
+    corners = np.ascontiguousarray(seen[faces])
+    return corners, _NEAR * max(float(np.abs(corners[..., 2]).max(initial=0.0)), 1e-300)
 
 
 def rasterize_corners(corners: F64, near: float, shape: tuple[int, int], *, threads: int = 1) -> Raster:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
+from thesisrecon.geometry._from_arrays import require_mesh
 from thesisrecon.geometry._zbuffer import (
     Raster,
     image_corners,
@@ -169,14 +170,18 @@ def render(
     """
     if samples < 1:
         raise ValueError(f"render needs at least one sample a side; got {samples}")
-    _check(mesh)
+    require_mesh("render", mesh)
     shape = camera.size[::-1]
     rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
     valid = np.empty(shape, dtype=bool)
     behind = np.asarray(background, dtype=np.float32)
     values = mesh.colors if mesh.texture is None or mesh.uv is None else mesh.uv
     source = None if values is None else np.ascontiguousarray(values, dtype=np.float32)
-    lit = [] if shading is None else [a.astype(np.float32) for a in (mesh.vertices, _vertex_normals(mesh))]
+    lit: list[F32] = []
+    if shading is not None:
+        # About the camera: single precision would round coordinates of a map grid.
+        shading = _moved(shading, camera.centre)
+        lit = [a.astype(np.float32) for a in (mesh.vertices - camera.centre, _vertex_normals(mesh))]
 
     def measure(start: int, stop: int, raster: Raster) -> None:
         valid[start:stop] = raster.face >= 0
@@ -189,7 +194,7 @@ def render(
             color = _colors(mesh, source, part)
             if shading is not None:
                 points, normals = (part.interpolate(v, mesh.faces).reshape(-1, 3) for v in lit)
-                _shade(color.reshape(-1, 3), points, normals, camera.centre, shading)
+                _shade(color.reshape(-1, 3), points, normals, np.zeros(3), shading)
             _average_blocks(color, part.face, samples, behind, rgb[first:last])
 
     if samples == 1:
@@ -218,19 +223,6 @@ def _in_parts(
     run_in_strips(work, height // samples, threads)
 
 
-def _check(mesh: TexturedMesh) -> None:
-    if not isinstance(mesh, TexturedMesh):
-        raise ValueError(
-            f"render needs a TexturedMesh; got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
-        )
-    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
-        raise ValueError("the faces refer to vertices that do not exist")
-    if mesh.uv is not None and mesh.uv.shape != (len(mesh.faces), 3, 2):
-        raise ValueError(f"uv must be ({len(mesh.faces)}, 3, 2); got {mesh.uv.shape}")
-    if mesh.colors is not None and mesh.colors.shape != mesh.vertices.shape:
-        raise ValueError(f"colors must be {mesh.vertices.shape}; got {mesh.colors.shape}")
-
-
 def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
     """Unlit colours (H, W, 3), 0 to 255; ``source``: texture coordinates, colours of the vertices or None."""
     if source is None:
@@ -240,6 +232,15 @@ def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
     color = np.zeros((*raster.face.shape, 3), dtype=np.float32)
     sample_texture(mesh.texture, raster.interpolate(source), raster.face, color)
     return color
+
+
+def _moved(shading: Shading, origin: F64) -> Shading:
+    """The shading in coordinates about another origin."""
+    lights = (
+        light if light.position is None else replace(light, position=tuple(np.subtract(light.position, origin)))
+        for light in shading.lights
+    )
+    return replace(shading, lights=tuple(lights))
 
 
 def _shade(color: F32, points: F32, normals: F32, eye: F64, shading: Shading) -> None:
