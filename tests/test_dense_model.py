@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,22 @@ import pytest
 
 import thesisrecon
 from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
-from thesisrecon import Camera, Reconstruction, StageFailure, depth_maps, fuse_depth_maps, texture, write_mesh
+from thesisrecon import (
+    Camera,
+    PipelineConfig,
+    Reconstruction,
+    StageFailure,
+    TexturedMesh,
+    depth_maps,
+    fuse_depth_maps,
+    texture,
+    write_mesh,
+)
 from thesisrecon.errors import UsageError
-from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.geometry.camera_matrix import decompose_camera, project
 from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.stereo.depth import MultiViewStereo
+from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from validation.scenes.real import load_fixture_depth
 
@@ -93,6 +107,50 @@ def test_a_surface_of_plain_depths_has_them(walled):
     assert np.isfinite(off).mean() > 0.9
     small = fuse_depth_maps([depth[::2, ::2] for depth in depths], cameras)
     assert np.nanmedian(np.abs(thesisrecon.render(small, cameras[1]).depth / depths[1] - 1.0)) < 0.01
+
+
+@pytest.mark.parametrize("fusion", [VolumetricFusion(), DepthSheets()], ids=["volumetric", "sheets"])
+def test_infinite_depths_of_a_renderer_are_unknown(fusion):
+    """Renderers give infinity where no surface is."""
+    K = np.array([[200.0, 0, 119.5], [0, 200, 89.5], [0, 0, 1]])
+    cameras = [Camera(K, np.eye(3), np.array([-x, 0.0, 0.0]), SIZE) for x in (0.0, 0.2)]
+    config = replace(PipelineConfig(), model=SurfaceModel(fusion=fusion))
+    found = []
+    for empty in (np.nan, np.inf):
+        depth = np.full(SIZE[::-1], 3.0)
+        depth[:, SIZE[0] // 2 :] = empty
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found.append(fuse_depth_maps([depth, depth], cameras, config=config))
+    assert len(found[0].faces)
+    for name in ("vertices", "faces"):
+        np.testing.assert_array_equal(getattr(found[1], name), getattr(found[0], name))
+
+
+def test_observations_are_in_the_pixels_of_the_reduced_images(monkeypatch, walled):
+    """A depth estimator of your own may use them."""
+    seen = []
+
+    def prepare(self, images, reconstruction, **more):
+        seen.append(reconstruction)
+        raise StageFailure("seen")
+
+    monkeypatch.setattr(MultiViewStereo, "prepare", prepare)
+    cameras = _cameras()
+    X = np.column_stack([*np.random.default_rng(0).uniform(-0.8, 0.8, (2, 60)), np.full(60, 6.0)])
+    xy = np.stack([camera.project(X) for camera in cameras])
+    xy[~((xy >= 0.0) & (xy <= np.array(SIZE) - 1.0)).all(axis=2)] = np.nan
+    arrays = (np.stack([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t"))
+    given = Reconstruction.from_cameras(*arrays, sizes=SIZE, X=X, xy=xy)
+    with pytest.raises(StageFailure, match="seen"):
+        depth_maps([image.rgb for image in walled.images], given, max_size=120)
+    (reduced,) = seen
+    tracks = reduced.tracks
+    assert len(tracks.xy) > 100
+    for i, P in enumerate(reduced.P):
+        here = tracks.view_index == i
+        off = project(P, reduced.X[tracks.point_index[here]]) - tracks.xy[here]
+        np.testing.assert_allclose(off, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("max_size", "side"), [(None, 1600), (1700, 1700), (400, 400)])
@@ -178,6 +236,8 @@ def test_wrong_input_gets_one_sentence(walled, tmp_path):
             lambda: texture(fuse_depth_maps([np.ones((180, 240))], cameras[:1]), images, [1]),
             "thesisrecon.Camera",
         ),
+        (lambda: texture(None, images, cameras), "texture needs a TexturedMesh; got a NoneType"),
+        (lambda: texture(TexturedMesh(np.eye(3), np.array([[0, 1, 3]])), images, cameras), "do not exist"),
         (lambda: fuse_depth_maps([np.ones((180, 240))]), "needs the cameras"),
         (lambda: fuse_depth_maps([np.ones((100, 240))], cameras[:1]), "needs a camera of its shape"),
     ):

@@ -15,7 +15,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.geometry._conditioning import resizing_transform
-from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients
+from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients, require_mesh
 from thesisrecon.io._images import list_images, read_image, rotation_words
 from thesisrecon.pipeline._image_pair import ImageInput
 from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks
@@ -133,7 +133,7 @@ def fuse_depth_maps(
     Parameters
     ----------
     depth_maps : sequence of DepthMap or ndarray (H, W)
-        Result of :func:`depth_maps`; or plain depths z in the camera frame, NaN where unknown, of images
+        Result of :func:`depth_maps`; or plain depths z in the camera frame, NaN or infinite where unknown, of images
         without distortion, whose standard deviation is taken as the size of a pixel.
     cameras, sizes : sequence of Camera, tuple (K, R, t) or Reconstruction, array_like
         For plain depths: their cameras; for maps of another size they are scaled, (x + 0.5) s - 0.5.
@@ -203,7 +203,8 @@ def texture(
     Raises
     ------
     ValueError, StageFailure
-        If a camera is missing or is not of its image's size; if no view shows a face completely.
+        If the mesh is invalid; if a camera is missing or is not of its image's size; if no view shows a face
+        completely.
 
     Examples
     --------
@@ -218,6 +219,7 @@ def texture(
     >>> texture(mesh, [image], [camera]).texture.dtype
     dtype('uint8')
     """
+    require_mesh("texture", mesh)
     method = as_config(config)
     read, model = _scene("texture", images, cameras, sizes, max_size or method.images.max_size_px)
     views = [pinhole_view(image, model, i, max_side=max(image.size)) for i, image in enumerate(read)]
@@ -251,7 +253,9 @@ def _scene(
     if isinstance(cameras, Reconstruction) and len(cameras.tracks.xy):
         kept = cameras.registered[cameras.tracks.view_index]
         t, number = cameras.tracks, np.cumsum(cameras.registered) - 1
-        tracks = Tracks(number[t.view_index[kept]], t.point_index[kept], t.xy[kept], len(read), t.n_points)
+        view = number[t.view_index[kept]]
+        xy = (t.xy[kept] + 0.5) * np.array([image.scale for image in read])[view, None] - 0.5
+        tracks = Tracks(view, t.point_index[kept], xy, len(read), t.n_points)
         model = replace(model, X=cameras.X, valid=cameras.valid, inlier=cameras.inlier[kept], tracks=tracks)
     return read, model
 
@@ -294,7 +298,8 @@ def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
 def _plain(number: int, depth: F32 | F64, camera: Camera) -> DepthMap:
     """The depth map of an array of the camera's size or smaller."""
     z: F32 = np.array(depth, dtype=np.float32)
-    z[~(z > 0.0)] = np.nan
+    # Renderers give infinity where no surface is.
+    z[~((z > 0.0) & (z < np.inf))] = np.nan
     if z.ndim != 2 or not camera.is_pinhole:
         raise ValueError(f"plain depths need (H, W) and a camera without distortion; got {z.shape}")
     height, width = z.shape
