@@ -133,8 +133,8 @@ def fuse_depth_maps(
     Parameters
     ----------
     depth_maps : sequence of DepthMap or ndarray (H, W)
-        Result of :func:`depth_maps`; or plain depths z in the camera frame, NaN or infinite where unknown, of images
-        without distortion, whose standard deviation is taken as the size of a pixel.
+        Result of :func:`depth_maps`; or plain depths z in the camera frame, NaN or infinite where unknown, of
+        images without distortion, whose standard deviation is taken as the size of a pixel.
     cameras, sizes : sequence of Camera, tuple (K, R, t) or Reconstruction, array_like
         For plain depths: their cameras; for maps of another size they are scaled, (x + 0.5) s - 0.5.
     config, threads : PipelineConfig, str or Path, int

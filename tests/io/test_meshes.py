@@ -1,5 +1,7 @@
 """Meshes and point clouds as files."""
 
+from dataclasses import replace
+
 import numpy as np
 import trimesh
 
@@ -51,6 +53,21 @@ def test_a_bare_mesh_is_written_and_the_bytes_are_the_same_again(tmp_path):
         write_mesh(tmp_path / name, TexturedMesh(roof().vertices, roof().faces))
     assert (tmp_path / "one.glb").read_bytes() == (tmp_path / "two.glb").read_bytes()
     assert len(trimesh.load(tmp_path / "one.glb", process=False, force="mesh").faces) == 2
+
+
+def test_a_mesh_that_no_program_could_read_is_not_written(tmp_path):
+    plain = TexturedMesh(roof().vertices, roof().faces)
+    hole = np.where(np.arange(4)[:, None] == 3, np.nan, plain.vertices)
+    for mesh, words in (
+        (replace(plain, vertices=hole), "vertices of faces must be finite"),
+        (replace(plain, faces=plain.faces + 1), "vertices that do not exist"),
+        (replace(roof(), uv=roof().uv * np.nan), "uv must be finite"),
+    ):
+        refuses(ValueError, words, write_mesh, tmp_path / "model.glb", mesh)
+    assert not (tmp_path / "model.glb").exists()
+    unused = replace(plain, vertices=np.vstack([np.full(3, np.nan), plain.vertices]), faces=plain.faces + 1)
+    write_mesh(tmp_path / "model.glb", unused)
+    np.testing.assert_allclose(read_mesh(tmp_path / "model.glb").vertices, plain.vertices, atol=1e-7)
 
 
 def test_a_textured_glb_is_read_as_it_was_written(tmp_path):

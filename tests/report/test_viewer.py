@@ -116,6 +116,14 @@ def test_a_flat_model_has_a_box():
     assert (np.array(data["high"]) > data["low"]).all()
 
 
+def test_a_fan_about_a_stray_is_shown_all_the_same():
+    angle = np.linspace(0.0, 2.0 * np.pi, 41)[:-1]
+    rim = np.column_stack([np.cos(angle), np.sin(angle), np.full(40, 4.0)])
+    faces = np.array([[k, (k + 1) % 40, 40] for k in range(40)])
+    fan = TexturedMesh(np.vstack([rim, [[0.0, 0.0, 1000.0]]]), faces)
+    assert len(corners(data_of(fan))) == 40
+
+
 def test_a_stray_does_not_take_the_resolution_of_the_rest():
     mesh = synthetic.sphere_model()
     far = np.array([[500.0, 0, 0], [501, 0, 0], [500, 1, 0]])

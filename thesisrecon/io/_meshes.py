@@ -17,6 +17,7 @@ import PIL.Image
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
+from thesisrecon.geometry._from_arrays import require_mesh
 from thesisrecon.io._files import read_bytes, write_atomically
 from thesisrecon.records import TexturedMesh
 
@@ -122,8 +123,9 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
 
     Raises
     ------
-    UsageError, OutputError
-        If the name does not end in .glb or ``mesh`` is not a TexturedMesh; if the file cannot be written.
+    ValueError, UsageError, OutputError
+        If the mesh is invalid; the name does not end in .glb or ``mesh`` is not a TexturedMesh; the file
+        cannot be written.
 
     Examples
     --------
@@ -138,15 +140,16 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
         raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
     if not isinstance(mesh, TexturedMesh):
         raise UsageError(f"write_mesh needs a TexturedMesh; got a {type(mesh).__name__}")
+    require_mesh("write_mesh", mesh)
     import trimesh
     from trimesh.visual import material as materials
     from trimesh.visual import texture as textures
 
     if mesh.texture is None or mesh.uv is None:
-        colors = None
+        colors, (used, number) = None, np.unique(mesh.faces, return_inverse=True)
         if mesh.colors is not None:
-            colors = np.column_stack([mesh.colors, np.full(len(mesh.colors), 255, dtype=np.uint8)])
-        vertices, faces = mesh.vertices * _HALF_TURN, mesh.faces
+            colors = np.column_stack([mesh.colors[used], np.full(len(used), 255, dtype=np.uint8)])
+        vertices, faces = mesh.vertices[used] * _HALF_TURN, number.reshape(-1, 3)
         made: Any = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
     else:
         vertices, faces, uv = _split_seams(mesh)

@@ -69,9 +69,11 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
 
 
 def _without_outliers(mesh: TexturedMesh) -> TexturedMesh:
-    """Remove far faces, which would leave few quantization levels for the rest."""
+    """Remove far faces, which would leave few quantization levels for the rest, if there is a rest."""
     distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
     keep = (distance <= _OUTLIER * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
+    if not keep.any():
+        return mesh
     return replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
 
 
