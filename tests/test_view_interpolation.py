@@ -21,6 +21,7 @@ from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
+from thesisrecon.stereo._planar import PlanarRectification
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.views.interpolation import InterpolatedPair
 
@@ -122,6 +123,25 @@ def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
         between.prepare_pair(photograph(0), photograph(1), config=config)
     monkeypatch.setattr(MultiViewStereo, "failure", StageFailure("no parallax"))
     refuses(StageFailure, "no parallax", between.prepare_pair, photograph(0), photograph(1), config=config)
+
+
+@pytest.mark.parametrize(("degrees", "possible"), [(0.0, True), (-80.0, True), (100.0, False), (180.0, False)])
+def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeypatch, degrees, possible):
+    """Halfway between an image and one upside down the frame of the view would be a point."""
+    c, s, middle = np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), np.array([19.5, 14.5])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    turn[:2, 2] = middle - turn[:2, :2] @ middle
+    known = DisparityMap(np.zeros((30, 40), np.float32), np.ones((30, 40), np.float32), 0.2)
+    frame = PlanarRectification(np.stack([np.eye(3), turn]), (40, 30))
+    dense = SimpleNamespace(frame=frame, left=known, right=known)
+    pair = SimpleNamespace(F=cross_matrix(np.array([1.0, 0.0, 0.0])), xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
+    monkeypatch.setattr(MultiViewStereo, "match_two_views", lambda *_, **__: dense)
+    if possible:
+        assert between.prepare_pair(photograph(0), photograph(1)).view(0.5).shape == (30, 40, 3)
+        return
+    with pytest.raises(StageFailure, match=f"rolled against each other; by {degrees:.0f} degrees"):
+        between.prepare_pair(photograph(0), photograph(1))
 
 
 def test_records_are_matched_at_their_own_size_and_without_masked_pixels():

@@ -20,7 +20,7 @@ from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo._planar import PlanarRectification
 from thesisrecon.stereo._postprocessing import match_both_sides
-from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right
+from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
 
 _COARSE = 4
 """Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""
@@ -28,6 +28,8 @@ _MIN_SIDE = 64
 """Smaller images are not reduced."""
 _MIN_CONFIDENCE = 0.3
 """Minimum confidence of the disparities from which the largest one is estimated."""
+_MAX_ROLL_DEG = 90.0
+"""Largest rotation of the images against each other: halfway, views show 0.7 of the field of view."""
 _SIDE_BY_SIDE = "take the images side by side, not one behind the other"
 
 
@@ -175,8 +177,9 @@ def prepare_pair(
     Raises
     ------
     UsageError, StageFailure
-        If the images are the same or differ in size; if they do not match, show no parallax, or the camera
-        moved forwards (an epipole lies inside an image: its epipolar lines cannot become rows).
+        If the images are the same or differ in size; if they do not match, show no parallax, are rolled
+        against each other by more than 90 degrees, or the camera moved forwards (an epipole lies inside an
+        image: its epipolar lines cannot become rows).
     """
     config = as_config(config)
     first, second = (
@@ -193,6 +196,9 @@ def prepare_pair(
             raise
         raise StageFailure(failure.reason, failure.evidence, _SIDE_BY_SIDE) from None
     assert isinstance(dense.frame, PlanarRectification)
+    if abs(roll := roll_between(dense.frame.H, first.size)) > _MAX_ROLL_DEG:
+        evidence = f"by {abs(roll):.0f} degrees, at most {_MAX_ROLL_DEG:.0f} leave views between them"
+        raise StageFailure("the images are rolled against each other", evidence, "turn one of them upright")
     return InterpolatedPair((first.rgb, second.rgb), dense.frame.H, dense.left, dense.right)
 
 

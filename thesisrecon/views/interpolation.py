@@ -62,6 +62,32 @@ def original_from_rectified(H: F64, size: tuple[int, int], s: float) -> F64:
     ndarray (3, 3)
         The homography; its determinant is positive where those of H are.
     """
+    corners, left, right = _quadrilaterals(H, size)
+    return _homography((1.0 - s) * left + s * right, corners)
+
+
+def roll_between(H: F64, size: tuple[int, int]) -> float:
+    """Return the angle by which the second image is rotated about its axis against the first, in degrees.
+
+    Parameters
+    ----------
+    H, size
+        As in :func:`original_from_rectified`. If the angle approaches 180 degrees, the quadrilateral of the
+        views in the middle shrinks to a point.
+
+    Returns
+    -------
+    float
+        From -180 to 180.
+    """
+    _, *both = _quadrilaterals(H, size)
+    left, right = (quadrilateral - quadrilateral.mean(axis=0) for quadrilateral in both)
+    across = left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
+    return float(np.degrees(np.arctan2(across.sum(), (left * right).sum())))
+
+
+def _quadrilaterals(H: F64, size: tuple[int, int]) -> tuple[F64, F64, F64]:
+    """A rectangle (4, 2) of image pixels in front of both cameras, and its place in the frame for each."""
     width, height = size
     middle = 0.5 * np.array([width - 1.0, height - 1.0])
     reach = np.maximum(middle, 0.5) * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -73,7 +99,7 @@ def original_from_rectified(H: F64, size: tuple[int, int], s: float) -> F64:
         reach *= SHRINK
     corners = middle + reach
     left, right = (dehomogenize(homogenize(corners) @ side.T) for side in H)
-    return _homography((1.0 - s) * left + s * right, corners)
+    return corners, left, right
 
 
 def _homography(source: F64, target: F64) -> F64:
