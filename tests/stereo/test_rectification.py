@@ -222,6 +222,15 @@ def test_pairs_without_depth_are_refused_with_a_reason():
     refuses(StageFailure, "no parallax", rectify_cameras, *near, SIZE, SIZE, xy1=scene.xy1, xy2=x2)
 
 
+@pytest.mark.parametrize("motion", ["beside", "toed in", "upwards", "diagonal"])
+def test_images_in_the_other_order_do_not_fit_the_fundamental_matrix(motion):
+    """Their rows would be off by tens of pixels; with noise the right ones are within one or two."""
+    scene = make_pair(motion, np.random.default_rng(13), noise_px=0.5)
+    sizes = scene.sizes[::-1]
+    refuses(StageFailure, "does not fit the matches", rectify_pair, scene.F, scene.xy2, scene.xy1, *sizes)
+    rectify_pair(scene.F.T, scene.xy2, scene.xy1, *sizes)
+
+
 def test_contradictions_and_too_little_are_refused_with_a_reason():
     scene = make_pair("forward", np.random.default_rng(12))
     # Half of the points moved to the other side of the epipole, where their lines run on.

@@ -16,6 +16,8 @@ from thesisrecon.geometry.two_view import sampson_residuals
 
 _PARALLAX_PER_NOISE, _MIN_PARALLAX_PX = 3.0, 0.05
 """Least parallax (90 % quantile): this multiple of the epipolar distances plus this many px."""
+_MAX_OFF_PX, _MAX_OFF_REL = 1.0, 0.001
+"""Largest median distance of the matches of F from their epipolar lines, in px or over their extent."""
 
 
 def homography_linear(xy1: F64, xy2: F64) -> F64:
@@ -66,15 +68,25 @@ def require_parallax_of_matches(
 
     F is then arbitrary and the images contain no depth: the camera only rotated, or the scene is a plane.
     ``at_infinity`` is the homography of the plane at infinity of known cameras: a plane then has parallax.
+    Without it, matches that are no inliers of F are refused too, as of images in the other order.
     """
-    noise = float(np.quantile(np.abs(sampson_residuals(F, xy1, xy2)), 0.9))
+    distances = np.abs(sampson_residuals(F, xy1, xy2))
+    noise, off = (float(np.quantile(distances, share)) for share in (0.9, 0.5))
+    most = max(_MAX_OFF_PX, _MAX_OFF_REL * float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max())))
     if at_infinity is None:
         what, residuals = "one homography", _homography_residuals(xy1, xy2)
     else:
         what, residuals = "a scene at infinity", homography_residuals(at_infinity, xy1, xy2)
     parallax = float(np.quantile(residuals, 0.9))
-    if parallax > _PARALLAX_PER_NOISE * noise + _MIN_PARALLAX_PX:
+    fits = at_infinity is not None or off <= most
+    if fits and parallax > _PARALLAX_PER_NOISE * noise + _MIN_PARALLAX_PX:
         return
+    if not fits and parallax > most:
+        raise StageFailure(
+            "the fundamental matrix does not fit the matches",
+            f"their median distance from the epipolar lines is {off:.3g} px",
+            "estimate it from these matches, with the images in this order",
+        )
     raise StageFailure(
         "the images show no parallax: the camera only rotated, or the scene is a plane or too far away",
         f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px; the noise is {noise:.2g} px",

@@ -22,10 +22,8 @@ from thesisrecon.geometry._conditioning import require_calibration, require_fini
 from thesisrecon.geometry._homography import require_parallax_of_matches
 from thesisrecon.geometry.camera_matrix import calibration_matrix, rq
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
-from thesisrecon.geometry.two_view import enforce_rank_two, epipoles, sampson_residuals
+from thesisrecon.geometry.two_view import enforce_rank_two, epipoles
 
-MAX_RESIDUAL = 0.005
-"""Median distance of matches from their epipolar lines, per long side, above which F is rejected."""
 OFF_ROTATION = 1e-4
 """Tolerance of R'R - I: a rotation written with four digits passes."""
 IN_FRONT = 0.75
@@ -135,14 +133,6 @@ def pair_from_fundamental(
     require_finite("pair_from_fundamental", F, xy1, xy2)
     require_calibration("view synthesis", K1)
     require_calibration("view synthesis", K2)
-    distance = np.abs(sampson_residuals(enforce_rank_two(F), xy1, xy2))
-    extent = float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()))
-    if not np.median(distance) <= MAX_RESIDUAL * extent:
-        raise StageFailure(
-            "the fundamental matrix does not fit the matches",
-            f"their median distance from the epipolar lines is {np.median(distance):.3g} px",
-            "estimate it from these matches",
-        )
     require_parallax_of_matches(F, xy1, xy2)
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
