@@ -154,6 +154,22 @@ def test_a_linear_photograph_is_moved_exactly():
     assert np.isnan(near[beyond]).all()
 
 
+@pytest.mark.parametrize("zoom", [2.0, 6.0, 16.0])
+def test_enlarged_surfaces_have_no_holes_and_stay_apart(zoom):
+    y, x = np.mgrid[0:24, 0:32].astype(float)
+    near = np.where(x < 16, 1.0, 5.0)
+    # The right half is in front and has moved away from the left one.
+    target = zoom * np.stack([x - 12.0 + np.where(x < 16, 0.0, 2.0), y - 4.0], axis=-1)
+    source, front = forward_map(target, near, size=(40, 30), step=1.0)
+    at = np.arange(40) / zoom + 12.0
+    left, right = at <= 15.0, (at >= 18.0) & (at <= 33.0)
+    assert left.any()
+    for seen, places in ((left, at), (right, at - 2.0)):
+        np.testing.assert_allclose(source[..., 0][:, seen], np.tile(places[seen], (30, 1)), atol=1e-4)
+    between = (at > 15.0 + 0.51 + 0.5 / zoom) & (at < 18.0 - 0.51 - 0.5 / zoom)
+    assert np.isnan(front[:, between]).all()
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_nearer_pixel_wins_in_any_order(order):
     """A square in front of a wall; the photograph is also walked through from its other end."""

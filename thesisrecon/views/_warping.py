@@ -21,8 +21,11 @@ BACKGROUND_FRACTION = 0.4
 may be an outlier."""
 MIN_AREA = 1e-9
 """Twice the area (px^2) of the smallest triangle that is drawn."""
-STRETCH = 3.0
-"""Neighbouring pixels of one surface come at most this far apart (px)."""
+STRETCH, ENLARGED = 3.0, 2.0
+"""Neighbouring pixels of one surface come at most this far apart (px), or so many times their median
+distance in an enlarged view."""
+SPARSE = 16
+"""Subsampling step for the median."""
 
 
 @kernel
@@ -314,17 +317,26 @@ def forward_map(
 
     ``target_xy`` (h, w, 2): position of each pixel in the view, NaN for none; ``inverse_depth`` (h, w):
     larger values are in front, in any unit (a disparity, for example). Pixels are corners of small triangles
-    in which positions are interpolated. Neighbours belong to one surface if they come at most 3 px apart and
-    their inverse depth differs by at most ``step``; at discontinuities a pixel covers half a pixel to each
-    side. Back faces are not drawn.
+    in which positions are interpolated. Neighbours belong to one surface if they come at most 3 px apart, or
+    twice their median distance, and their inverse depth differs by at most ``step``; at discontinuities a
+    pixel covers half a pixel to each side. Back faces are not drawn.
     """
     target = np.ascontiguousarray(target_xy, dtype=np.float64)
     near = np.ascontiguousarray(inverse_depth, dtype=np.float32)
     source = np.full((size[1], size[0], 2), np.nan, dtype=np.float32)
     front = np.full((size[1], size[0]), np.nan, dtype=np.float32)
-    limits = np.array([step, STRETCH])
+    limits = np.array([step, max(STRETCH, ENLARGED * _median_distance(target))])
     run_in_strips(lambda rows: _draw_surface(target, near, limits, rows, source, front), size[1], threads)
     return source, front
+
+
+def _median_distance(target: F64) -> float:
+    """Median distance (px, along either axis) of neighbouring pixels in the view; 0 without any."""
+    pairs = (target[:, 1:], target[:, :-1]), (target[1:], target[:-1])
+    apart = [np.abs(a[::SPARSE, ::SPARSE] - b[::SPARSE, ::SPARSE]).max(axis=2).ravel() for a, b in pairs]
+    distances = np.concatenate(apart)
+    known = distances[np.isfinite(distances)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
