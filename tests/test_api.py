@@ -160,6 +160,9 @@ def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path):
     with pytest.raises(UsageError, match="nothing"):
         thesisrecon.match_rectified(tmp_path / "nothing.png", right, max_disparity_px=12)
     refuses(ValueError, "same shape", thesisrecon.match_rectified, left, right[:-2], max_disparity_px=12)
+    deep = left.astype(np.uint16) * 257
+    words = r"grey levels 0 to 255; got uint16 up to 65\d\d\d"
+    refuses(ValueError, words, thesisrecon.match_rectified, deep, deep, max_disparity_px=12)
 
 
 def test_a_model_is_rendered_through_the_front_door():

@@ -175,5 +175,11 @@ def match_rectified(
     6.0
     """
     images = [side if isinstance(side, np.ndarray) else read_pixels(side) for side in (left, right)]
+    for image in images:
+        # Levels of rectified images may exceed the range a little; those of 16 bits would all be white.
+        if image.dtype.kind in "iu" and image.max(initial=0) > 255:
+            raise ValueError(
+                f"match_rectified needs grey levels 0 to 255; got {image.dtype} up to {image.max()}"
+            )
     dense = as_config(config).dense
     return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)

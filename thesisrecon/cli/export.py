@@ -27,7 +27,12 @@ def export(
     ],
     images: Annotated[
         Path | None,
-        typer.Option("--images", help="Folder of the original images (default: that of the run)."),
+        typer.Option(
+            "--images",
+            parser=parse_folder,
+            metavar="DIR",
+            help="Folder of the original images (default: that of the run).",
+        ),
     ] = None,
     masks: Annotated[
         Path | None,

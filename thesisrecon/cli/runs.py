@@ -47,6 +47,7 @@ def reconstruct(
         Path | None,
         typer.Option(
             "--from",
+            parser=parse_folder,
             metavar="DATABASE|SPARSE",
             help="Take the matches of a COLMAP database, or the tracks of a COLMAP sparse model; its cameras "
             "are not used.",
@@ -54,7 +55,12 @@ def reconstruct(
     ] = None,
     images_folder: Annotated[
         Path | None,
-        typer.Option("--images", help="With --from: the folder of the images, for colours and the model."),
+        typer.Option(
+            "--images",
+            parser=parse_folder,
+            metavar="DIR",
+            help="With --from: the folder of the images, for colours and the model.",
+        ),
     ] = None,
     masks: Annotated[
         Path | None,

@@ -153,8 +153,8 @@ def _view(name: str, entry: Any, camera: int) -> SparseView:
     size = (int(entry["width"]), int(entry["height"])) if "width" in entry else None
     # The record checks shapes and values; its tolerance for R is that of four digits.
     Camera(K, R, t, size or (1, 1), k)
-    if k.shape != (3,) or np.linalg.det(R) < 0 or max(size or (1, 1)) > _MAX_SIDE_PX:
-        raise ValueError("three coefficients, a rotation and possible sides are needed")
+    if k.shape != (3,) or max(size or (1, 1)) > _MAX_SIDE_PX:
+        raise ValueError("three coefficients and possible sides are needed")
     return SparseView(name, R, t, K, size, k, camera)
 
 
