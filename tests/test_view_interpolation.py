@@ -125,7 +125,9 @@ def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
     refuses(StageFailure, "no parallax", between.prepare_pair, photograph(0), photograph(1), config=config)
 
 
-@pytest.mark.parametrize(("degrees", "possible"), [(0.0, True), (-80.0, True), (100.0, False), (180.0, False)])
+@pytest.mark.parametrize(
+    ("degrees", "possible"), [(0.0, True), (-80.0, True), (100.0, False), (180.0, False)]
+)
 def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeypatch, degrees, possible):
     """Halfway between an image and one upside down the frame of the view would be a point."""
     c, s, middle = np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), np.array([19.5, 14.5])
@@ -134,7 +136,9 @@ def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeyp
     known = DisparityMap(np.zeros((30, 40), np.float32), np.ones((30, 40), np.float32), 0.2)
     frame = PlanarRectification(np.stack([np.eye(3), turn]), (40, 30))
     dense = SimpleNamespace(frame=frame, left=known, right=known)
-    pair = SimpleNamespace(F=cross_matrix(np.array([1.0, 0.0, 0.0])), xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    pair = SimpleNamespace(
+        F=cross_matrix(np.array([1.0, 0.0, 0.0])), xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2))
+    )
     monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
     monkeypatch.setattr(MultiViewStereo, "match_two_views", lambda *_, **__: dense)
     if possible:

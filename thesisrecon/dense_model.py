@@ -253,9 +253,9 @@ def _scene(
     if isinstance(cameras, Reconstruction) and len(cameras.tracks.xy):
         kept = cameras.registered[cameras.tracks.view_index]
         t, number = cameras.tracks, np.cumsum(cameras.registered) - 1
-        view = number[t.view_index[kept]]
-        xy = (t.xy[kept] + 0.5) * np.array([image.scale for image in read])[view, None] - 0.5
-        tracks = Tracks(view, t.point_index[kept], xy, len(read), t.n_points)
+        index = number[t.view_index[kept]]
+        xy = (t.xy[kept] + 0.5) * np.array([image.scale for image in read])[index, None] - 0.5
+        tracks = Tracks(index, t.point_index[kept], xy, len(read), t.n_points)
         model = replace(model, X=cameras.X, valid=cameras.valid, inlier=cameras.inlier[kept], tracks=tracks)
     return read, model
 

@@ -126,7 +126,9 @@ def test_light_does_not_depend_on_the_origin():
     vertices = np.column_stack([x, y, 4.0 + 0.3 * np.sin(3.0 * x)])
     at = np.arange(size * size).reshape(size, size)
     corners = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
-    faces = np.concatenate([np.stack([corners[k].ravel() for k in face], 1) for face in ((0, 2, 1), (0, 3, 2))])
+    faces = np.concatenate(
+        [np.stack([corners[k].ravel() for k in face], 1) for face in ((0, 2, 1), (0, 3, 2))]
+    )
     origin, lamp = np.array([5e5, 5e6, 100.0]), np.array([0.2, -0.3, 0.5])
     seen = []
     for shift in (np.zeros(3), origin):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.geometry._conditioning import (
     require_calibration,
@@ -155,7 +155,8 @@ def require_mesh(caller: str, mesh: TexturedMesh) -> None:
         raise ValueError(f"{caller} needs a TexturedMesh; {given}")
     if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
         raise ValueError(f"{caller}: the faces refer to vertices that do not exist")
-    if not np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all():
+    finite: B8 = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
+    if not finite[mesh.faces].all():
         raise ValueError(f"{caller}: the vertices of faces must be finite")
     if mesh.uv is not None and mesh.uv.shape != (len(mesh.faces), 3, 2):
         raise ValueError(f"{caller}: uv must be ({len(mesh.faces)}, 3, 2); got {mesh.uv.shape}")

@@ -237,7 +237,9 @@ def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
 def _moved(shading: Shading, origin: F64) -> Shading:
     """The shading in coordinates about another origin."""
     lights = (
-        light if light.position is None else replace(light, position=tuple(np.subtract(light.position, origin)))
+        light
+        if light.position is None
+        else replace(light, position=tuple(np.subtract(light.position, origin)))
         for light in shading.lights
     )
     return replace(shading, lights=tuple(lights))
