@@ -1,4 +1,4 @@
-"""What the judgements of the stages make of answers that are incomplete."""
+"""Judgements of the stages from incomplete and from reduced answers."""
 
 import numpy as np
 

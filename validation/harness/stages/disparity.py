@@ -57,7 +57,7 @@ class DisparityStage(Stage):
         seconds = []
         for _ in range(runs):
             start = time.process_time()
-            # What the columns at the left border cost is not OpenCV's.
+            # The columns that we add at the left border are not counted as OpenCV's.
             _match(task.method, pair, widened=False)
             seconds.append(time.process_time() - start)
         place = options.place(task.stage, task.scene, task.method)
