@@ -193,9 +193,8 @@ def test_alignment_drops_patches_with_weak_gradients():
 
 def product_twin(a, b, closeness):
     lengths = np.linalg.norm(a), np.linalg.norm(b)
-    return (
-        max(float(a @ b) / (lengths[0] * lengths[1]), 0.0) * max(min(lengths), 1.0) / max(lengths) * closeness
-    )
+    cosine = float(a @ b) / (lengths[0] * lengths[1]) if min(lengths) >= 1.0 else 1.0
+    return max(cosine, 0.0) * max(min(lengths), 1.0) / max(*lengths, 1.0) * closeness
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
@@ -235,6 +234,12 @@ def test_displacements_that_agree_weigh_one():
     assert _displacement_weight(a, -a, 1.0) == 0.0
     assert _displacement_weight(a, np.array([10.0, 10.0]), 0.8) == pytest.approx(0.4)
     assert _displacement_weight(0.01 * a, -0.01 * a, 0.8) == pytest.approx(0.8)
+    # A corner that stays has no direction that another could contradict.
+    for still in (0.0 * a, 0.05 * a, -0.05 * a):
+        for moved in (0.2 * a, -0.2 * a):
+            expected = 0.8 / float(np.hypot(*moved))
+            assert _displacement_weight(still, moved, 0.8) == pytest.approx(expected)
+            assert _displacement_weight(moved, still, 0.8) == pytest.approx(expected)
     assert _relative_difference_weight(a, a, 5.0, 0.3) == 1.0
     assert _relative_difference_weight(a, -a, 5.0, 0.3) < 1e-6
     near, far = (_relative_difference_weight(a, a + 3.0, apart, 0.3) for apart in (5.0, 50.0))

@@ -33,10 +33,10 @@ def _displacement_weight(a: F64, b: F64, closeness: float) -> float:
     positions.
     """
     na, nb = np.hypot(a[0], a[1]), np.hypot(b[0], b[1])
-    if na < 1.0 and nb < 1.0:
-        return float(closeness)
-    cosine = (a[0] * b[0] + a[1] * b[1]) / max(na * nb, 1e-12)
-    shorter, longer = max(min(na, nb), 1.0), max(na, nb)
+    cosine = 1.0
+    if min(na, nb) >= 1.0:
+        cosine = (a[0] * b[0] + a[1] * b[1]) / (na * nb)
+    shorter, longer = max(min(na, nb), 1.0), max(max(na, nb), 1.0)
     return float(max(cosine, 0.0) * (shorter / longer) * closeness)
 
 
