@@ -243,6 +243,24 @@ def test_the_pyramids_point_at_the_scene():
     assert (scene.corners[:, :2, 2].mean(axis=1) > scene.corners[:, 2:, 2].mean(axis=1)).all()
 
 
+def test_a_scene_in_map_coordinates_is_drawn_about_its_middle():
+    """WebGL draws in single precision, whose steps are half a metre there."""
+    data, origin = made_up_run(points=300), np.array([5e5, 5e6, 100.0])
+    scene = figures.build_scene(data.metric.reconstruction)
+    names = {"points", "centres", "corners", "low", "high"}
+    moved = replace(scene, **{name: getattr(scene, name) + origin for name in names})
+    drawn = [figures.scene_figure(one, [p.name for p in data.images], None) for one in (scene, moved)]
+    extent = float((scene.high - scene.low).max())
+    for here, there in zip(*(figure["data"] for figure in drawn), strict=True):
+        for axis in "xyz":
+            one, other = (np.array(trace[axis], dtype=float) for trace in (here, there))
+            assert np.nanmax(np.abs(other)) <= 0.5 * extent
+            np.testing.assert_allclose(other, one, atol=2e-4 * extent)
+    for axis in ("xaxis", "yaxis", "zaxis"):
+        low, high = drawn[1]["layout"]["scene"][axis]["range"]
+        assert abs(low + high) < 1e-6 * extent
+
+
 def test_a_scene_without_points_still_shows_its_cameras():
     data = made_up_run(points=50)
     reconstruction = data.metric.reconstruction

@@ -7,7 +7,7 @@ version of plotly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Any
 
@@ -141,7 +141,7 @@ def scene_figure(
     scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | str | None, *, accent: str = _ACCENT
 ) -> Figure:
     """Cameras and points as a plotly.js figure; ``colors`` are those of the points X, or one for all."""
-    digits = _useful_digits(scene)
+    scene, digits = _about_middle(scene), _useful_digits(scene)
     paint: object = "#9fb4c7" if colors is None else colors
     if isinstance(colors, np.ndarray):
         paint = [f"#{bytes(rgb).hex()}" for rgb in colors[scene.index]]
@@ -162,6 +162,12 @@ def scene_figure(
         "hoverlabel": {"font": {"family": "system-ui, sans-serif"}},
     }
     return {"data": [points, _pyramids(scene, digits, accent), centres], "layout": layout}
+
+
+def _about_middle(scene: Scene) -> Scene:
+    """The scene about its middle: WebGL draws in single precision, too coarse far from the origin."""
+    names, middle = ("points", "centres", "corners", "low", "high"), 0.5 * (scene.low + scene.high)
+    return replace(scene, **{name: getattr(scene, name) - middle for name in names})
 
 
 def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
