@@ -5,10 +5,14 @@ import pytest
 from scipy import stats
 
 from tests.epipolar.pairs import make_pair
-from thesisrecon.epipolar._refinement import epipolar_distance_std
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_lines, epipoles
+from thesisrecon.geometry.two_view import (
+    enforce_rank_two,
+    epipolar_distance_std,
+    epipolar_lines,
+    epipoles,
+)
 from thesisrecon.records import FundamentalFit
 from validation.metrics.fundamental_precision import (
     _degrees_of_freedom,

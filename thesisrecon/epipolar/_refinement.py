@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar._frame import PairFrame, as_matches
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.kernels import copy_to, empty, kernel
 from thesisrecon.numerics._small_solvers import orthogonalize_columns, solve_damped
 
@@ -317,21 +316,3 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
     moved -= np.outer(pixels, pixels @ moved) / norm**2
     covariance: F64 = sigma**2 * moved @ moved.T
     return covariance
-
-
-def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
-    """Standard deviation (N,) of the distances of exact matches to their epipolar lines in image 2.
-
-    First order in the error of F alone. A match with own noise sigma has sqrt(std^2 + sigma^2 (1 + g1 / g2))
-    with g1 and g2 the squared gradients of x2' F x1 by x1 and x2.
-    """
-    xy1, xy2 = as_matches(xy1, xy2)
-    x1, x2 = homogenize(xy1), homogenize(xy2)
-    lines = x1 @ F.T
-    norm = np.sqrt(np.sum(lines[:, :2] ** 2, axis=1, keepdims=True)) + 1e-300
-    # The distance is x2 . l / |l12|; near 0 only the derivative of the numerator matters.
-    foot = x2.copy()
-    foot[:, :2] -= np.sum(x2 * lines, axis=1, keepdims=True) * lines[:, :2] / norm**2
-    gradient = (foot[:, :, None] * x1[:, None, :]).reshape(-1, 9) / norm
-    variance = np.einsum("na,ab,nb->n", gradient, covariance, gradient)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

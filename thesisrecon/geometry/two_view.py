@@ -184,6 +184,32 @@ def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
     return np.abs(_algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
 
 
+def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
+    """Return the standard deviations of the distances of exact matches to their epipolar lines in image 2.
+
+    First order in the error of F alone. A match with own noise sigma has sqrt(std^2 + sigma^2 (1 + g1 / g2))
+    with g1 and g2 the squared gradients of x2' F x1 by x1 and x2.
+
+    Parameters
+    ----------
+    F, covariance, xy1, xy2 : ndarray (3, 3), (9, 9), (N, 2) and (N, 2)
+        Fundamental matrix, covariance of its entries (row-major), and matches, px.
+
+    Returns
+    -------
+    ndarray (N,)
+    """
+    x1, x2 = homogenize(xy1), homogenize(xy2)
+    lines = x1 @ F.T
+    norm = np.sqrt(np.sum(lines[:, :2] ** 2, axis=1, keepdims=True)) + 1e-300
+    # The distance is x2 . l / |l12|; near 0 only the derivative of the numerator matters.
+    foot = x2.copy()
+    foot[:, :2] -= np.sum(x2 * lines, axis=1, keepdims=True) * lines[:, :2] / norm**2
+    gradient = (foot[:, :, None] * x1[:, None, :]).reshape(-1, 9) / norm
+    variance = np.einsum("na,ab,nb->n", gradient, covariance, gradient)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
 def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
     """Return the homography x2 ~ H x1 of unit norm between two images induced by a plane (3.29 - 3.32).
 

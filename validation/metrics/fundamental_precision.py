@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
-from thesisrecon.epipolar._refinement import epipolar_distance_std, fundamental_covariance
+from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras
+from thesisrecon.geometry.two_view import epipolar_distance_std, epipoles, fundamental_from_cameras
 from thesisrecon.records import FundamentalFit
 
 PARAMETERS = 7
