@@ -171,7 +171,7 @@ def sideways_fundamental(xy1, xy2, rng):
     del rng
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) / np.sqrt(2.0)
     inliers = np.abs(xy1[:, 1] - xy2[:, 1]) < 2.0
-    return FundamentalFit(F, inliers, 0.5, np.eye(9))
+    return FundamentalFit(F, inliers, 0.5, np.zeros((9, 9)))
 
 
 def one_by_one(function, items):

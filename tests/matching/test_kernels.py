@@ -106,7 +106,7 @@ def test_growth_equals_its_numpy_twin():
     place = xy1 - (14.0, 0.0)
     index, score, second_best = _match_guided(
         one.pyramid, (xy1, one.features.scale), (affine, place, radius),
-        (xy2, two.features.scale, two.patches), two.cells, (F, 1.5, 0.7),
+        (xy2, two.features.scale, two.patches), two.cells, (F, np.full(len(xy1), 1.5), 0.7),
     )  # fmt: skip
     correlation = one.patches @ two.patches.T
     allowed = np.linalg.norm(place[:, None] - xy2[None], axis=2) <= 12.0

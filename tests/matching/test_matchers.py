@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -182,6 +183,27 @@ def test_growth_multiplies_the_matches_and_alignment_makes_them_finer(stereo):
     seeds, corners = run(SeedsAndGrowth(growth=False), *stereo), run(SeedsAndGrowth(align=False), *stereo)
     assert len(whole.xy1) > 1.5 * len(seeds.xy1)
     assert np.median(errors(corners)) > 3.0 * np.median(errors(whole))
+
+
+def test_growth_reaches_where_f_is_uncertain(stereo):
+    """F is off by up to 10 px at the right edge, as its covariance says."""
+    change = np.zeros((3, 3))
+    change[2, 0] = 10.0 / stereo[0].size[0] / np.sqrt(2.0)
+
+    def tilted(xy1, xy2, rng, std=1.0):
+        fit = sideways_fundamental(xy1, xy2, rng)
+        covariance = std**2 * np.outer(change, change)
+        return replace(fit, F=fit.F + change, covariance=covariance)
+
+    def grown(estimate):
+        rng = np.random.default_rng(0)
+        matches = SeedsAndGrowth().match(*stereo, pair=(0, 1), estimate_fundamental=estimate, rng=rng)
+        assert (errors(matches) < 1.5).mean() > 0.9
+        return len(matches.xy1)
+
+    known = grown(sideways_fundamental)
+    assert grown(tilted) > 0.95 * known
+    assert grown(partial(tilted, std=0.0)) < 0.5 * known
 
 
 def test_relative_difference_and_thresholds_drop_wrong_matches():

@@ -10,6 +10,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.two_view import epipolar_distance_std
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import align_corners, align_matches, strongest_distinct
 from thesisrecon.matching._prepared import (
@@ -31,7 +32,7 @@ from thesisrecon.matching._prepared import (
 )
 from thesisrecon.matching._seeds import SeedSet, corners_of_seeds, map_support, seed_matches
 from thesisrecon.numerics._nearest import nearest_neighbours
-from thesisrecon.records import Features, Image, Matches
+from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.
 APART = 3.0
@@ -46,6 +47,8 @@ MIN_MAP_SUPPORT = 1.0
 DECIDING_SEEDS = 100
 # Maximum search radius around a prediction relative to the long side, and minimum correlation there.
 RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
+# Standard deviations of an epipolar line that its band contains at least (HZ 11.11).
+BAND_SIGMAS = 3.0
 # Pairs with a wide baseline have few seeds: their maps are accurate to 20 %, their positions to a few pixels.
 OBLIQUE_NEIGHBOURS, SEED_AFFINE_STD, GROWN_AFFINE_STD, SEED_SHIFT = 3, 0.2, 0.1, 5.0
 # Fraction of the corners of image 1 above which matched corners are not matched again.
@@ -153,15 +156,15 @@ def _match_guided(
     predicted: tuple[F64, F64, F64],
     corners2: tuple[F64, F32, F32],
     grid2: tuple[float, I64, I64, I64],
-    gate: tuple[F64, float, float],
+    gate: tuple[F64, F64, float],
 ) -> tuple[I64, F32, F32]:
     """Most similar corner of image 2 near the predicted position and epipolar line of each corner.
 
     ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2),
     position (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape
-    (2,), start, order of the corners of image 2; ``gate`` = F, half width of the epipolar band px, minimum
-    correlation. Returns the corner of image 2 (-1: none), the correlation and the second best correlation
-    elsewhere (-1: none).
+    (2,), start, order of the corners of image 2; ``gate`` = F, half widths (N,) of the epipolar bands px,
+    minimum correlation. Returns the corner of image 2 (-1: none), the correlation and the second best
+    correlation elsewhere (-1: none).
     """
     xy1, scale1 = corners1
     affine, position, radius = predicted
@@ -182,7 +185,7 @@ def _match_guided(
         determinant = affine_determinant(affine[n])
         if determinant == 0.0:
             continue
-        found = _corners_in_band(xy1[n], (position[n], radius[n]), (F, band), xy2, grid2, near)
+        found = _corners_in_band(xy1[n], (position[n], radius[n]), (F, band[n]), xy2, grid2, near)
         if found == 0:
             continue
         _warp_windows(view1, (xy1[n], scale1[n]), (affine[n], determinant), sizes, (window, ready, raster))
@@ -292,7 +295,8 @@ class SeedsAndGrowth:
         Maximum ratio of the distances to the best and second best match, of seeds and of guided matches
         (within their part of the epipolar band).
     band_rel : float
-        Half width of the epipolar band, relative to the long side.
+        Minimum half width of the epipolar band, relative to the long side; three standard deviations of the
+        epipolar line if that is more.
     neighbours : int
         Number of matches that define a local affine map.
     affine_std : float
@@ -388,9 +392,9 @@ class SeedsAndGrowth:
 
     def _verified_seeds(
         self, sets: Iterable[SeedSet], estimate: EstimateFundamental, rng: np.random.Generator
-    ) -> tuple[Matches, F64] | None:
+    ) -> tuple[Matches, FundamentalFit] | None:
         """The largest set of seeds that agree with one F, and F; tries later sets only if few agree."""
-        best: tuple[Matches, F64] | None = None
+        best: tuple[Matches, FundamentalFit] | None = None
         most = 0
         for seeds, support in sets:
             for trial in self._trials(seeds, support):
@@ -419,12 +423,12 @@ class SeedsAndGrowth:
         self,
         view1: PreparedImage,
         view2: PreparedImage,
-        start: tuple[Matches, F64],
+        start: tuple[Matches, FundamentalFit],
         estimate: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
         """Match corners near few seeds: align the seeds and their maps, then the matches of a first pass."""
-        known, F = start
+        known, fit = start
         near = replace(self, neighbours=min(self.neighbours, OBLIQUE_NEIGHBOURS))
         scale = np.full(len(known.xy1), view1.features.scale.max(), np.float32)
         places = (known.xy1, scale, known.xy2, known.affine)
@@ -434,7 +438,7 @@ class SeedsAndGrowth:
         aligned = np.flatnonzero(score >= MIN_CORRELATION)
         if len(aligned) >= MIN_FOR_F:
             known = select_matches(replace(known, xy2=xy2, affine=affine), aligned)
-        grown = near._grow_in_rounds(view1, view2, (known, F), estimate, rng)
+        grown = near._grow_in_rounds(view1, view2, (known, fit), estimate, rng)
         verified = _verified(align_matches(view1, view2, grown, affine_std=GROWN_AFFINE_STD), estimate, rng)
         return grown if verified is None else near._grow_in_rounds(view1, view2, verified, estimate, rng)
 
@@ -442,7 +446,7 @@ class SeedsAndGrowth:
         self,
         view1: PreparedImage,
         view2: PreparedImage,
-        start: tuple[Matches, F64],
+        start: tuple[Matches, FundamentalFit],
         estimate: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
@@ -468,21 +472,26 @@ class SeedsAndGrowth:
         return select_matches(both, rows[np.argsort(both.index1[rows], kind="stable")])
 
     def _grow(
-        self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, F: F64
+        self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, fit: FundamentalFit
     ) -> Matches:
-        """Match the ``chosen`` corners of image 1, guided by F and the local maps of known matches."""
+        """Match the ``chosen`` corners of image 1, guided by F and the local maps of known matches.
+
+        F is uncertain far from its matches: a narrow band would keep those that confirm its error.
+        """
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
         near = nearest_neighbours(known.xy1, xy1, min(self.neighbours, len(known.xy1)))
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, RADIUS_REL * long_side)
+        std = epipolar_distance_std(fit.F, fit.covariance, xy1, position)
+        band = np.maximum(self.band_rel * long_side, BAND_SIGMAS * std)
         index, score, second_best = _match_guided(
             view1.pyramid,
             (xy1, scale1),
             (affine, position, radius),
             (view2.features.xy, view2.features.scale, view2.patches),
             view2.cells,
-            (F, self.band_rel * long_side, MIN_CORRELATION),
+            (fit.F, band, MIN_CORRELATION),
         )
         index[1.0 - score > self.grown_ratio**2 * (1.0 - second_best)] = -1
         rows = one_to_one(index, score)
@@ -492,7 +501,7 @@ class SeedsAndGrowth:
 
 def _verified(
     matches: Matches, estimate: EstimateFundamental, rng: np.random.Generator
-) -> tuple[Matches, F64] | None:
+) -> tuple[Matches, FundamentalFit] | None:
     """The matches that agree with one F, and F; None if no F is found."""
     if len(matches.xy1) < MIN_FOR_F:
         return None
@@ -500,4 +509,4 @@ def _verified(
         fit = estimate(matches.xy1, matches.xy2, rng)
     except StageFailure:
         return None
-    return select_matches(matches, fit.inliers), fit.F
+    return select_matches(matches, fit.inliers), fit
