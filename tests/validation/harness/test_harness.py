@@ -166,7 +166,7 @@ def test_no_gate_without_its_reason(tmp_path):
         (["report", "-o", "OUT", "--images", "nowhere"], "the folder of images nowhere does not exist"),
         (["check", "-o", "OUT", "--threads", "0"], "must be positive"),
         (["report", "-o", "OUT", "--max-side", "10"], "--max-side must be at least 64 px"),
-        (["report", "-o", "OUT", "--resume", "OUT"], "another folder than --out"),
+        (["report", "-o", "OUT", "--resume", "OUT", "--scenes", "street"], "another folder than --out"),
     ],
 )
 def test_wrong_options_are_named(arguments, words, tmp_path, capsys):

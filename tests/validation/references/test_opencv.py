@@ -41,7 +41,7 @@ def test_points_of_world_to_camera_matrices_are_where_they_were(solve, looked):
 def test_matches_in_the_cache_are_those_of_these_images(tmp_path):
     found = []
     for number in range(2):
-        paths = tuple(tmp_path / f"{number}" / "images" / f"{side}.png" for side in "ab")
+        paths = tuple(tmp_path / f"{number}" / "scene" / "images" / f"{side}.png" for side in "ab")
         paths[0].parent.mkdir(parents=True)
         for k, path in enumerate(paths):
             grey = texture(160, 200, 5 * number)[:, 10 * k : 150 + 10 * k]
