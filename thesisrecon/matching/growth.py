@@ -484,7 +484,7 @@ class SeedsAndGrowth:
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, RADIUS_REL * long_side)
         std = epipolar_distance_std(fit.F, fit.covariance, xy1, position)
-        band = np.maximum(self.band_rel * long_side, BAND_SIGMAS * std)
+        band = np.fmax(self.band_rel * long_side, BAND_SIGMAS * std)  # NaN: a method without covariance
         index, score, second_best = _match_guided(
             view1.pyramid,
             (xy1, scale1),
