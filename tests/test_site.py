@@ -218,8 +218,6 @@ def test_every_table_of_evidence_names_its_command(page):
         title = section.partition("\n")[0]
         if page.name in NOT_MEASURED or title in ("## Complexity", "## Rules", "## Tests"):
             continue
-        if page.name == "scaling.md" and "`python -m validation study growth-of-c" in section:
-            continue
         assert STAMP.search(section), (title, count)
 
 

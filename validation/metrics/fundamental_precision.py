@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar._frame import PairFrame, check_matches
+from thesisrecon.epipolar._frame import PairFrame, as_matches, check_matches
 from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.two_view import epipolar_distance_std, epipoles, fundamental_from_cameras
@@ -41,7 +41,8 @@ def _ellipse_95(nu: float) -> float:
 def epipolar_distance_interval(fit: FundamentalFit, xy1: F64, xy2: F64) -> F64:
     """Return the half 95 % intervals (N,) px of the distances of exact matches (N, 2) px to their epipolar
     lines in image 2."""
-    return _student_95(_degrees_of_freedom(fit)) * epipolar_distance_std(fit.F, fit.covariance, xy1, xy2)
+    std = epipolar_distance_std(fit.F, fit.covariance, *as_matches(xy1, xy2))
+    return _student_95(_degrees_of_freedom(fit)) * std
 
 
 @dataclass(frozen=True)

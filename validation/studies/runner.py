@@ -81,6 +81,7 @@ OF_PAGES = {
         ["--colmap", "--sizes", "100", "300"],
         ["--sizes", "1000"],
         ["--sizes", "100", "--set", "matching.many_share=1"],
+        ["--scene", "street", "--sizes", "100", "--set", "matching.many_share=1"],
         ["--scene", "street", "--sizes", "100", "1000"],
         ["--until", "model", "--sizes", "12", "48", "100"],
     ],
