@@ -76,7 +76,6 @@ OF_PAGES = {
     "critical-motions": [["--trials", "200"]],
     "epipolar": [["--trials", "2000"]],
     "epipolar-methods": [["--trials", "500"]],
-    "growth-of-cameras": [[], ["--core-views", "0", "--kinds", "place", "--sizes", "100", "300"]],
     "growth-of-cost": [
         ["--colmap", "--sizes", "100", "300"],
         ["--sizes", "1000"],
