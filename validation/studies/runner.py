@@ -82,7 +82,7 @@ OF_PAGES = {
         ["--sizes", "100", "--set", "matching.many_share=1"],
         ["--scene", "street", "--sizes", "100", "--set", "matching.many_share=1"],
         ["--scene", "street", "--sizes", "100", "1000"],
-        ["--until", "model", "--sizes", "12", "48", "100"],
+        ["--until", "model", "--sizes", "12", "48"],
     ],
     "harsh": [["--trials", "8"]],
     "main-job": [["--repeats", "3"]],
