@@ -53,7 +53,8 @@ def require_at_least(method: object, **least: float) -> None:
         The method, and the least value of some of its fields.
     """
     for name, bound in least.items():
-        if getattr(method, name) < bound:
+        # NaN is below every bound.
+        if not getattr(method, name) >= bound:
             raise ValueError(f"{name} must be at least {bound}; got {getattr(method, name)}")
 
 

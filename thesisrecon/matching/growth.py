@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, I64
-from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.errors import StageFailure, UsageError, require_at_least
 from thesisrecon.geometry.two_view import epipolar_distance_std
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import align_corners, align_matches, strongest_distinct
@@ -343,16 +343,12 @@ class SeedsAndGrowth:
     oblique_pairs: int = 6
 
     def __post_init__(self) -> None:
-        for name, least in (("neighbours", 1), ("oblique_pairs", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
+        require_at_least(self, neighbours=1, oblique_pairs=0, affine_std=0)
         for name in ("ratio", "grown_ratio", "band_rel"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
         if not 0.0 < self.many_share <= 1.0:
             raise ValueError(f"many_share must be above 0 and at most 1; got {self.many_share}")
-        if not self.affine_std >= 0.0:
-            raise ValueError(f"affine_std must be at least 0; got {self.affine_std}")
 
     def prepare(self, image: Image, features: Features) -> PreparedImage:
         """See `thesisrecon.config.Matcher.prepare`."""

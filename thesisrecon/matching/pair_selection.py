@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, require_at_least
 from thesisrecon.kernels import kernel
 from thesisrecon.matching._bag_of_words import word_weights
 from thesisrecon.matching._prepared import MapAll
@@ -183,10 +183,7 @@ class OverlapEstimate:
     words: int = 65536
 
     def __post_init__(self) -> None:
-        least = {"all_up_to": 0, "nearest": 1, "most": 1, "spread": 0, "shortlist": 1, "words": 1}
-        for name, bound in least.items():
-            if getattr(self, name) < bound:
-                raise ValueError(f"{name} must be at least {bound}; got {getattr(self, name)}")
+        require_at_least(self, all_up_to=0, nearest=1, most=1, spread=0, shortlist=1, words=1)
 
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
