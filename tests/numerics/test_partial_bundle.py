@@ -34,18 +34,6 @@ def test_points_reach_the_least_squares_optimum_of_each():
         np.testing.assert_allclose(X[j, :3] / X[j, 3], best, atol=1e-5)
 
 
-@pytest.mark.parametrize("height", [0.0, 0.7, 4.0])
-def test_exact_points_of_a_plane_stay_where_they_are(height):
-    block = make_block(points=100)
-    G = np.eye(4)
-    G[:3, :3] = Rotation.from_rotvec([0.5, -0.8, 0.3]).as_matrix()
-    X = (block.Xh * [1.0, 1.0, 0.0, 1.0] + [0.0, 0.0, height, 0.0]) @ G.T
-    P = block.cameras.P @ np.linalg.inv(G)
-    z = np.einsum("kab,kb->ka", P[block.view], X[block.point])
-    moved = refine_points(P, X, block.view, block.point, z[:, :2] / z[:, 2:], iterations=10)
-    np.testing.assert_allclose(moved, X, atol=1e-7)
-
-
 def test_unusable_points_are_left_alone():
     block = make_block(points=6)
     X = block.Xh.copy()

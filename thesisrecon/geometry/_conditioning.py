@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -11,8 +13,13 @@ _TRIANGULAR = 1e-9
 """Largest deviation of K from upper triangular with K33 = 1, by rounding."""
 _ORTHOGONAL = 2e-4
 """Largest deviation of R'R from the identity; four printed digits leave at most 2 sqrt(3) 5e-5."""
-_MAX_CONDITION = 1e8
-"""Largest condition number of a whitening transform with unit columns; of georeferenced points up to 1e7."""
+_MAX_STRETCH = 1e3
+"""Largest stretch s of one direction of space against another in a whitened frame.
+
+Rounding errors grow to s eps of the scene, 2e-9 px in an image of 1e4 px. Relief below 1 / s of the scene
+moves its images by no more than their noise (1 px in 1e3), and with more stretch noise moves points farther
+than a linearisation holds.
+"""
 
 
 def checked_inverse(G: F64, caller: str) -> F64:
@@ -124,31 +131,65 @@ def scene_frame(X: F64) -> tuple[F64, float]:
     return origin, 1.0 / size if size > 0.0 else 1.0
 
 
+class SpaceFrame(NamedTuple):
+    """Coordinates S N X of space: N (4, 4) centres and scales, S (4, 4) stretches.
+
+    Each is applied by itself: of coordinates far from the origin their product would lose the digits that
+    centring keeps.
+    """
+
+    N: F64
+    S: F64
+
+    def points(self, X: F64) -> F64:
+        """Return points (N, 4) in the frame."""
+        return np.asarray(X @ self.N.T @ self.S.T)
+
+    def cameras(self, P: F64) -> F64:
+        """Return cameras (..., 3, 4) in the frame."""
+        return np.asarray(P @ np.linalg.inv(self.N) @ np.linalg.inv(self.S))
+
+    def points_back(self, X: F64) -> F64:
+        """Return points (N, 4) of the frame in the caller's coordinates."""
+        return np.asarray(X @ np.linalg.inv(self.S).T @ np.linalg.inv(self.N).T)
+
+    def cameras_back(self, P: F64) -> F64:
+        """Return cameras (..., 3, 4) of the frame in the caller's coordinates."""
+        return np.asarray(P @ self.S @ self.N)
+
+
+def centring_transform(X: F64) -> F64:
+    """Similarity (4, 4) that takes the median of homogeneous points to 0, their median distance to 1."""
+    finite = np.abs(X[:, 3]) > np.finfo(float).eps * np.linalg.norm(X, axis=1)
+    origin, scale = scene_frame(X[finite, :3] / X[finite, 3:])
+    return np.block([[scale * np.eye(3), -scale * origin[:, None]], [np.eye(4)[3:]]])
+
+
 def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
     """M for which the unit vectors x = M X / |M X| have sum x x' proportional to I (Tyler, Ann. Stat. 1987).
 
-    Every point counts as a direction, so neither homogeneous scales nor a few far points matter. Points of a
-    plane are not stretched until their rounding errors fill space: M keeps an inverse of eight digits. det M
-    > 0, which keeps orientations; I for fewer than 4 points.
+    Every point counts as a direction, so neither homogeneous scales nor a few far points matter. No direction
+    is stretched more than ``_MAX_STRETCH`` times another, so that coplanar points keep their digits. det M >
+    0, which keeps orientations; I for fewer than 4 points.
     """
     M = np.eye(4)
-    norms = np.linalg.norm(X, axis=1)
-    X = X[norms > 0.0] / norms[norms > 0.0, None]
+    X = X[np.linalg.norm(X, axis=1) > 0.0]
     if len(X) < 4:
         return M
     for _ in range(rounds):
         moved = X @ M.T
         moved /= np.linalg.norm(moved, axis=1)[:, None]
         values, vectors = np.linalg.eigh(moved.T @ moved / len(moved))
-        stretch = 1.0 / np.sqrt(np.maximum(4.0 * values, 1e-12))
-        M = (vectors * stretch) @ vectors.T @ M
-        M /= np.linalg.norm(M)
-        # The scale of a column costs no digits of the inverse.
-        column = np.linalg.norm(M, axis=0)
-        U, s, Vt = np.linalg.svd(M / column)
-        if s[0] > _MAX_CONDITION * s[3]:
-            M = (U * np.maximum(s, s[0] / _MAX_CONDITION)) @ Vt * column
+        M = (vectors / np.sqrt(np.maximum(4.0 * values, _MAX_STRETCH**-2))) @ vectors.T @ M
+        U, s, Vt = np.linalg.svd(M)
+        M = (U * np.minimum(s / s[3], _MAX_STRETCH)) @ Vt
     return M
+
+
+def whitening_frame(X: F64) -> SpaceFrame:
+    """Frame that centres and then whitens points (N, 4)."""
+    N = centring_transform(X)
+    return SpaceFrame(N, whitening_transform(X @ N.T))
 
 
 def unit_norm(F: F64) -> F64:

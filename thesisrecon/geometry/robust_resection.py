@@ -13,7 +13,7 @@ from thesisrecon.geometry._conditioning import (
     require_calibration,
     require_finite,
     require_shapes,
-    whitening_transform,
+    whitening_frame,
 )
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, depth, project
 from thesisrecon.geometry.homogeneous import homogenize
@@ -192,14 +192,16 @@ def resect_projective(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -
     if len(X) < _SAMPLE:
         return None, none
     # The points of one view may fill a corner of the frame: whitening keeps all digits.
-    M = whitening_transform(X)
-    Y = X @ M.T
+    frame = whitening_frame(X)
+    Y = frame.points(X)
     Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
     best_cost, best, drawn = np.inf, None, 0
     scored = rng.choice(len(Y), 1000, replace=False) if len(Y) > 1000 else np.arange(len(Y))
+    # Few samples of six determine the camera if most points are on a line or plane.
+    of_all = resect_linear(Y, xy)[None]
     for _ in range(_MAX_BATCHES):
         samples = rng.random((_BATCH, len(Y))).argpartition(_SAMPLE - 1, axis=1)[:, :_SAMPLE]
-        P = resect_linear(Y[samples], xy[samples])
+        P = np.append(resect_linear(Y[samples], xy[samples]), of_all, axis=0)
         P = np.concatenate([P, -P])
         squared = _squared_residuals(P, Y[scored], xy[scored]) / threshold_px**2
         cost = np.minimum(squared, 1.0).sum(axis=1)
@@ -212,7 +214,7 @@ def resect_projective(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -
     if best is None:
         return None, none
     found, inlier = _refit(best, Y, xy, threshold_px)
-    return (None if found is None else found @ M), inlier
+    return (None if found is None else frame.cameras_back(found)), inlier
 
 
 def _refit(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:

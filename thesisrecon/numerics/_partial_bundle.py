@@ -8,7 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_transform
+from thesisrecon.geometry._conditioning import (
+    SpaceFrame,
+    centring_transform,
+    pixel_conditioning,
+    whitening_frame,
+)
 from thesisrecon.kernels import copy_to, empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
 from thesisrecon.numerics._metric_kernels import (
@@ -187,7 +192,7 @@ def refine_points(
     if not used.any():
         return X
     options = _PointOptions(loss_px, iterations, 1e-9, 1, True)
-    return _refine_in_frame(P, X, o, used, whitening_transform(X[used]), options)
+    return _refine_in_frame(P, X, o, used, whitening_frame(X[used]), options)
 
 
 def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
@@ -199,13 +204,14 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
     o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
-    cameras = _unit_cameras(pixel_conditioning(o.seen.xy) @ P)
-    M = np.asarray(np.linalg.qr(cameras.reshape(-1, 4))[1])
+    N = centring_transform(X[used])
+    cameras = _unit_cameras(pixel_conditioning(o.seen.xy) @ P @ np.linalg.inv(N))
+    S = np.asarray(np.linalg.qr(cameras.reshape(-1, 4))[1])
     # Cameras with one centre leave a direction of space undetermined.
-    if len(M) < 4 or not np.abs(np.diag(M)).min() > 1e-13 * np.abs(M).max():
-        M = np.eye(4)
+    if len(S) < 4 or not np.abs(np.diag(S)).min() > 1e-13 * np.abs(S).max():
+        S = np.eye(4)
     options = _PointOptions(np.inf, _MAX_ITERATIONS, 1e-14, 2, False)
-    return _refine_in_frame(P, X, o, used, M, options)
+    return _refine_in_frame(P, X, o, used, SpaceFrame(N, S), options)
 
 
 def _usable_points(P: F64, X: F64, observations: Observations) -> tuple[SortedObservations, B8]:
@@ -220,17 +226,19 @@ def _unit_cameras(P: F64) -> F64:
     return np.asarray(P / np.where(norms > 0.0, norms, 1.0))
 
 
-def _refine_in_frame(P: F64, X: F64, o: SortedObservations, used: B8, M: F64, options: _PointOptions) -> F64:
-    """Refine the ``used`` points in conditioned pixels and the space M X; norms and signs are kept."""
+def _refine_in_frame(
+    P: F64, X: F64, o: SortedObservations, used: B8, frame: SpaceFrame, options: _PointOptions
+) -> F64:
+    """Refine the ``used`` points in conditioned pixels and a frame of space; norms and signs are kept."""
     norms, T = np.linalg.norm(X, axis=1), pixel_conditioning(o.seen.xy)
     # The scale of a camera has no effect on its projections, but must not push depths below rounding.
-    cameras = np.ascontiguousarray(_unit_cameras(T @ P @ np.linalg.inv(M)))
-    moved = np.where(used[:, None], X, 0.0) @ M.T
+    cameras = np.ascontiguousarray(_unit_cameras(frame.cameras(T @ P)))
+    moved = frame.points(np.where(used[:, None], X, 0.0))
     moved[used] /= np.linalg.norm(moved[used], axis=1, keepdims=True)
     xy = o.seen.xy * T[0, 0] + T[:2, 2]
     options = options._replace(delta=options.delta * float(T[0, 0]))
     _refine_each_point(cameras, moved, o.start, o.seen.view_index, xy, options)
-    back = moved @ np.linalg.inv(M).T
+    back = frame.points_back(moved)
     lengths = np.linalg.norm(back, axis=1, keepdims=True)
     back *= norms[:, None] / np.where(lengths > 0.0, lengths, 1.0)
     return np.where(used[:, None] & np.isfinite(back).all(axis=1, keepdims=True), back, X)
@@ -276,17 +284,17 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     scale), and huge variances in undetermined directions, as for too few points or points on one plane.
     """
     size = float(np.linalg.norm(P))
-    T, M = pixel_conditioning(xy), whitening_transform(X)
-    points = X @ M.T
+    T, frame = pixel_conditioning(xy), whitening_frame(X)
+    points = frame.points(X)
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    start = (T @ P @ np.linalg.inv(M)).reshape(1, 12)
+    start = frame.cameras(T @ P).reshape(1, 12)
     scale = float(T[0, 0])
     weighting = Weighting(1.0, loss_px * scale)
     problem = _CameraProblem(points, _one_view_observations(xy * scale + T[:2, 2]), weighting)
     end, _, _ = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
-    back = np.kron(np.linalg.inv(T), M.T)
-    raw = back @ end[0]
+    back = np.kron(np.linalg.inv(T), (frame.S @ frame.N).T)
+    raw = frame.cameras_back(np.linalg.inv(T) @ end.reshape(3, 4)).ravel()
     back *= size / np.linalg.norm(raw)
     raw *= size / np.linalg.norm(raw)
     # The norm is fixed, so the part of an error along P is only a change of scale.

@@ -10,25 +10,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_transform
+from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_frame
 from thesisrecon.numerics._elimination import revert_crossing_points
 from thesisrecon.numerics._levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting, sort_observations
 from thesisrecon.numerics._projective_kernels import (
     UnitState,
     linearize_projective,
-    project_projective,
     projective_cost,
     tangent_step,
 )
 from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, build_layout
+from thesisrecon.numerics._small_solvers import TINY
 
 _VIEW_DOF = 11
 
 
 @dataclass(frozen=True)
 class ProjectiveBundleResult:
-    """Cameras and points in the caller's frame, norms and signs, residuals (K, 2) and 1/2 sum rho, px^2."""
+    """Cameras and points in the caller's frame, norms and signs; their residuals (K, 2), 1/2 sum rho px^2."""
 
     P: F64
     X: F64
@@ -90,29 +90,36 @@ def refine_projective_bundle(
     seen_points = np.diff(o.start) > 0
     free = observed & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))
 
-    T, M = pixel_conditioning(o.seen.xy), whitening_transform(X[seen_points])
+    T, frame = pixel_conditioning(o.seen.xy), whitening_frame(X[seen_points])
     scale = float(T[0, 0])
     conditioned = replace(o, seen=o.seen._replace(xy=o.seen.xy * scale + T[:2, 2]))
     block = np.where(free, np.cumsum(free) - 1, -1)
     none = np.zeros((len(free), 0), dtype=np.int64)
     layout = build_layout(conditioned, block, width=_VIEW_DOF, common=none, border=0)
     problem = _ProjectiveProblem(layout, Weighting(1.0, loss_px * scale), layout.jacobians())
-    cameras, P_norms = _unit_rows((T @ P @ np.linalg.inv(M)).reshape(-1, 12), observed)
-    points, X_norms = _unit_rows(X @ M.T, seen_points)
+    cameras, P_norms = _unit_rows(frame.cameras(T @ P).reshape(-1, 12), observed)
+    points, X_norms = _unit_rows(frame.points(X), seen_points)
     start = UnitState.at(cameras, points)
-    end, cost, _ = run_levenberg_marquardt(
+    end, _, _ = run_levenberg_marquardt(
         problem, start, max_iterations=max_iterations, min_camera_gain=settled * (loss_px * scale) ** 2
     )
 
-    P_back = np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4) @ M
-    X_back = (end.X * X_norms[:, None]) @ np.linalg.inv(M).T
-    residual = project_projective(end.P.reshape(-1, 3, 4), end.X, conditioned.seen)
-    return ProjectiveBundleResult(
-        np.where(free[:, None, None], _with_norms(P_back, P, axis=(1, 2)), P),
-        np.where(seen_points[:, None], _with_norms(X_back, X, axis=1), X),
-        o.unsort(residual) / scale,
-        cost / scale**2,
-    )
+    P_back = frame.cameras_back(np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4))
+    X_back = frame.points_back(end.X * X_norms[:, None])
+    P = np.where(free[:, None, None], _with_norms(P_back, P, axis=(1, 2)), P)
+    X = np.where(seen_points[:, None], _with_norms(X_back, X, axis=1), X)
+    residual = _residuals(P, X, observations)
+    distance = np.linalg.norm(residual, axis=1)
+    below = np.minimum(distance, loss_px)
+    return ProjectiveBundleResult(P, X, residual, 0.5 * float(below @ (2.0 * distance - below)))
+
+
+def _residuals(P: F64, X: F64, o: Observations) -> F64:
+    """Return projection minus observation (K, 2) of what is returned; huge in a focal plane."""
+    image = np.einsum("kab,kb->ka", P[o.view_index], X[o.point_index])
+    w = image[:, 2:]
+    tiny = TINY * np.abs(image).max(axis=1, keepdims=True, initial=TINY)
+    return np.asarray(image[:, :2] / np.copysign(np.maximum(np.abs(w), tiny), w) - o.xy)
 
 
 def _unit_rows(rows: F64, used: B8) -> tuple[F64, F64]:

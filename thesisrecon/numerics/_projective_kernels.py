@@ -1,4 +1,4 @@
-"""Compiled projection, cost and Jacobians of unit cameras and points in their tangent spaces."""
+"""Compiled cost and Jacobians of unit cameras and points in their tangent spaces."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import empty, kernel
+from thesisrecon.kernels import kernel
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting
 from thesisrecon.numerics._small_solvers import away_from_zero, loss_value, loss_weight
 
@@ -62,20 +62,6 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
         norm = np.sqrt(norm)
         for c in range(d):
             out[i, c] /= norm if norm > 0.0 else 1.0
-
-
-@kernel
-def project_projective(P: F64, X: F64, obs: Observations) -> F64:
-    """Return residuals (K, 2), projection minus observation; P (V, 3, 4), X (N, 4)."""
-    residual = empty((len(obs.xy), 2))
-    for k in range(len(obs.xy)):
-        p, x = P[obs.view_index[k]], X[obs.point_index[k]]
-        z0 = p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]
-        z1 = p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]
-        w = away_from_zero(p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3])
-        residual[k, 0] = z0 / w - obs.xy[k, 0]
-        residual[k, 1] = z1 / w - obs.xy[k, 1]
-    return residual
 
 
 @kernel

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry._conditioning import whitening_transform
+from thesisrecon.geometry._conditioning import whitening_frame
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.numerics._noise import noise_from_distances
@@ -212,9 +212,8 @@ def adjust_locally(
 
 def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
     """Transform to a well-conditioned frame: sum XX' = I over the valid points, unit norms, signs kept."""
-    T = whitening_transform(X[model.valid])
-    X = X @ T.T
-    P = P @ np.linalg.inv(T)
+    frame = whitening_frame(X[model.valid])
+    P, X = frame.cameras(P), frame.points(X)
     length = np.linalg.norm(X, axis=1, keepdims=True)
     norm = np.linalg.norm(P, axis=(1, 2), keepdims=True)
     return P / np.where(norm > 0, norm, 1.0), X / np.where(length > 0, length, 1.0)

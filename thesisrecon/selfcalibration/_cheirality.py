@@ -161,7 +161,7 @@ def _quasi_affine_frame(X: F64, v: F64) -> F64:
     Y = X @ basis.T / (X @ v)[:, None]
     centre = Y.mean(axis=0)
     value, vector = np.linalg.eigh(np.cov((Y - centre).T))
-    whiten = vector @ np.diag(np.maximum(value, 1e-18 * value.max()) ** -0.5) @ vector.T
+    whiten = vector @ np.diag(np.maximum(value, np.finfo(np.float64).eps * value.max()) ** -0.5) @ vector.T
     T = np.zeros((4, 4))
     T[:3] = whiten @ (basis - np.outer(centre, v))
     T[3] = v
