@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block
 from thesisrecon import resect
-from thesisrecon.geometry._conditioning import whitening_frame
+from thesisrecon.geometry._conditioning import centred_frame, whitening_transform
 from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics._observations import Observations
@@ -79,7 +79,7 @@ scenes = pytest.mark.parametrize("kind", [pytest.param(v, id=k) for k, v in (FLA
 @scenes
 def test_a_frame_loses_no_more_digits_than_its_stretch(kind):
     scene = _Scene(**kind)
-    frame = whitening_frame(scene.X)
+    frame = centred_frame(scene.X, whitening_transform)
     s = np.linalg.svd(frame.S, compute_uv=False)
     assert s[0] <= STRETCH * (1.0 + 1e-9) * s[3]
     P = frame.cameras_back(frame.cameras(scene.P))

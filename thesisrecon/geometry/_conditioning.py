@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -186,10 +187,10 @@ def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
     return M
 
 
-def whitening_frame(X: F64) -> SpaceFrame:
-    """Frame that centres and then whitens points (N, 4)."""
+def centred_frame(X: F64, stretch: Callable[[F64], F64]) -> SpaceFrame:
+    """Frame that centres points (N, 4), then stretches them by a function of the centred points."""
     N = centring_transform(X)
-    return SpaceFrame(N, whitening_transform(X @ N.T))
+    return SpaceFrame(N, stretch(X @ N.T))
 
 
 def unit_norm(F: F64) -> F64:

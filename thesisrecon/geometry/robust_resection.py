@@ -10,10 +10,11 @@ from numpy.random import Generator
 from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry._conditioning import (
+    centred_frame,
     require_calibration,
     require_finite,
     require_shapes,
-    whitening_frame,
+    whitening_transform,
 )
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, depth, project
 from thesisrecon.geometry.homogeneous import homogenize
@@ -192,7 +193,7 @@ def resect_projective(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -
     if len(X) < _SAMPLE:
         return None, none
     # The points of one view may fill a corner of the frame: whitening keeps all digits.
-    frame = whitening_frame(X)
+    frame = centred_frame(X, whitening_transform)
     Y = frame.points(X)
     Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
     best_cost, best, drawn = np.inf, None, 0

@@ -10,9 +10,10 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry._conditioning import (
     SpaceFrame,
+    centred_frame,
     centring_transform,
     pixel_conditioning,
-    whitening_frame,
+    whitening_transform,
 )
 from thesisrecon.kernels import copy_to, empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
@@ -192,7 +193,7 @@ def refine_points(
     if not used.any():
         return X
     options = _PointOptions(loss_px, iterations, 1e-9, 1, True)
-    return _refine_in_frame(P, X, o, used, whitening_frame(X[used]), options)
+    return _refine_in_frame(P, X, o, used, centred_frame(X[used], whitening_transform), options)
 
 
 def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
@@ -284,7 +285,7 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     scale), and huge variances in undetermined directions, as for too few points or points on one plane.
     """
     size = float(np.linalg.norm(P))
-    T, frame = pixel_conditioning(xy), whitening_frame(X)
+    T, frame = pixel_conditioning(xy), centred_frame(X, whitening_transform)
     points = frame.points(X)
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     start = frame.cameras(T @ P).reshape(1, 12)

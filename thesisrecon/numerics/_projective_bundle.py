@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry._conditioning import pixel_conditioning, whitening_frame
+from thesisrecon.geometry._conditioning import centred_frame, pixel_conditioning, whitening_transform
 from thesisrecon.numerics._elimination import revert_crossing_points
 from thesisrecon.numerics._levenberg_marquardt import run_levenberg_marquardt
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting, sort_observations
@@ -90,7 +90,7 @@ def refine_projective_bundle(
     seen_points = np.diff(o.start) > 0
     free = observed & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))
 
-    T, frame = pixel_conditioning(o.seen.xy), whitening_frame(X[seen_points])
+    T, frame = pixel_conditioning(o.seen.xy), centred_frame(X[seen_points], whitening_transform)
     scale = float(T[0, 0])
     conditioned = replace(o, seen=o.seen._replace(xy=o.seen.xy * scale + T[:2, 2]))
     block = np.where(free, np.cumsum(free) - 1, -1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry._conditioning import whitening_frame
+from thesisrecon.geometry._conditioning import centred_frame, whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.numerics._noise import noise_from_distances
@@ -212,7 +212,7 @@ def adjust_locally(
 
 def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
     """Transform to a well-conditioned frame: sum XX' = I over the valid points, unit norms, signs kept."""
-    frame = whitening_frame(X[model.valid])
+    frame = centred_frame(X[model.valid], whitening_transform)
     P, X = frame.cameras(P), frame.points(X)
     length = np.linalg.norm(X, axis=1, keepdims=True)
     norm = np.linalg.norm(P, axis=(1, 2), keepdims=True)
