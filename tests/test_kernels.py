@@ -121,6 +121,12 @@ def test_a_second_process_compiles_nothing(compiled):
     assert run_in(compiled, PYTHONHASHSEED="7") == ["8.0", "1"]
 
 
+def test_a_kernel_is_compiled_for_each_processor(compiled):
+    for processor in ({"NUMBA_CPU_NAME": "generic"}, {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}):
+        assert run_in(compiled, **processor) == ["8.0", "0"]
+        assert run_in(compiled, **processor) == ["8.0", "1"]
+
+
 def test_python_can_call_what_was_compiled_for_a_kernel(compiled, forks):
     code = """
 import caller, callee

@@ -7,17 +7,18 @@ order, ``tuple_of("module.Class", ...)`` a named tuple. A kernel that it lacks i
 from __future__ import annotations
 
 import importlib
-import platform
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from platform import node
 from typing import Any
 
 import numba
 from numba.core import types
+from numba.core.registry import cpu_target
 
 from thesisrecon.kernels import LIST, cache_folder
 from thesisrecon.runtime._executors import package_key
@@ -83,8 +84,8 @@ def precompile(until: str, workers: int, progress: Callable[[str, int, int], Non
 
 
 def _code_and_machine(lines: Sequence[str]) -> str:
-    machine = vars(numba.config)["CPU_NAME"], platform.machine(), platform.node()
-    return key_of(lines, machine, sys.version, numba.__version__, package_key())
+    processor = cpu_target.target_context.codegen().magic_tuple()
+    return key_of(lines, processor, node(), sys.version, numba.__version__, package_key())
 
 
 def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[str, int, int], None]) -> int:
