@@ -13,7 +13,7 @@ from thesisrecon.errors import unknown_word
 from thesisrecon.geometry._conditioning import require_finite, require_shapes
 from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients, require_inside
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.numerics._metric_bundle import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras
 from thesisrecon.numerics._observations import Observations, sort_observations
 from thesisrecon.records import Reconstruction, Tracks
@@ -29,6 +29,7 @@ LOSSES = ("huber", "squared")
 _HUBER_SIGMAS = 2.0
 _LEAST_SIGMA_PX = 1e-6
 _SIMILARITY_DOF = 7
+_SETTLED = 1e-8
 _MAX_BEHIND = 0.5
 """Fraction of observed points behind their cameras above which the poses must use another convention."""
 
@@ -56,6 +57,9 @@ class BundleAdjustment:
         In the order focal, aspect, skew, principal x and y, k1, k2, k3; zero where not free.
     point_covariance : ndarray (N, 3, 3)
         Infinite for points in fewer than two views.
+    sigmas_to_minimum : float
+        Distance of the cameras from the minimum in standard deviations, by the gradient: no camera parameter
+        is farther. Above 0.1 the adjustment has not converged, see ``converged``.
     """
 
     cameras: tuple[Camera, ...]
@@ -66,6 +70,12 @@ class BundleAdjustment:
     pose_covariance: F64
     intrinsics_covariance: F64
     point_covariance: F64
+    sigmas_to_minimum: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether another adjustment would move no camera parameter by a tenth of its standard deviation."""
+        return self.sigmas_to_minimum <= MAX_SIGMAS_TO_MINIMUM
 
     @property
     def centre_covariance(self) -> F64:
@@ -120,7 +130,7 @@ def bundle_adjust(
     sigma_px : float, optional
         Standard deviation of one image coordinate. None: estimated from the residuals.
     max_iterations : int
-        Maximum number of linear solves.
+        Maximum number of linear solves; if they do not suffice, ``converged`` is false.
 
     Returns
     -------
@@ -164,7 +174,8 @@ def bundle_adjust(
     knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
     _check(start, X, observed, chosen, bool(prior))
     require_inside(observed.view_index, observed.xy, np.array([view.size for view in views]))
-    fit, noise = None, 1.0 if sigma_px is None else sigma_px
+    fit = None
+    noise = weight = 1.0 if sigma_px is None else sigma_px
     # A first pass estimates noise that is not given: the weight of the prior and the width depend on it.
     for last in (True,) if sigma_px is not None else (False, True):
         width = _HUBER_SIGMAS * noise if loss_px is None else loss_px
@@ -173,11 +184,12 @@ def bundle_adjust(
             sigma_px=noise,
             loss_px=width,
             max_iterations=max_iterations,
+            settled=_SETTLED,
             covariance=last,
             point_covariance=last,
         )
         fit = refine_metric_bundle(start, X, observed, free=chosen, prior=knowledge, options=options)
-        start, X, noise = fit.cameras, fit.X, max(fit.sigma_px, _LEAST_SIGMA_PX)
+        start, X, weight, noise = fit.cameras, fit.X, noise, max(fit.sigma_px, _LEAST_SIGMA_PX)
     assert fit is not None
     assert fit.pose_covariance is not None
     assert fit.point_covariance is not None
@@ -196,7 +208,7 @@ def bundle_adjust(
     )
     return BundleAdjustment(
         refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance,
-        fit.point_covariance,
+        fit.point_covariance, fit.sigmas_to_minimum * weight / noise,
     )  # fmt: skip
 
 

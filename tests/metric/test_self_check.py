@@ -122,6 +122,15 @@ def test_a_contradicted_known_focal_is_reported_once_without_advice_on_weights()
     assert contradicted_focal_priors(model, MetricAdjustment(without, 0.0, 0.02)) == []
 
 
+@pytest.mark.parametrize(("far", "fails"), [(0.09, False), (0.11, True), (np.inf, True)])
+def test_an_adjustment_that_has_not_converged_is_not_trusted(far, fails):
+    scene = make_scene(points=400, sigma_px=0.5, seed=3)
+    model = true_model(scene, prior_for(projective_reconstruction(scene)))
+    check, failed_checks = doubts_of(replace(model, sigmas_to_minimum=far), scene)
+    assert check["sigmas_to_minimum"] == far
+    assert any("not converged" in doubt for doubt in failed_checks) == fails
+
+
 def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_doubted():
     rng = np.random.default_rng(0)
     row = make_scene(views=3, points=400, seed=1)

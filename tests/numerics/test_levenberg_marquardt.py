@@ -80,6 +80,22 @@ def test_rosenbrock_from_the_classical_start():
     np.testing.assert_allclose(answer.x, [1.0, 1.0], atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("weak", [1e-4, 5e-5])
+def test_a_small_gain_of_a_damped_step_is_no_minimum(seed, weak):
+    """Nearly dependent columns: the first damped step along their difference gains next to nothing."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(4000, 3))
+    A[:, 1] = A[:, 0] + weak * A[:, 1]
+    true, noise = rng.normal(size=3), rng.normal(size=4000)
+    best = true + np.linalg.lstsq(A, noise, rcond=None)[0]
+    std = np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
+    # The strong directions start at the minimum, the weak one 2 standard deviations from it.
+    start = best + 2.0 * std[0] * np.array([1.0, -1.0, 0.0])
+    found = minimize_residuals(lambda x: A @ (x - true) - noise, start, jacobian=lambda _: A, tolerance=1e-7)
+    assert np.abs((found.x - best) / std).max() < 0.1
+
+
 def test_covariance_of_a_line_is_the_textbook_one():
     rng = np.random.default_rng(1)
     u = np.linspace(0.0, 1.0, 400)

@@ -276,7 +276,8 @@ def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: _Tens
     """The fit; whether the matches determine it is not tested."""
     n, m = len(problem.X), len(problem.L)
     start = problem.retract((np.zeros(18), np.zeros((n + m, 4))), np.zeros(18))
-    c, f = run_levenberg_marquardt(problem, start, max_iterations=50, tolerance=1e-9, initial_damping=1e-3)[0]
+    found = run_levenberg_marquardt(problem, start, max_iterations=50, tolerance=1e-9, initial_damping=1e-3)
+    c, f = found.state
     residual = problem.residual(c, f)
     sigma = float(np.sqrt(np.sum(residual**2) / max(3 * n + 2 * m - 18, 1)))
     of_cameras = sigma**2 * invert_information(problem.linearize((c, f)).hessian)

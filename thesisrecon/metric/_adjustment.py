@@ -9,9 +9,14 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.metric._model import CENTRE, FOCAL, K1, MANY_VIEWS, WIDTH, MetricEstimate, residual_norms
+from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
 from thesisrecon.numerics._block_scatter import BlockScatter, block_scatter
-from thesisrecon.numerics._metric_bundle import BundleOptions, MetricBundleResult, refine_metric_bundle
+from thesisrecon.numerics._metric_bundle import (
+    MAX_ITERATIONS,
+    BundleOptions,
+    MetricBundleResult,
+    refine_metric_bundle,
+)
 from thesisrecon.numerics._noise import best_huber_width, noise_from_distances
 from thesisrecon.numerics._observations import Observations
 
@@ -20,8 +25,6 @@ MAX_LOSS_SIGMAS = 20.0
 """For a larger width of Huber's loss, in sigmas, least squares is used."""
 RAYLEIGH_90 = 2.1460
 """90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
-LITTLE_DAMPING = 1e-8
-"""Long image sequences have bending modes of low curvature: stronger damping would keep their drift."""
 SETTLED, ROUND_SETTLED = 1e-5, 1e-3
 """Predicted gain of the cameras, half a squared distance in standard deviations, at which an adjustment ends;
 larger if the observations are chosen again after it."""
@@ -54,7 +57,9 @@ class MetricAdjustment:
     inflation: float = 1.0
     threads: int = 1
 
-    def options(self, model: MetricEstimate, *, iterations: int, settled: float = SETTLED) -> BundleOptions:
+    def options(
+        self, model: MetricEstimate, *, iterations: int = MAX_ITERATIONS, settled: float = SETTLED
+    ) -> BundleOptions:
         """Weights and loss for the noise of a model."""
         return BundleOptions(
             sigma_px=self.inflation * model.sigma_px,
@@ -62,7 +67,6 @@ class MetricAdjustment:
             max_iterations=iterations,
             settled=settled,
             threads=self.threads,
-            damping=LITTLE_DAMPING if model.registered.sum() > MANY_VIEWS else BundleOptions.damping,
         )
 
     def row_prior(self, model: MetricEstimate) -> IntrinsicsPrior:
@@ -95,12 +99,14 @@ class MetricAdjustment:
         *,
         free: B8 | None = None,
         fixed: B8 | None = None,
-        iterations: int,
+        iterations: int = MAX_ITERATIONS,
         settled: float = ROUND_SETTLED,
+        keep_noise: bool = False,
     ) -> tuple[MetricEstimate, MetricBundleResult]:
         """Adjust the model to its inliers, by default all that the prior leaves ``free``; measure noise.
 
-        ``fixed`` (V,) cameras do not move.
+        ``fixed`` (V,) cameras do not move. With ``keep_noise`` the noise stays that of the
+        adjustment, and the result is its minimum.
         """
         prior, moves = self.row_prior(model), self.free(model)
         result = refine_metric_bundle(
@@ -112,13 +118,14 @@ class MetricAdjustment:
             options=self.options(model, iterations=iterations, settled=settled),
             fixed=fixed,
         )
+        model = replace(model, cameras=result.cameras, X=result.X, sigmas_to_minimum=result.sigmas_to_minimum)
+        if keep_noise:
+            return model, result
         norms = np.linalg.norm(result.residual_px, axis=1)
         sigma = max(noise_from_distances(norms), self.noise_floor_px)
         width = best_huber_width(np.abs(result.residual_px).ravel(), sigma)
         model = replace(
             model,
-            cameras=result.cameras,
-            X=result.X,
             sigma_px=sigma,
             loss_sigmas=min(width / sigma, MAX_LOSS_SIGMAS),
             tail=tail_width(norms, sigma),

@@ -24,7 +24,6 @@ FOLDS = 5
 MIN_HELD_OUT = 30
 MAX_REMAINING = 0.25
 """Largest cost of held-out observations of a richer model that is adopted, relative to the simple one."""
-ITERATIONS = 25
 MAX_CHANGE = 0.05
 """Relative change of centres and focal lengths up to which the simpler model is accurate enough."""
 
@@ -87,7 +86,7 @@ def _held_out_cost(
     """Huber's loss of held-out observations, in the noise and the loss of the model ``unit``."""
     inlier = model.inlier.copy()
     inlier[held] = False
-    model = adjustment.run(replace(model, inlier=inlier), iterations=ITERATIONS)[0]
+    model = adjustment.run(replace(model, inlier=inlier))[0]
     t = model.tracks
     xy, _ = reproject_observations(model, t.view_index[held], t.point_index[held])
     size = np.linalg.norm(np.nan_to_num(xy, nan=np.inf) - t.xy[held], axis=1) / unit.sigma_px

@@ -19,6 +19,7 @@ from thesisrecon.metric._model import (
     residual_norms,
 )
 from thesisrecon.metric._uncertainty import USUAL_INFLATION
+from thesisrecon.numerics._metric_bundle import MAX_SIGMAS_TO_MINIMUM
 from thesisrecon.numerics._noise import MAD_FACTOR, noise_from_distances
 from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.numerics._partial_bundle import refine_pose
@@ -206,6 +207,7 @@ def self_check(
         "sigma_rel": float(noise_from_distances(noise) / np.median(longest)) if len(noise) else np.inf,
         "principal_shift_max_long_sides": float(shift.max()),
         "focal_change_since_calibration": float(change.max()) if both.any() else 0.0,
+        "sigmas_to_minimum": model.sigmas_to_minimum,
     }
     each = check_views(model, sigmas=sigmas)
     worst = {
@@ -285,7 +287,12 @@ def _failed_model(check: Mapping[str, float]) -> list[str]:
     low, high = check["focal_min_long_sides"], check["focal_max_long_sides"]
     std, share, noise = check["focal_std_rel_max"], check["explained_share"], check["sigma_rel"]
     shift, change = check["principal_shift_max_long_sides"], check["focal_change_since_calibration"]
+    far = check["sigmas_to_minimum"]
     passed = {
+        f"Bundle adjustment has not converged: its cameras are {far:.2g} standard deviations from the "
+        "minimum, but should be within 0.1. Adjust the result again by bundle_adjust, or add images": (
+            not far > MAX_SIGMAS_TO_MINIMUM
+        ),
         f"Focal lengths of {low:.2f} to {high:.2f} long sides are implausible for images": (
             _FOCAL_RANGE[0] < low and high < _FOCAL_RANGE[1]
         ),

@@ -37,7 +37,8 @@ class MetricEstimate:
     """Metric cameras, points (zeros where not ``valid``) and inliers of one adjustment round.
 
     ``loss_sigmas`` is the width of Huber's loss in sigmas, ``tail`` the width of the residuals' tail relative
-    to normal noise, by which gates are widened.
+    to normal noise, by which gates are widened, ``sigmas_to_minimum`` the distance of the cameras from the
+    minimum of the last adjustment in standard deviations.
     """
 
     tracks: Tracks
@@ -50,6 +51,7 @@ class MetricEstimate:
     sigma_px: float
     loss_sigmas: float = 2.0
     tail: float = 1.0
+    sigmas_to_minimum: float = np.nan
 
     @property
     def gate_px(self) -> float:

@@ -29,8 +29,6 @@ MAX_OBSERVATIONS = 15000
 MAX_VIEWS, RUN = 200, 20
 """Maximum number of views tested, and length of the runs of neighbours that are chosen from more views:
 15,000 observations are too few for all."""
-ITERATIONS = 30
-"""A deformed model is in a long valley of the cost, where a dozen iterations do not suffice."""
 FALSE_ALARM_RATE = 1e-3
 STD_FLOOR = 2e-3
 """Floor of the relative standard deviation of an own focal."""
@@ -92,7 +90,7 @@ def _adjust_per_view(
     if np.isfinite(focal_spread):
         spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
         known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
-    options = replace(adjustment, inflation=1.0).options(model, iterations=ITERATIONS)
+    options = replace(adjustment, inflation=1.0).options(model)
     return refine_metric_bundle(
         MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
         model.X,
@@ -317,7 +315,7 @@ def _free_focals(model: MetricEstimate, adjustment: MetricAdjustment) -> tuple[F
     shared[known, FOCAL] = shared[:, FOCAL].max() + 1 + alike
     std, free = prior.std.copy(), adjustment.free(model)
     std[:, FOCAL], free[FOCAL] = np.inf, True
-    options = adjustment.options(model, iterations=ITERATIONS)
+    options = adjustment.options(model)
     result = refine_metric_bundle(
         replace(cameras, shared=shared),
         model.X,

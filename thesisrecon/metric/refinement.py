@@ -70,9 +70,10 @@ MIN_CHANGE = 0.002
 START_ROUNDS = 3
 MAX_ROUNDS = 4
 """Final rounds of triangulation and adjustment."""
-PRECISE_ROUNDS, PRECISE_ITERATIONS, SAME_POINTS = 5, 15, 0.98
-"""Maximum number of selections of points in large sets, iterations of the adjustment to each, and fraction of
-unchanged points at which the selection ends."""
+NOISE_ROUNDS = 2
+"""Further adjustments after which noise and inliers are estimated again; they change less each time."""
+PRECISE_ROUNDS, SAME_POINTS = 5, 0.98
+"""Maximum number of selections of points in large sets, and fraction of equal points at which they end."""
 LENS_STD = 0.02
 """Prior standard deviation about 0 of k2 and k3 of a camera with several images."""
 NOISE_FLOOR_PX = 0.02
@@ -81,8 +82,6 @@ MAX_ROTATION_RESIDUAL = 0.3
 """Upgraded cameras further from a scaled rotation (norm of 3 C C' / tr(C C') - I) are resected again."""
 UNDETERMINED_REL = 0.1
 """Focal lengths that their own matches determine worse than this (95 %, relative) are reported."""
-LAST_ITERATIONS = 25
-"""Zoomed images give a long valley of the cost: the last adjustment must reach its bottom."""
 NOT_EXPLAINED = (
     "One value per image hardly predicts held-out observations better, so the shared values stay; their "
     "intervals contain the difference"
@@ -193,13 +192,13 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     assert model.cameras.shared is not None
     hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
     if hierarchical is None:
-        return _selected(model), adjustment, own, scatter
+        return model, adjustment, own, scatter
     inflation = float(np.sqrt(max(scatter.median_ratio, 1.0)))
     model, adjustment = apply_hierarchical_prior(
         model, replace(adjustment, inflation=inflation), hierarchical
     )
     model = _iterate_inliers(model, adjustment)
-    return _selected(model), adjustment, own, adjustment.scatter(model)
+    return model, adjustment, own, adjustment.scatter(model)
 
 
 def _selected(model: MetricEstimate) -> MetricEstimate:
@@ -207,14 +206,19 @@ def _selected(model: MetricEstimate) -> MetricEstimate:
 
 
 def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:
-    """Adjust and triangulate until the inliers stay the same, then adjust to convergence."""
+    """Adjust and triangulate until the inliers stay the same, then adjust to convergence.
+
+    The noise and the inliers of the result are those of its last adjustment, so that it is their minimum.
+    """
     for _ in range(MAX_ROUNDS):
         before = model.inlier
-        model = adjustment.run(model, iterations=10)[0]
+        model = adjustment.run(model)[0]
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
         if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
             break
-    return adjustment.run(model, iterations=LAST_ITERATIONS, settled=SETTLED)[0]
+    for _ in range(NOISE_ROUNDS):
+        model = adjustment.run(_selected(model))[0]
+    return adjustment.run(_selected(model), settled=SETTLED, keep_noise=True)[0]
 
 
 def _adjust_to_precise_points(
@@ -226,7 +230,7 @@ def _adjust_to_precise_points(
     before = np.empty(0, dtype=np.int64)
     for _ in range(PRECISE_ROUNDS):
         model, points = with_precise_points(model, tracks)
-        model = adjustment.run(model, iterations=PRECISE_ITERATIONS)[0]
+        model = adjustment.run(model)[0]
         if len(np.intersect1d(points, before)) >= SAME_POINTS * len(points):
             break
         before = points

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import scipy
@@ -17,9 +17,11 @@ Step = TypeVar("Step")
 StepOut = TypeVar("StepOut", covariant=True)
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
-# Curvature, relative to the diagonal, of the least determined combination of unknowns that must converge.
-# Stronger damping divides the predicted gain of such a combination by up to damping / _WEAKEST.
+# Damping below which a step is as good as undamped: the curvature, relative to the diagonal, of the least
+# determined combination of unknowns that must converge.
 _WEAKEST = 1e-8
+# Gain relative to the cost that is below its rounding.
+_ROUNDING = 1e-15
 # Unknowns above which information is inverted by Cholesky.
 _MANY = 1200
 
@@ -47,50 +49,67 @@ class _Problem(Protocol[State, Step]):
     def cost(self, state: State) -> float: ...
 
 
+@dataclass(frozen=True)
+class Descent(Generic[State]):
+    """Final state, its cost, the number of linear solves and the last damping.
+
+    ``remaining`` is the gain of the cameras that an undamped step promised at the final state, or at the one
+    before it if that was small: half the squared Newton decrement.
+    """
+
+    state: State
+    cost: float
+    iterations: int
+    damping: float
+    remaining: float
+
+
 def run_levenberg_marquardt(
     problem: _Problem[State, Step],
     state: State,
     *,
     max_iterations: int,
-    tolerance: float = 1e-7,
+    tolerance: float = 1e-10,
     min_camera_gain: float = 0.0,
-    initial_damping: float = 1e-4,
-) -> tuple[State, float, int]:
-    """Minimise a problem by Levenberg-Marquardt; return the final state, its cost, linear solves (6.7).
+    initial_damping: float = _WEAKEST,
+) -> Descent[State]:
+    """Minimise a problem by Levenberg-Marquardt (6.7).
 
     The cost never rises and singular systems raise nothing. The damping multiplies the diagonal (Marquardt
     1963), so that units do not matter and gauge freedoms need no other treatment; it follows Nielsen
-    (IMM-REP-1999-05). At convergence the gain of cost, predicted or actual, is at most ``tolerance`` relative
-    to the cost, or that of the cameras, predicted, is below ``min_camera_gain``.
+    (IMM-REP-1999-05). It ends when the predicted gain of an undamped step is at most ``tolerance`` relative
+    to the cost, or that of the cameras at most ``min_camera_gain``. A small gain of a damped step is no sign
+    of a minimum: in a valley the damping makes steps short.
     """
     system = problem.linearize(state)
-    cost = system.cost
-    damping, growth = initial_damping, 2.0
-    for iteration in range(1, max_iterations + 1):
-        solved = system.solve(damping)
-        gain, predicted, camera_gain, candidate = -1.0, 1.0, np.inf, state
+    cost, damping, growth = system.cost, initial_damping, 2.0
+    iteration = 0
+    while iteration < max_iterations and damping <= _MAX_DAMPING:
+        iteration += 1
+        solved, least = system.solve(damping), damping <= _WEAKEST
+        gain, predicted, camera_gain, candidate = -1.0, np.inf, np.inf, state
         if solved is not None:
             step, predicted, camera_gain = solved
-            camera_gain *= max(1.0, damping / _WEAKEST)
-            if predicted <= tolerance * 1e-3 * cost:
-                return state, cost, iteration
             candidate = problem.retract(state, step)
             gain = cost - problem.cost(candidate)
+        small = camera_gain <= min_camera_gain or predicted <= tolerance * cost
         if gain > 0.0 and np.isfinite(gain):
-            state, previous = candidate, cost
+            state, cost = candidate, cost - gain
+            if small and least:
+                return Descent(state, cost, iteration, damping, camera_gain)
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / predicted - 1.0) ** 3), _MIN_DAMPING)
+            if small and growth == 2.0:
+                damping = min(damping, _WEAKEST)
             growth = 2.0
-            if gain <= tolerance * previous or camera_gain < min_camera_gain:
-                return state, cost - gain, iteration
-            cost -= gain
-            if iteration < max_iterations:
-                system = problem.linearize(state)
-                cost = system.cost
+            system = problem.linearize(state)
+            cost = system.cost
+        elif (small and least) or predicted <= _ROUNDING * cost:
+            break
         else:
             damping, growth = damping * growth, growth * 2.0
-            if damping > _MAX_DAMPING:
-                return state, cost, iteration
-    return state, cost, max_iterations
+    solved = system.solve(_WEAKEST)
+    remaining = np.inf if solved is None else solved[2]
+    return Descent(state, cost, iteration, damping, remaining)
 
 
 @dataclass(frozen=True)
@@ -199,9 +218,10 @@ def minimize_residuals(
     if not (np.isfinite(x0).all() and np.isfinite(residual_fn(x0)).all()):
         raise ValueError("minimize_residuals needs a start with finite residuals")
     problem = _VectorProblem(residual_fn, jacobian, loss)
-    x, cost, _ = run_levenberg_marquardt(
+    found = run_levenberg_marquardt(
         problem, x0, max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3
     )
+    x, cost = found.state, found.cost
     residual = residual_fn(x)
     variance = 2.0 * cost / max(len(residual) - len(x0), 1)
     return ResidualMinimum(x, cost, variance * invert_information(problem.linearize(x).hessian), residual)

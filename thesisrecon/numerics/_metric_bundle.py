@@ -23,7 +23,7 @@ from thesisrecon.numerics._intrinsic_unknowns import (
     assign_columns,
     number_unknowns,
 )
-from thesisrecon.numerics._levenberg_marquardt import run_levenberg_marquardt
+from thesisrecon.numerics._levenberg_marquardt import Descent, run_levenberg_marquardt
 from thesisrecon.numerics._metric_kernels import (
     POSE_DOF,
     MetricCameras,
@@ -46,6 +46,10 @@ from thesisrecon.numerics._schur import BundleLayout, BundleStep, BundleSystem, 
 # the curvature along a residual is kept. Reweighting is safe far from the minimum, Newton's method faster
 # near it.
 _MIN_CURVATURE, _NEWTON_GAIN = 0.3, 1e-3
+MAX_ITERATIONS = 300
+"""Bound of the linear solves of one adjustment: a long valley of the cost takes fifty to a hundred."""
+MAX_SIGMAS_TO_MINIMUM = 0.1
+"""Distance of the cameras from the minimum, in standard deviations, up to which it counts as reached."""
 
 _Covariances = tuple[F64, F64 | None, F64 | None]
 """Covariances of intrinsics (G, C, C), poses (V, 6, 6) and points (N, 3, 3)."""
@@ -63,12 +67,11 @@ class BundleOptions:
 
     sigma_px: float = 1.0
     loss_px: float = 1.0
-    max_iterations: int = 20
+    max_iterations: int = MAX_ITERATIONS
     settled: float = 0.0
     covariance: bool = False
     point_covariance: bool = False
     noise_floor_px: float = 0.0
-    damping: float = 1e-4
     threads: int = 1
 
     def __post_init__(self) -> None:
@@ -84,6 +87,8 @@ class MetricBundleResult:
     units of the given sigma, priors included. ``intrinsics_covariance`` (G, C, C) is zero for entries that do
     not move, ``pose_covariance`` (V, 6, 6) that of (rotation vector in rad, translation) of x -> exp(w) x + d
     in each camera frame, ``point_covariance`` (N, 3, 3) infinite for points in fewer than two views.
+    ``sigmas_to_minimum`` is (g' H^-1 g)^(1/2) of the cameras: the largest undamped step of any function of
+    them in its standard deviations, for noise of the given sigma.
     """
 
     cameras: MetricCameras
@@ -93,7 +98,8 @@ class MetricBundleResult:
     intrinsics_covariance: F64
     pose_covariance: F64 | None
     sigma_px: float
-    point_covariance: F64 | None = None
+    point_covariance: F64 | None
+    sigmas_to_minimum: float
 
 
 @dataclass(frozen=True)
@@ -195,7 +201,8 @@ def refine_metric_bundle(
         np.ascontiguousarray(cameras.group, dtype=np.int64),
         np.ascontiguousarray(scale * (X - origin)),
     )
-    state, cost = _minimize(problem, _State(start, values), options)
+    found = _minimize(problem, _State(start, values), options)
+    state, cost = found.state, found.cost
     end, moved = state.model, problem.moves
     refined = replace(
         cameras,
@@ -211,27 +218,23 @@ def refine_metric_bundle(
         covariances = _covariances(problem, state, noise, scale, points=options.point_covariance)
     return MetricBundleResult(
         refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), cost,
-        *covariances[:2], sigma, covariances[2],
+        *covariances[:2], sigma, covariances[2], float(np.sqrt(2.0 * max(found.remaining, 0.0))),
     )  # fmt: skip
 
 
-def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> tuple[_State, float]:
-    """Return the minimum and its cost: by reweighting, then by steps close to Newton's."""
-    most, damping, settled = options.max_iterations, options.damping, options.settled
-    state, cost, iterations = run_levenberg_marquardt(
-        problem,
-        state,
-        max_iterations=most,
-        tolerance=_NEWTON_GAIN,
-        min_camera_gain=settled,
-        initial_damping=damping,
+def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Descent[_State]:
+    """Return the minimum: by reweighting, then by steps close to Newton's."""
+    most, settled = options.max_iterations, options.settled
+    found = run_levenberg_marquardt(
+        problem, state, max_iterations=most, tolerance=_NEWTON_GAIN, min_camera_gain=settled
     )
-    if iterations < most:
+    if found.iterations < most:
         near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
-        state, cost, _ = run_levenberg_marquardt(
-            near, state, max_iterations=most - iterations, min_camera_gain=settled, initial_damping=damping
-        )
-    return state, cost
+        found = run_levenberg_marquardt(
+            near, found.state, max_iterations=most - found.iterations, min_camera_gain=settled,
+            initial_damping=found.damping,
+        )  # fmt: skip
+    return found
 
 
 def _metric_problem(

@@ -292,7 +292,7 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     scale = float(T[0, 0])
     weighting = Weighting(1.0, loss_px * scale)
     problem = _CameraProblem(points, _one_view_observations(xy * scale + T[:2, 2]), weighting)
-    end, _, _ = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations)
+    end = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations).state
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), (frame.S @ frame.N).T)
     raw = frame.cameras_back(np.linalg.inv(T) @ end.reshape(3, 4)).ravel()
@@ -348,7 +348,7 @@ def refine_pose(
     problem = _PoseProblem(_one_view_observations(xy), columns, weighting)
     moved, points = scale * (t + R @ origin), np.ascontiguousarray(scale * (X - origin))
     start = MetricModel(R[None], moved[None], intrinsics[None], np.zeros(1, dtype=np.int64), points)
-    end, _, _ = run_levenberg_marquardt(problem, start, max_iterations=iterations)
+    end = run_levenberg_marquardt(problem, start, max_iterations=iterations).state
     units = np.ones(6 + len(columns))
     units[3:6] = 1.0 / scale
     covariance = invert_information(problem.linearize(end).hessian) * units * units[:, None]

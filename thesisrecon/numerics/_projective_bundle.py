@@ -100,9 +100,9 @@ def refine_projective_bundle(
     cameras, P_norms = _unit_rows(frame.cameras(T @ P).reshape(-1, 12), observed)
     points, X_norms = _unit_rows(frame.points(X), seen_points)
     start = UnitState.at(cameras, points)
-    end, _, _ = run_levenberg_marquardt(
+    end = run_levenberg_marquardt(
         problem, start, max_iterations=max_iterations, min_camera_gain=settled * (loss_px * scale) ** 2
-    )
+    ).state
 
     P_back = frame.cameras_back(np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4))
     X_back = frame.points_back(end.X * X_norms[:, None])
