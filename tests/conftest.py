@@ -5,9 +5,14 @@ import logging
 import os
 
 import pytest
+from hypothesis import settings
 
 from thesisrecon.cli.main import run_command
 from thesisrecon.runtime._run_folder import bytes_from_record
+
+# The same examples on every machine: whether a test passes is no matter of chance.
+settings.register_profile("same", derandomize=True, database=None)
+settings.load_profile("same")
 
 LOCAL = {
     "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": ":0", "worker_dashboard_address": None,

@@ -65,9 +65,13 @@ def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed):
     shift, X = rng.normal(size=3), ball(800, seed)
     path = paths.orbit(moved(cameras, turn, shift), X @ turn.T + shift, 12)
     middle, up = paths._geometric_median(X @ turn.T + shift), turn @ UP
+    # The weight of the axes turns the estimated direction, on short arcs most (Davis and Kahan's bound).
+    rows, _, axis = np.array([camera.R for camera in cameras]).transpose(1, 0, 2)
+    weighted = paths.TILT_WEIGHT * axis.T @ axis
+    rolled = np.linalg.norm(weighted @ UP) / np.linalg.eigvalsh(rows.T @ rows + weighted)[1]
     for camera in path:
         np.testing.assert_allclose(project(camera, middle), [79.5, 59.5], atol=1e-6)
-        assert abs(camera.R[0] @ up) < 0.06
+        assert abs(camera.R[0] @ up) < rolled + 1e-9
         assert -camera.R[1] @ up > 0.1
         assert np.linalg.norm(camera.centre - shift) > 1.2
     # A swing has no first camera to start from, but what it passes is the same.
