@@ -9,6 +9,7 @@ import csv
 import json
 import math
 import os
+import re
 import shlex
 import shutil
 import stat
@@ -46,6 +47,16 @@ def _escaped(c: str) -> str:
     if unicodedata.category(c) not in _CONTROL_CATEGORIES and c not in _BIDI_MARKS:
         return c
     return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}"
+
+
+def natural_key(name: str) -> tuple[list[tuple[str, int, str]], str]:
+    """Sorting key of names in the order of characters, but of numbers by value: frame9 before frame10."""
+    # A run of digits stands where its first digit would; int() refuses thousands of digits.
+    parts = [
+        ("0", len(part.lstrip("0")), part.lstrip("0")) if part[0] in "0123456789" else (part, 0, "")
+        for part in re.findall(r"[0-9]+|[^0-9]", name, re.DOTALL)
+    ]
+    return parts, name
 
 
 def shortened(text: str, longest: int = 60) -> str:

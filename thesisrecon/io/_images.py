@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import stat
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, suppress
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io._files import SPECIAL_FILE, printable
+from thesisrecon.io._files import SPECIAL_FILE, natural_key, printable
 from thesisrecon.io._pixels import (
     EXIF_INVERSE,
     EXIF_TRANSFORMS,
@@ -35,6 +36,7 @@ from thesisrecon.io._pixels import (
     decoding_bytes,
     resized_to,
 )
+from thesisrecon.io._raw_files import RAW_FILE, RAW_SIGNATURE, RAW_SUFFIXES, refuse_raw_file
 from thesisrecon.records import Image
 
 DEMO_IMAGES = 6
@@ -60,8 +62,19 @@ ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image
 # Raw files, and HEIC files without their reader, are listed so that they are refused by name, not overlooked.
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".jp2", ".avif"),
-    *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2"),
+    *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", *RAW_SUFFIXES),
 )
+"""Suffixes of files that are listed unseen; others are listed if they begin like an image."""
+_SIGNATURE = re.compile(
+    rb"\xff\xd8\xff|\x89PNG\r\n|II[*+]\0|MM\0[*+]|BM.{4}\0{4}.{4}[\x0c\x28\x34\x38\x40\x6c\x7c]\0\0\0|GIF8[79]a"
+    rb"|RIFF.{4}WEBP|\0\0\0\x0cj[PX]|\xff\x4f\xff\x51|.{4}ftyp(?:avi[fs]|mif1|msf1|hei[cmsx]|hev[cmsx])"
+    rb"|P[1-6]\s+(?:#[^\n]*\n\s*)*\d+\s+\d+\s|" + RAW_SIGNATURE.pattern,
+    re.DOTALL,
+)
+"""First bytes of images and raw files, under any name."""
+_SIGNATURE_BYTES = 256
+_THUMBNAIL_SUFFIXES = (".thm",)
+"""JPEG files of 160 x 120 pixels that cameras write beside their images and videos."""
 _HEIF_SUFFIXES = (".heic", ".heif")
 _GENERIC_FOLDERS = ("images", "photographs", "photos", "pictures", "dcim")
 MAX_FILE_BYTES = 2**31
@@ -113,18 +126,30 @@ def image_without_pixels(name: str, size: tuple[int, int]) -> Image:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List the image files of a folder by suffix, sorted, without hidden files and sub-folders."""
+    """List the image files of a folder by suffix or content, without hidden files and sub-folders.
+
+    Numbers in names are compared as numbers: frame9 before frame10.
+    """
     if not folder.exists():
         raise UsageError(f"there is no folder {folder}")
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a folder; give the folder of the images")
     try:
-        entries = sorted(folder.iterdir(), key=lambda path: path.name)
+        entries = sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
     except OSError as error:
         raise UsageError(f"the folder {folder} cannot be read: {error.strerror}") from None
-    return [
-        p for p in entries if p.suffix.lower() in SUFFIXES and not p.name.startswith(".") and not p.is_dir()
-    ]
+    return [p for p in entries if not p.name.startswith(".") and not p.is_dir() and _is_listed(p)]
+
+
+def _is_listed(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    if suffix in SUFFIXES or suffix in _THUMBNAIL_SUFFIXES or not path.is_file():
+        return suffix in SUFFIXES
+    try:
+        with path.open("rb") as file:
+            return _SIGNATURE.match(file.read(_SIGNATURE_BYTES)) is not None
+    except OSError:
+        return False
 
 
 def images_folder(source: ImageSource) -> Path | None:
@@ -193,15 +218,14 @@ def read_images(
         first = distinct.setdefault(decoded.digest, decoded)
         if first is not decoded:
             refused[decoded.image.name] = f"has the same pixels as {first.image.name}"
-    return ImageSet(
-        tuple(sorted(distinct.values(), key=lambda d: d.image.name)), dict(sorted(refused.items()))
-    )
+    # The items are in the order of their names.
+    return ImageSet(tuple(distinct.values()), {name: refused[name] for name, _ in items if name in refused})
 
 
 def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
+    """Names and files or arrays in the order of the names."""
     if isinstance(source, str | Path):
-        paths = list_images(Path(source))
-        return sorted(zip(_names(path.name for path in paths), paths, strict=True), key=lambda pair: pair[0])
+        source = list_images(Path(source))
     paths = [Path(item) for item in source if isinstance(item, str | Path)]
     # Files of one name from several folders are distinguished by their paths.
     full = len({path.name for path in paths}) < len(paths)
@@ -214,7 +238,7 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
 
     names = _names(name_of(n, item) for n, item in enumerate(source))
     items = [Path(item) if isinstance(item, str) else item for item in source]
-    return sorted(zip(names, items, strict=True), key=lambda pair: pair[0])
+    return sorted(zip(names, items, strict=True), key=lambda pair: natural_key(pair[0]))
 
 
 def _names(names: Iterable[str]) -> list[str]:
@@ -277,18 +301,23 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
         )
     try:
         # Opened here, since Pillow does not close files that it cannot read.
-        with path.open("rb") as stream, PIL.Image.open(stream, formats=_formats()) as file:
-            needed = decoding_bytes(file)
-            if needed > MAX_DECODED_BYTES:
-                raise UnusableImage(_too_large(file, needed))
-            with _budget.reserve(needed), closing(file):
-                return use(file)
+        with path.open("rb") as stream:
+            refuse_raw_file(stream, path.suffix)
+            stream.seek(0)
+            with PIL.Image.open(stream, formats=_formats()) as file:
+                needed = decoding_bytes(file)
+                if needed > MAX_DECODED_BYTES:
+                    raise UnusableImage(_too_large(file, needed))
+                with _budget.reserve(needed), closing(file):
+                    return use(file)
     except UnusableImage:
         raise
     except PIL.Image.DecompressionBombError:
         limit = 2 * (PIL.Image.MAX_IMAGE_PIXELS or 0) // 10**6
         raise UnusableImage(f"claims more than {limit} megapixels") from None
     except PIL.UnidentifiedImageError:
+        if path.suffix.lower() in RAW_SUFFIXES:
+            raise UnusableImage(RAW_FILE) from None
         if path.suffix.lower() in _HEIF_SUFFIXES and "HEIF" not in _formats():
             raise UnusableImage("is a HEIC image: install pillow-heif, the extra heif, to read it") from None
         raise UnusableImage("is not an image of a known format") from None

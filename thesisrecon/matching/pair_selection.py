@@ -58,7 +58,7 @@ class AllPairs:
 
 @dataclass(frozen=True)
 class SequenceWindow:
-    """Each image with the next ones in the order of the file names.
+    """Each image with the next ones in the order of the file names, with numbers compared as numbers.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Unpack
 
@@ -20,6 +21,9 @@ from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
+
+_MAX_LISTED = 5
+"""Files left out for one reason that are listed one by one in the warnings."""
 
 
 def reconstruct(
@@ -160,7 +164,7 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
     if found + refused == 0:
         raise UsageError("the list of images is empty")
     warnings += [f"{p.image.name}: {p.note}" for p in inputs.decoded if p.note]
-    warnings += [f"{name} is left out: it {reason}" for name, reason in inputs.refused.items()]
+    warnings += _refusals(inputs.refused)
     # The masks of frames that were not chosen are no mistake.
     warnings += unused if not counts else []
     warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
@@ -168,6 +172,20 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
     counts |= {"read": found, "refused": refused} | ({"masked": masked} if masked else {})
     run.finish("images", counts=counts, warnings=warnings)
     return inputs
+
+
+def _refusals(refused: Mapping[str, str]) -> list[str]:
+    """A warning about each file that is left out, and one about many of the same reason."""
+    names: dict[str, list[str]] = {}
+    for name, reason in refused.items():
+        names.setdefault(reason, []).append(name)
+    found: list[str] = []
+    for reason, files in names.items():
+        if len(files) > _MAX_LISTED:
+            found.append(f"{files[0]} and {len(files) - 1} more files are left out: each {reason}")
+        else:
+            found += [f"{name} is left out: it {reason}" for name in files]
+    return found
 
 
 def _exif_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
