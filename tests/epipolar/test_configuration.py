@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.epipolar.configuration import (
     Configuration,
+    _eigenvalue_errors,
     _rotation_homography,
     _rotation_test,
     classify_configuration,
@@ -123,3 +125,13 @@ def test_exact_and_wrong_calls():
     refuses(StageFailure, "needed at least 12", classify_configuration, pair.F, xy1[:11], xy2[:11])
     refuses(ValueError, "11", classify_configuration, pair.F, xy1, xy2, inliers=np.ones(11, bool))
     refuses(ValueError, "rank 2", classify_configuration, np.zeros((3, 3)), xy1, xy2)
+
+
+@pytest.mark.parametrize("scale", [0.1, 30.0, -2.0])
+def test_the_eigenvalues_of_a_homography_do_not_depend_on_its_scale(scale):
+    rng = np.random.default_rng(2)
+    H = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix() + 1e-3 * rng.normal(size=(3, 3))
+    root = 1e-4 * rng.normal(size=(9, 9))
+    expected = _eigenvalue_errors(H, root @ root.T)
+    assert 0.0 < expected < np.inf
+    assert _eigenvalue_errors(scale * H, scale**2 * root @ root.T) == pytest.approx(expected, rel=1e-6)

@@ -98,6 +98,9 @@ def test_a_homography_of_noisy_matches_has_their_noise_and_its_covariance():
         error = fit.H * np.sign(np.sum(fit.H * H)) - H
         ratios.append(squared_in_covariance(error, fit.covariance, 8))
         sigmas.append(fit.sigma_px)
+        # H has unit norm: no part of its error is along H.
+        along = fit.covariance @ fit.H.ravel()
+        assert np.linalg.norm(along) < 1e-9 * np.linalg.norm(fit.covariance)
     assert 0.45 < np.mean(sigmas) < 0.55
     assert 0.7 < np.mean(ratios) < 1.5
 

@@ -10,6 +10,7 @@ from tests.conftest import refuses
 from tests.geometry import properties as twins
 from tests.geometry.properties import holds_for_every, random_camera
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.geometry._conditioning import pixel_conditioning
 from thesisrecon.geometry.camera_matrix import (
     camera_centre,
     compose_camera,
@@ -18,7 +19,10 @@ from thesisrecon.geometry.camera_matrix import (
     project,
     undistort,
 )
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.polynomial_triangulation import (
+    _conditioning,
+    _intersect_planes,
     _roots_in_unit_interval,
     correct_matches,
     triangulate_polynomial,
@@ -415,3 +419,24 @@ def test_pixels_beyond_the_distortion_model_stay_unchanged():
     # r - 0.3 r^3 is never above 0.703.
     far = np.array([[3.0, 0.0], [0.6, 0.6], [0.0, 0.0]])
     np.testing.assert_array_equal(undistort(far, -0.3), far)
+
+
+@pytest.mark.parametrize("half", [1e-4, 0.3, 2e3])
+def test_pixels_of_every_scale_are_conditioned(half):
+    xy = np.array([[5.0, 3.0], [-3.0, -4.0], [1.0, 2.0]]) * half
+    box = np.array([xy.min(axis=0), xy.max(axis=0)])
+    T = pixel_conditioning(xy)
+    moved = homogenize(box) @ T.T
+    np.testing.assert_allclose(np.linalg.norm(moved[:, :2], axis=1), 1.0)
+    np.testing.assert_allclose(moved[0, :2], -moved[1, :2])
+    scale, centre, _ = _conditioning(np.stack([xy, 2.0 * xy]))
+    assert np.abs(scale * (np.stack([xy, 2.0 * xy]) - centre[:, None])).max() == pytest.approx(1.0)
+
+
+def test_the_size_of_a_point_of_three_planes_does_not_depend_on_theirs():
+    planes = np.random.default_rng(5).normal(size=(3, 4))
+    X = np.empty(4)
+    size = _intersect_planes(*planes, X)
+    np.testing.assert_allclose(planes @ X, 0.0, atol=1e-12)
+    for scales in np.diag([2.0, -2.0, 2.0]) + 1.0:
+        assert _intersect_planes(*(planes * scales[:, None]), np.empty(4)) == pytest.approx(size)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from thesisrecon.numerics._nearest import nearest_neighbours
+from thesisrecon.numerics._nearest import _grid, nearest_neighbours
 
 
 @pytest.mark.parametrize(("points", "count"), [(1, 1), (12, 10), (40, 40), (900, 7)])
@@ -30,3 +30,11 @@ def test_equally_distant_points_come_in_the_order_of_their_numbers() -> None:
     xy = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     assert nearest_neighbours(xy, np.zeros((1, 2)), 5).tolist() == [[3, 4, 0, 1, 2]]
     assert nearest_neighbours(np.zeros((4, 2)), np.full((1, 2), 3.0), 3).tolist() == [[0, 1, 2]]
+
+
+def test_cells_hold_about_two_points_wherever_the_points_are() -> None:
+    xy = np.random.default_rng(0).uniform([-300.0, 5e4], [180.0, 5.036e4], (900, 2))
+    low, cell, shape = _grid(xy)
+    np.testing.assert_array_equal(low, xy.min(axis=0))
+    assert 400 < shape[0] * shape[1] < 600
+    assert (shape * cell > np.ptp(xy, axis=0)).all()

@@ -8,7 +8,7 @@ import pytest
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.selfcalibration._candidates import plane_from_focals, select_candidate
+from thesisrecon.selfcalibration._candidates import _no_candidate_failure, plane_from_focals, select_candidate
 from thesisrecon.selfcalibration._dual_quadric import quadric_hypotheses
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
@@ -115,3 +115,20 @@ def test_given_focals_without_a_solution_are_named(focals, reported):
     with pytest.raises(StageFailure, match="near the given focal length") as failure:
         select_candidate(frame, estimate, RotationCriterion(), [], max_candidates=3, min_in_front_ratio=0.9)
     assert f"{reported} (+-" in failure.value.evidence
+
+
+@pytest.mark.parametrize(
+    ("focal", "words"),
+    [((499.4, 499.8), "499 px"), ((500.0, 500.8), "500 to 501 px"), ((700.0, 500.0), "500 to 700 px")],
+)
+def test_a_failure_near_given_focal_lengths_states_them(focal, words):
+    scene = make_scene(views=4)
+    given = projective_reconstruction(scene)
+    options = IntrinsicsOptions(cameras="per-image", focal_px=500.0, focal_std_rel=0.02)
+    frame = normalized_frame(given, prior_for(given, options))
+    mean = frame.prior.mean.copy()
+    mean[:, 0] = [*focal, *focal]
+    frame = replace(frame, prior=replace(frame.prior, mean=mean))
+    failure = _no_candidate_failure(frame, given, 40)
+    assert str(failure.reason).endswith("near the given focal length")
+    assert failure.evidence.startswith(f"{words} (+- 2.0%) at working size was given")

@@ -9,10 +9,16 @@ from hypothesis import strategies as st
 
 from tests.selfcalibration.test_direct_methods import adjusted, at_distance, prior_for, reprojected
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.numerics._noise import soft_l1
 from thesisrecon.selfcalibration import _refinement
 from thesisrecon.selfcalibration._candidates import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
-from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals, refine_hypotheses
+from thesisrecon.selfcalibration._refinement import (
+    RotationCriterion,
+    dual_image_residuals,
+    minimize_batch,
+    refine_hypotheses,
+)
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import _overlapping_pairs, _pair_residuals, _plane_for_focals
 
@@ -130,3 +136,12 @@ def test_candidates_are_distinguished_by_focals_or_plane():
     ]
     assert [a.method for a in distinct_candidates(frame, answers, 9)] == ["b", "c"]
     assert [a.method for a in distinct_candidates(frame, answers, 1)] == ["b"]
+
+
+def test_the_minimum_with_a_robust_loss_is_that_of_the_loss():
+    data, width = np.array([-3.0, -0.1, 0.0, 0.2, 0.3, 5.0, 9.0]), 0.3
+    x, cost = minimize_batch(lambda x: x - data, np.array([[0.7], [-2.0]]), iterations=200, loss_scale=width)
+    grid = np.linspace(-1.0, 1.0, 200_001)
+    losses = np.mean([soft_l1((grid - d) ** 2, width)[0] for d in data], axis=0)
+    np.testing.assert_allclose(x[:, 0], grid[losses.argmin()], atol=2e-5)
+    np.testing.assert_allclose(cost, losses.min(), rtol=1e-9)
