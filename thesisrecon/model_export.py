@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -16,13 +17,14 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.io import _export_formats as formats
-from thesisrecon.io._colmap_writing import has_skew, write_sparse_model
+from thesisrecon.io._colmap_writing import COLMAP_FILES, has_skew, write_sparse_model
 from thesisrecon.io._export_formats import calibration, coefficients
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import MAX_DECODED_BYTES, find_images, read_image, rotation_words
 from thesisrecon.io._masks import find_masks, read_mask
 from thesisrecon.io._models import colmap_model_in
+from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._executors import available_threads
@@ -69,6 +71,15 @@ _PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
     "bundler": lambda folder, model, _: formats.write_bundler(folder, model),
 }
 """Formats with undistorted images, perhaps with masks."""
+_FILES: Mapping[str, Sequence[str]] = {
+    **dict.fromkeys(("colmap", "colmap-undistorted"), COLMAP_FILES),
+    "nerfstudio": ("transforms.json", "points.ply"),
+    "openmvs": ("scene.mvs",),
+    "bundler": ("bundle.out", "list.txt"),
+    "opencv": ("poses.yml", "camera_[0-9]*.yml"),
+    "kalibr": ("camchain.yaml",),
+}
+"""Files of each format beside images and masks."""
 FORMATS = (*_PINHOLE, *_DISTORTED)
 
 
@@ -80,6 +91,7 @@ def export(
     images: str | Path | None = None,
     masks: str | Path | None = None,
     threads: int = 0,
+    overwrite: bool = False,
 ) -> ExportReport:
     """Write a model for another program.
 
@@ -88,7 +100,7 @@ def export(
     model : SparseModel, RunResult or path
         A model, a run or its output folder, or a COLMAP model.
     out : path
-        Folder of the export; created if missing, files of the same names are replaced.
+        Folder of the export; created if missing.
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"``, ``"openmvs"`` and ``"bundler"`` write undistorted images
         of pinhole cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
@@ -99,6 +111,8 @@ def export(
         Folder of the masks of the original images; None: that of the run, if it had masks.
     threads : int
         Number of images that are undistorted at the same time; 0: one per processor.
+    overwrite : bool
+        Replace files of the same names that thesisrecon did not write, or that were changed since.
 
     Returns
     -------
@@ -108,8 +122,8 @@ def export(
     Raises
     ------
     UsageError, StageFailure, OutputError
-        If the format is unknown or cannot represent the cameras, or the images are not found, have another
-        size or would be replaced; if an image cannot be read; if a file cannot be written.
+        If the format is unknown or cannot represent the cameras, the images are not found or have another
+        size, or a file would be replaced; if an image cannot be read; if a file cannot be written.
 
     Examples
     --------
@@ -134,18 +148,21 @@ def export(
     require_separate(folder, to, model=source, images=images, masks=masks)
     model = as_sparse_model(model)
     _require_cameras(model, to)
-    if (folder / "run.json").exists():
+    if os.path.lexists(folder / "run.json"):
         raise UsageError(f"the folder {folder} holds a run; export to another folder")
     notes = lost + (_rounding_notes(model) if to in ("nerfstudio", "openmvs") else [])
     if to in _DISTORTED:
-        file, more = _DISTORTED[to](folder, model)
+        with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
+            file, more = _DISTORTED[to](folder, model)
         return ExportReport(file, (*notes, *more))
     undistorted = _undistorted(model, bundler=to == "bundler")
     if masks is not None and to == "bundler":
         notes, masks = [*notes, "no masks are written: Bundler has none"], None
     files = None if masks is None else _mask_files(Path(masks), model, undistorted, to)
-    _write_images(folder, model, undistorted, images, files, threads)
-    return ExportReport(_PINHOLE[to](folder, undistorted, files is not None), tuple(notes))
+    written = [Path("images", name) for name in undistorted.names] + [Path(name) for _, name in files or ()]
+    with claim_folder(folder, overwrite=overwrite, names=[*_FILES[to], *written]):
+        _write_images(folder, model, undistorted, images, files, threads)
+        return ExportReport(_PINHOLE[to](folder, undistorted, files is not None), tuple(notes))
 
 
 def require_separate(
@@ -174,8 +191,8 @@ def require_separate(
     written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
     colmap = None if model is None else colmap_model_in(Path(model))
     given = [Path(path) for path in (colmap, images, masks) if path is not None]
-    replaced = {path.resolve() for path in written}
-    lost = next((path for path in given if path.resolve() in replaced), None)
+    there = [path for path in written if path.exists()]
+    lost = next((path for path in given if path.exists() and any(map(path.samefile, there))), None)
     if lost is not None:
         raise UsageError(
             f"the export to {folder} would replace the originals in {lost}; export to another folder"

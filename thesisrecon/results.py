@@ -244,20 +244,22 @@ class RunResult:
         xy = (r.tracks.xy[seen] + 0.5) / self.images[i].scale - 0.5
         return SeenPoints(xy, row[r.tracks.point_index[seen]])
 
-    def save(self, folder: str | Path) -> None:
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write ``cameras.json``, ``points.ply``, ``sparse/0``, ``model.glb`` and ``summary.json``.
 
         Parameters
         ----------
         folder : path
-            Created if missing; files of these names are replaced.
+            Created if missing.
+        overwrite : bool
+            Replace files of these names that thesisrecon did not write, or that were changed since.
 
         Raises
         ------
-        OutputError
-            If a file cannot be written.
+        UsageError, OutputError
+            If a file would be replaced; if a file cannot be written.
         """
         # Imported on use, because the writers import this module.
         from thesisrecon.pipeline._outputs import save_result
 
-        save_result(self, Path(folder))
+        save_result(self, Path(folder), overwrite=overwrite)

@@ -170,7 +170,9 @@ def test_a_folder_of_photographs_is_not_written_over(run, refused):
     said = refused(["render", run, "-o", photographs])
     assert "contains 'frame-0001.png', which this command did not create" in said
     assert (photographs / "frame-0001.png").read_bytes() == b"dear"
-    assert "cannot be used" in refused(["render", run, "-o", photographs / "frame-0001.png"])
+    assert "move the file that is in the place of a folder" in refused(
+        ["render", run, "-o", photographs / "frame-0001.png"]
+    )
 
 
 def test_progress_is_reported_to_the_end(run):

@@ -113,11 +113,13 @@ def test_the_folder_of_another_version(make, words, tmp_path, run_cli):
 
 @pytest.mark.parametrize("make", [pipe, links("/dev/zero"), writes(files.deep_json()), sparse(10**13)])
 def test_an_invalid_run_file_counts_as_another_run(make, tmp_path, run_cli):
-    """An invalid run file may be replaced: the folder holds no results."""
     folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
     out.mkdir()
     make(out / "run.json")
-    run_cli(["reconstruct", str(folder), "-o", str(out), *FEATURES], 0)
+    command = ["reconstruct", str(folder), "-o", str(out), *FEATURES]
+    assert "holds another run (its run.json " in run_cli(command, 2)
+    assert [path.name for path in out.iterdir()] == ["run.json"]
+    run_cli([*command, "--overwrite"], 0)
     assert json.loads((out / "run.json").read_text(encoding="utf-8"))["seed"] == 0
 
 
@@ -132,7 +134,9 @@ def test_nothing_is_written_through_the_links_of_a_folder(tmp_path, run_cli):
         (out / name).symlink_to(victim)
     (out / "01-features" / ".manifest.json.partial").symlink_to(tmp_path / "new.txt")
     (out / "01-features" / "manifest.json").unlink()
-    run_cli(command, 0)
+    assert "holds another run (its run.json is damaged" in run_cli(command, 2)
+    assert (out / "report.html").is_symlink()
+    run_cli([*command, "--overwrite"], 0)
     assert victim.read_text(encoding="utf-8") == "dear"
     assert not (tmp_path / "new.txt").exists()
     assert not any(path.is_symlink() for path in out.rglob("*.*"))

@@ -11,9 +11,10 @@ from tests.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._files import write_json
+from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.pipeline import _steps
 from thesisrecon.records import PairChoice, StageReport
-from thesisrecon.runtime._run_folder import LOCK_FILE, RunDirectory, StageFolder
+from thesisrecon.runtime._run_folder import RunDirectory, StageFolder
 from thesisrecon.runtime._run_position import run_position
 
 IMAGES = 10

@@ -58,6 +58,12 @@ MaxSize = Annotated[
 Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
 
 
+Overwrite = Annotated[
+    bool,
+    typer.Option("--overwrite", help="Replace existing files that thesisrecon did not write."),
+]
+
+
 def folder_option(words: str) -> Any:
     """The option ``-o`` with this help."""
     return typer.Option("-o", "--out", parser=parse_folder, metavar="FOLDER", help=words)

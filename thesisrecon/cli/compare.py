@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from thesisrecon.cli.common import cap_threads, parse_folder
+from thesisrecon.cli.common import Overwrite, cap_threads, parse_folder
+from thesisrecon.errors import UsageError
 from thesisrecon.io._files import printable
 
 _MOST_ROWS = 60
@@ -21,11 +22,12 @@ def compare(
     page: Annotated[
         Path | None, typer.Option("--page", help="Write a page (HTML) with both models in 3D.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Compare two models of the same images after a similarity alignment."""
     cap_threads(0)
     from thesisrecon.comparison import compare_models
-    from thesisrecon.io._files import write_json, write_text
+    from thesisrecon.io._files import json_text, write_new
     from thesisrecon.report._comparison import (
         camera_table,
         comparison_page,
@@ -34,6 +36,8 @@ def compare(
         summary_table,
     )
 
+    if json is not None and json == page:
+        raise UsageError("--json and --page name the same file; give different ones")
     found = compare_models(a, b)
     lines = [f"A: {a}", f"B: {b} (reference)", headline(found), *(f"note: {note}" for note in found.notes)]
     cameras = camera_table(found)
@@ -42,11 +46,11 @@ def compare(
         lines += ["", *_aligned(rows)]
     if len(cameras) > _MOST_ROWS + 1:
         lines.append(f"and {len(cameras) - 1 - _MOST_ROWS} more cameras; --json writes all")
-    typer.echo("\n".join(printable(line) for line in lines))
-    if json is not None:
-        write_json(json, {"a": str(a), "b": str(b), **found.as_table()})
+    files = {} if json is None else {json: json_text({"a": str(a), "b": str(b), **found.as_table()})}
     if page is not None:
-        write_text(page, comparison_page(found, str(a), str(b)))
+        files |= {page: comparison_page(found, str(a), str(b))}
+    write_new(files, overwrite=overwrite)
+    typer.echo("\n".join(printable(line) for line in lines))
 
 
 def _aligned(rows: list[list[str]]) -> list[str]:

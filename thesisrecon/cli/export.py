@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from thesisrecon.cli.common import OutputFolder, Threads, cap_threads, interruptible, parse_folder
+from thesisrecon.cli.common import OutputFolder, Overwrite, Threads, cap_threads, interruptible, parse_folder
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import printable, read_positions
 
@@ -54,6 +54,7 @@ def export(
         typer.Option("--align", metavar="FILE", help="Known camera positions: a CSV of name,x,y,z."),
     ] = None,
     threads: Threads = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write cameras, points and undistorted images for another program."""
     cap_threads(threads)
@@ -79,7 +80,9 @@ def export(
         images, lost = images or recorded_images(model), list[str]()
         if masks is None:
             masks, lost = recorded_masks(model, to)
-        written = write_export(found, folder, to=to, images=images, masks=masks, threads=threads)
+        written = write_export(
+            found, folder, to=to, images=images, masks=masks, threads=threads, overwrite=overwrite
+        )
     for note in (*lost, *written.notes):
         typer.echo(f"note: {note}")
     typer.echo(f"{len(found.views)} images and {len(found.X)} points: {printable(str(written.file))}")

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 _DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
 """Small depth maps: the demo should show a model soon."""
+OverwriteRun = Annotated[
+    bool,
+    typer.Option("--overwrite", help="Replace another run, or changed result files, in the output folder."),
+]
 
 
 def reconstruct(
@@ -109,9 +113,7 @@ def reconstruct(
             help="Run workers as threads (local), as processes, or on a Dask cluster.",
         ),
     ] = "local",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace another run in the output folder.")
-    ] = False,
+    overwrite: OverwriteRun = False,
 ) -> None:
     """Reconstruct cameras, points and a textured model from images."""
     cap_threads(threads)
@@ -132,22 +134,13 @@ def reconstruct(
     _run_from(source, out, seed, chosen | options | {"images": images_folder})
 
 
-def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0) -> None:
+def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0, overwrite: OverwriteRun = False) -> None:
     """Reconstruct the courtyard images that come with the package."""
     cap_threads(threads)
-    from thesisrecon.config import ImageOptions
-    from thesisrecon.io._images import demo_images, read_images
-    from thesisrecon.runtime._run_folder import RUN_FILE
+    from thesisrecon.io._images import demo_images
 
-    images, there = demo_images(), read_json(out / RUN_FILE)
-    if there is not None:
-        found = read_images(images, max_size_px=ImageOptions().max_size_px).decoded
-        own = {one.image.name: one.digest for one in found}
-        if not isinstance(there, dict) or there.get("images") != own:
-            raise UsageError(f"the folder {out} holds a run of other images; choose another one for the demo")
-    # The folder may hold a demo of an older version with other settings.
-    options = {"threads": threads or None, "overwrite": True}
-    _run(images, out, 0, {"set": _DEMO_SETTINGS} | options)
+    options = {"threads": threads or None, "overwrite": overwrite}
+    _run(demo_images(), out, 0, {"set": _DEMO_SETTINGS} | options)
 
 
 def _run(images: Path | list[Path], out: Path, seed: int, options: Mapping[str, Any]) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -13,12 +16,13 @@ import numpy as np
 from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import OutputError, UsageError, counted
+from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io._images import read_image
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.io._models import read_cameras
+from thesisrecon.io._outputs import OutputFolder, claim_folder
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
@@ -37,6 +41,8 @@ _FRAME_MS = 100
 _DEFAULT_SIDE_PX = 1000
 _NO_MODEL = "No surface model was built"
 """Beginning of the warning of a run whose surface stage failed."""
+_OWN = re.compile(r"frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.(webp|png)")
+"""Names of the files of these commands."""
 _MIDWAY = 0.5
 _BEYOND = 0.5
 """Length, in baselines, by which the sequence of the tensor extends beyond each camera."""
@@ -142,32 +148,32 @@ def render_run(
     background: tuple[int, int, int] = (0, 0, 0),
     threads: int = 1,
     progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> str:
     """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence."""
     mesh, cameras = _read_run(out)
-    _claim(folder)
-    size = size or cameras[0].scaled(min(1.0, _DEFAULT_SIDE_PX / max(cameras[0].size))).size
-    views = _camera_path(mesh, cameras, path, frames, size)
-    # Written first: it marks the folder as one of these commands.
-    given = {"path": path, "light": light, "background": background, "width": size[0], "height": size[1]}
-    write_json(folder / FRAMES, {**given, "frames": [_camera_entry(k, view) for k, view in enumerate(views)]})
-    _remove_old(folder, len(views))
-    shading = _shading(mesh, cameras, light)
-    report, done = progress or (lambda *_: None), 0
+    with _claimed(folder, path, frames, overwrite=overwrite) as outputs:
+        size = size or cameras[0].scaled(min(1.0, _DEFAULT_SIDE_PX / max(cameras[0].size))).size
+        views = _camera_path(mesh, cameras, path, frames, size)
+        listed = [_camera_entry(k, view) for k, view in enumerate(views)]
+        given = {"path": path, "light": light, "background": background, "width": size[0], "height": size[1]}
+        shading = _shading(mesh, cameras, light)
+        report, done = progress or (lambda *_: None), 0
 
-    def draw(k: int) -> None:
-        view = render(mesh, views[k], shading=shading(views[k]), background=background)
-        write_frame(folder, k + 1, view.color)
+        def draw(k: int) -> None:
+            view = render(mesh, views[k], shading=shading(views[k]), background=background)
+            write_frame(folder, k + 1, view.color)
 
-    def finished(_: int, __: Any) -> None:
-        nonlocal done
-        done += 1
-        # The last step is the animation.
-        report("views", done, len(views) + 1)
+        def finished(_: int, __: Any) -> None:
+            nonlocal done
+            done += 1
+            # The last step is the animation.
+            report("views", done, len(views) + 1)
 
-    Workers(threads).run(draw, [(k,) for k in range(len(views))], finished)
-    animation = _animate(folder, path, len(views))
-    finished(len(views), animation)
+        with _described(outputs, path, {**given, "frames": listed}):
+            Workers(threads).run(draw, [(k,) for k in range(len(views))], finished)
+            animation = _animate(folder, path, len(views))
+        finished(len(views), animation)
     return _written(folder, len(views), size, animation)
 
 
@@ -181,33 +187,74 @@ def interpolate_images(
     max_size_px: int | None = None,
     threads: int = 1,
     progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> str:
     """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``."""
     _check_images(paths)
-    _claim(folder)
-    config = PipelineConfig()
-    if max_size_px is not None:
-        config = replace(config, images=ImageOptions(max_size_px))
-    images = [read_image(path, max_size_px=config.images.max_size_px).images[0] for path in paths]
-    report = progress or (lambda *_: None)
-    report("correspondence", 0, 1)
-    sequence = METHODS[method](images, frames, config=config, seed=seed)
-    report("correspondence", 1, 1)
-    listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(sequence.frame_metadata)]
-    write_json(folder / FRAMES, {"method": method, **sequence.metadata, "frames": listed})
-    _remove_old(folder, frames)
-    drawn = []
-    for k, caption in enumerate(sequence.captions):
-        rgb = sequence.draw(k, threads)
-        write_frame(folder, k + 1, rgb)
-        drawn.append((caption, rgb))
-        report("views", k + 1, frames + 2)
-    animation = _animate(folder, method, frames, milliseconds=_FRAME_MS)
-    report("views", frames + 1, frames + 2)
-    title = "Between " + " and ".join(image.name for image in images)
-    write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
-    report("views", frames + 2, frames + 2)
+    with _claimed(folder, method, frames, overwrite=overwrite) as outputs:
+        config = PipelineConfig()
+        if max_size_px is not None:
+            config = replace(config, images=ImageOptions(max_size_px))
+        images = [read_image(path, max_size_px=config.images.max_size_px).images[0] for path in paths]
+        report = progress or (lambda *_: None)
+        report("correspondence", 0, 1)
+        sequence = METHODS[method](images, frames, config=config, seed=seed)
+        report("correspondence", 1, 1)
+        listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(sequence.frame_metadata)]
+        drawn = []
+        content = {"method": method, **sequence.metadata, "frames": listed}
+        with _described(outputs, method, content):
+            for k, caption in enumerate(sequence.captions):
+                rgb = sequence.draw(k, threads)
+                write_frame(folder, k + 1, rgb)
+                drawn.append((caption, rgb))
+                report("views", k + 1, frames + 2)
+            animation = _animate(folder, method, frames, milliseconds=_FRAME_MS)
+            report("views", frames + 1, frames + 2)
+            title = "Between " + " and ".join(image.name for image in images)
+            write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
+        report("views", frames + 2, frames + 2)
     return _written(folder, frames, rgb.shape[1::-1], animation)
+
+
+@contextmanager
+def _claimed(folder: Path, name: str, frames: int, *, overwrite: bool) -> Iterator[OutputFolder]:
+    """Claim a folder in which ``frames.json`` records the files of an earlier command.
+
+    A folder without it may hold no file: an image may be called frame-0001.png.
+    """
+    there = None if (folder / FRAMES).is_symlink() else read_json(folder / FRAMES)
+    files = there.get("files") if isinstance(there, dict) else None
+    known: dict[str, str | None] = {FRAMES: None} if isinstance(files, dict) else {}
+    known |= {name: digest for name, digest in (files or {}).items() if known and _OWN.fullmatch(name)}
+
+    def check(_: OutputFolder) -> None:
+        strange = [] if known or overwrite or not os.path.lexists(folder) else sorted(folder.iterdir())
+        if foreign := [path.name for path in strange if not is_partial(path.name)]:
+            what = f"contains {foreign[0]!r}, which this command did not create"
+            raise UsageError(f"the folder {folder} {what}; choose an empty or a new folder")
+
+    names = [FRAMES, *_file_names(name, frames)]
+    with claim_folder(
+        folder, overwrite=overwrite, names=names, known=known, locked=False, check=check
+    ) as outputs:
+        yield outputs
+
+
+def _file_names(name: str, frames: int) -> list[str]:
+    files = [frame_name(k + 1) for k in range(frames)] + [f"{name}{animation_suffix()}"]
+    return [*files, STRIP] if name in METHODS else files
+
+
+@contextmanager
+def _described(outputs: OutputFolder, name: str, content: dict[str, Any]) -> Iterator[None]:
+    """Remove the files of an earlier command and write ``frames.json``, at the end with digests."""
+    names = _file_names(name, len(content["frames"]))
+    outputs.remove([Path(old) for old in outputs.digests if old not in (FRAMES, *names)])
+    # Written first, too, so that the files of an interrupted command are known.
+    write_json(outputs.path / FRAMES, {**content, "files": dict.fromkeys(names)})
+    yield
+    write_json(outputs.path / FRAMES, {**content, "files": {name: outputs.written[name] for name in names}})
 
 
 def _check_images(paths: Sequence[Path]) -> None:
@@ -249,31 +296,6 @@ def _missing_model(out: Path) -> str:
         return f"the run in {out} has cameras but no model: {reason}"
     command = f"thesisrecon reconstruct IMAGES -o {out}, without --until"
     return f"the run in {out} has no model yet ({MODEL}); continue it with {command}"
-
-
-def _claim(folder: Path) -> None:
-    """Raise ``UsageError`` if a folder contains other files: an image may be called frame-0001.png."""
-    if isinstance(read_json(folder / FRAMES), dict):
-        return
-    try:
-        names = [path.name for path in folder.iterdir()] if folder.exists() else []
-    except OSError as error:
-        raise UsageError(f"the folder {folder} cannot be used: {error.strerror}") from None
-    if foreign := sorted(name for name in names if not is_partial(name)):
-        strange = f"contains {foreign[0]!r}, which this command did not create"
-        raise UsageError(f"the folder {folder} {strange}; choose an empty or a new folder")
-
-
-def _remove_old(folder: Path, frames: int) -> None:
-    names = {frame_name(k + 1) for k in range(frames)}
-    old = [p for p in folder.glob("frame-*.png") if p.name not in names]
-    old += [folder / f"{path}{suffix}" for path in (*PATHS, *METHODS) for suffix in (".webp", ".png")]
-    old += [folder / STRIP, *folder.glob(".*.partial")]
-    try:
-        for path in old:
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder {folder}", error) from None
 
 
 def _camera_path(

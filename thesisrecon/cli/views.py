@@ -11,6 +11,7 @@ import typer
 from thesisrecon.cli.common import (
     Frames,
     MaxSize,
+    Overwrite,
     Seed,
     Threads,
     cap_threads,
@@ -48,6 +49,7 @@ def render(
     ] = "black",
     folder: Annotated[Path | None, folder_option("Output folder (OUT/views/PATH).")] = None,
     threads: Threads = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render the model of a run along a camera path."""
     cap_threads(threads)
@@ -66,6 +68,7 @@ def render(
             background=_color(background),
             threads=threads or available_threads(),
             progress=progress,
+            overwrite=overwrite,
         )
     typer.echo(written)
 
@@ -104,6 +107,7 @@ def interpolate(
     max_size: MaxSize = None,
     folder: Annotated[Path | None, folder_option("Output folder (views/METHOD).")] = None,
     threads: Threads = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Compute views between two or three images."""
     cap_threads(threads)
@@ -122,6 +126,7 @@ def interpolate(
             max_size_px=max_size,
             threads=threads or available_threads(),
             progress=progress,
+            overwrite=overwrite,
         )
     typer.echo(written)
     typer.echo(f"page: {printable(str(folder / STRIP))}")

@@ -27,6 +27,7 @@ _SKEW_REL = 1e-9
 """Skew below this fraction of the focal length is rounding."""
 _MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 6}
 _CAMERA_SENSOR = 0
+COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
 POINT_2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _TRACK_ENTRY = np.dtype([("image", "<u4"), ("row", "<u4")])
 

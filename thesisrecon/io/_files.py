@@ -16,10 +16,12 @@ import stat
 import unicodedata
 from collections.abc import Mapping
 from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import OutputError, UsageError
+from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, not_ours
 
 MAX_TEXT_BYTES = 2**26
 """Limit of text files: far above any list of pairs, far below the memory of a computer."""
@@ -99,32 +101,66 @@ def is_partial(name: str) -> bool:
     return name.startswith(".") and name.endswith(_PARTIAL)
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all, flushed to the disk; OutputError, and the old file stays."""
+def write_atomically(path: Path, content: bytes, *, cached: bool = False) -> None:
+    """Write a file completely or not at all, flushed to the disk; OutputError, and the old file stays.
+
+    In a claimed folder other files than own ones are not replaced; ``cached`` is that of
+    :meth:`OutputFolder.admit`.
+    """
     partial = path.with_name(f".{path.name}{_PARTIAL}")
+    claim = claim_of(path)
+    changed = claim is None or claim.admit(path, content, cached=cached)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if changed:
+            _make_parents(path, claim)
         # A link of this name must not be followed.
         partial.unlink(missing_ok=True)
+        if not changed:
+            return
         with partial.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+        if claim is not None and not cached and os.path.lexists(path):
+            # Another program may have written it meanwhile.
+            claim.require_own(path)
         partial.replace(path)
-    except OSError as error:
+    except (OSError, UsageError) as error:
         with suppress(OSError):
             partial.unlink()
-        raise OutputError(path, error) from None
+        raise OutputError(path, error) if isinstance(error, OSError) else error from None
 
 
-def write_text(path: Path, text: str) -> None:
+def _make_parents(path: Path, claim: OutputFolder | None) -> None:
+    if claim is None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    else:
+        claim.make_parents(path)
+
+
+def write_text(path: Path, text: str, *, cached: bool = False) -> None:
     """Write a text as UTF-8; surrogates become question marks."""
-    write_atomically(path, text.encode("utf-8", "replace"))
+    write_atomically(path, text.encode("utf-8", "replace"), cached=cached)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write mappings, sequences, numbers, text and arrays as indented JSON; NaN and infinity become null."""
-    write_text(path, json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n")
+def write_json(path: Path, value: Any, *, cached: bool = False) -> None:
+    """Write mappings, sequences, numbers, text and arrays as JSON of :func:`json_text`."""
+    write_text(path, json_text(value), cached=cached)
+
+
+def json_text(value: Any) -> str:
+    """Indented JSON in which NaN and infinity are null."""
+    return json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n"
+
+
+def write_new(texts: Mapping[Path, str], *, overwrite: bool) -> None:
+    """Write single texts; UsageError, and nothing is written, if an existing file would be replaced."""
+    files = {path: text.encode("utf-8", "replace") for path, text in texts.items()}
+    new = {path: file for path, file in files.items() if digest_of(path) != sha256(file).hexdigest()}
+    if refused := next((path for path in new if not overwrite and os.path.lexists(path)), None):
+        raise not_ours(refused)
+    for path, file in new.items():
+        write_atomically(path, file)
 
 
 def as_read(value: Any) -> Any:
@@ -154,8 +190,11 @@ def link(source: Path, target: Path) -> None:
     """Give a file a second name, by a hard link if possible, else by a copy."""
     # Several programs may link the same target in a shared folder at the same time.
     partial = target.with_name(f".{target.name}.{os.getpid()}{_PARTIAL}")
+    claim = claim_of(target)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        if claim is not None:
+            claim.admit(target, b"", cached=True)
+        _make_parents(target, claim)
         partial.unlink(missing_ok=True)
         try:
             os.link(source, partial)

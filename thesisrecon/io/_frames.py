@@ -8,8 +8,9 @@ contrast do not change it.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -25,6 +26,7 @@ from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import FRAMES_FOLDER, printable, read_json, write_json
 from thesisrecon.io._images import decode_file, list_images
+from thesisrecon.io._outputs import OutputFolder, claim_folder, claim_of, digest_of
 from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
 
 _CHOICE = "frames.json"
@@ -83,29 +85,39 @@ class FrameSource:
         progress: Progress = lambda *_: None,
     ) -> tuple[list[Path], int, list[str]]:
         """Return the chosen frames, the number of all frames, and warnings, as ``out`` records them."""
-        record, home = out / FRAMES_FOLDER / _CHOICE, self.home(out)
-        digest, known = self.identity["digest"], read_json(record)
-        unchanged = isinstance(known, dict) and known.get("digest") == digest
-        if not unchanged or not all((home / name).is_file() for name in known["names"]):
-            names, total, warnings = (
-                self._write_frames(home, threads, progress) if self.video else self._listed_frames(map_all)
-            )
-            known = {"digest": digest, "names": names, "total": total, "warnings": warnings}
-            write_json(record, known)
-        return [home / name for name in known["names"]], known["total"], known["warnings"]
+        record, home, warnings = out / FRAMES_FOLDER / _CHOICE, self.home(out), list[str]()
+        digest, claim = self.identity["digest"], claim_of(record)
+        with claim_folder(out) if claim is None else nullcontext(claim) as outputs:
+            if os.path.lexists(record):
+                outputs.require_own(record)
+            known = read_json(record) if outputs.unchanged(record) else {}
+            own = list(zip(known.get("names", ()), known.get("digests", ()), strict=False))
+            damaged = [name for name, found in own if digest_of(home / name) != found]
+            if known.get("digest") != digest or damaged:
+                chosen = (
+                    self._write_frames(outputs, threads, progress) if self.video else self._listed(map_all)
+                )
+                if known.get("digest") == digest:
+                    more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
+                    found = f"{FRAMES_FOLDER}/{damaged[0]}{more}"
+                    warnings = [f"{found}: missing, damaged or exchanged, and extracted again"]
+                known = {"digest": digest, **chosen}
+                write_json(record, known)
+        return [home / name for name in known["names"]], known["total"], known["warnings"] + warnings
 
-    def _listed_frames(self, map_all: MapAll) -> tuple[list[str], int, list[str]]:
+    def _listed(self, map_all: MapAll) -> dict[str, Any]:
         paths = list_images(self.path)
         sharpness = list(map_all(_file_sharpness, paths))
         starts = range(0, len(paths), self.every)
         best = [max(range(n, min(n + self.every, len(paths))), key=sharpness.__getitem__) for n in starts]
-        return [paths[n].name for n in best], len(paths), []
+        return {"names": [paths[n].name for n in best], "total": len(paths), "warnings": []}
 
-    def _write_frames(self, home: Path, threads: int, progress: Progress) -> tuple[list[str], int, list[str]]:
-        """Decode the video and write the best frame of each window; two frames are in memory at a time."""
-        for old in list_images(home) if home.is_dir() else ():
-            old.unlink()
-        names: list[str] = []
+    def _write_frames(self, outputs: OutputFolder, threads: int, progress: Progress) -> dict[str, Any]:
+        """Decode the video and write the best frame of each window; two frames are in memory at a time.
+
+        Frames of another video, or of an interrupted command, are removed.
+        """
+        digests: dict[str, str] = {}
         warnings: list[str] = []
         total = 0
 
@@ -119,12 +131,17 @@ class FrameSource:
             number, (frame, stated) = max(window, key=measured)
             turn = _UPRIGHT.get(frame.rotation)
             image = frame.to_image()
-            names.append(f"{self.path.stem}-{number:06d}.png")
-            write_image(home / names[-1], np.array(image if turn is None else image.transpose(turn)))
+            name = f"{FRAMES_FOLDER}/{self.path.stem}-{number:06d}.png"
+            outputs.trust(outputs.path / name)
+            write_image(outputs.path / name, np.array(image if turn is None else image.transpose(turn)))
+            digests[name] = outputs.written[name]
             progress("frames", total, max(total, stated))
-        if not names:
+        if not digests:
             raise UsageError(f"{self.path} contains no video frame that can be decoded")
-        return names, total, warnings
+        listed = [name for name in outputs.digests if name.startswith(f"{FRAMES_FOLDER}/")]
+        outputs.remove([Path(n) for n in listed if n not in digests and Path(n).name != _CHOICE])
+        names = [Path(name).name for name in digests]
+        return {"names": names, "digests": [*digests.values()], "total": total, "warnings": warnings}
 
 
 def _sharpness(image: PIL.Image.Image) -> float:

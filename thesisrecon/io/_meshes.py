@@ -140,6 +140,11 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
         raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
     if not isinstance(mesh, TexturedMesh):
         raise UsageError(f"write_mesh needs a TexturedMesh; got a {type(mesh).__name__}")
+    write_atomically(path, glb_bytes(mesh))
+
+
+def glb_bytes(mesh: TexturedMesh) -> bytes:
+    """The GLB that :func:`write_mesh` writes."""
     require_mesh("write_mesh", mesh)
     import trimesh
     from trimesh.visual import material as materials
@@ -163,7 +168,7 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
         )
         visual = new_visual(uv=_normalized(uv, mesh.texture), material=material)
         made = trimesh.Trimesh(vertices * _HALF_TURN, faces, visual=visual, process=False)
-    write_atomically(path, made.export(file_type="glb"))
+    return bytes(made.export(file_type="glb"))
 
 
 def box_in_file(mesh: TexturedMesh) -> list[list[float]]:

@@ -16,10 +16,11 @@ from thesisrecon import __version__
 from thesisrecon._settings import toml_from_config
 from thesisrecon.arrays import F32, U8
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.io._colmap_writing import write_colmap_model
+from thesisrecon.io._colmap_writing import COLMAP_FILES, write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import read_json, write_atomically, write_json, write_text
-from thesisrecon.io._meshes import write_mesh
+from thesisrecon.io._meshes import glb_bytes
+from thesisrecon.io._outputs import claim_folder
 from thesisrecon.pipeline._state import name_images
 from thesisrecon.pipeline._tiles import TILE_FILES, TILES, write_tiles
 from thesisrecon.records import Reconstruction, TexturedMesh
@@ -27,7 +28,7 @@ from thesisrecon.report._data import ReportData, pictured, point_colors, summari
 from thesisrecon.report._page import render_report
 from thesisrecon.results import SUMMARY, RunResult, folder_with
 from thesisrecon.runtime._run import Run, Until
-from thesisrecon.runtime._run_folder import RunDirectory
+from thesisrecon.runtime._run_folder import RUN_FILE, RunDirectory
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
 from thesisrecon.surface._simplification import reduce_faces
 from thesisrecon.surface.model import SurfaceModel
@@ -36,12 +37,14 @@ from thesisrecon.surface.texture_atlas import TextureAtlas
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
 PAGE = "report.html"
-COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
 SURFACE_FILES = ("model.glb", "model-full.glb", *TILE_FILES)
 MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
-REPLACED_FILES = (*RESULT_FILES, *(f"group-*/{name}" for name in RESULT_FILES))
+REPLACED_FILES = (*RESULT_FILES, *(f"group-[0-9]*/{name}" for name in RESULT_FILES))
 """Files of another run that a run removes from its folder."""
+CONFIG = "config.toml"
+WRITTEN_FILES = (*REPLACED_FILES, CONFIG, *(f"group-[0-9]*/{name}" for name in (CONFIG, RUN_FILE)))
+"""Files that a run writes beside the results of its stages."""
 MAX_AFFINE = 1e3
 """Largest affine coordinate written to affine.ply, in median depths of the best observed view."""
 
@@ -122,7 +125,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         run.warnings.extend(warnings)
         result = _described(run, result, until, failure)
         config = toml_from_config(run.config)
-        write_text(out / "config.toml", config)
+        write_text(out / CONFIG, config)
         page = ReportData(
             title=run.title,
             images=result.images,
@@ -151,16 +154,16 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     return result
 
 
-def save_result(result: RunResult, folder: Path) -> None:
+def save_result(result: RunResult, folder: Path, *, overwrite: bool) -> None:
     """Copy the result files of a run; those that no folder contains are written, except the page."""
-    if (out := folder_with(result)) is not None:
-        for path in (path for name in RESULT_FILES for path in sorted(out.glob(name))):
-            if path.is_file():
-                write_atomically(folder / path.relative_to(out), path.read_bytes())
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_results(RunDirectory(folder), result)
-    write_json(folder / SUMMARY, result.summary)
+    with claim_folder(folder, overwrite=overwrite, names=RESULT_FILES):
+        if (out := folder_with(result)) is not None:
+            for path in (path for name in RESULT_FILES for path in sorted(out.glob(name))):
+                if path.is_file():
+                    write_atomically(folder / path.relative_to(out), path.read_bytes())
+            return
+        _write_results(RunDirectory(folder), result)
+        write_json(folder / SUMMARY, result.summary)
 
 
 def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, threads: int) -> list[str]:
@@ -172,18 +175,19 @@ def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, th
     directory.remove(SURFACE_FILES if mesh is None else SURFACE_FILES[1:])
     if mesh is None:
         return []
-    write_mesh(path, mesh)
-    if path.stat().st_size <= 1e6 * max_mb or not result.views:
+    content = glb_bytes(mesh)
+    if len(content) <= 1e6 * max_mb or not result.views:
+        write_atomically(path, content)
         return []
-    path.replace(whole)
+    write_atomically(whole, content)
     texels = TextureAtlas.max_texels if mesh.texture is None else mesh.texture[..., 0].size
-    size, share, smaller = whole.stat().st_size, 1.0, mesh
-    while size > 1e6 * max_mb:
-        share *= 0.9 * 1e6 * max_mb / size
+    share, smaller = 1.0, mesh
+    while len(content) > 1e6 * max_mb:
+        share *= 0.9 * 1e6 * max_mb / len(content)
         smaller = reduce_faces(mesh, int(share * len(mesh.faces)), threads=threads)
         atlas = TextureAtlas(max_texels=int(share * texels))
-        write_mesh(path, atlas.texture(smaller, result.views, threads=threads))
-        size = path.stat().st_size
+        content = glb_bytes(atlas.texture(smaller, result.views, threads=threads))
+    write_atomically(path, content)
     tiles = counted(write_tiles(directory, mesh, smaller), "tile")
     faces = f"{len(smaller.faces)} of {len(mesh.faces)} faces"
     limit = f"model.max_glb_mb={max_mb:g}"

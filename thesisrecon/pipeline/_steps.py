@@ -19,7 +19,7 @@ from thesisrecon.pipeline._matching_stages import (
     split_groups,
     take_group,
 )
-from thesisrecon.pipeline._outputs import RESULT_FILES, write_outputs
+from thesisrecon.pipeline._outputs import RESULT_FILES, WRITTEN_FILES, write_outputs
 from thesisrecon.pipeline._stages import (
     build_model,
     build_tracks,
@@ -55,7 +55,7 @@ Source = Mapping[str, str]
 @contextmanager
 def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Iterator[None]:
     """Start the workers and lock the output folder of a run."""
-    claim = run.directory.claim(_settings_identity(run, source), overwrite=overwrite)
+    claim = run.directory.claim(_settings_identity(run, source), overwrite=overwrite, results=WRITTEN_FILES)
     with run.workers, claim, run.resumable():
         yield
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import I64
-from thesisrecon.io._files import write_json
-from thesisrecon.io._meshes import box_in_file, write_mesh
+from thesisrecon.io._files import write_atomically, write_json
+from thesisrecon.io._meshes import box_in_file, glb_bytes
 from thesisrecon.records import TexturedMesh
 from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.surface._mesh import halve_surface
 from thesisrecon.surface.texture_atlas import cut_tile
 
 TILES = "tiles/tiles.json"
-TILE_FILES = (TILES, "tiles/tile-*.glb")
+TILE_FILES = (TILES, "tiles/tile-[0-9]*.glb")
 TILE_FACES, TILE_MB = 100_000, 10.0
 """Largest number of faces and largest size of a tile in megabytes (10^6 bytes)."""
 
@@ -29,11 +29,12 @@ def write_tiles(directory: RunDirectory, whole: TexturedMesh, coarse: TexturedMe
     while open_:
         faces = open_.pop()
         tile = cut_tile(whole, faces)
-        path = folder / f"tile-{len(entries) - 1:04d}.glb"
-        write_mesh(path, tile)
-        if path.stat().st_size > 1e6 * TILE_MB and len(faces) > 1:
+        content = glb_bytes(tile)
+        if len(content) > 1e6 * TILE_MB and len(faces) > 1:
             open_ += _halves(tile, faces, -(-len(faces) // 2))
             continue
+        path = folder / f"tile-{len(entries) - 1:04d}.glb"
+        write_atomically(path, content)
         entries.append({"file": path.name, "level": 1, "faces": len(faces), "box": box_in_file(tile)})
     write_json(directory.path / TILES, {"tiles": entries})
     return len(entries) - 1

@@ -24,18 +24,19 @@ import numpy as np
 from thesisrecon import records
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import (
-    FRAMES_FOLDER,
     as_read,
     is_partial,
     link,
+    read_bytes,
     read_json,
     write_atomically,
     write_json,
 )
+from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder, claim_of, lock_part
 from thesisrecon.records import StageReport
 
 FORMAT = 2
-RUN_FILE, LOCK_FILE, MANIFEST_FILE = "run.json", ".lock", "manifest.json"
+RUN_FILE, MANIFEST_FILE = "run.json", "manifest.json"
 _DESCRIPTION = "description"
 
 
@@ -125,6 +126,15 @@ def _require(holds: bool, rule: str) -> None:
         raise ValueError(rule)
 
 
+def _is_record(path: Path) -> bool:
+    """Whether a file is a record, with any key."""
+    try:
+        with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+            return not path.is_symlink() and archive.comment == _seal(archive)
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return False
+
+
 def _seal_of_plain(stream: BinaryIO) -> bytes:
     """Expected seal of an archive; ``ValueError`` if it is compressed, since it may be a zip bomb."""
     with zipfile.ZipFile(stream) as archive:
@@ -177,20 +187,22 @@ class StageFolder:
     def save(self, item: str, key: str, record: Any) -> None:
         """Write the record of an item."""
         own = self.path / f"{item}.npz"
-        write_atomically(own, bytes_from_record(record, key))
+        write_atomically(own, bytes_from_record(record, key), cached=True)
         if self.shared is not None:
             link(own, self.shared / f"{key}.npz")
 
     def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
-        """Write the manifest of a finished stage and remove stale and partial files."""
+        """Write the manifest of a finished stage and remove stale records and partial files."""
         try:
-            for stale in [*self.path.glob("*.npz"), *self.path.glob(".*.partial")]:
-                if is_partial(stale.name) or stale.stem not in keys:
+            # Nothing is removed through a link.
+            there = [] if self.path.is_symlink() else self.path.iterdir()
+            for stale in [path for path in there if ".npz" in path.suffixes]:
+                if is_partial(stale.name) or (stale.stem not in keys and _is_record(stale)):
                     stale.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(self.path, error) from None
         content = {"format": FORMAT, "settings": settings, "keys": keys, "report": dataclasses.asdict(report)}
-        write_json(self.path / MANIFEST_FILE, content)
+        write_json(self.path / MANIFEST_FILE, content, cached=True)
 
     def finished(self, keys: Mapping[str, str]) -> StageReport | None:
         """Return the report of the run that computed these items; None if the keys differ."""
@@ -230,53 +242,77 @@ class RunDirectory:
                 os.utime(path, ns=(start, start))
 
     @contextmanager
-    def claim(self, identity: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
-        """Lock the folder for a run; ``identity`` is the part known before the images are read."""
-        with _locked(self.path):
-            self._check(identity, overwrite)
+    def claim(
+        self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()
+    ) -> Iterator[None]:
+        """Claim the folder for a run that writes ``results``; ``identity`` needs no image.
+
+        In a group the folder of the whole run is claimed already.
+        """
+        whole = claim_of(self.path)
+        if whole is not None:
+            self._check(identity, overwrite, whole)
+            with lock_part(whole, self.path):
+                yield
+            return
+        claim = claim_folder(
+            self.path,
+            overwrite=overwrite,
+            names=results,
+            check=lambda outputs: self._check(identity, overwrite, outputs),
+        )
+        with claim as outputs:
             yield
+            if outputs.kept:
+                outputs.require_complete([RUN_FILE])
+
+    @property
+    def _outputs(self) -> OutputFolder:
+        outputs = claim_of(self.path / RUN_FILE)
+        assert outputs is not None, "the folder must be claimed"
+        return outputs
 
     def adopt(self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()) -> None:
         """Resume the same run in the claimed folder, or replace another one and remove its ``results``."""
-        if self._check(identity, overwrite):
+        if self._check(identity, overwrite, self._outputs):
             self.remove(results)
         # A resumed run keeps its file and time: its records are not older.
         if read_json(self.path / RUN_FILE) != as_read(identity):
             write_json(self.path / RUN_FILE, identity)
+        self._outputs.kept = True
 
     def remove(self, names: Sequence[str]) -> None:
-        """Remove files (``*`` stands for any part of a name) and the folders that are empty afterwards."""
-        try:
-            for path in (path for name in names for path in self._named(name)):
-                path.unlink(missing_ok=True)
-                for parent in path.parents[: len(path.relative_to(self.path).parents) - 1]:
-                    if parent.is_dir() and not any(parent.iterdir()):
-                        parent.rmdir()
-        except OSError as error:
-            place = f"the output folder {self.path}, whose old results must be removed,"
-            raise OutputError(place, error) from None
+        """Remove own files and the folders that are empty afterwards (:meth:`OutputFolder.remove`)."""
+        here = self._outputs.name_of(self.path)
+        self._outputs.remove([f"{here}/{name}" for name in names])
 
-    def _named(self, name: str) -> list[Path]:
-        return sorted(self.path.glob(name)) if "*" in name else [self.path / name]
-
-    def _check(self, identity: Mapping[str, Any], overwrite: bool) -> bool:
-        """Whether the folder holds another run."""
-        there = read_json(self.path / RUN_FILE)
-        if there is None:
-            strange = sorted(p.name for p in self.path.iterdir() if p.name not in (LOCK_FILE, FRAMES_FOLDER))
-            if strange and RUN_FILE not in strange and not all(map(is_partial, strange)):
-                foreign = f"{strange[0]!r}, which thesisrecon did not create; choose an empty or a new folder"
-                raise UsageError(f"the output folder {self.path} holds {foreign}")
-            # A damaged run file identifies no run: other files count as another run.
-            return bool(strange)
+    def _check(self, identity: Mapping[str, Any], overwrite: bool, outputs: OutputFolder) -> bool:
+        """Whether the folder holds another run; UsageError if this one must not use the folder."""
+        if not os.path.lexists(self.path / RUN_FILE):
+            paths = sorted(self.path.iterdir()) if os.path.lexists(self.path) else []
+            strange = [p.name for p in paths if p.is_symlink() or not outputs.lists(outputs.name_of(p))]
+            if foreign := [name for name in strange if name != LOCK_FILE and not is_partial(name)]:
+                what = f"{foreign[0]!r}, which thesisrecon did not create; choose an empty or a new folder"
+                raise UsageError(f"the output folder {self.path} holds {what}")
+            return False
+        there, difference = self._identity()
         if isinstance(there, dict):
             there = {name: value for name, value in there.items() if name in (*identity, "source")}
-        difference = next(_differences(there, as_read(identity)), "")
+        difference = difference or next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
             replaced = "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
             advice = f"choose another folder, or {replaced}"
             raise UsageError(f"the output folder {self.path} holds another run ({difference}); {advice}")
         return bool(difference)
+
+    def _identity(self) -> tuple[Any, str]:
+        """The content of the run file, and why it cannot be read."""
+        try:
+            return json.loads(read_bytes(self.path / RUN_FILE).decode("utf-8")), ""
+        except OSError as error:
+            return None, f"its {RUN_FILE} cannot be read: {error.strerror or error}"
+        except (ValueError, RecursionError):
+            return None, f"its {RUN_FILE} is damaged, or was not written by thesisrecon"
 
 
 def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
@@ -330,25 +366,3 @@ def is_running(folder: Path) -> bool:
     except OSError:
         return True
     return False
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Create and lock the folder; the lock ends with the process."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-    except OSError as error:
-        raise OutputError(f"the output folder {folder}", error) from None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        message = f"another run is writing to the output folder {folder}; choose another one"
-        raise UsageError(message) from None
-    try:
-        # The time at which a run began or was resumed.
-        os.utime(handle)
-        yield
-    finally:
-        os.close(handle)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from thesisrecon.errors import counted
 from thesisrecon.io._files import read_json
+from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.runtime._run import FOLDERS
-from thesisrecon.runtime._run_folder import LOCK_FILE, MANIFEST_FILE, RUN_FILE, is_running, read_record
+from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, is_running, read_record
 
 MIN_ITEMS = 3
 """Minimum number of items from which the remaining time is estimated."""

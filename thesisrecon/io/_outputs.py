@@ -1,0 +1,356 @@
+"""The rule for output files: without ``overwrite`` nothing is replaced or removed that was not written here.
+
+A command claims its output folder. The record of the folder (its lock file) lists name and digest of each
+file before it is written: a file with one of its digests was written by thesisrecon and is unchanged. Nothing
+is replaced or removed through a link, and a refused command leaves no trace.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from io import BufferedReader
+from pathlib import Path
+
+from thesisrecon.errors import OutputError, StageFailure, UsageError, WorkersLost
+
+LOCK_FILE = ".lock"
+_ENTRY = '["'
+"""Beginning of each line of a record: a JSON list of name and digest."""
+_MAX_RECORD_BYTES = 2**26
+"""Far above any record, far below the memory of a computer."""
+_claims: list[OutputFolder] = []
+
+
+def digest_of(path: Path) -> str | None:
+    """SHA-256 of a regular file; None for anything else, links too."""
+    try:
+        with _open_regular(path) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return None
+
+
+def _open_regular(path: Path) -> BufferedReader:
+    """Open a regular file; OSError for links and others (opening a pipe would block)."""
+    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is not a regular file")
+    return file
+
+
+def _absolute(path: Path) -> str:
+    """The absolute path without ``..``; links are not followed."""
+    return os.path.abspath(path)  # noqa: PTH100 (Path.resolve follows links)
+
+
+def not_ours(path: Path) -> UsageError:
+    """The error for a file that must not be replaced."""
+    ways = "move it, choose another place, or use --overwrite (overwrite=True) to replace it"
+    return UsageError(f"{path} was not written by thesisrecon, or was changed since; {ways}")
+
+
+class OutputFolder:
+    """A claimed folder: which of its files may be replaced or removed.
+
+    ``known`` maps names to digests of files that thesisrecon wrote; None stands for any content.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool, known: Mapping[str, str | None] | None = None) -> None:
+        self.path, self.overwrite = path, overwrite
+        self.root = _absolute(path)
+        self.digests: dict[str, set[str | None]] = {name: {d} for name, d in (known or {}).items()}
+        self.written: dict[str, str] = {}
+        self.kept = False  #: whether the work of a command that fails is kept
+        self._created: list[Path] = []
+        self._stored: set[Path] = set()
+        self._used = False
+        self._folder = self._record = -1
+
+    def name_of(self, path: Path) -> str:
+        """The name of a file relative to the folder."""
+        return Path(_absolute(path)).relative_to(self.root).as_posix()
+
+    def lists(self, name: str) -> bool:
+        """Whether thesisrecon wrote files of this name, or in the folder of this name."""
+        return any(known == name or known.startswith(f"{name}/") for known in self.digests)
+
+    def owns(self, path: Path) -> bool:
+        """Whether a file may be replaced or removed."""
+        if self._link_above(path) is not None or stat.S_ISDIR(os.lstat(path).st_mode):
+            return False
+        known, digest = self.digests.get(self.name_of(path), set()), digest_of(path)
+        return self.overwrite or (digest is not None and (digest in known or None in known))
+
+    def _link_above(self, path: Path) -> Path | None:
+        """The outermost link among the folders between this one and a file."""
+        folders = [Path(self.root, part) for part in Path(self.name_of(path)).parents if part.name]
+        return next((folder for folder in reversed(folders) if folder.is_symlink()), None)
+
+    def unchanged(self, path: Path) -> bool:
+        """Whether a file is there as thesisrecon wrote it."""
+        return digest_of(path) in self.digests.get(self.name_of(path), set()) - {None}
+
+    def require(self, names: Sequence[str | Path]) -> None:
+        """Raise ``UsageError`` if a file of these names must not be written."""
+        for name in names:
+            self._require_no_link(self.path / name)
+        for path in self._existing(names):
+            self.require_own(path)
+
+    def _require_no_link(self, path: Path) -> None:
+        if (link := self._link_above(path)) is not None:
+            way = "replace the link by a folder, or choose another output folder"
+            raise UsageError(f"{path} is not written, because {link} is a link; {way}")
+
+    def require_own(self, path: Path) -> None:
+        """Raise ``UsageError`` if an existing file must not be replaced."""
+        if path.is_dir() and not path.is_symlink():
+            raise OutputError(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
+        self._require_no_link(path)
+        if not self.owns(path):
+            raise not_ours(path)
+
+    def _existing(self, names: Sequence[str | Path]) -> list[Path]:
+        """The existing files of these names; texts with ``*`` or ``[`` are glob patterns, paths are not."""
+        patterns = [isinstance(name, str) and ("*" in name or "[" in name) for name in names]
+        found = [
+            sorted(self.path.glob(str(name))) if pattern else [self.path / name]
+            for name, pattern in zip(names, patterns, strict=True)
+        ]
+        return [path for paths in found for path in paths if os.path.lexists(path)]
+
+    def trust(self, path: Path) -> None:
+        """Allow to replace a file that the record lists, whatever its content is now."""
+        if (digest := digest_of(path)) is not None and (own := self.digests.get(self.name_of(path))):
+            own.add(digest)
+
+    def admit(self, path: Path, content: bytes, *, cached: bool) -> bool:
+        """Check and record that a file is written; False if it has this content already.
+
+        ``cached``: a stored result of a stage, which belongs to its run by name and is not recorded.
+        """
+        self.require_present()
+        there = os.path.lexists(path)
+        if there or not cached:
+            self._require_no_link(path)
+        if cached:
+            self._stored.add(path.parent)
+            self._used = True
+            return True
+        name, digest = self.name_of(path), hashlib.sha256(content).hexdigest()
+        same = there and digest_of(path) == digest
+        if there and not same:
+            self.require_own(path)
+        self._note(name, digest)
+        self._used = True
+        if not there:
+            self._created.append(path)
+        return not same
+
+    def _note(self, name: str, digest: str) -> None:
+        self.written[name] = digest
+        if digest in self.digests.setdefault(name, set()):
+            return
+        self.digests[name].add(digest)
+        if self._record >= 0:
+            before = os.fstat(self._record)
+            try:
+                # A new line first: the last one of a killed command may be incomplete.
+                os.write(self._record, f"\n{json.dumps([name, digest])}".encode())
+            except OSError as error:
+                raise OutputError(self.path / LOCK_FILE, error) from None
+            # Its time is that at which the command began.
+            os.utime(self._record, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+    def make_parents(self, path: Path) -> None:
+        """Create the folders of a file below this one, which is never created again."""
+        folder = Path(_absolute(path)).parent
+        if str(folder) != self.root and not folder.is_dir():
+            self.make_parents(folder)
+            folder.mkdir(exist_ok=True)
+
+    def remove(self, names: Sequence[str | Path]) -> None:
+        """Remove own files of these names, and the folders that are empty afterwards."""
+        try:
+            for path in self._existing(names):
+                if self.owns(path):
+                    self._unlink(path)
+        except OSError as error:
+            place = f"the output folder {self.path}, whose old results must be removed,"
+            raise OutputError(place, error) from None
+
+    def _unlink(self, path: Path) -> None:
+        path.unlink(missing_ok=True)
+        self.written.pop(self.name_of(path), None)
+        for parent in list(path.parents)[: len(Path(self.name_of(path)).parents) - 1]:
+            if any(parent.iterdir()):
+                break
+            parent.rmdir()
+
+    def require_present(self) -> None:
+        """Raise ``UsageError`` if the folder was moved or removed since it was claimed."""
+        with suppress(OSError):
+            if os.path.samestat(self.path.stat(), os.fstat(self._folder)):
+                return
+        way = "repeat the command, which continues if the folder is back in its place"
+        raise UsageError(
+            f"the output folder {self.path} was moved or removed while the command was writing to it; {way}"
+        )
+
+    def require_complete(self, names: Iterable[str]) -> None:
+        """Raise ``UsageError`` if these files, or others that the command wrote, are no longer there."""
+        self.require_present()
+        files = [*(self.path / name for name in (*names, *self.written)), *self._stored]
+        if (gone := next((path for path in files if not os.path.lexists(path)), None)) is not None:
+            raise UsageError(f"{gone} was removed while the command was writing to {self.path}; repeat it")
+
+    def open(self, *, locked: bool) -> Callable[[], None]:
+        """Create and lock the folder; returns the function that ends it, without a trace if it is unused."""
+        missing = [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
+        lock, new = self.path / LOCK_FILE, not os.path.lexists(self.path / LOCK_FILE)
+
+        def close() -> None:
+            with suppress(OSError):
+                if locked and new and self._record >= 0 and not self._used:
+                    lock.unlink()
+                for folder in missing if not self._used else ():
+                    folder.rmdir()
+            for handle in (self._record, self._folder):
+                if handle >= 0:
+                    os.close(handle)
+
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+            if locked:
+                self._record = _locked(lock)
+        except OSError as error:
+            close()
+            raise OutputError(f"the output folder {self.path}", error) from None
+        except UsageError:
+            close()
+            raise
+        return close
+
+    def read_record(self) -> None:
+        """Add the files that the record lists."""
+        lock = self.path / LOCK_FILE
+        if not os.path.lexists(lock):
+            return
+        try:
+            with _open_regular(lock) as file:
+                lines = [line for line in file.read(_MAX_RECORD_BYTES).decode().splitlines() if line]
+        except (OSError, UnicodeDecodeError):
+            lines = ["of another program"]
+        if not all(line.startswith(_ENTRY) or line == _ENTRY[:1] for line in lines):
+            raise UsageError(f"{lock} was not written by thesisrecon; move it, or choose another folder")
+        for line in lines:
+            # The last line of a killed command may be incomplete.
+            with suppress(ValueError):
+                name, digest = json.loads(line)
+                self.digests.setdefault(name, set()).add(digest)
+
+    def withdraw(self) -> None:
+        """Remove the files that this command created."""
+        with suppress(OSError, UsageError):
+            self.require_present()
+            replaced = len(self._created) < len(self.written)
+            for path in self._created:
+                if os.path.lexists(path) and self.owns(path):
+                    self._unlink(path)
+            self._used = replaced
+
+
+def _locked(lock: Path) -> int:
+    """Open and lock a file, which is created; the lock ends with the process."""
+    while True:
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(handle)
+            message = f"another run is writing to the output folder {lock.parent}; choose another one"
+            raise UsageError(message) from None
+        # A command that was refused removes the file that it created.
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle), lock.stat()):
+                # The time at which a run began or was resumed.
+                os.utime(handle)
+                return handle
+        os.close(handle)
+
+
+@contextmanager
+def claim_folder(
+    path: Path,
+    *,
+    overwrite: bool = False,
+    names: Sequence[str | Path] = (),
+    known: Mapping[str, str | None] | None = None,
+    locked: bool = True,
+    check: Callable[[OutputFolder], object] = lambda _: None,
+) -> Iterator[OutputFolder]:
+    """Claim an output folder for the block, in which :func:`write_atomically` obeys the rule.
+
+    ``names``: files that the command writes; ``known``: own files by another record; ``locked``: lock the
+    folder and keep a record in it; ``check`` may refuse the folder.
+    """
+
+    outputs = OutputFolder(path, overwrite=overwrite, known=known)
+
+    def judge() -> None:
+        try:
+            if locked:
+                outputs.read_record()
+            check(outputs)
+        except OSError as error:
+            raise OutputError(f"the output folder {path}", error) from None
+        outputs.require(names)
+
+    # A refused command creates nothing; a folder in use is locked before it is judged.
+    if not os.path.lexists(path / LOCK_FILE):
+        judge()
+    close = outputs.open(locked=locked)
+    try:
+        judge()
+        _claims.append(outputs)
+        try:
+            yield outputs
+            outputs.require_present()
+        except (UsageError, StageFailure) as refusal:
+            if not outputs.kept and not isinstance(refusal, OutputError | WorkersLost):
+                outputs.withdraw()
+            raise
+        finally:
+            _claims.remove(outputs)
+    finally:
+        close()
+
+
+@contextmanager
+def lock_part(outputs: OutputFolder, folder: Path) -> Iterator[None]:
+    """Create and lock a folder in a claimed one."""
+    try:
+        outputs.make_parents(folder / LOCK_FILE)
+        handle = _locked(folder / LOCK_FILE)
+    except OSError as error:
+        raise OutputError(f"the output folder {folder}", error) from None
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def claim_of(path: Path) -> OutputFolder | None:
+    """The innermost claimed folder that holds a file."""
+    place = _absolute(path)
+    found = [claim for claim in _claims if place.startswith(claim.root.rstrip(os.sep) + os.sep)]
+    return max(found, key=lambda claim: len(claim.root), default=None)
