@@ -266,7 +266,7 @@ def test_the_demo_replaces_another_run_only_on_request(monkeypatch, tmp_path, re
     assert "holds another run" in refused(["demo", "-o", tmp_path])
     assert read(tmp_path / "run.json") == {"settings": {}, "images": {}}
     # One image is too few for a model, which is found after the folder was taken over.
-    assert "only 1 image" in refused(["demo", "-o", tmp_path, "--overwrite"], 3)
+    assert "1 usable image; at least two" in refused(["demo", "-o", tmp_path, "--overwrite"], 3)
     assert len(read(tmp_path / "run.json")["images"]) == 1
 
 

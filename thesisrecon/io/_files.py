@@ -16,12 +16,11 @@ import stat
 import unicodedata
 from collections.abc import Mapping
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import OutputError, UsageError
-from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, not_ours
+from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, has_content, not_ours
 
 MAX_TEXT_BYTES = 2**26
 """Limit of text files: far above any list of pairs, far below the memory of a computer."""
@@ -156,7 +155,7 @@ def json_text(value: Any) -> str:
 def write_new(texts: Mapping[Path, str], *, overwrite: bool) -> None:
     """Write single texts; UsageError, and nothing is written, if an existing file would be replaced."""
     files = {path: text.encode("utf-8", "replace") for path, text in texts.items()}
-    new = {path: file for path, file in files.items() if digest_of(path) != sha256(file).hexdigest()}
+    new = {path: file for path, file in files.items() if not has_content(path, [digest_of(file)])}
     if refused := next((path for path in new if not overwrite and os.path.lexists(path)), None):
         raise not_ours(refused)
     for path, file in new.items():

@@ -26,7 +26,7 @@ from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import FRAMES_FOLDER, printable, read_json, write_json
 from thesisrecon.io._images import decode_file, list_images
-from thesisrecon.io._outputs import OutputFolder, claim_folder, claim_of, digest_of
+from thesisrecon.io._outputs import OutputFolder, claim_folder, claim_of, has_content
 from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
 
 _CHOICE = "frames.json"
@@ -92,7 +92,7 @@ class FrameSource:
                 outputs.require_own(record)
             known = read_json(record) if outputs.unchanged(record) else {}
             own = list(zip(known.get("names", ()), known.get("digests", ()), strict=False))
-            damaged = [name for name, found in own if digest_of(home / name) != found]
+            damaged = [name for name, found in own if not has_content(home / name, [found])]
             if known.get("digest") != digest or damaged:
                 chosen = (
                     self._write_frames(outputs, threads, progress) if self.video else self._listed(map_all)

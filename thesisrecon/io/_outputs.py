@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
@@ -28,13 +28,22 @@ _MAX_RECORD_BYTES = 2**26
 _claims: list[OutputFolder] = []
 
 
-def digest_of(path: Path) -> str | None:
-    """SHA-256 of a regular file; None for anything else, links too."""
+def digest_of(content: bytes) -> str:
+    """Size and SHA-256 of the content of a file."""
+    return f"{len(content)} {hashlib.sha256(content).hexdigest()}"
+
+
+def has_content(path: Path, digests: Collection[str | None]) -> bool:
+    """Whether a regular file (no link) has the content of one of these digests; None stands for any."""
     try:
         with _open_regular(path) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            size = f"{os.fstat(file.fileno()).st_size} "
+            # A file of another size may be too large to be read.
+            if None in digests or not any(known and known.startswith(size) for known in digests):
+                return None in digests
+            return size + hashlib.file_digest(file, "sha256").hexdigest() in digests
     except OSError:
-        return None
+        return False
 
 
 def _open_regular(path: Path) -> BufferedReader:
@@ -86,8 +95,7 @@ class OutputFolder:
         """Whether a file may be replaced or removed."""
         if self._link_above(path) is not None or stat.S_ISDIR(os.lstat(path).st_mode):
             return False
-        known, digest = self.digests.get(self.name_of(path), set()), digest_of(path)
-        return self.overwrite or (digest is not None and (digest in known or None in known))
+        return self.overwrite or has_content(path, self.digests.get(self.name_of(path), ()))
 
     def _link_above(self, path: Path) -> Path | None:
         """The outermost link among the folders between this one and a file."""
@@ -96,7 +104,7 @@ class OutputFolder:
 
     def unchanged(self, path: Path) -> bool:
         """Whether a file is there as thesisrecon wrote it."""
-        return digest_of(path) in self.digests.get(self.name_of(path), set()) - {None}
+        return has_content(path, self.digests.get(self.name_of(path), set()) - {None})
 
     def require(self, names: Sequence[str | Path]) -> None:
         """Raise ``UsageError`` if a file of these names must not be written."""
@@ -129,8 +137,8 @@ class OutputFolder:
 
     def trust(self, path: Path) -> None:
         """Allow to replace a file that the record lists, whatever its content is now."""
-        if (digest := digest_of(path)) is not None and (own := self.digests.get(self.name_of(path))):
-            own.add(digest)
+        if own := self.digests.get(self.name_of(path)):
+            own.add(None)
 
     def admit(self, path: Path, content: bytes, *, cached: bool) -> bool:
         """Check and record that a file is written; False if it has this content already.
@@ -145,8 +153,8 @@ class OutputFolder:
             self._stored.add(path.parent)
             self._used = True
             return True
-        name, digest = self.name_of(path), hashlib.sha256(content).hexdigest()
-        same = there and digest_of(path) == digest
+        name, digest = self.name_of(path), digest_of(content)
+        same = there and has_content(path, [digest])
         if there and not same:
             self.require_own(path)
         self._note(name, digest)
