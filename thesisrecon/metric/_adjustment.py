@@ -25,7 +25,7 @@ MAX_LOSS_SIGMAS = 20.0
 """For a larger width of Huber's loss, in sigmas, least squares is used."""
 RAYLEIGH_90 = 2.1460
 """90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
-SETTLED, ROUND_SETTLED = 1e-5, 1e-3
+SETTLED, ROUND_SETTLED = 1e-4, 5e-3
 """Predicted gain of the cameras, half a squared distance in standard deviations, at which an adjustment ends;
 larger if the observations are chosen again after it."""
 MIN_VIEWS_PER_LENS = 3
