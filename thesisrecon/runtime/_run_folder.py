@@ -268,9 +268,8 @@ class RunDirectory:
 
     @property
     def _outputs(self) -> OutputFolder:
-        outputs = claim_of(self.path / RUN_FILE)
-        assert outputs is not None, "the folder must be claimed"
-        return outputs
+        # A writer that is called alone has no claim; its folder belongs to the caller.
+        return claim_of(self.path / RUN_FILE) or OutputFolder(self.path, overwrite=True)
 
     def adopt(self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()) -> None:
         """Resume the same run in the claimed folder, or replace another one and remove its ``results``."""
