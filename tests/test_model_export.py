@@ -1,6 +1,7 @@
 """Exports are read back by the programs themselves or by a reader of the format, and project known points."""
 
 import json
+import shutil
 import struct
 import threading
 import tracemalloc
@@ -548,3 +549,29 @@ def test_coordinates_far_from_the_origin_are_reported(tmp_path, images):
     model = make_model(BARREL, PINCUSHION)
     report = export(replace(model, X=model.X + 5e6), tmp_path, to="nerfstudio", images=images)
     assert "rounded to 0.5" in report.notes[0]
+
+
+@pytest.mark.parametrize("to", ["colmap-undistorted", "openmvs", "bundler"])
+def test_transparent_pixels_of_images_are_masks_in_exports(tmp_path, images, to):
+    model = make_model(BARREL, PINCUSHION)
+    folder = tmp_path / "images"
+    shutil.copytree(images, folder)
+    (name,) = (name for name in model.names if name.endswith("c.png"))
+    rgb = np.asarray(PIL.Image.open(folder / name).convert("RGB"))
+    alpha = np.full(rgb.shape[:2], 255, np.uint8)
+    PIL.Image.fromarray(np.dstack([rgb, alpha])).save(folder / name)
+    assert export(model, tmp_path / "opaque", to=to, images=folder).file.exists()
+    assert not (tmp_path / "opaque" / "masks").exists()
+    alpha[MASKED] = 0
+    PIL.Image.fromarray(np.dstack([rgb, alpha])).save(folder / name)
+    report = export(model, tmp_path / "out", to=to, images=folder)
+    if to == "bundler":
+        assert report.notes == ("no masks are written: Bundler has none",)
+        assert not (tmp_path / "out" / "masks").exists()
+        return
+    (tmp_path / "masks").mkdir()
+    PIL.Image.fromarray(alpha).save(tmp_path / "masks" / "c.png.png")
+    export(model, tmp_path / "given", to=to, images=images, masks=tmp_path / "masks")
+    for file in sorted((tmp_path / "given" / "masks").rglob("*.png")):
+        same = tmp_path / "out" / file.relative_to(tmp_path / "given")
+        np.testing.assert_array_equal(pixels_of(same), pixels_of(file))

@@ -22,7 +22,7 @@ from thesisrecon.geometry.camera_matrix import cheirality
 from thesisrecon.geometry.robust_resection import resect
 from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.geometry.two_view import epipolar_lines
-from thesisrecon.io._images import read_pixels
+from thesisrecon.io._images import is_rgba, read_levels, read_pixels
 from thesisrecon.io._meshes import write_mesh
 from thesisrecon.io._models import read_cameras
 from thesisrecon.model_export import export
@@ -73,7 +73,7 @@ def draw_epipolar_lines(
 
     Parameters
     ----------
-    image1, image2 : path or ndarray (H, W) or (H, W, 3) uint8
+    image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
         Files, read at full size, or images.
     F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
         Fundamental matrix and matches in pixels of these images.
@@ -105,7 +105,7 @@ def rectify(
 
     Parameters
     ----------
-    image1, image2 : path or ndarray (H, W) or (H, W, 3) uint8
+    image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
         Files, read at full size, or images.
     F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
         Fundamental matrix and N >= 8 of its inliers in pixels of these images.
@@ -138,7 +138,7 @@ def rectify(
     True
     """
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    images = read_pixels(image1), read_pixels(image2)
+    images = read_levels(image1), read_levels(image2)
     size1, size2 = ((image.shape[1], image.shape[0]) for image in images)
     frame = rectify_pair(F, xy1, xy2, size1, size2, methods=PLANAR if planar else METHODS)
     return RectifiedImages.of(frame, images, disparity_range(frame, xy1, xy2))
@@ -151,9 +151,9 @@ def match_rectified(
 
     Parameters
     ----------
-    left, right : path or ndarray (H, W) or (H, W, 3)
+    left, right : path or ndarray (H, W), (H, W, 3) or (H, W, 4)
         Two images of the same size: files (read at full size; ``UsageError`` or ``StageFailure`` if one
-        cannot be read), or grey levels 0 to 255 with NaN for missing pixels.
+        cannot be read), or levels 0 to 255 with NaN for missing pixels; transparent pixels are missing.
     max_disparity_px : float
         Largest disparity; x_right = x_left - d with d from 0 to this.
     config : PipelineConfig, str or path, optional
@@ -174,7 +174,10 @@ def match_rectified(
     >>> round(float(np.nanmedian(found.disparity)), 1)
     6.0
     """
-    images = [side if isinstance(side, np.ndarray) else read_pixels(side) for side in (left, right)]
+    images = [
+        side if isinstance(side, np.ndarray) and not is_rgba(side) else read_levels(side)
+        for side in (left, right)
+    ]
     for image in images:
         # Levels of rectified images may exceed the range a little; those of 16 bits would all be white.
         if image.dtype.kind in "iu" and image.max(initial=0) > 255:

@@ -41,7 +41,7 @@ def depth_maps(
 
     Parameters
     ----------
-    images : path or sequence of paths or ndarray (H, W) or (H, W, 3) uint8
+    images : path or sequence of paths or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
         Their cameras in pixels of the images (arrays with ``sizes``), after EXIF rotation unless they are

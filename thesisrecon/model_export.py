@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,8 +22,14 @@ from thesisrecon.io._colmap_writing import COLMAP_FILES, has_skew, write_sparse_
 from thesisrecon.io._export_formats import calibration, coefficients
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import read_json
-from thesisrecon.io._images import MAX_DECODED_BYTES, find_images, read_image, rotation_words
-from thesisrecon.io._masks import find_masks, read_mask
+from thesisrecon.io._images import (
+    MAX_DECODED_BYTES,
+    find_images,
+    may_be_transparent,
+    read_image,
+    rotation_words,
+)
+from thesisrecon.io._masks import USELESS_MASKS, find_masks, read_mask
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
@@ -108,7 +115,8 @@ def export(
         Folder of the original images; None: the folder that the run was made from. Those of a COLMAP model
         are used as stored, without EXIF rotation.
     masks : path, optional
-        Folder of the masks of the original images; None: that of the run, if it had masks.
+        Folder of the masks of the original images; None: that of the run, if it had masks. Transparent pixels
+        of the images are masked too.
     threads : int
         Number of images that are undistorted at the same time; 0: one per processor.
     overwrite : bool
@@ -156,13 +164,22 @@ def export(
             file, more = _DISTORTED[to](folder, model)
         return ExportReport(file, (*notes, *more))
     undistorted = _undistorted(model, bundler=to == "bundler")
-    if masks is not None and to == "bundler":
-        notes, masks = [*notes, "no masks are written: Bundler has none"], None
-    files = None if masks is None else _mask_files(Path(masks), model, undistorted, to)
-    written = [Path("images", name) for name in undistorted.names] + [Path(name) for _, name in files or ()]
-    with claim_folder(folder, overwrite=overwrite, names=[*_FILES[to], *written]):
-        _write_images(folder, model, undistorted, images, files, threads)
-        return ExportReport(_PINHOLE[to](folder, undistorted, files is not None), tuple(notes))
+    may_mask = masks is not None or any(map(may_be_transparent, _image_paths(images, model)))
+    names = [formats.mask_name(to, name) for name in undistorted.names if may_mask and to != "bundler"]
+    _require_distinct(names, "have the mask")
+    found = {} if masks is None else find_masks(Path(masks), model.names)[0]
+    paths = _image_paths(images, model)
+    files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
+    with claim_folder(folder, overwrite=overwrite, names=files):
+        has_mask = _write_images(folder, model, undistorted, paths, found, names, threads)
+        masked = masks is not None or any(has_mask)
+        notes += [USELESS_MASKS] if masked and not any(has_mask) else []
+        notes += ["no masks are written: Bundler has none"] if masked and not names else []
+        # Programs want a mask for every image or for none.
+        for view, name, there in zip(undistorted.views, names if masked else (), has_mask, strict=False):
+            if not there:
+                write_image(folder / name, np.full(calibration(view)[1][::-1], 255, dtype=np.uint8))
+        return ExportReport(_PINHOLE[to](folder, undistorted, masked), tuple(notes))
 
 
 def require_separate(
@@ -277,7 +294,7 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
 
 
 def _require_distinct(names: Sequence[str], what: str) -> None:
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise UsageError(f"two images of the model would {what} {twice}; rename one of them")
 
@@ -336,34 +353,27 @@ def _growing_radius(distortion: F64) -> float:
     return float(np.sqrt(squares.min())) if len(squares) else np.inf
 
 
-def _mask_files(
-    masks: Path, model: SparseModel, pinholes: SparseModel, to: str
-) -> list[tuple[Path | None, str]]:
-    """The mask of each view, if any, and the file to write: programs want a mask for every image."""
-    names = [formats.mask_name(to, name) for name in pinholes.names]
-    _require_distinct(names, "have the mask")
-    found, _ = find_masks(masks, model.names)
-    return [(found.get(view), name) for view, name in zip(model.names, names, strict=True)]
+def _image_paths(images: str | Path | None, model: SparseModel) -> list[Path]:
+    if images is None:
+        raise UsageError(
+            "the model does not record the folder of its images; give it with --images (images=)"
+        )
+    return find_images(Path(images), model.names)
 
 
 def _write_images(
     folder: Path,
     model: SparseModel,
     pinholes: SparseModel,
-    images: str | Path | None,
-    masks: Sequence[tuple[Path | None, str]] | None,
+    paths: Sequence[Path],
+    masks: Mapping[str, Path],
+    mask_names: Sequence[str],
     threads: int,
-) -> None:
-    """Undistort the images of a model, and their masks, into a folder."""
-    if images is None:
-        raise UsageError(
-            "the model does not record the folder of its images; give it with --images (images=)"
-        )
-    paths = find_images(Path(images), model.names)
-
+) -> list[bool]:
+    """Undistort the images of a model into a folder, and their masks; return which have one."""
     whole = int(np.iinfo(np.int32).max)
 
-    def write(i: int) -> None:
+    def write(i: int) -> bool:
         (K, size), distortion = calibration(model.views[i]), coefficients(model.views[i])
         pinhole_K, pinhole_size = calibration(pinholes.views[i])
         with _budget.reserve(_WORKING_BYTES * (math.prod(size) + math.prod(pinhole_size))):
@@ -372,8 +382,9 @@ def _write_images(
                 rule = rotation_words(model.as_stored)
                 sizes = f"{image.size} pixels {rule}, but {size} (width, height) in the model"
                 raise UsageError(f"{paths[i]} has {sizes}; give the images of the model")
-            file, name = (None, "") if masks is None else masks[i]
-            mask = None if file is None else read_mask(file, image, as_stored=model.as_stored)
+            mask, file = image.mask, masks.get(model.names[i])
+            if file is not None:
+                mask = read_mask(file, image, as_stored=model.as_stored)
             rgb, used = image.rgb, mask
             if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
                 frames = K, distortion, pinhole_K, pinhole_size
@@ -381,9 +392,9 @@ def _write_images(
                 if mask is not None:
                     _, used = undistort_image(mask[:, :, None].astype(np.uint8), *frames, mask=mask)
             write_image(folder / "images" / pinholes.views[i].name, rgb)
-            if name:
-                used = np.ones(rgb.shape[:2], bool) if used is None else used
-                write_image(folder / name, np.where(used, 255, 0).astype(np.uint8))
+            if used is not None and mask_names:
+                write_image(folder / mask_names[i], np.where(used, 255, 0).astype(np.uint8))
+            return mask is not None
 
     with ThreadPoolExecutor(threads or available_threads()) as pool:
-        list(pool.map(write, range(len(paths))))
+        return list(pool.map(write, range(len(paths))))

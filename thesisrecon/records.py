@@ -61,6 +61,14 @@ class Image:
         weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)
         return np.ascontiguousarray(self.rgb.astype(np.float32) @ weights)
 
+    @property
+    def levels(self) -> F32:
+        """(H, W, 3) float32, NaN in masked pixels."""
+        levels = self.rgb.astype(np.float32)
+        if self.mask is not None:
+            levels[~self.mask] = np.nan
+        return levels
+
 
 @dataclass(frozen=True)
 class Seeds:

@@ -15,7 +15,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry._homography import require_parallax_of_matches
 from thesisrecon.geometry.two_view import epipoles
-from thesisrecon.io._images import read_image, read_pixels
+from thesisrecon.io._images import read_image, read_levels, read_pixels
 from thesisrecon.pipeline._image_pair import match_pair
 from thesisrecon.records import DisparityMap, Image, TwoView
 from thesisrecon.stereo._planar import PlanarRectification
@@ -108,14 +108,15 @@ def prepare_rectified_pair(
     ValueError, UsageError, StageFailure
         If shapes differ, or a file does not exist or cannot be read.
     """
+    levels = read_levels(left), read_levels(right)
     images = read_pixels(left), read_pixels(right)
     shapes = [image.shape[:2] for image in images]
     if shapes[0] != shapes[1]:
         raise ValueError(f"rectified images must have the same size; got {shapes[0]} and {shapes[1]}")
     if disparity is None:
         config = as_config(config)
-        most = _largest_disparity(*images, config)
-        maps = match_both_sides(partial(config.dense.match_rectified, max_disparity_px=most), *images)
+        most = _largest_disparity(*levels, config)
+        maps = match_both_sides(partial(config.dense.match_rectified, max_disparity_px=most), *levels)
     elif isinstance(disparity, tuple):
         maps = _as_map(disparity[0]), _as_map(disparity[1])
     else:
@@ -136,7 +137,7 @@ def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
     return DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.0)
 
 
-def _largest_disparity(left: U8, right: U8, config: PipelineConfig) -> float:
+def _largest_disparity(left: U8 | F32, right: U8 | F32, config: PipelineConfig) -> float:
     """Estimate the largest disparity (px), with a margin, from the pair at a quarter of its size."""
     widest = 0.5 * float(left.shape[1])
     if min(left.shape[:2]) < _MIN_SIDE:
@@ -148,7 +149,7 @@ def _largest_disparity(left: U8, right: U8, config: PipelineConfig) -> float:
     return min(widest, _COARSE * (1.05 * float(np.quantile(sure, 0.999)) + 2.0))
 
 
-def _reduced(image: U8) -> F32:
+def _reduced(image: U8 | F32) -> F32:
     """Average blocks of ``_COARSE`` x ``_COARSE`` pixels; incomplete blocks are cut off."""
     height, width = (side // _COARSE for side in image.shape[:2])
     blocks = image[: _COARSE * height, : _COARSE * width].reshape(height, _COARSE, width, _COARSE, 3)

@@ -19,9 +19,9 @@ REMEDIES = Path(__file__).with_name("remedies.toml")
 SOURCES = {
     "Images that are left out": {
         "io/_images.py": ("read_images", "_read", "decode_file", "_too_large", "_decoded_image"),
-        "io/_pixels.py": ("resized_to",),
+        "io/_pixels.py": ("resized_to", "opaque_part"),
         "io/_raw_files.py": ("RAW_FILE", "refuse_raw_file"),
-        "io/_masks.py": ("find_masks",),
+        "io/_masks.py": ("find_masks", "USELESS_MASKS"),
         "io/_frames.py": ("_decoded",),
         "pipeline/reconstruction.py": ("_read_inputs", "_refusals", "_exif_warnings"),
         "pipeline/_matching_stages.py": ("finish_features",),

@@ -145,7 +145,8 @@ class FrameSource:
 
 
 def _sharpness(image: PIL.Image.Image) -> float:
-    grey = StoredImage(image).rows(0, image.height).convert("L")
+    stored = StoredImage(image)
+    grey = stored.rows(0, image.height).convert("RGBA" if stored.layered else "RGB").convert("L")
     levels = np.asarray(grey.reduce(-(-max(grey.size) // _MEASURED_SIDE)), dtype=np.float32)
     return float(gaussian_laplace(levels, 1.0).var() / (levels.var() + _CONTRAST_FLOOR))
 

@@ -24,7 +24,7 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import F64, U8
+from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import SPECIAL_FILE, natural_key, printable
 from thesisrecon.io._pixels import (
@@ -34,6 +34,7 @@ from thesisrecon.io._pixels import (
     StoredImage,
     UnusableImage,
     decoding_bytes,
+    opaque_part,
     resized_to,
 )
 from thesisrecon.io._raw_files import RAW_FILE, RAW_SIGNATURE, RAW_SUFFIXES, refuse_raw_file
@@ -89,6 +90,7 @@ _ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _WIDTH_35MM = 36.0
 _FOCAL_RANGE_35MM = (1.0, 1e5)
 """mm; values outside are mistakes."""
+_ANY_SIZE = int(np.iinfo(np.int32).max)
 _budget = MemoryBudget(MAX_DECODED_BYTES)
 
 
@@ -198,7 +200,8 @@ def read_images(
 ) -> ImageSet:
     """Read all images of a folder or a list, reduced to ``max_size_px``; unusable ones get a reason.
 
-    ``source`` is a folder, or a sequence of files, (H, W) or (H, W, 3) uint8 arrays and Image records.
+    ``source`` is a folder, or a sequence of files, uint8 arrays (H, W), (H, W, 3) or (H, W, 4) and Image
+    records. Transparent pixels are masked.
     ``map_all`` is an ordered map; that of a thread pool reads several images at the same time. Files are
     rotated upright unless they are read ``as_stored``. Names are printable; equal names are numbered.
     Duplicates, blank and small images are unusable too.
@@ -258,20 +261,22 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
         decoded = DecodedImage(replace(item, name=name), "")
     else:
         array = np.asarray(item)
-        if array.dtype != np.uint8 or (array.ndim != 2 and array.shape[2:] != (3,)):
+        if array.dtype != np.uint8 or (array.ndim != 2 and array.shape[2:] not in ((3,), (4,))):
             raise ValueError(
-                f"an image array must be (H, W) or (H, W, 3) uint8; got {array.shape} {array.dtype}"
+                "an image array must be (H, W), (H, W, 3) or (H, W, 4) uint8; "
+                f"got {array.shape} {array.dtype}"
             )
-        stored = StoredImage(PIL.Image.fromarray(array))
-        decoded = DecodedImage(Image(name, resized_to(stored, max_size_px), stored.size), "")
-    rgb = decoded.image.rgb
+        decoded = DecodedImage(_image(name, StoredImage(PIL.Image.fromarray(array)), max_size_px), "")
+    decoded = with_digest(decoded)
+    rgb, mask = decoded.image.rgb, decoded.image.mask
     if min(rgb.shape[:2]) < MIN_SIDE:
         raise UnusableImage(
             f"has only {rgb.shape[1]} x {rgb.shape[0]} pixels; the minimum is {MIN_SIDE} x {MIN_SIDE}"
         )
-    if np.ptp(rgb.reshape(-1, 3), axis=0).max() < BLANK_RANGE:
+    used = rgb.reshape(-1, 3) if mask is None else rgb[mask]
+    if not len(used) or np.ptp(used, axis=0).max() < BLANK_RANGE:
         raise UnusableImage("is blank: all its pixels have nearly the same colour")
-    return with_digest(decoded)
+    return decoded
 
 
 def with_digest(decoded: DecodedImage) -> DecodedImage:
@@ -330,14 +335,27 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
         ) from None
 
 
+def _image(name: str, stored: StoredImage, max_size_px: int) -> Image:
+    rgb, mask = opaque_part(resized_to(stored, max_size_px))
+    return Image(name, rgb, stored.size, mask)
+
+
 def _decoded_image(name: str, max_size_px: int, as_stored: bool, file: PIL.Image.Image) -> DecodedImage:
     # Cameras store a preview as a second frame of a JPEG (MPO).
     several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
     stored, focal_35mm = load_pixels(file, as_stored=as_stored)
     known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
     focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
-    image = Image(name, resized_to(stored, max_size_px), stored.size)
+    image = _image(name, stored, max_size_px)
     return DecodedImage(image, "", focal, "only the first frame is used" if several else "")
+
+
+def may_be_transparent(path: Path) -> bool:
+    """Whether the header of an image file states transparency."""
+    try:
+        return decode_file(path, lambda file: StoredImage(file).layered)
+    except UnusableImage:
+        return False
 
 
 def _too_large(file: PIL.Image.Image, needed: int) -> str:
@@ -389,8 +407,28 @@ def _exif(file: PIL.Image.Image) -> tuple[int, float]:
 
 def read_pixels(side: Any) -> U8:
     """A file at full size, or a checked array, as RGB."""
+    return _full_image(side).rgb
+
+
+def is_rgba(array: NDArray[Any]) -> bool:
+    """Whether an array is an 8-bit image with alpha."""
+    return array.dtype == np.uint8 and array.shape[2:] == (4,)
+
+
+def read_levels(side: Any) -> U8 | F32:
+    """As :func:`read_pixels`; with transparency in single precision, NaN where it is."""
+    image = _full_image(side)
+    return image.rgb if image.mask is None else image.levels
+
+
+def _full_image(side: Any) -> Image:
     if not isinstance(side, np.ndarray):
-        return read_image(side, max_size_px=int(np.iinfo(np.int32).max)).images[0].rgb
-    if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] != 3):
-        raise ValueError(f"an image must be a uint8 array (H, W, 3); got {side.dtype} {side.shape}")
-    return side if side.ndim == 3 else np.repeat(side[:, :, None], 3, axis=2)
+        return read_image(side, max_size_px=_ANY_SIZE).images[0]
+    if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] not in (3, 4)):
+        raise ValueError(
+            f"an image must be a uint8 array (H, W, 3) or (H, W, 4); got {side.dtype} {side.shape}"
+        )
+    try:
+        return _image("", StoredImage(PIL.Image.fromarray(side)), _ANY_SIZE)
+    except UnusableImage as refusal:
+        raise StageFailure(f"an image {refusal}") from None

@@ -1,4 +1,4 @@
-"""Masks of images: files named like the images whose black pixels are left out."""
+"""Masks of images: files named like the images whose black or transparent pixels are left out."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from thesisrecon.io._pixels import UnusableImage
 from thesisrecon.records import Image
 
 _NAMES = "the mask of IMG.jpg is IMG.jpg.png, or IMG with any suffix"
+
+USELESS_MASKS = "the masks leave out no pixel of any image"
 
 
 def check_masks_folder(masks: Path, images: Path | None) -> Path:
@@ -84,9 +86,9 @@ def add_masks(
 
 
 def read_mask(path: Path, image: Image, *, as_stored: bool = False) -> B8 | None:
-    """Pixels to use of an image at working size, by nearest neighbour; None: all."""
+    """Pixels to use of an image at working size, by nearest neighbour, within its own mask; None: all."""
     try:
-        full = decode_file(path, lambda file: load_pixels(file, as_stored=as_stored)[0].nonblack())
+        full = decode_file(path, lambda file: load_pixels(file, as_stored=as_stored)[0].unmasked())
     except UnusableImage as refusal:
         raise UsageError(f"the mask {path} {refusal}; replace or remove it") from None
     size, (width, height) = full.shape[::-1], image.original_size
@@ -100,6 +102,8 @@ def read_mask(path: Path, image: Image, *, as_stored: bool = False) -> B8 | None
     steps = size[0] / width / image.scale, size[1] / height / image.scale
     x, y = (_nearest(image.size[k], steps[k], size[k]) for k in (0, 1))
     mask = np.ascontiguousarray(full[np.ix_(y, x)])
+    if image.mask is not None:
+        mask &= image.mask
     if not mask.any():
         raise UsageError(
             f"the mask {path} leaves no pixel of {image.name}: black pixels are left out, all others are used"

@@ -24,6 +24,8 @@ _STRIPE_ROWS = 256
 _REDUCING_GAP = 3.0
 """Reduction left to the Lanczos filter; larger reductions average whole pixels first."""
 _LANCZOS = PIL.Image.Resampling.LANCZOS
+OPAQUE = 128
+"""Least alpha of a pixel that is used: at least half of it is covered."""
 _DECODED_BYTES, _COEFFICIENT_BYTES = 4, 2
 _DECODED_BYTES_OF = {"WEBP": 16, "AVIF": 14, "HEIF": 14, "JPEG2000": 20}
 """Measured bytes per pixel at the peak of decoding; these decoders hold the image several times."""
@@ -79,7 +81,10 @@ _ROWS_FROM_END = {EXIF_TRANSFORMS[orientation] for orientation in (3, 4, 7, 8)}
 
 @dataclass(frozen=True)
 class StoredImage:
-    """A decoded Pillow image of any mode, seen upright by its ``transform`` (None = as stored) and as RGB."""
+    """A decoded Pillow image of any mode, seen upright by its ``transform`` (None = as stored).
+
+    Its levels are RGB, or RGBA if it has transparency.
+    """
 
     stored: PIL.Image.Image
     transform: Transpose | None = None
@@ -91,19 +96,38 @@ class StoredImage:
         return (height, width) if self.transform in _ROWS_ARE_COLUMNS else (width, height)
 
     def rows(self, start: int, stop: int) -> PIL.Image.Image:
-        """Rows ``start`` to ``stop`` of the upright image in RGB."""
+        """Rows ``start`` to ``stop`` of the upright image in RGB; in RGBa (premultiplied) if ``layered``."""
         part = self._stored_part(start, stop)
-        rgb = self._eight_bit(part) if self._deep else _rgb(part)
-        return rgb if self.transform is None else rgb.transpose(self.transform)
+        levels = self._eight_bit(part) if self._deep else _eight_bit_colours(part)
+        return levels if self.transform is None else levels.transpose(self.transform)
+
+    @property
+    def layered(self) -> bool:
+        """Whether pixels may be transparent. (The A of LAB is a colour.)"""
+        return self.stored.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in self.stored.info
 
     def stripes(self, height: int = _STRIPE_ROWS) -> Iterator[tuple[int, int]]:
         """(start, stop) of stripes of rows of the upright image."""
         return ((start, min(start + height, self.size[1])) for start in range(0, self.size[1], height))
 
-    def nonblack(self) -> B8:
-        """Pixels (H, W) of the upright image whose grey level is not 0, whatever their transparency."""
+    def unmasked(self) -> B8:
+        """Pixels (H, W) that the upright image uses as a mask: neither black nor transparent.
+
+        Without a black pixel, or if all are black, the mask is the transparency, and without a pixel that is
+        neither, the colours.
+        """
         grey = self.stored if self._deep else self.stored.convert("L")
-        return np.asarray(np.asarray(grey if self.transform is None else grey.transpose(self.transform)) != 0)
+        nonblack = np.asarray(
+            np.asarray(grey if self.transform is None else grey.transpose(self.transform)) != 0
+        )
+        if not self.layered:
+            return nonblack
+        parts = (np.asarray(self.rows(*stripe).getchannel("a")) >= OPAQUE for stripe in self.stripes())
+        opaque = np.concatenate(list(parts))
+        if nonblack.all() or not nonblack.any():
+            return opaque
+        both = nonblack & opaque
+        return both if both.any() else nonblack
 
     def _stored_part(self, start: int, stop: int) -> PIL.Image.Image:
         width, height = self.stored.size
@@ -129,37 +153,57 @@ class StoredImage:
     def _eight_bit(self, part: PIL.Image.Image) -> PIL.Image.Image:
         low, high = self._range
         grey = (_finite(part) - low) * (255.0 / max(high - low, 1e-12))
-        return PIL.Image.fromarray(np.rint(np.clip(grey, 0, 255)).astype(np.uint8)).convert("RGB")
+        levels = PIL.Image.fromarray(np.rint(np.clip(grey, 0, 255)).astype(np.uint8)).convert("RGB")
+        if not self.layered:
+            return levels
+        opaque = np.asarray(part) != self.stored.info["transparency"]
+        levels.putalpha(PIL.Image.fromarray(np.where(opaque, 255, 0).astype(np.uint8)))
+        return levels.convert("RGBa")
 
 
 def _finite(part: PIL.Image.Image) -> F64:
     return np.nan_to_num(np.asarray(part).astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _rgb(part: PIL.Image.Image) -> PIL.Image.Image:
-    """Convert to RGB; transparent pixels become mid-grey, since their colours are meaningless."""
-    # The A of LAB is a colour.
-    if part.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in part.info:
-        layered = part.convert("RGBA")
-        ground = PIL.Image.new("RGBA", layered.size, (128, 128, 128, 255))
-        return PIL.Image.alpha_composite(ground, layered).convert("RGB")
-    return part.convert("RGB")
+def _eight_bit_colours(part: PIL.Image.Image) -> PIL.Image.Image:
+    # Resampling averages colours times alpha, so that those of transparent pixels have no weight.
+    return part.convert("RGBA").convert("RGBa") if StoredImage(part).layered else part.convert("RGB")
 
 
 def resized_to(image: StoredImage, max_size_px: int) -> U8:
-    """Reduce an image to a long side by one exact scale s along both axes, (x + 0.5) s - 0.5."""
+    """Reduce an image to a long side by one exact scale s along both axes, (x + 0.5) s - 0.5.
+
+    The result is (H, W, 3), or (H, W, 4) with alpha if the image is ``layered``.
+    """
     width, height = image.size
     scale = max_size_px / max(width, height)
     if scale >= 1:
-        rgb = np.empty((height, width, 3), dtype=np.uint8)
+        levels = np.empty((height, width, 4 if image.layered else 3), dtype=np.uint8)
         for start, stop in image.stripes():
-            rgb[start:stop] = np.asarray(image.rows(start, stop))
-        return rgb
+            levels[start:stop] = _straight(image.rows(start, stop))
+        return levels
     long, short = max_size_px, math.floor(min(width, height) * scale)
     size = (long, short) if width >= height else (short, long)
     if min(size) < 1:
         raise UnusableImage(f"has {width} x {height} pixels: too narrow to be reduced to {max_size_px}")
     return _resized(image, size, (min(width, size[0] / scale), min(height, size[1] / scale)))
+
+
+def opaque_part(levels: U8) -> tuple[U8, B8 | None]:
+    """RGB, grey where it is transparent, and the other pixels as a mask, None if all are opaque."""
+    if levels.shape[2] == 3:
+        return levels, None
+    mask = levels[:, :, 3] >= OPAQUE
+    if not mask.any():
+        raise UnusableImage("is transparent in all pixels: save it without its alpha channel")
+    rgb = np.ascontiguousarray(levels[:, :, :3])
+    rgb[~mask] = 128
+    return rgb, None if mask.all() else mask
+
+
+def _straight(levels: PIL.Image.Image) -> U8:
+    """Levels of RGB, or of RGBA from colours times alpha."""
+    return np.array(levels.convert("RGBA") if levels.mode == "RGBa" else levels)
 
 
 def _resized(image: StoredImage, size: tuple[int, int], extent: tuple[float, float]) -> U8:
@@ -169,9 +213,10 @@ def _resized(image: StoredImage, size: tuple[int, int], extent: tuple[float, flo
     (Pillow itself may begin with the columns if an image is more than twice as high as wide.)
     """
     by = [max(int(e / s / _REDUCING_GAP), 1) for e, s in zip(extent, size, strict=True)]
-    narrow = PIL.Image.new("RGB", (size[0], -(-image.size[1] // by[1])))
+    mode = "RGBa" if image.layered else "RGB"
+    narrow = PIL.Image.new(mode, (size[0], -(-image.size[1] // by[1])))
     for start, stop in image.stripes(max(_STRIPE_ROWS // by[1], 1) * by[1]):
         part = image.rows(start, stop).reduce((by[0], by[1]))
         box = (0.0, 0.0, extent[0] / by[0], float(part.height))
         narrow.paste(part.resize((size[0], part.height), _LANCZOS, box=box), (0, start // by[1]))
-    return np.array(narrow.resize(size, _LANCZOS, box=(0.0, 0.0, float(size[0]), extent[1] / by[1])))
+    return _straight(narrow.resize(size, _LANCZOS, box=(0.0, 0.0, float(size[0]), extent[1] / by[1])))

@@ -16,7 +16,7 @@ RAW_SUFFIXES = (
 )
 RAW_FILE = "is a raw file: convert it to JPEG, PNG or TIFF"
 RAW_SIGNATURE = re.compile(
-    rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|\0MRM|II\x1a\0\0\0HEAPCCDR|....ftypcrx |II\*\0....CR",
+    rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|\0MRM|II\x1a\0\0\0HEAPCCDR|....ftypcrx |II\*\0....CR\x02\0",
     re.DOTALL,
 )
 """First bytes of raw files; only the last kind (CR2) is a TIFF file."""

@@ -22,7 +22,7 @@ from thesisrecon.runtime._run import stream
 
 OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
 ImageInput = str | Path | np.ndarray | Image
-"""A file, a uint8 array (H, W) or (H, W, 3), or an :class:`Image`."""
+"""A file, a uint8 array (H, W), (H, W, 3) or (H, W, 4), or an :class:`Image`."""
 MASK_REACH = 4.0
 """Half width, in pixels of its scale, of the window that determines the position of a corner."""
 
@@ -34,8 +34,8 @@ def match_pair(
 
     Parameters
     ----------
-    image1, image2 : path, ndarray (H, W) or (H, W, 3) uint8, or Image
-        The two images.
+    image1, image2 : path, ndarray (H, W), (H, W, 3) or (H, W, 4) uint8, or Image
+        The two images; transparent pixels are masked.
     config : PipelineConfig, str or path, optional
         Settings, the name of a preset, or a TOML file; None: the preset ``default``.
     seed : int

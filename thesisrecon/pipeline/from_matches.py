@@ -17,7 +17,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap_reading import read_database
 from thesisrecon.io._images import images_folder
-from thesisrecon.io._masks import add_masks, check_masks_folder
+from thesisrecon.io._masks import USELESS_MASKS, add_masks, check_masks_folder
 from thesisrecon.io._models import read_model
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.pipeline._given import (
@@ -288,6 +288,8 @@ def _reconstruct(
                     inputs, warnings = add_masks(
                         inputs, Path(masks), as_stored=views.as_stored, map_all=run.workers.map_all
                     )
+                    if all(image.mask is None for image in inputs.images):
+                        warnings.append(USELESS_MASKS)
                 given = outside_masks(at_working_size(given, inputs.images), inputs.images)
             run.finish("images", counts={"read": len(digests), "refused": 0}, warnings=warnings)
             result = empty_result(run, inputs)

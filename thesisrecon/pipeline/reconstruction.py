@@ -14,7 +14,7 @@ from thesisrecon.errors import UsageError, counted
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._frames import FrameSource
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
-from thesisrecon.io._masks import add_masks, check_masks_folder
+from thesisrecon.io._masks import USELESS_MASKS, add_masks, check_masks_folder
 from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline._outputs import REPLACED_FILES
 from thesisrecon.pipeline._state import PipelineState
@@ -46,7 +46,7 @@ def reconstruct(
 
     Parameters
     ----------
-    images : path, or sequence of path, ndarray (H, W) or (H, W, 3) uint8, or Image
+    images : path, or sequence of path, ndarray (H, W), (H, W, 3) or (H, W, 4) uint8, or Image
         A folder, or the images; with ``every`` a video (extra ``video``) or a folder of frames.
     out : path
         Output folder: created if missing, resumed if it holds the same run.
@@ -64,7 +64,7 @@ def reconstruct(
         Single settings: ``{"matching.ratio": 0.7}`` or ``["matching.ratio=0.7"]``.
     masks : path, optional
         Folder of masks: the black pixels of ``NAME.png``, or of a file like the image with any suffix, give
-        no features, no depth and no texture. Images without one are used as a whole.
+        no features, no depth and no texture; transparent pixels of images give none either.
     every : int, optional
         Take the sharpest of each ``every`` frames; those of a video are written to ``out/00-frames``.
     seed : int
@@ -169,6 +169,7 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
     warnings += unused if not counts else []
     warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
     masked = sum(image.mask is not None for image in inputs.images)
+    warnings += [USELESS_MASKS] if masks is not None and inputs.images and not masked else []
     counts |= {"read": found, "refused": refused} | ({"masked": masked} if masked else {})
     run.finish("images", counts=counts, warnings=warnings)
     return inputs

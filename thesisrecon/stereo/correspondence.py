@@ -87,8 +87,8 @@ class PairMatching:
         frame = rectify_pair(F, xy1, xy2, image1.rgb.shape[1::-1], image2.rgb.shape[1::-1], methods=methods)
         wanted = _searched_range(frame, xy1, xy2)
         gain = _brightness_gain(image1.rgb, image2.rgb, xy1, xy2)
-        left = frame.warp(image1.rgb.astype(np.float32), 0)
-        right = frame.warp(image2.rgb.astype(np.float32) * gain, 1)
+        left = frame.warp(image1.levels, 0)
+        right = frame.warp(image2.levels * gain, 1)
         match = partial(self.matcher.match, disparity_range=wanted)
         return RectifiedPair(frame, (left, right), gain, *match_both_sides(match, left, right))
 

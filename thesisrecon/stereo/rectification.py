@@ -58,7 +58,9 @@ class RectifiedImages:
     shift: int
 
     @classmethod
-    def of(cls, frame: Rectification, images: tuple[U8, U8], disparities: tuple[int, int]) -> RectifiedImages:
+    def of(
+        cls, frame: Rectification, images: tuple[U8 | F32, U8 | F32], disparities: tuple[int, int]
+    ) -> RectifiedImages:
         """Resample two images; one moves to the right by whole columns so that disparities begin at 0.
 
         Parameters
