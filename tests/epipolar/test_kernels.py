@@ -122,6 +122,18 @@ def test_distances_and_score_equal_numpy(seed):
     assert kernels.truncated_score(f, columns, gate, 0.5 * score, (0.0, 0.0))[0] == 1.0
 
 
+@pytest.mark.parametrize(("errors", "kept"), [(2.0, True), (4.0, False)])
+def test_a_matrix_is_given_up_by_its_first_points_only_three_standard_errors_above(errors, kept):
+    f = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0])  # y1 - y2
+    columns = np.random.default_rng(0).uniform(-1.0, 1.0, (4, 10 * kernels.STRIDE))
+    columns[3] = columns[1]
+    wrong = round(0.5 * kernels.STRIDE + errors * np.sqrt(0.25 * kernels.STRIDE))
+    columns[3, :wrong] += 1.0
+    score, _, seen = kernels.truncated_score(f, columns, 0.1, 0.5, (0.0, 0.0))
+    assert score == (pytest.approx(wrong / columns.shape[1]) if kept else 1.0)
+    assert seen == (columns.shape[1] if kept else kernels.STRIDE)
+
+
 def test_sequential_test_gives_up_wrong_matrices_early_and_keeps_right_ones():
     rng = np.random.default_rng(0)
     n, right, wrong, kept, seen = 2000, 0.4, 0.05, 0, []
