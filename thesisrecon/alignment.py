@@ -17,6 +17,7 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import UsageError, counted, unknown_word
 from thesisrecon.geometry.similarity import Similarity, estimate_similarity
 from thesisrecon.io._models import read_model
+from thesisrecon.io._positions import read_positions
 from thesisrecon.results import RunResult, folder_with
 from thesisrecon.sparse_model import SparseModel
 
@@ -29,6 +30,8 @@ _MIN_WIDTH_REL = 1e-3
 _ROUNDING_REL = 1e-9
 """Residuals below this fraction of the extent are rounding."""
 _PARAMETERS = 7
+_MAX_SPREAD_DEG, _FAR_SPREADS = 0.1, 100.0
+"""Degrees: sites are smaller than 11 km and far from (0, 0); lengths of this kind are of a rig of 10 cm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +44,8 @@ class AlignmentReport:
     inlier: B8  #: (N,) positions used by the final fit
     sigma: float  #: standard deviation of one coordinate, estimated from the inliers
     unknown: tuple[str, ...] = ()  #: names of positions without an image in the model
+    #: latitude and longitude (degrees) and height (m) of the origin if the positions were degrees
+    origin: tuple[float, float, float] | None = None
 
     @property
     def distance(self) -> F64:
@@ -56,6 +61,12 @@ class AlignmentReport:
         rms = math.sqrt(float(np.mean(self.distance[self.inlier] ** 2)))
         total = f"{int(self.inlier.sum())} of {counted(len(self.names), 'position')} used"
         lines.append(f"{total}, residual {rms:.4g} RMS; 1 unit of the model is {self.similarity.scale:.6g}")
+        if self.origin is not None:
+            latitude, longitude, height = self.origin
+            lines.append(
+                "degrees were converted to metres east, north and up of latitude "
+                f"{latitude:.7f}, longitude {longitude:.7f}, height {height:.7g} m (WGS84)"
+            )
         if self.unknown:
             lines.append(
                 f"{counted(len(self.unknown), 'position')} without an image, such as {self.unknown[0]}"
@@ -89,7 +100,10 @@ def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
 
 
 def align_to_positions(
-    model: SparseModel | RunResult | str | Path, positions: Mapping[str, ArrayLike], *, seed: int = 0
+    model: SparseModel | RunResult | str | Path,
+    positions: Mapping[str, ArrayLike] | str | Path,
+    *,
+    seed: int = 0,
 ) -> tuple[SparseModel, AlignmentReport]:
     """Move a model to known positions of its cameras by a robust similarity.
 
@@ -101,8 +115,10 @@ def align_to_positions(
     ----------
     model : SparseModel, RunResult or path
         A model, a run or its output folder, or a COLMAP model.
-    positions : mapping of str to (3,)
-        Image name -> position, in metres or any other unit.
+    positions : mapping of str to (3,), or path
+        Image name -> position, in metres or any other unit of length; or a CSV file of ``name,x,y,z``. If
+        its header names latitude, longitude and height (degrees and metres, WGS84), they become metres east,
+        north and up of their median.
     seed : int
         Random seed of the triples, which are drawn only for more than 18 positions.
 
@@ -114,8 +130,8 @@ def align_to_positions(
     Raises
     ------
     UsageError
-        If fewer than three images have a position, a position is not three finite numbers, or the positions
-        or the camera centres lie on one line within their noise.
+        If fewer than three images have a position, a position is not three finite numbers, the positions look
+        like degrees, or they or the camera centres lie on one line within their noise.
 
     Examples
     --------
@@ -128,6 +144,9 @@ def align_to_positions(
     >>> round(report.similarity.scale, 6), aligned.views[1].centre.round(6).tolist()
     (2.5, [12.5, 10.0, 10.0])
     """
+    origin = None
+    if isinstance(positions, str | Path):
+        positions, origin = read_positions(Path(positions))
     model = as_sparse_model(model)
     centres = {view.name: view.centre for view in model.views}
     names = tuple(name for name in positions if name in centres)
@@ -142,12 +161,26 @@ def align_to_positions(
         target = np.full((len(names), 3), np.nan)
     if target.shape != (len(names), 3) or not np.isfinite(target).all():
         raise UsageError("alignment needs three finite coordinates of each position")
-    for points, what in ((source, "camera centres"), (target, "positions")):
-        _require_width(points, what, 0.0)
+    _require_lengths(target)
+    _require_width(source, "camera centres", 0.0)
     similarity, inlier, sigma = _robust_similarity(source, target, seed)
     _require_width(target[inlier], "positions", sigma)
-    report = AlignmentReport(similarity, names, similarity.apply(source) - target, inlier, sigma, unknown)
+    residual = similarity.apply(source) - target
+    report = AlignmentReport(similarity, names, residual, inlier, sigma, unknown, origin)
     return model.transformed(similarity), report
+
+
+def _require_lengths(positions: F64) -> None:
+    """Refuse positions (N, 3) that are probably degrees: of a small spread, far from (0, 0)."""
+    centre = np.median(positions[:, :2], axis=0)
+    spread = float(np.quantile(np.abs(positions[:, :2] - centre), 0.75, axis=0).max())
+    first, second = np.abs(positions[:, :2]).max(axis=0)
+    inside = max(first, second) <= 180.0 and min(first, second) <= 90.0
+    if inside and spread < _MAX_SPREAD_DEG and float(np.linalg.norm(centre)) > _FAR_SPREADS * spread:
+        raise UsageError(
+            "the positions look like latitude and longitude in degrees, which are no lengths; give a file "
+            "whose header names the columns lat, lon and alt, or subtract an offset if they are lengths"
+        )
 
 
 def _require_width(points: F64, what: str, sigma: float) -> None:
@@ -171,7 +204,7 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
 
     # A triple fits itself, so that the quantile of Rousseeuw counts three positions more than half.
     rank = (n + 4) // 2
-    best, least = estimate_similarity(source, target), math.inf
+    best, least = None, math.inf
     for triple in _triples(n, seed):
         try:
             found = estimate_similarity(source[triple], target[triple])
@@ -180,6 +213,9 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
         quantile = float(np.partition(distances(found), rank - 1)[rank - 1])
         if quantile < least:
             best, least = found, quantile
+    if best is None:
+        _require_width(target, "positions", 0.0)
+        best = estimate_similarity(source, target)
     # Rousseeuw's correction for few points, and the quantile of the lengths of normal residuals.
     sigma = least * (1.0 + 5.0 / max(n - 3, 1)) / math.sqrt(2.0 * gammaincinv(1.5, rank / (n + 1)))
     inlier = distances(best) <= _INLIER_SIGMAS * max(sigma, floor)

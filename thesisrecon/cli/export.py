@@ -9,7 +9,7 @@ import typer
 
 from thesisrecon.cli.common import OutputFolder, Overwrite, Threads, cap_threads, interruptible, parse_folder
 from thesisrecon.errors import UsageError
-from thesisrecon.io._files import printable, read_positions
+from thesisrecon.io._files import printable
 
 
 def export(
@@ -51,7 +51,9 @@ def export(
     ] = None,
     align: Annotated[
         Path | None,
-        typer.Option("--align", metavar="FILE", help="Known camera positions: a CSV of name,x,y,z."),
+        typer.Option(
+            "--align", metavar="FILE", help="Known camera positions: a CSV of name,x,y,z or name,lat,lon,alt."
+        ),
     ] = None,
     threads: Threads = 0,
     overwrite: Overwrite = False,
@@ -60,7 +62,6 @@ def export(
     cap_threads(threads)
     if scale is not None and align is not None:
         raise UsageError("--scale and --align exclude each other; positions determine the scale")
-    positions = None if align is None else read_positions(align)
     from thesisrecon.alignment import align_to_positions, scaled
     from thesisrecon.io._models import read_model
     from thesisrecon.model_export import export as write_export
@@ -73,8 +74,8 @@ def export(
     found = read_model(model)
     if scale is not None:
         found = scaled(found, *scale)
-    if positions is not None:
-        found, report = align_to_positions(found, positions)
+    if align is not None:
+        found, report = align_to_positions(found, align)
         typer.echo("\n".join(map(printable, str(report).splitlines())))
     with interruptible("repeat the command to write all files"):
         images, lost = images or recorded_images(model), list[str]()

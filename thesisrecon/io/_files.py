@@ -5,7 +5,6 @@ If the program is killed at any moment, the old file or the new one is there.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -222,38 +221,6 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
             )
         pairs.append((names[0], names[1]))
     return pairs
-
-
-def read_positions(path: Path) -> dict[str, tuple[float, float, float]]:
-    """Read camera positions, one "name,x,y,z" per line, perhaps after a header."""
-    positions: dict[str, tuple[float, float, float]] = {}
-    first = True
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        header, first = first, False
-        try:
-            ((name, x, y, z),) = csv.reader([line], skipinitialspace=True)
-            place = (float(x), float(y), float(z))
-            if name in positions or not all(map(math.isfinite, place)):
-                raise ValueError
-        except (ValueError, csv.Error):
-            if header and not any(map(_is_number, line.split(",")[1:])):
-                continue
-            raise UsageError(
-                f"line {number} of {path} must hold name,x,y,z with finite numbers, one line per image; "
-                f"got {shortened(line.strip())!r}"
-            ) from None
-        positions[name] = place
-    return positions
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _names(line: str) -> list[str]:
