@@ -289,3 +289,17 @@ def test_a_line_follows_each_of_its_ends():
     # At an end the line moves by the move of that end and by nothing of the other.
     at_ends = np.einsum("mkc,mec->mke", _line_moves(ends), ends)
     np.testing.assert_allclose(at_ends, np.tile(np.eye(2), (20, 1, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(("n", "m"), [(200, 0), (0, 200)])
+def test_the_noise_of_the_equations_is_that_of_trials(n, m):
+    rng = np.random.default_rng(4)
+    zoomed = three_cameras(rng) * np.array([[0.4, 0.4, 1.0], [1.0, 1.0, 1.0], [1.6, 1.6, 1.0]])[:, :, None]
+    exact = matches(zoomed, rng, n, m, 0.0)
+    equations = _tensor_equations(*exact)
+    t = equations.solve().ravel()
+    squares = [
+        np.sum((_tensor_equations(*(xy + rng.normal(0.0, 0.05, xy.shape) for xy in exact)).A @ t) ** 2)
+        for _ in range(150)
+    ]
+    assert np.mean(squares) == pytest.approx(0.05**2 * np.sum((equations.noise @ t) ** 2), rel=0.05)

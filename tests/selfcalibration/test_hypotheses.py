@@ -8,7 +8,12 @@ import pytest
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.selfcalibration._candidates import _no_candidate_failure, plane_from_focals, select_candidate
+from thesisrecon.selfcalibration._candidates import (
+    _biased_focal,
+    _no_candidate_failure,
+    plane_from_focals,
+    select_candidate,
+)
 from thesisrecon.selfcalibration._dual_quadric import quadric_hypotheses
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
@@ -132,3 +137,18 @@ def test_a_failure_near_given_focal_lengths_states_them(focal, words):
     failure = _no_candidate_failure(frame, given, 40)
     assert str(failure.reason).endswith("near the given focal length")
     assert failure.evidence.startswith(f"{words} (+- 2.0%) at working size was given")
+
+
+def test_a_focal_length_off_that_of_bundle_adjustment_is_reported():
+    scene = make_scene(views=5)
+    found = calibrate(METHODS[0], scene)
+    given = projective_reconstruction(scene)
+    frame, best = normalized_frame(given, prior_for(given, IntrinsicsOptions())), found.candidates[0]
+    assert _biased_focal(frame, best, found.identifiability) == ()
+    for factor, words in ((1.2, "+20%"), (0.8, "-20%")):
+        (sentence,) = _biased_focal(
+            frame, replace(best, K=best.K * [[[factor], [factor], [1.0]]]), found.identifiability
+        )
+        assert (
+            f"the focal length of this method is {words} from that of bundle adjustment, 1500 px" in sentence
+        )
