@@ -29,7 +29,7 @@ LOSSES = ("huber", "squared")
 _HUBER_SIGMAS = 2.0
 _LEAST_SIGMA_PX = 1e-6
 _SIMILARITY_DOF = 7
-_SETTLED = 1e-8
+_SETTLED = 1e-6
 _MAX_BEHIND = 0.5
 """Fraction of observed points behind their cameras above which the poses must use another convention."""
 
@@ -98,7 +98,7 @@ def bundle_adjust(
     loss: str = "huber",
     loss_px: float | None = None,
     sigma_px: float | None = None,
-    max_iterations: int = 50,
+    max_iterations: int = 200,
 ) -> BundleAdjustment:
     """Refine cameras and points together, with their covariances (6.7, HZ 18.1 and A6.3).
 
