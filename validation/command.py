@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.io._outputs import join_claim
 from thesisrecon.runtime._signals import with_resume_advice
 from validation.ablation import command as ablation
 from validation.harness.gates import read_gates
@@ -39,15 +40,16 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, StageFailure) as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
-    with with_resume_advice("run the same command to start again"):
-        try:
+    try:
+        with with_resume_advice("run the same command to start again"), join_claim(options.out) as outputs:
+            outputs.require(["index.html", "results.json", "options.json"])
             judged = run_tasks(options, STAGES, _print_progress)
-        except ValueError as error:
-            print(f"validation: {error}", file=sys.stderr)
-            return 2
-    results, earlier = collect(options, judged, gates), _last_results(options)
-    write_results(options.out, results)
-    page = write_pages(options, STAGES, judged, results, earlier)
+            results, earlier = collect(options, judged, gates), _last_results(options)
+            write_results(options.out, results)
+            page = write_pages(options, STAGES, judged, results, earlier)
+    except ValueError as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
     if parsed.command == "check":
         _print_gates(results)
     broken = counted(len(results.broken) + len(results.missing), "gate")

@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.errors import counted
+from thesisrecon.io._files import write_text
+from thesisrecon.io._outputs import join_claim
 from thesisrecon.runtime._signals import install_signal_handlers
 from validation.harness.process import own_cores, run_process
 from validation.mutations import CopiedTree
@@ -279,7 +281,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--warm", action="store_true", help="skip the test run without faults")
     parser.add_argument("--again", action="store_true", help="repeat the uncaught faults of OUT")
     parsed = parser.parse_args(arguments)
-    parsed.out.mkdir(parents=True, exist_ok=True)
     results: dict[Mutant, Verdict] = {}
     if parsed.again:
         results = {v.mutant: v for v in read_verdicts(parsed.out / "mutants.json")}
@@ -288,12 +289,14 @@ def main(arguments: list[str] | None = None) -> int:
     else:
         mutants = [m for package in parsed.packages for m in draw(ROOT, package, parsed.sample, parsed.seed)]
     try:
-        for count, verdict in enumerate(judge_all(Bench(parsed.out.resolve()), mutants, warm=parsed.warm)):
-            results[verdict.mutant] = verdict
-            print(f"{count + 1} of {len(mutants)}: {table([verdict]).splitlines()[-1]}", flush=True)
-            verdicts = list(results.values())
-            (parsed.out / "mutants.md").write_text(table(verdicts) + "\n", encoding="utf-8")
-            (parsed.out / "mutants.json").write_text(json.dumps([asdict(v) for v in verdicts], indent=1))
+        with join_claim(parsed.out):
+            judged = judge_all(Bench(parsed.out.resolve()), mutants, warm=parsed.warm)
+            for count, verdict in enumerate(judged):
+                results[verdict.mutant] = verdict
+                print(f"{count + 1} of {len(mutants)}: {table([verdict]).splitlines()[-1]}", flush=True)
+                verdicts = list(results.values())
+                write_text(parsed.out / "mutants.md", table(verdicts) + "\n")
+                write_text(parsed.out / "mutants.json", json.dumps([asdict(v) for v in verdicts], indent=1))
     except ValueError as error:
         print(f"mutants: {error}", file=sys.stderr)
         return 1

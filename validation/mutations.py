@@ -20,6 +20,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from thesisrecon.errors import counted
+from thesisrecon.io._files import write_text
+from thesisrecon.io._outputs import empty_folder, join_claim
 from thesisrecon.runtime._signals import install_signal_handlers
 from validation.harness.gates import Gate, read_gates
 from validation.harness.process import last_words, own_cores, run_process
@@ -126,8 +128,7 @@ class CopiedTree:
         return {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(self.out / "kernels")}
 
     def set_up(self) -> None:
-        shutil.rmtree(self.tree, ignore_errors=True)
-        self.tree.mkdir(parents=True)
+        empty_folder(self.tree)
         for name in self.copied:
             source, target = ROOT / name, self.tree / name
             if source.is_dir():
@@ -250,9 +251,8 @@ def table(fates: Sequence[Fate]) -> str:
 
 def write_fates(out: Path, fates: Sequence[Fate]) -> None:
     """Write ``mutations.md`` and ``mutations.json`` into ``out``."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "mutations.md").write_text(table(fates) + "\n", encoding="utf-8")
-    (out / "mutations.json").write_text(json.dumps([asdict(f) for f in fates], indent=1), encoding="utf-8")
+    write_text(out / "mutations.md", table(fates) + "\n")
+    write_text(out / "mutations.json", json.dumps([asdict(f) for f in fates], indent=1))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -271,10 +271,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     fates: list[Fate] = []
     try:
-        for fate in plant_all(Bench(parsed.out.resolve()), mutations, sound=parsed.sound):
-            fates.append(fate)
-            print(table([fate]).splitlines()[-1], flush=True)
-            write_fates(parsed.out, fates)
+        with join_claim(parsed.out):
+            for fate in plant_all(Bench(parsed.out.resolve()), mutations, sound=parsed.sound):
+                fates.append(fate)
+                print(table([fate]).splitlines()[-1], flush=True)
+                write_fates(parsed.out, fates)
     except ValueError as error:
         print(f"mutations: {error}", file=sys.stderr)
         return 1

@@ -13,7 +13,7 @@ from tests.fake_stages import fake_config, photographs
 from thesisrecon import load, reconstruct
 from thesisrecon.errors import OutputError, StageFailure, UsageError
 from thesisrecon.io._files import write_atomically, write_new
-from thesisrecon.io._outputs import LOCK_FILE, claim_folder, claim_of
+from thesisrecon.io._outputs import LOCK_FILE, claim_folder, claim_of, empty_folder
 from validation.studies.robustness import disk_ends
 
 CHANGED = (
@@ -168,6 +168,23 @@ def test_a_folder_is_locked_and_claims_end(tmp_path):
         with claim_folder(tmp_path / "out" / "inner") as inner:
             assert claim_of(tmp_path / "out" / "inner" / "a") is inner
     assert claim_of(tmp_path / "out" / "a") is None
+
+
+def test_a_folder_is_emptied_only_if_a_command_made_it(tmp_path):
+    work, photos = tmp_path / "work", tmp_path / "photos"
+    empty_folder(work)
+    (work / "x").write_bytes(b"ours")
+    empty_folder(work)
+    assert list(work.iterdir()) == []
+    photos.mkdir()
+    empty_folder(photos)
+    (tmp_path / LOCK_FILE).unlink()
+    (photos / "a.jpg").write_bytes(b"of the user")
+    refuses(UsageError, "photos was not written by thesisrecon.*; move it, or choose", empty_folder, photos)
+    work.rmdir()
+    work.symlink_to(photos)
+    refuses(UsageError, "work was not written by thesisrecon", empty_folder, work)
+    assert content(tmp_path) == {"photos/a.jpg": b"of the user"}
 
 
 def test_single_files_are_written_all_or_none(tmp_path):

@@ -374,3 +374,29 @@ def test_memory_of_large_images_is_measured(tmp_path, capsys):
     assert run_study("large-images", ["--long-side", "96", "--formats", "GIF", "-o", str(tmp_path)]) == 0
     assert re.search(r"^\| GIF \| 0\.0 \| \d+ \|  \|$", capsys.readouterr().out, re.M)
     assert not list(tmp_path.glob("large.*"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["report", "--scenes", "courtyard", "--stages", "fundamental", "--quick", "-o"],
+        ["ablate", "ransac", "-o"],
+        ["study", "critical-motions", "-o"],
+    ],
+)
+def test_files_of_the_user_in_an_output_folder_survive(arguments, tmp_path, capsys):
+    names = ("data/a.jpg", "work/a.jpg", "study.json", "index.html", "critical-motions.md")
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"of the user")
+    run = run_studies if arguments[0] == "study" else command.main
+    assert run([*arguments[run is run_studies :], str(tmp_path)]) == 2
+    assert "was not written by thesisrecon, or was changed since; move it, or" in capsys.readouterr().err
+    assert {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()} == set(names)
+
+
+def test_a_file_of_numbers_is_not_replaced(tmp_path, capsys):
+    (tmp_path / "x.json").write_bytes(b"of the user")
+    assert run_studies(["critical-motions", "--json", str(tmp_path / "x.json")]) == 2
+    assert "x.json exists already" in capsys.readouterr().err
+    assert (tmp_path / "x.json").read_bytes() == b"of the user"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -26,7 +26,7 @@ from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import FRAMES_FOLDER, printable, read_json, write_json
 from thesisrecon.io._images import decode_file, list_images
-from thesisrecon.io._outputs import OutputFolder, claim_folder, claim_of, has_content
+from thesisrecon.io._outputs import OutputFolder, has_content, join_claim
 from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
 
 _CHOICE = "frames.json"
@@ -86,8 +86,8 @@ class FrameSource:
     ) -> tuple[list[Path], int, list[str]]:
         """Return the chosen frames, the number of all frames, and warnings, as ``out`` records them."""
         record, home, warnings = out / FRAMES_FOLDER / _CHOICE, self.home(out), list[str]()
-        digest, claim = self.identity["digest"], claim_of(record)
-        with claim_folder(out) if claim is None else nullcontext(claim) as outputs:
+        digest = self.identity["digest"]
+        with join_claim(out) as outputs:
             if os.path.lexists(record):
                 outputs.require_own(record)
             known = read_json(record) if outputs.unchanged(record) else {}

@@ -12,9 +12,10 @@ import fcntl
 import hashlib
 import json
 import os
+import shutil
 import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from io import BufferedReader
 from pathlib import Path
 
@@ -60,9 +61,10 @@ def _absolute(path: Path) -> str:
     return os.path.abspath(path)  # noqa: PTH100 (Path.resolve follows links)
 
 
-def not_ours(path: Path) -> UsageError:
-    """The error for a file that must not be replaced."""
+def not_ours(path: Path, *, optional: bool = True) -> UsageError:
+    """The error for a file that must not be replaced; ``optional``: the command has ``--overwrite``."""
     ways = "move it, choose another place, or use --overwrite (overwrite=True) to replace it"
+    ways = ways if optional else "move it, or choose another place"
     return UsageError(f"{path} was not written by thesisrecon, or was changed since; {ways}")
 
 
@@ -72,7 +74,9 @@ class OutputFolder:
     ``known`` maps names to digests of files that thesisrecon wrote; None stands for any content.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool, known: Mapping[str, str | None] | None = None) -> None:
+    def __init__(
+        self, path: Path, *, overwrite: bool | None, known: Mapping[str, str | None] | None = None
+    ) -> None:
         self.path, self.overwrite = path, overwrite
         self.root = _absolute(path)
         self.digests: dict[str, set[str | None]] = {name: {d} for name, d in (known or {}).items()}
@@ -95,7 +99,7 @@ class OutputFolder:
         """Whether a file may be replaced or removed."""
         if self._link_above(path) is not None or stat.S_ISDIR(os.lstat(path).st_mode):
             return False
-        return self.overwrite or has_content(path, self.digests.get(self.name_of(path), ()))
+        return bool(self.overwrite) or has_content(path, self.digests.get(self.name_of(path), ()))
 
     def _link_above(self, path: Path) -> Path | None:
         """The outermost link among the folders between this one and a file."""
@@ -124,7 +128,7 @@ class OutputFolder:
             raise OutputError(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
         self._require_no_link(path)
         if not self.owns(path):
-            raise not_ours(path)
+            raise not_ours(path, optional=self.overwrite is not None)
 
     def _existing(self, names: Sequence[str | Path]) -> list[Path]:
         """The existing files of these names; texts with ``*`` or ``[`` are glob patterns, paths are not."""
@@ -266,6 +270,17 @@ class OutputFolder:
                 name, digest = json.loads(line)
                 self.digests.setdefault(name, set()).add(digest)
 
+    def empty(self, folder: Path) -> None:
+        """Make a folder empty, whose whole content belongs to the commands that use this function."""
+        name = self.name_of(folder)
+        there = os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir()))
+        if folder.is_symlink() or (there and name not in self.digests):
+            raise not_ours(folder, optional=False)
+        self._note(name, "")
+        self._used = True
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+
     def withdraw(self) -> None:
         """Remove the files that this command created."""
         with suppress(OSError, UsageError):
@@ -300,7 +315,7 @@ def _locked(lock: Path) -> int:
 def claim_folder(
     path: Path,
     *,
-    overwrite: bool = False,
+    overwrite: bool | None = False,
     names: Sequence[str | Path] = (),
     known: Mapping[str, str | None] | None = None,
     locked: bool = True,
@@ -308,8 +323,9 @@ def claim_folder(
 ) -> Iterator[OutputFolder]:
     """Claim an output folder for the block, in which :func:`write_atomically` obeys the rule.
 
-    ``names``: files that the command writes; ``known``: own files by another record; ``locked``: lock the
-    folder and keep a record in it; ``check`` may refuse the folder.
+    ``names``: files that the command writes; ``overwrite``: None if the command has no such option;
+    ``known``: own files by another record; ``locked``: lock the folder and keep a record in it; ``check`` may
+    refuse it.
     """
 
     outputs = OutputFolder(path, overwrite=overwrite, known=known)
@@ -341,6 +357,21 @@ def claim_folder(
             _claims.remove(outputs)
     finally:
         close()
+
+
+@contextmanager
+def join_claim(path: Path) -> Iterator[OutputFolder]:
+    """The claim that holds a folder already, or a new one, in which the work of a failure is kept."""
+    claim = claim_of(path / LOCK_FILE)
+    with nullcontext(claim) if claim is not None else claim_folder(path, overwrite=None) as outputs:
+        outputs.kept = outputs.kept or claim is None
+        yield outputs
+
+
+def empty_folder(folder: Path) -> None:
+    """Make a folder empty that is new, empty or of an earlier command (:meth:`OutputFolder.empty`)."""
+    with join_claim(folder.parent) as outputs:
+        outputs.empty(folder)
 
 
 @contextmanager

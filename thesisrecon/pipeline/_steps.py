@@ -110,7 +110,7 @@ def _run_group(
     whole: PipelineState, name: str, views: Sequence[int], steps: Sequence[Step], surface_required: bool
 ) -> dict[str, Any]:
     """Reconstruct a group as a run of its own; return its entry in the summary of the whole."""
-    directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared)
+    directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared, part=True)
     run = whole.run.inside(directory)
     inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
     state = PipelineState(run, inputs, empty_result(run, inputs), whole.until)

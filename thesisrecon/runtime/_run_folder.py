@@ -229,6 +229,7 @@ class RunDirectory:
 
     path: Path
     shared: Path | None = None
+    part: bool = False  #: of a group, in the folder of the whole run
 
     def stage(self, folder: str) -> StageFolder:
         """The folder of a stage, such as ``01-features``."""
@@ -245,11 +246,8 @@ class RunDirectory:
     def claim(
         self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()
     ) -> Iterator[None]:
-        """Claim the folder for a run that writes ``results``; ``identity`` needs no image.
-
-        In a group the folder of the whole run is claimed already.
-        """
-        whole = claim_of(self.path)
+        """Claim the folder for a run that writes ``results``; ``identity`` needs no image."""
+        whole = claim_of(self.path) if self.part else None
         if whole is not None:
             self._check(identity, overwrite, whole)
             with lock_part(whole, self.path):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.io._outputs import join_claim
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
@@ -35,20 +36,21 @@ def write_analysis(analysis: Analysis, out: str | Path) -> Path:
     Raises :class:`~thesisrecon.errors.OutputError` if the folder cannot be written.
     """
     out = Path(out)
-    tables, plan = write_tables(analysis, out), analysis.plan
-    write_page(
-        out / PAGE,
-        Path(__file__).parent / "page.html.j2",
-        [_section(analysis, measure) for measure in plan.measures],
-        title=plan.study.title,
-        words=plan.study.words,
-        facts=_facts(analysis),
-        findings=_findings(analysis),
-        warnings=analysis.warnings,
-        failures=failures_of(analysis.rows),
-        versions=[("commit", commit()), *plan.versions.items()],
-        tables=[t.name for t in tables],
-    )
+    with join_claim(out):
+        tables, plan = write_tables(analysis, out), analysis.plan
+        write_page(
+            out / PAGE,
+            Path(__file__).parent / "page.html.j2",
+            [_section(analysis, measure) for measure in plan.measures],
+            title=plan.study.title,
+            words=plan.study.words,
+            facts=_facts(analysis),
+            findings=_findings(analysis),
+            warnings=analysis.warnings,
+            failures=failures_of(analysis.rows),
+            versions=[("commit", commit()), *plan.versions.items()],
+            tables=[t.name for t in tables],
+        )
     return out / PAGE
 
 

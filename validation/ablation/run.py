@@ -13,6 +13,7 @@ from typing import Any
 
 from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.io._files import write_json
+from thesisrecon.io._outputs import join_claim
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.store import STEPS, WORK, Outcome, Store, finite
 from validation.ablation.study import FunctionTask, Study
@@ -93,16 +94,18 @@ def ablate(
         are stored in the row.
     """
     plan, store = plan_study(study), Store(Path(out).resolve())
-    store.prepare()
-    write_json(store.path / "study.json", _study_record(plan))
-    todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
-    total = len({row.key for row in plan.rows})
-    lost: dict[str, Outcome] = {}
-    if todo:
-        with crew_of(executor, threads) as crew:
-            session = _Session(plan, store, crew, State(total, total - len(todo)), on_progress)
-            lost = session.run(list(todo.values()))
-    shutil.rmtree(store.path / WORK, ignore_errors=True)
+    with join_claim(store.path) as outputs:
+        outputs.empty(store.path / WORK)
+        store.prepare()
+        write_json(store.path / "study.json", _study_record(plan))
+        todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
+        total = len({row.key for row in plan.rows})
+        lost: dict[str, Outcome] = {}
+        if todo:
+            with crew_of(executor, threads) as crew:
+                session = _Session(plan, store, crew, State(total, total - len(todo)), on_progress)
+                lost = session.run(list(todo.values()))
+        shutil.rmtree(store.path / WORK, ignore_errors=True)
     return _rows(plan, store, lost)
 
 

@@ -73,7 +73,7 @@ class Store:
             "cpu_s": outcome.cpu_s,
             "steps": list(outcome.steps),
         }
-        write_json(self.path / kind / f"{key}.json", {**record, **found})
+        write_json(self.path / kind / f"{key}.json", {**record, **found}, cached=True)
 
 
 def finite(metrics: Mapping[str, float], wanted: Collection[str]) -> tuple[dict[str, float], str]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import os
 import sys
 import tempfile
 import traceback
@@ -29,6 +30,7 @@ from typing import Any
 
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
+from thesisrecon.io._outputs import join_claim
 from validation.metrics.record import Metric, markdown_table
 from validation.scenes.real import REAL_SCENES, Scene, data_root, load_fixture_scene, load_real_scene
 from validation.stamp import stamp
@@ -179,10 +181,13 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
     options = vars(study_parser(name, function).parse_args(list(arguments)))
     out, json_file, texts = options.pop("out"), options.pop("json"), list[str]()
     metrics: list[Metric] = []
-    with output_folder(out) as folder:
-        if "out" in inspect.signature(function).parameters:
-            options["out"] = folder
-        try:
+    if json_file is not None and os.path.lexists(json_file):
+        print(f"study {name}: {json_file} exists already; move it, or choose another name", file=sys.stderr)
+        return 2
+    try:
+        with output_folder(out, [f"{name}.md", f"{name}.json"]) as folder:
+            if "out" in inspect.signature(function).parameters:
+                options["out"] = folder
             for part in function(**options):
                 if not part:
                     continue
@@ -195,9 +200,9 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
                     write_json(folder / f"{name}.json", metrics)
                 if json_file is not None:
                     write_json(json_file, metrics)
-        except (UsageError, StageFailure) as error:
-            print(f"study {name}: {error}", file=sys.stderr)
-            return 2
+    except (UsageError, StageFailure) as error:
+        print(f"study {name}: {error}", file=sys.stderr)
+        return 2
     if not texts:
         print(f"study {name}: the images are not on this machine (THESISRECON_DATA)", file=sys.stderr)
         return 2
@@ -281,10 +286,12 @@ def _summary(function: StudyFunction) -> str:
 
 
 @contextmanager
-def output_folder(folder: Path | None) -> Iterator[Path]:
+def output_folder(folder: Path | None, names: Sequence[str]) -> Iterator[Path]:
+    """The folder of a study that writes these tables, else a temporary one."""
     if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        yield folder.resolve()
+        with join_claim(folder.resolve()) as outputs:
+            outputs.require(names)
+            yield folder.resolve()
         return
     with tempfile.TemporaryDirectory() as place:
         yield Path(place)
