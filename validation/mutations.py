@@ -21,7 +21,7 @@ from pathlib import Path
 
 from thesisrecon.errors import counted
 from thesisrecon.io._files import write_text
-from thesisrecon.io._outputs import empty_folder, join_claim
+from thesisrecon.io._outputs import clear_folder, join_claim
 from thesisrecon.runtime._signals import install_signal_handlers
 from validation.harness.gates import Gate, read_gates
 from validation.harness.process import last_words, own_cores, run_process
@@ -128,7 +128,8 @@ class CopiedTree:
         return {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(self.out / "kernels")}
 
     def set_up(self) -> None:
-        empty_folder(self.tree)
+        clear_folder(self.tree)
+        self.tree.mkdir(parents=True)
         for name in self.copied:
             source, target = ROOT / name, self.tree / name
             if source.is_dir():

@@ -13,7 +13,7 @@ from tests.fake_stages import fake_config, photographs
 from thesisrecon import load, reconstruct
 from thesisrecon.errors import OutputError, StageFailure, UsageError
 from thesisrecon.io._files import write_atomically, write_new
-from thesisrecon.io._outputs import LOCK_FILE, claim_folder, claim_of, empty_folder
+from thesisrecon.io._outputs import LOCK_FILE, claim_folder, claim_of, clear_folder
 from validation.studies.robustness import disk_ends
 
 CHANGED = (
@@ -70,7 +70,7 @@ def test_nothing_is_written_or_removed_through_a_link(tmp_path, overwrite):
     assert content(theirs) == {"x.txt": b"ours"}
 
 
-def test_only_own_files_and_empty_folders_are_removed(tmp_path):
+def test_only_own_files_and_clear_folders_are_removed(tmp_path):
     write(tmp_path, name="a/b/x.txt")
     write(tmp_path, name="a/y.txt")
     (tmp_path / "a" / "b" / "z.txt").write_bytes(b"of the user")
@@ -170,21 +170,19 @@ def test_a_folder_is_locked_and_claims_end(tmp_path):
     assert claim_of(tmp_path / "out" / "a") is None
 
 
-def test_a_folder_is_emptied_only_if_a_command_made_it(tmp_path):
+def test_a_folder_is_cleared_only_if_a_command_made_it(tmp_path):
     work, photos = tmp_path / "work", tmp_path / "photos"
-    empty_folder(work)
+    clear_folder(work)
+    work.mkdir()
     (work / "x").write_bytes(b"ours")
-    empty_folder(work)
-    assert list(work.iterdir()) == []
+    clear_folder(work)
+    assert not work.exists()
     photos.mkdir()
-    empty_folder(photos)
-    (tmp_path / LOCK_FILE).unlink()
     (photos / "a.jpg").write_bytes(b"of the user")
-    refuses(UsageError, "photos was not written by thesisrecon.*; move it, or choose", empty_folder, photos)
-    work.rmdir()
+    refuses(UsageError, "photos was not written by thesisrecon.*; move it, or choose", clear_folder, photos)
     work.symlink_to(photos)
-    refuses(UsageError, "work was not written by thesisrecon", empty_folder, work)
-    assert content(tmp_path) == {"photos/a.jpg": b"of the user"}
+    refuses(UsageError, "work was not written by thesisrecon", clear_folder, work)
+    assert content(photos) == {"a.jpg": b"of the user"}
 
 
 def test_single_files_are_written_all_or_none(tmp_path):

@@ -270,8 +270,8 @@ class OutputFolder:
                 name, digest = json.loads(line)
                 self.digests.setdefault(name, set()).add(digest)
 
-    def empty(self, folder: Path) -> None:
-        """Make a folder empty, whose whole content belongs to the commands that use this function."""
+    def clear(self, folder: Path) -> None:
+        """Remove a folder that is empty or was cleared before: its whole content belongs to the commands."""
         name = self.name_of(folder)
         there = os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir()))
         if folder.is_symlink() or (there and name not in self.digests):
@@ -279,7 +279,6 @@ class OutputFolder:
         self._note(name, "")
         self._used = True
         shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True, exist_ok=True)
 
     def withdraw(self) -> None:
         """Remove the files that this command created."""
@@ -368,10 +367,10 @@ def join_claim(path: Path) -> Iterator[OutputFolder]:
         yield outputs
 
 
-def empty_folder(folder: Path) -> None:
-    """Make a folder empty that is new, empty or of an earlier command (:meth:`OutputFolder.empty`)."""
+def clear_folder(folder: Path) -> None:
+    """Remove a folder of an earlier command (:meth:`OutputFolder.clear`)."""
     with join_claim(folder.parent) as outputs:
-        outputs.empty(folder)
+        outputs.clear(folder)
 
 
 @contextmanager

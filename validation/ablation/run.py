@@ -95,7 +95,7 @@ def ablate(
     """
     plan, store = plan_study(study), Store(Path(out).resolve())
     with join_claim(store.path) as outputs:
-        outputs.empty(store.path / WORK)
+        outputs.clear(store.path / WORK)
         store.prepare()
         write_json(store.path / "study.json", _study_record(plan))
         todo = {row.key: row for row in plan.rows if store.load(row.key) is None}

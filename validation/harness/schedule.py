@@ -16,7 +16,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from thesisrecon.io._files import write_text
-from thesisrecon.io._outputs import empty_folder
+from thesisrecon.io._outputs import clear_folder
 from validation.harness.forks import Template
 from validation.harness.process import Process, failure_of, last_words, own_cores
 from validation.harness.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
@@ -47,7 +47,7 @@ def run_tasks(
 ) -> dict[tuple[str, str], tuple[Judgement, dict[str, Outcome]]]:
     """Return the judgement and outcomes of each (stage, scene); failures do not stop other tasks."""
     earlier = earlier_run(options)
-    empty_folder(options.out / "data")
+    clear_folder(options.out / "data")
     write_text(options.out / "options.json", json.dumps(options.to_json()))
     tasks = tasks_of(options, stages)
     place_of = {task: n for n, task in enumerate(tasks)}

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io._outputs import empty_folder
+from thesisrecon.io._outputs import clear_folder
 from thesisrecon.records import Reconstruction
 from validation.harness.gates import camera_limit
 from validation.harness.process import Process, own_cores, run_process
@@ -121,7 +121,7 @@ METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colm
 def run_method(method: str, scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> Outcome:
     """Run one method on one scene in the emptied folder ``out`` and read its result."""
     images = scene.image_paths[0].parent
-    empty_folder(out)
+    clear_folder(out)
     process = run_process(
         _command(method, images, out, threads),
         log=out.with_suffix(".log"),
@@ -200,7 +200,7 @@ def measure_scene(
 
 def warm_up(scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> float:
     """Compile the kernels into an empty cache; return the seconds of ``default`` meanwhile."""
-    empty_folder(Path(environment["NUMBA_CACHE_DIR"]))
+    clear_folder(Path(environment["NUMBA_CACHE_DIR"]))
     cold = run_method(OURS, scene, out / "cold" / "default", threads=threads, environment=environment)
     run_method(THESIS, scene, out / "cold" / "thesis", threads=threads, environment=environment)
     report_progress(f"{scene.name}: {OURS}, compiling: {cold.wall_s:.1f} s {cold.failure}")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from thesisrecon.io._images import DEMO_IMAGES, demo_images
-from thesisrecon.io._outputs import empty_folder
+from thesisrecon.io._outputs import clear_folder
 from validation.studies.package.built import build, check_built, find_built
 from validation.studies.package.environments import (
     captured,
@@ -47,7 +47,7 @@ class Checks:
 
     def install(self) -> list[str]:
         """Install the wheel into an empty environment."""
-        empty_folder(self.out / "environment")
+        clear_folder(self.out / "environment")
         make_environment(self.out / "environment", self.python)
         install(self.interpreter, str(find_built(self.out).wheel))
         return []
