@@ -164,7 +164,9 @@ def test_images_without_an_opaque_pixel_are_left_out_with_a_reason(tmp_path):
         PIL.Image.fromarray(cutout(n, alpha=np.zeros_like(OPAQUE))).save(tmp_path / f"{n}.png")
     found = read_images(tmp_path, max_size_px=1600)
     assert not found.images
-    assert set(found.refused.values()) == {"is transparent in all pixels: save it without its alpha channel"}
+    assert set(found.refused.values()) == {
+        "is blank: all its pixels are transparent; save it without its alpha channel"
+    }
     # The colour of what is used decides whether an image is blank.
     flat = np.dstack([np.full((*SIZE[::-1], 3), 90, np.uint8), np.where(OPAQUE, 255, 0).astype(np.uint8)])
     assert "is blank" in read_images([flat], max_size_px=1600).refused["image-0"]
@@ -252,10 +254,10 @@ def test_rectified_images_have_no_levels_where_they_are_transparent():
 
 def test_transparent_arrays_are_a_stage_failure():
     nothing = np.zeros((*SIZE[::-1], 4), np.uint8)
-    refuses(StageFailure, "an image is transparent in all pixels", read_levels, nothing)
+    refuses(StageFailure, "an image is blank: all its pixels are transparent", read_levels, nothing)
     refuses(
         StageFailure,
-        "transparent in all pixels",
+        "all its pixels are transparent",
         thesisrecon.match_pair,
         colours(),
         np.zeros((*SIZE[::-1], 4), np.uint8),

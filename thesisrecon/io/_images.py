@@ -274,7 +274,7 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
             f"has only {rgb.shape[1]} x {rgb.shape[0]} pixels; the minimum is {MIN_SIDE} x {MIN_SIDE}"
         )
     used = rgb.reshape(-1, 3) if mask is None else rgb[mask]
-    if not len(used) or np.ptp(used, axis=0).max() < BLANK_RANGE:
+    if len(used) and np.ptp(used, axis=0).max() < BLANK_RANGE:
         raise UnusableImage("is blank: all its pixels have nearly the same colour")
     return decoded
 

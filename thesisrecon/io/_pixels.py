@@ -195,7 +195,7 @@ def opaque_part(levels: U8) -> tuple[U8, B8 | None]:
         return levels, None
     mask = levels[:, :, 3] >= OPAQUE
     if not mask.any():
-        raise UnusableImage("is transparent in all pixels: save it without its alpha channel")
+        raise UnusableImage("is blank: all its pixels are transparent; save it without its alpha channel")
     rgb = np.ascontiguousarray(levels[:, :, :3])
     rgb[~mask] = 128
     return rgb, None if mask.all() else mask
