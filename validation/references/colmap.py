@@ -203,6 +203,8 @@ def main() -> None:
     parser.add_argument("--refine-principal-point", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
     parsed = parser.parse_args()
+    if parsed.out.exists() and any(parsed.out.iterdir()):
+        parser.error(f"{parsed.out} is not empty, and would be emptied; choose a new folder")
     refine = parsed.refine_principal_point
     reconstruct_with_pycolmap(
         parsed.images, parsed.out, refine_principal_point=refine, threads=parsed.threads
