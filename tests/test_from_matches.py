@@ -220,7 +220,7 @@ def test_a_database_gives_the_same_cameras(verified, tmp_path, from_rows):
 
 def test_other_files_are_no_database(tmp_path):
     (tmp_path / "text.db").write_text("no database")
-    with pytest.raises(UsageError, match="is not a COLMAP database"):
+    with pytest.raises(UsageError, match="is not a valid COLMAP database"):
         reconstruct_from_colmap(tmp_path / "text.db")
     with pytest.raises(UsageError, match="there is no COLMAP database or model"):
         reconstruct_from_colmap(tmp_path / "none.db")

@@ -18,6 +18,7 @@ import logging
 import operator
 import os
 import pickle
+import stat
 import sys
 import tempfile
 import threading
@@ -175,7 +176,7 @@ def cache_folder() -> Path:
     Returns
     -------
     Path
-        A folder that can be written to.
+        The first folder that can be written to; else an own one for temporary files.
     """
     if os.environ.get(CACHE_VARIABLE):
         return Path(os.environ[CACHE_VARIABLE]) / "thesisrecon"
@@ -184,7 +185,20 @@ def cache_folder() -> Path:
         beside.mkdir(parents=True, exist_ok=True)
         if os.access(beside, os.W_OK):
             return beside
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thesisrecon" / "kernels"
+    # Path.home fails in a container whose user has neither HOME nor an entry of a name.
+    with contextlib.suppress(OSError, RuntimeError):
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thesisrecon" / "kernels"
+        home.mkdir(parents=True, exist_ok=True)
+        if os.access(home, os.W_OK):
+            return home
+    with contextlib.suppress(OSError):
+        own = Path(tempfile.gettempdir()) / f"thesisrecon-kernels-{os.getuid()}"
+        own.mkdir(mode=0o700, exist_ok=True)
+        found = own.lstat()
+        # Machine code of another user must not be run.
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+            return own
+    return beside
 
 
 class KernelCache(NullCache):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from thesisrecon.io import _export_formats as formats
 from thesisrecon.io._colmap_writing import COLMAP_FILES, has_skew, write_sparse_model
 from thesisrecon.io._export_formats import calibration, coefficients
 from thesisrecon.io._exports import write_image
-from thesisrecon.io._files import read_json
+from thesisrecon.io._files import first_repeated, read_json, require_image_name
 from thesisrecon.io._images import (
     MAX_DECODED_BYTES,
     find_images,
@@ -221,6 +220,7 @@ def _require_cameras(model: SparseModel, to: str) -> None:
     if not model.views:
         raise UsageError("the model has no camera; there is nothing to export")
     for view in model.views:
+        require_image_name(view.name, "the model")
         if view.K is None or view.size is None:
             raise UsageError(f"image {view.name} has no intrinsics or no size, which every export needs")
         if view.distortion is None:
@@ -294,14 +294,16 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
 
 
 def _require_distinct(names: Sequence[str], what: str) -> None:
-    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    twice = first_repeated(names, as_files=True)
     if twice is not None:
-        raise UsageError(f"two images of the model would {what} {twice}; rename one of them")
+        raise UsageError(
+            f"two images of the model would {what} {twice} (regardless of case); rename one of them"
+        )
 
 
 def _file_name(name: str, *, plain: bool) -> str:
     """Relative name of a JPEG or PNG file, for list files of names (``plain``) without blanks."""
-    path = PurePath(*(part for part in PurePath(name).parts if part not in ("..", PurePath(name).anchor)))
+    path = PurePath(name)
     text = path.as_posix() if path.suffix.lower() in (".jpg", ".jpeg", ".png") else f"{path.as_posix()}.png"
     return "_".join(text.split()) if plain else text
 

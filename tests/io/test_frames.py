@@ -147,3 +147,17 @@ def test_bad_sources_of_frames_are_one_sentence(folder, tmp_path, monkeypatch, r
     assert "cannot be read as a video" in refused(["reconstruct", clip, "--every", "2", "-o", out])
     shutil.copy(files.__file__, clip)
     assert "cannot be read as a video" in refused(["reconstruct", clip, "--every", "2", "-o", out])
+
+
+def test_a_video_of_frames_that_do_not_fit_in_memory_is_refused(video, tmp_path, monkeypatch):
+    monkeypatch.setattr("thesisrecon.io._frames.MAX_DECODED_BYTES", 160 * 120 * 28)
+    names, _, _ = FrameSource(video, 3).choose(tmp_path / "fits", threads=64)
+    assert len(names) == 3
+    monkeypatch.setattr("thesisrecon.io._frames.MAX_DECODED_BYTES", 160 * 120 * 27)
+    refuses(
+        UsageError,
+        "frames of 160 x 120 pixels; .* the limit of",
+        FrameSource(video, 3).choose,
+        tmp_path / "o",
+    )
+    assert not list(tmp_path.rglob("o/*/*.png"))

@@ -191,7 +191,7 @@ def test_arrays_and_files_with_the_same_name_are_distinguished(tmp_path):
     (tmp_path / "x").mkdir()
     first, second = save(tmp_path / "a.png", picture(0)), save(tmp_path / "x" / "a.png", picture(1))
     names = [image.name for image in read_images([second, first], max_size_px=1600).images]
-    assert names == sorted([str(first), str(second)])
+    assert names == ["a.png", "x/a.png"]
     arrays = read_images([picture(0), picture(1)[..., 0]], max_size_px=48)
     assert [image.name for image in arrays.images] == []
     arrays = read_images([picture(0), picture(1)[..., 0]], max_size_px=90)

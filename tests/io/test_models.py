@@ -188,7 +188,7 @@ def test_other_paths_are_refused(tmp_path):
     ("file", "old", "new", "words"),
     [
         ("cameras", "SIMPLE_PINHOLE", "LYTRO", "cameras.txt is not a valid COLMAP file"),
-        ("cameras", "600", "-600", "camera 1 is of an unknown kind, or its parameters are invalid"),
+        ("cameras", "600", "-600", "camera 1 needs finite parameters and positive focal lengths"),
         ("cameras", "1 SIMPLE", "2 SIMPLE", "image 'a b.jpg' of the COLMAP model refers to a missing camera"),
         ("images", "1 a b.jpg", "1", "images.txt is not a valid COLMAP file"),
         ("points3D", "\n1 ", "\n99 ", "refers to a missing point"),
@@ -203,3 +203,45 @@ def test_a_damaged_text_model_is_refused(tmp_path, file, old, new, words):
     path = tmp_path / f"{file}.txt"
     path.write_text(path.read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
     refuses(UsageError, words, read_model, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("camera", "sentence"),
+    [
+        ("1 PINHOLE 0 96 100 100 64 48", "the sides must be 1 to"),
+        ("1 PINHOLE 128 -1 100 100 64 48", "the sides must be 1 to"),
+        ("1 PINHOLE 128 99999999999 100 100 64 48", "the sides must be 1 to"),
+        ("1 PINHOLE 128 96 100 0 64 48", "positive focal lengths"),
+        ("1 PINHOLE 128 96 100 -100 64 48", "positive focal lengths"),
+        ("1 OPENCV_FISHEYE 128 96 100 -1 64 48 0 0 0 0", "positive focal lengths"),
+        ("1 SIMPLE_RADIAL 128 96 -100 64 48 0", "positive focal lengths"),
+        ("1 PINHOLE 128 96 inf 100 64 48", "finite parameters"),
+        ("1 PINHOLE 128 96 100 100 nan 48", "finite parameters"),
+        ("1 PINHOLE 128 96 100 100 64", "another number of parameters"),
+    ],
+)
+def test_impossible_cameras_of_a_colmap_model_are_refused(tmp_path, camera, sentence):
+    for name, text in (("cameras", camera), ("images", ""), ("points3D", "")):
+        (tmp_path / f"{name}.txt").write_text(text + "\n")
+    refuses(UsageError, sentence, read_model, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "pose", ["1 0 0 0 0 0 0 0", "1 0 0 0 1e300 0 0 0", "1 0 0 0 nan 0 0 1", "1 0 0 0 0 1 0 0 0 0 -1 0"]
+)
+def test_impossible_poses_of_a_trajectory_are_refused(tmp_path, pose):
+    (tmp_path / "poses.txt").write_text(pose + "\n")
+    refuses(UsageError, "line 1 of .* each line needs a pose", read_model, tmp_path / "poses.txt")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"width": float("inf")}, {"width": 0}, {"height": -5}, {"K": [[100, 0, 64], [0, -100, 48], [0, 0, 1]]},
+     {"K": [[float("nan"), 0, 64], [0, 100, 48], [0, 0, 1]]}, {"t": [0, 0, float("inf")]},
+     {"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, {"R": [[0, 0, 0]] * 3}],
+)  # fmt: skip
+def test_impossible_cameras_of_a_file_are_refused_by_name(tmp_path, change):
+    K = [[100, 0, 64], [0, 100, 48], [0, 0, 1]]
+    camera = {"name": "a.png", "width": 128, "height": 96, "K": K, "R": np.eye(3).tolist(), "t": [0, 0, 0]}
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [camera | change]}))
+    refuses(UsageError, "the entry 'a.png' cannot be used", read_model, tmp_path)

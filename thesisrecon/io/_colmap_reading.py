@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import scipy
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._colmap_writing import PIXEL_CENTRE, POINT_2D
-from thesisrecon.io._files import read_bytes
+from thesisrecon.io._files import first_repeated, read_bytes, require_image_name
 from thesisrecon.sparse_model import SparseModel, SparseView
 
 _FILES = ("cameras", "images", "points3D")
 _MAX_BYTES = 2**32
+MAX_SIDE_PX = 2**24
 _MAX_IMAGES = 2**31 - 1
 """COLMAP numbers the pair of images a < b as a times this plus b."""
 _NO_POINT = str(2**64 - 1)
@@ -100,9 +103,19 @@ def _parsed(file: Path, parse: Callable[[bytes], Iterator[Any]]) -> list[Any]:
 
 def _camera(number: int, kind: int, size: tuple[int, int], params: Sequence[float]) -> _Camera:
     name, count = _KINDS[kind] if 0 <= kind < len(_KINDS) else ("", 0)
-    if not (len(params) == count > 0 and min(size) > 0 and np.isfinite(params).all() and params[0] > 0.0):
-        raise ValueError(f"camera {number} is of an unknown kind, or its parameters are invalid")
+    if len(params) != count or not count:
+        raise ValueError(f"camera {number} is of an unknown kind, or has another number of parameters")
+    if not 1 <= min(size) <= max(size) <= MAX_SIDE_PX:
+        sides = f"{in_words(size[0])} x {in_words(size[1])}"
+        raise ValueError(f"camera {number} has {sides} pixels; the sides must be 1 to {MAX_SIDE_PX}")
+    if not (np.isfinite(params).all() and min(params[: _last_focal(name) + 1]) > 0.0):
+        raise ValueError(f"camera {number} needs finite parameters and positive focal lengths")
     return _Camera(number, name, size, np.array(params, np.float64))
+
+
+def _last_focal(kind: str) -> int:
+    """Place of the last focal length, of one or two, among the parameters."""
+    return 0 if kind.startswith(("SIMPLE_", "RADIAL")) else 1
 
 
 def _image(camera: int, name: str, pose: Sequence[float], xy: F64, point: I64) -> _Image:
@@ -187,8 +200,7 @@ def _view(image: _Image, cameras: dict[int, _Camera]) -> SparseView:
     _, kind, size, params = cameras[image.camera]
     K = distortion = None
     if kind != "EQUIRECTANGULAR":
-        # The last focal length, of one or two.
-        focal = 0 if kind.startswith(("SIMPLE_", "RADIAL")) else 1
+        focal = _last_focal(kind)
         K = np.diag([params[0], params[focal], 1.0])
         K[:2, 2] = params[focal + 1 : focal + 3] - PIXEL_CENTRE
         places = _RADIAL.get(kind)
@@ -201,12 +213,14 @@ def _view(image: _Image, cameras: dict[int, _Camera]) -> SparseView:
 def _observations(images: Sequence[_Image], ids: I64) -> tuple[I64, I64, F64]:
     """View, point and pixel of the observations of points, sorted by point, then view."""
     order = np.argsort(ids, kind="stable")
+    known = ids[order]
     views, points, xy = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
     for i, image in enumerate(images):
         seen = image.point >= 0
-        if not np.isin(image.point[seen], ids).all():
+        place = np.searchsorted(known, image.point[seen])
+        if not (place < len(known)).all() or (known[place] != image.point[seen]).any():
             raise UsageError(f"image {image.name!r} of the COLMAP model refers to a missing point")
-        points.append(order[np.searchsorted(ids[order], image.point[seen])])
+        points.append(order[place])
         views.append(np.full(len(points[-1]), i))
         xy.append(image.xy[seen] - PIXEL_CENTRE)
     view, point = np.concatenate(views), np.concatenate(points)
@@ -224,32 +238,142 @@ class Database:
     matches: dict[tuple[int, int], I64]
 
 
+_MAX_BLOB = 2**28
+"""Bytes of a value: ten million keypoints with their shapes."""
+_MIN_ROW = 4
+"""Bytes that a row takes in a file at least."""
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+_TABLES = {
+    "cameras": "camera_id, width, height",
+    "images": "image_id, name, camera_id",
+    "keypoints": "image_id, rows, cols, data",
+    "two_view_geometries": "pair_id, rows, cols, data",
+    "matches": "pair_id, rows, cols, data",
+}
+
+
 def read_database(path: Path) -> Database:
-    """Read the keypoints and the verified matches, or the raw matches if none are verified."""
+    """Read the keypoints and the verified matches, or the raw matches if none are verified.
+
+    Nothing is written beside the file. Time and memory are bounded by its size.
+    """
     if not path.is_file():
         raise UsageError(f"there is no COLMAP database or model at {path}")
+    path = path.resolve()
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
-            return _read_tables(base, path)
-    except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
-        raise UsageError(f"{path} is not a COLMAP database: {error}") from None
+        before = _states(path)
+        with _opened(path) as base:
+            found = _read_tables(base, path, sum(size for size, _ in before))
+        if _states(path) != before:
+            raise UsageError(
+                f"{path} was changed while it was read; repeat the command when COLMAP has ended"
+            )
+        return found
+    except UsageError:
+        raise
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}") from None
+    except MemoryError:
+        raise UsageError(f"{path} does not fit in memory") from None
+    except (sqlite3.Error, ValueError, TypeError, KeyError, OverflowError) as error:
+        raise UsageError(f"{path} is not a valid COLMAP database: {error}") from None
 
 
-def _read_tables(base: sqlite3.Connection, path: Path) -> Database:
-    columns = "SELECT image_id, name, width, height FROM images JOIN cameras USING (camera_id) ORDER BY name"
-    images = base.execute(columns).fetchall()
-    number = {row[0]: i for i, row in enumerate(images)}
+def _beside(path: Path, kind: str) -> Path:
+    return path.with_name(f"{path.name}-{kind}")
+
+
+def _states(path: Path) -> list[tuple[int, int]]:
+    """Size and time of a database and of its log of changes, if it has one."""
+    found = [file.stat() for file in (path, _beside(path, "wal")) if file.is_file()]
+    return [(state.st_size, state.st_mtime_ns) for state in found]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database; SQLite would create files beside it, so one with a log of changes is copied."""
+    journal, log = _beside(path, "journal"), _beside(path, "wal")
+    if journal.is_file():
+        with journal.open("rb") as file:
+            # SQLite may delete a file that the journal names.
+            if file.read(len(_JOURNAL)) == _JOURNAL:
+                advice = "open the database once in COLMAP, which completes the change"
+                raise UsageError(f"{path} has an interrupted change in {journal.name}; {advice}")
+    with TemporaryDirectory() as folder:
+        place, mode = path, "mode=ro&immutable=1"
+        if log.is_file() and log.stat().st_size:
+            place, mode = Path(folder) / "copy.db", "mode=rw"
+            shutil.copyfile(path, place)
+            shutil.copyfile(log, _beside(place, "wal"))
+        with closing(sqlite3.connect(f"{place.as_uri()}?{mode}", uri=True)) as base:
+            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_BLOB)
+            base.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
+            base.execute("PRAGMA trusted_schema = OFF")
+            yield base
+
+
+def _rows(base: sqlite3.Connection, table: str, size: int) -> Iterator[tuple[Any, ...]]:
+    """Rows of a table that is stored in the file, of altogether at most its size."""
+    kinds = base.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)).fetchall()
+    computed = any(column[-1] for column in base.execute(f"PRAGMA table_xinfo({table})"))
+    virtual = any("VIRTUAL" in (sql or "").upper().split()[:2] for _, sql in kinds)
+    if [kind for kind, _ in kinds] != ["table"] or computed or virtual:
+        raise ValueError(f"it has no stored table {table}, but perhaps a view; make it with COLMAP")
+    total = 0
+    for row in base.execute(f"SELECT {_TABLES[table]} FROM {table}"):
+        total += _MIN_ROW + sum(len(value) for value in row if isinstance(value, bytes | str))
+        if total > size:
+            raise ValueError(f"its table {table} claims more data than the file holds")
+        yield row
+
+
+def _array(what: str, rows: Any, cols: Any, data: Any, dtype: str) -> Any:
+    counts = isinstance(rows, int) and isinstance(cols, int) and rows >= 0 and cols >= 2
+    if not counts or not isinstance(data, bytes) or len(data) != rows * cols * 4:
+        held = f"{len(data)} bytes" if isinstance(data, bytes) else in_words(data)
+        raise ValueError(f"{what} claim {in_words(rows)} x {in_words(cols)} numbers but hold {held}")
+    return np.frombuffer(data, dtype).reshape(rows, cols)[:, :2]
+
+
+def _read_tables(base: sqlite3.Connection, path: Path, size: int) -> Database:
+    cameras = {}
+    for camera, width, height in _rows(base, "cameras", size):
+        if not all(isinstance(side, int) and 1 <= side <= MAX_SIDE_PX for side in (width, height)):
+            sides = f"{in_words(width)} x {in_words(height)}"
+            rule = f"the sides must be whole numbers from 1 to {MAX_SIDE_PX}"
+            raise ValueError(f"camera {in_words(camera)} has {sides} pixels; {rule}")
+        cameras[camera] = (width, height)
+    images = []
+    for image, name, camera in _rows(base, "images", size):
+        if camera not in cameras:
+            raise ValueError(f"image {in_words(name)} refers to a missing camera")
+        images.append((require_image_name(name, path), image, cameras[camera]))
+    if not images:
+        raise UsageError(f"{path} holds no images; run COLMAP's feature extractor and matcher first")
+    images.sort()
+    names = [row[0] for row in images]
+    if (twice := first_repeated(names)) is not None:
+        raise UsageError(f"{path} holds {twice!r} twice; each image needs a name of its own")
+    number = {row[1]: i for i, row in enumerate(images)}
     keypoints = [np.zeros((0, 2)) for _ in images]
-    for image, rows, cols, data in base.execute("SELECT image_id, rows, cols, data FROM keypoints"):
+    for image, rows, cols, data in _rows(base, "keypoints", size):
         if rows and image in number:
-            values = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2]
-            keypoints[number[image]] = values.astype(np.float64) - PIXEL_CENTRE
+            i = number[image]
+            values = _array(f"the keypoints of {in_words(names[i])}", rows, cols, data, "<f4")
+            keypoints[i] = values.astype(np.float64) - PIXEL_CENTRE
+            if not np.isfinite(values).all():
+                raise ValueError(f"the keypoints of {in_words(names[i])} are not finite")
     for table in ("two_view_geometries", "matches"):
         found: dict[tuple[int, int], I64] = {}
-        for pair, rows, data in base.execute(f"SELECT pair_id, rows, data FROM {table} WHERE rows > 0"):
+        for pair, rows, cols, data in _rows(base, table, size):
+            if not rows:
+                continue
+            if not isinstance(pair, int) or any(image not in number for image in divmod(pair, _MAX_IMAGES)):
+                raise ValueError(f"its table {table} has a pair {in_words(pair)} of images that are missing")
             i, j = (number[image] for image in divmod(pair, _MAX_IMAGES))
-            found[i, j] = np.frombuffer(data, dtype="<u4").reshape(rows, 2).astype(np.int64)
+            what = f"the matches of {in_words(names[i])} and {in_words(names[j])}"
+            found[i, j] = _array(what, rows, cols, data, "<u4").astype(np.int64)
         if found:
-            sizes = np.array([row[2:] for row in images], dtype=np.int64)
-            return Database([row[1] for row in images], sizes, keypoints, found)
+            sizes = np.array([row[2] for row in images], dtype=np.int64)
+            return Database(names, sizes, keypoints, found)
     raise UsageError(f"{path} holds no matches; run COLMAP's matcher first")

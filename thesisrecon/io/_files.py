@@ -13,18 +13,21 @@ import shlex
 import shutil
 import stat
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-from thesisrecon.errors import OutputError, UsageError
+from thesisrecon.errors import OutputError, UsageError, in_words
 from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, has_content, not_ours
 
 MAX_TEXT_BYTES = 2**26
 """Limit of text files: far above any list of pairs, far below the memory of a computer."""
 _MAX_LINE = 2**14
 """Characters of a line of a pair list; two file names with folders are shorter on every system."""
+IMAGE_NAME_RULE = "an image name must be a relative path inside the folder of images, without '..'"
+_ABSOLUTE = re.compile(r"[A-Za-z]:|/|\\(?!x[0-9a-f]{2}|u[0-9a-f]{4})")
+"""Beginning of an absolute path of any system; printable names have \\x.. and \\u.... for characters."""
 FRAMES_FOLDER = "00-frames"
 """The frames of a video in a run folder, written before the run is identified by their pixels."""
 SPECIAL_FILE = "a pipe, a device or a socket"
@@ -47,6 +50,33 @@ def _escaped(c: str) -> str:
     if unicodedata.category(c) not in _CONTROL_CATEGORIES and c not in _BIDI_MARKS:
         return c
     return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}"
+
+
+def require_image_name(name: Any, source: object) -> str:
+    """Return the name of an image in ``source``; UsageError unless it is a relative path without ``..``.
+
+    A path is judged by the rules of every system, since models are copied between them.
+    """
+    if not is_image_name(name):
+        raise UsageError(f"{source} names an image {in_words(name)}; {IMAGE_NAME_RULE}")
+    return str(name)
+
+
+def is_image_name(name: Any) -> bool:
+    """Whether an image has a name of ``IMAGE_NAME_RULE``."""
+    parts = name.replace("\\", "/").split("/") if isinstance(name, str) else [".."]
+    return not (".." in parts or parts[-1] in ("", ".") or "\0" in name or _ABSOLUTE.match(name))
+
+
+def first_repeated(names: Iterable[str], *, as_files: bool = False) -> str | None:
+    """Return the first repeated name, if any; ``as_files`` ignores case and Unicode normalisation."""
+    seen = set[str]()
+    for name in names:
+        key = unicodedata.normalize("NFC", PurePosixPath(name).as_posix().casefold()) if as_files else name
+        if key in seen:
+            return name
+        seen.add(key)
+    return None
 
 
 def natural_key(name: str) -> tuple[list[tuple[str, int, str]], str]:

@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_laplace
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import FRAMES_FOLDER, printable, read_json, write_json
-from thesisrecon.io._images import decode_file, list_images
+from thesisrecon.io._images import MAX_DECODED_BYTES, decode_file, list_images
 from thesisrecon.io._outputs import OutputFolder, has_content, join_claim
 from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
 
@@ -33,6 +33,9 @@ _CHOICE = "frames.json"
 _MEASURED_SIDE = 1024
 _CONTRAST_FLOOR = 64.0
 """Added to the variance of the grey levels, so that the noise of a dark frame does not count as sharpness."""
+_FRAMES_HELD, _COPY_BYTES = 3, 12
+"""Decoded frames in memory at a time without those of threads, and bytes per pixel of their copies as RGB."""
+_MARGIN_PIXELS = 2**20
 _UPRIGHT = {turn: EXIF_TRANSFORMS[k] for turn, k in ((90, 8), (-90, 6), (180, 3), (-180, 3))}
 """Transform to the upright image by the rotation (degrees, counter-clockwise) that a video states."""
 _INSTALL = 'install the extra video (pip install ".[video]" in the clone), or give a folder of its frames'
@@ -158,6 +161,25 @@ def _file_sharpness(path: Path) -> float:
         return -1.0  # If all of a window are unreadable, one is taken and its reason reported.
 
 
+def _limit_memory(path: Path, video: Any, threads: int) -> None:
+    """Set the threads of a decoder, each of which holds a frame; UsageError if a frame is too large."""
+    codec = video.codec_context
+    each = max(4, codec.format.padded_bits_per_pixel / 8 if codec.format else 0)
+    fixed = _FRAMES_HELD * each + _COPY_BYTES
+    size = codec.width * codec.height
+    if size * (fixed + each) > MAX_DECODED_BYTES:
+        raise UsageError(
+            f"{path} has frames of {codec.width} x {codec.height} pixels; decoding them takes "
+            f"{size * (fixed + each) / 2**30:.1f} GiB of memory, more than the limit of "
+            f"{MAX_DECODED_BYTES / 2**30:.1f} GiB; reduce the size of the frames"
+        )
+    threads = max(1, min(threads, int((MAX_DECODED_BYTES / max(size, 1) - fixed) / each)))
+    video.thread_type, codec.thread_count = "AUTO", threads
+    # The size may change within a video; decoders count a margin around the frame.
+    largest = int(MAX_DECODED_BYTES / (fixed + threads * each)) + _MARGIN_PIXELS
+    codec.options = {"max_pixels": str(largest)}
+
+
 def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[Any, int]]:
     """PyAV frames of a video, each with the stated number of all frames (0: not stated); adds a warning."""
     try:
@@ -171,7 +193,7 @@ def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[An
             if not container.streams.video:
                 raise UsageError(f"{path} contains no video frame that can be decoded")
             video = container.streams.video[0]
-            video.thread_type, video.codec_context.thread_count = "AUTO", threads
+            _limit_memory(path, video, threads)
             for packet in container.demux(video):
                 try:
                     yield from ((frame, video.frames) for frame in packet.decode())

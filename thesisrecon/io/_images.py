@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import re
 import stat
 from collections.abc import Callable, Iterable, Sequence
@@ -26,7 +27,14 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io._files import SPECIAL_FILE, natural_key, printable
+from thesisrecon.io._files import (
+    IMAGE_NAME_RULE,
+    SPECIAL_FILE,
+    is_image_name,
+    natural_key,
+    printable,
+    require_image_name,
+)
 from thesisrecon.io._pixels import (
     EXIF_INVERSE,
     EXIF_TRANSFORMS,
@@ -155,11 +163,23 @@ def _is_listed(path: Path) -> bool:
 
 
 def images_folder(source: ImageSource) -> Path | None:
-    """Absolute path of the folder of all images; None if they are in several folders or in memory."""
+    """Absolute path of the folder below which all images have their names; None if there is none."""
     if isinstance(source, str | Path):
         return Path(source).absolute()
-    folders = {Path(item).absolute().parent if isinstance(item, str | Path) else None for item in source}
-    return folders.pop() if len(folders) == 1 else None
+    files = [Path(os.path.normpath(Path(item).absolute())) for item in source if isinstance(item, str | Path)]
+    if not files or len(files) < len(source):
+        return None
+    home = _common_folder(files)
+    return home if _share_names(files) or all(file.parent == home for file in files) else None
+
+
+def _share_names(files: Sequence[Path]) -> bool:
+    """Whether files of one name, from several folders, are distinguished by their paths."""
+    return len({file.name for file in files}) < len(files)
+
+
+def _common_folder(files: Sequence[Path]) -> Path:
+    return Path(os.path.commonpath([os.path.normpath(file.absolute().parent) for file in files]))
 
 
 def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
@@ -209,6 +229,8 @@ def read_images(
     items = _named_items(source)
 
     def read(item: tuple[str, Any]) -> DecodedImage | str:
+        if not is_image_name(item[0]):
+            return f"has to be renamed: {IMAGE_NAME_RULE}"
         try:
             return _read(*item, max_size_px, as_stored)
         except UnusableImage as refusal:
@@ -230,14 +252,15 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
     if isinstance(source, str | Path):
         source = list_images(Path(source))
     paths = [Path(item) for item in source if isinstance(item, str | Path)]
-    # Files of one name from several folders are distinguished by their paths.
-    full = len({path.name for path in paths}) < len(paths)
+    home = _common_folder(paths) if _share_names(paths) else None
     width = len(str(len(source)))
 
     def name_of(n: int, item: Any) -> str:
         if isinstance(item, str | Path):
-            return str(item) if full else Path(item).name
-        return item.name if isinstance(item, Image) else f"image-{n:0{width}d}"
+            return Path(item).name if home is None else os.path.relpath(item, home)
+        if isinstance(item, Image):
+            return require_image_name(item.name, "an Image record")
+        return f"image-{n:0{width}d}"
 
     names = _names(name_of(n, item) for n, item in enumerate(source))
     items = [Path(item) if isinstance(item, str) else item for item in source]

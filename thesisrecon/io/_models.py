@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,10 @@ import scipy
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, in_words
-from thesisrecon.io._colmap_reading import is_colmap_model, read_colmap_model
-from thesisrecon.io._files import read_json, read_text
+from thesisrecon.io._colmap_reading import MAX_SIDE_PX, is_colmap_model, read_colmap_model
+from thesisrecon.io._files import first_repeated, read_json, read_text, require_image_name
 from thesisrecon.sparse_model import SparseModel, SparseView
 
-_MAX_SIDE_PX = 2**24
 _ROUNDING = 1e-3
 """Deviation from a rotation that the printed digits of a pose may leave."""
 
@@ -37,9 +37,8 @@ def read_model(path: str | Path) -> SparseModel:
     else:
         model = SparseModel(_read_views(path) if path.suffix == ".json" else _read_trajectory(path))
         model = replace(model, as_stored=_from_colmap(path.parent))
-    names = model.names
-    if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
+    twice = first_repeated(require_image_name(name, path) for name in model.names)
+    if twice is not None:
         raise UsageError(f"{path} holds {twice!r} twice; each view needs a name of its own")
     return model
 
@@ -131,14 +130,16 @@ def read_cameras(path: str | Path) -> dict[str, Camera]:
 
 def _read_views(path: Path) -> list[SparseView]:
     """Views of a ``cameras.json``: a list with names, or a table by name, as some data sets have it."""
-    content = read_json(path)
+    content, views, last = read_json(path), list[SparseView](), ""
     try:
         cameras = content["cameras"]
         entries = cameras.items() if isinstance(cameras, dict) else [(item["name"], item) for item in cameras]
-        views = [_view(str(name), entry, i) for i, (name, entry) in enumerate(entries)]
-    except (TypeError, KeyError, ValueError, OverflowError):
-        rule = "it must list them with name, K, R and t or C, and width and height"
-        raise UsageError(f"{path} does not hold cameras; {rule}") from None
+        for i, (name, entry) in enumerate(entries):
+            last = f"; the entry {in_words(name)} cannot be used"
+            views.append(_view(str(name), entry, i))
+    except (TypeError, KeyError, ValueError, OverflowError, np.linalg.LinAlgError):
+        rule = "it must list them with name, finite K, R and t or C, and width and height"
+        raise UsageError(f"{path} does not hold cameras; {rule}{last}") from None
     if not views:
         raise UsageError(f"{path} holds no camera; no image of this run was registered")
     return views
@@ -153,7 +154,7 @@ def _view(name: str, entry: Any, camera: int) -> SparseView:
     size = (int(entry["width"]), int(entry["height"])) if "width" in entry else None
     # The record checks shapes and values; its tolerance for R is that of four digits.
     Camera(K, R, t, size or (1, 1), k)
-    if k.shape != (3,) or max(size or (1, 1)) > _MAX_SIDE_PX:
+    if k.shape != (3,) or max(size or (1, 1)) > MAX_SIDE_PX:
         raise ValueError("three coefficients and possible sides are needed")
     return SparseView(name, R, t, K, size, k, camera)
 
@@ -179,7 +180,8 @@ def _read_trajectory(path: Path) -> list[SparseView]:
 def _tum_pose(row: F64) -> tuple[F64, F64]:
     if not np.isfinite(row).all():
         raise ValueError("a number is not finite")
-    # A quaternion of zeros is a ValueError too.
+    if not 1e-9 < math.hypot(*row[4:]) < 1e9:
+        raise ValueError("the quaternion has no direction")
     return scipy.spatial.transform.Rotation.from_quat(row[4:]).as_matrix().T, row[1:4]
 
 
@@ -187,4 +189,6 @@ def _kitti_pose(row: F64) -> tuple[F64, F64]:
     M = row.reshape(3, 4)
     if not (np.isfinite(M).all() and np.allclose(M[:, :3] @ M[:, :3].T, np.eye(3), atol=_ROUNDING)):
         raise ValueError("it is not a rotation")
+    if np.linalg.det(M[:, :3]) < 0.0:
+        raise ValueError("it is a reflection")
     return scipy.spatial.transform.Rotation.from_matrix(M[:, :3]).as_matrix().T, M[:, 3]

@@ -14,6 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
+from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image, rotation_words
 from thesisrecon.matching._prepared import select_matches
 from thesisrecon.matching.tracks import corners_from_matches
@@ -85,6 +86,8 @@ def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored:
     names = [f"image-{i}" for i in range(count)] if names is None else [str(name) for name in names]
     if len(names) != count or len(set(names)) != count:
         raise UsageError(f"names must be {count} different names, one for each size; got {len(names)}")
+    for name in names:
+        require_image_name(name, "the list of names")
     if isinstance(images, str | Path):
         folder = Path(images)
         missing = [name for name in names if not (folder / name).is_file()]

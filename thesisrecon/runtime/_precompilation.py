@@ -110,8 +110,11 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
                     finished.append(line)
             worker.stdin.close()
 
-    with starting_processes():
-        workers = [_started() for _ in range(min(count, -(-len(lines) // KERNELS_PER_WORKER)))]
+    workers = list[subprocess.Popen[str]]()
+    # An embedded Python has no executable, and processes and threads may be limited.
+    with suppress(OSError), starting_processes():
+        for _ in range(min(count, -(-len(lines) // KERNELS_PER_WORKER))):
+            workers.append(_started())
 
     def kill() -> None:
         for worker in workers:
@@ -119,8 +122,9 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
 
     with kill_on_exit(kill):
         feeding = [threading.Thread(target=feed, args=(worker,), daemon=True) for worker in workers]
-        for thread in feeding:
-            thread.start()
+        with suppress(RuntimeError):
+            for thread in feeding:
+                thread.start()
         try:
             for thread in feeding:
                 while thread.is_alive():
@@ -140,7 +144,7 @@ def _started() -> subprocess.Popen[str]:
     # multiprocessing would import the script of the user again. In a session of its own the process does not
     # get the Ctrl-C of the terminal; without its input it ends.
     return subprocess.Popen(
-        [sys.executable, "-P", "-c", WORKER],  # -P: no imports from the current folder
+        [sys.executable or "python3", "-P", "-c", WORKER],  # -P: no imports from the current folder
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
