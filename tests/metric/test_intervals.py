@@ -50,7 +50,15 @@ def test_heavy_tails_bring_the_floor():
 
 def test_the_share_of_model_error_follows_its_signs():
     def scatter(contradiction, blocks=32):
-        return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, blocks)
+        return BlockScatter(
+            np.ones((1, 8)),
+            np.ones(8),
+            np.ones((1, 8)),
+            np.ones((1, 8)),
+            np.zeros((1, 8)),
+            contradiction,
+            blocks,
+        )
 
     assert lack_of_fit(scatter(1.0), 1.0) == 0.0
     assert lack_of_fit(scatter(2.5), 1.0) == 1.0

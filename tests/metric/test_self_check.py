@@ -26,6 +26,9 @@ from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
 
 SIGMAS, ANGLE = 7.0, 1e-3
+STATED = {
+    "focal_px": (0, 1.0), "aspect": (1, 0.0), "principal_x_px": (3, 1.0), "principal_y_px": (4, 1.0)
+}  # fmt: skip
 
 
 def true_model(scene, prior):
@@ -40,11 +43,19 @@ def true_model(scene, prior):
     return retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
 
 
-def doubts_of(model, scene):
-    intervals = [
-        {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 1.0, "")}
+def stated(model, **std):
+    """Intervals of every view; other standard deviations by name."""
+    return [
+        {
+            name: IntrinsicInterval(float(model.cameras.intrinsics[g, column]), std.get(name, usual), "")
+            for name, (column, usual) in STATED.items()
+        }
         for g in model.cameras.group
     ]
+
+
+def doubts_of(model, scene, **std):
+    intervals = stated(model, **std)
     calibration = SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
     return self_check(model, calibration, intervals, sigmas=SIGMAS)[:2]
 
@@ -174,7 +185,9 @@ def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself
     model, adjustment = true_model(scene, prior), MetricAdjustment(prior, 0.0, 0.02)
 
     def scatter(contradiction):
-        return BlockScatter(np.ones((1, 8)), np.ones(8), np.ones((1, 8)), contradiction, 32)
+        return BlockScatter(
+            np.ones((1, 8)), np.ones(8), np.ones((1, 8)), np.ones((1, 8)), np.zeros((1, 8)), contradiction, 32
+        )
 
     assert inconsistent_principal_point(model, adjustment, scatter(3.0)) == []
     assert len(inconsistent_principal_point(model, adjustment, scatter(12.0))) == 1
@@ -278,9 +291,31 @@ def test_a_blurred_image_is_named_and_trusted():
     scene = replace(scene, tracks=replace(scene.tracks, xy=scene.tracks.xy + blurred[:, None] * noise))
     model = replace(true_model(scene, prior_for(projective_reconstruction(scene))), sigma_px=1.0)
     model = retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
-    focal = {"focal_px": IntrinsicInterval(1500.0, 1.0, "")}
     calibration = SelfCalibration(np.eye(4), scene.K, np.zeros_like(scene.K), True, ())
-    _, failed_checks, limitations = self_check(model, calibration, [focal] * 8, sigmas=SIGMAS)
+    _, failed_checks, limitations = self_check(model, calibration, stated(model), sigmas=SIGMAS)
     assert failed_checks == []
     assert len(limitations) == 1
     assert limitations[0].startswith("Image #4: reprojection noise")
+
+
+def test_crops_that_determine_their_principal_point_are_trusted():
+    scene = make_scene(sigma_px=0.5, seed=3, principal_shift=(300.0, 0.0))
+    model = true_model(scene, prior_for(projective_reconstruction(scene)))
+    assert doubts_of(model, scene)[1] == []
+    (only,) = doubts_of(model, scene, principal_x_px=40.0)[1]
+    assert "long side away from the image centre, and the images hardly determine it" in only
+
+
+def test_an_uncertain_aspect_ratio_is_not_trusted():
+    scene, _, model = setting()
+    assert doubts_of(model, scene, aspect=0.04)[1] == []
+    (only,) = doubts_of(model, scene, aspect=0.062)[1]
+    assert only.startswith("The aspect ratio of the pixels is determined only to 6%")
+
+
+def test_a_poor_start_is_no_evidence_against_the_end():
+    scene, _, model = setting()
+    calibration = SelfCalibration(np.eye(4), 0.6 * scene.K, np.zeros_like(scene.K), True, ())
+    check, failed, _ = self_check(model, calibration, stated(model), sigmas=SIGMAS)
+    assert check["focal_change_since_calibration"] > 0.4
+    assert failed == []

@@ -30,6 +30,8 @@ SETTLED, ROUND_SETTLED = 1e-4, 5e-3
 larger if the observations are chosen again after it."""
 MIN_VIEWS_PER_LENS = 3
 """k2 and k3 are estimated only if this many views share them."""
+CENTRE_DOF = 3.0
+"""Degrees of freedom of the prior of principal points: heavy tails with finite variance."""
 FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
 
 
@@ -77,11 +79,11 @@ class MetricAdjustment:
         mean[:, : K1 + 1], std[:, : K1 + 1] = self.prior.mean[first], self.prior.std[first]
         has_lens = _shares_a_lens(model) & (std[:, K1] > 0.0)
         std[:, K1 + 1 :] = np.where(has_lens, self.lens_std, 0.0)[:, None]
-        # Images may be crops: a principal point far from its mean gets the weight of a Cauchy distribution,
-        # (1 + (off / std)^2)^-1.
-        for column in CENTRE:
-            off = model.cameras.intrinsics[:, column] - mean[:, column]
-            std[:, column] = np.hypot(std[:, column], np.where(std[:, column] > 0.0, off, 0.0))
+        # Images may be crops: the principal point has a bivariate t distribution, whose weight over that of
+        # the normal one falls with the distance from the mean.
+        off, known = model.cameras.intrinsics[:, CENTRE] - mean[:, CENTRE], std[:, CENTRE] > 0.0
+        squared = np.sum(np.where(known, off, 0.0) ** 2, axis=1, keepdims=True)
+        std[:, CENTRE] = np.hypot(std[:, CENTRE], np.where(known, np.sqrt(squared / (CENTRE_DOF + 2.0)), 0.0))
         unknown = ~np.isfinite(mean)
         mean[unknown] = model.cameras.intrinsics[unknown]
         kinds = self.hierarchical

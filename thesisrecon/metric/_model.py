@@ -28,6 +28,8 @@ the views; of more than ``MANY_VIEWS`` each view gets the numbers below. A view 
 LONG_PER_VIEW, PRECISE_PER_VIEW = 1000, 500
 """Observations per view of large sets: of the longest tracks while views are added, then of the most precise
 points."""
+MAX_CENTRE_SIGMAS = 3.0
+"""Principal points further from their mean, in standard deviations of the prior, are tried at the mean."""
 PRIOR_RESIDUALS = 6
 """Weight of the prior in the noise of a point, as a number of residuals."""
 
@@ -197,6 +199,21 @@ def with_tracks(model: MetricEstimate, tracks: Tracks) -> MetricEstimate:
     X, none = np.zeros((tracks.n_points, 3)), np.zeros(tracks.n_points, dtype=bool)
     model = replace(model, tracks=tracks, X=X, valid=none, inlier=none[tracks.point_index])
     return retriangulate_tracks(model, sigmas=LATE_SIGMAS)
+
+
+def with_expected_centres(model: MetricEstimate, prior: IntrinsicsPrior) -> MetricEstimate:
+    """The model with principal points far from their mean moved back to it.
+
+    The prior has two minima if the images hardly determine a principal point; that near the mean is tried.
+    """
+    first = np.unique(model.cameras.group, return_index=True)[1]
+    mean, std = prior.mean[first][:, CENTRE], prior.std[first][:, CENTRE]
+    intrinsics = model.cameras.intrinsics.copy()
+    far = (np.abs(intrinsics[:, CENTRE] - mean) > MAX_CENTRE_SIGMAS * std).any(axis=1)
+    if not far.any():
+        return model
+    intrinsics[:, CENTRE] = np.where(far[:, None], mean, intrinsics[:, CENTRE])
+    return replace(model, cameras=replace(model.cameras, intrinsics=intrinsics))
 
 
 def inlier_mask(model: MetricEstimate, *, sigmas: float) -> B8:

@@ -16,7 +16,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
-from thesisrecon.metric._model import CENTRE, FOCAL, WIDTH, MetricEstimate
+from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, SKEW, WIDTH, MetricEstimate
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._metric_bundle import MetricBundleResult, refine_metric_bundle
@@ -29,6 +29,11 @@ MAX_OBSERVATIONS = 15000
 MAX_VIEWS, RUN = 200, 20
 """Maximum number of views tested, and length of the runs of neighbours that are chosen from more views:
 15,000 observations are too few for all."""
+OWN_STD = 0.01
+"""Deviations of single images that a camera model may leave out: principal points in long sides
+(stabilisation), aspect ratio, and skew over the focal length (rolling shutter)."""
+FEW_VIEWS = 6
+"""Up to this number of views the intervals contain the effect of such deviations, as for critical motions."""
 FALSE_ALARM_RATE = 1e-3
 STD_FLOOR = 2e-3
 """Floor of the relative standard deviation of an own focal."""
@@ -73,20 +78,30 @@ def _adjust_per_view(
     columns: tuple[int, ...],
     *,
     focal_spread: float = np.inf,
+    own_std: float = np.inf,
 ) -> MetricBundleResult:
-    """Adjust the views with own, unknown values in some columns of intrinsics, with covariances."""
+    """Adjust the views with own values in some columns of intrinsics, with covariances.
+
+    The own values are unknown, or within ``own_std`` of those of the model.
+    """
     views, adjustment = np.flatnonzero(model.registered), replace(adjustment, hierarchical=None)
     cameras, seen = model.cameras, _subsample_inliers(model)
     assert cameras.shared is not None
     rows = cameras.group[views]
     shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
     prior, free = adjustment.row_prior(model), adjustment.free(model)
-    std = prior.std[rows].copy()
+    mean, std, longest = prior.mean[rows].copy(), prior.std[rows].copy(), model.sizes[views].max(axis=1)
+    units = {**dict.fromkeys(CENTRE, longest), SKEW: cameras.intrinsics[rows, FOCAL]}
     for column in columns:
         shared[:, column], free[column] = own, True
-        longest = model.sizes[views].max(axis=1)
-        std[:, column] = CENTRE_STD * longest if column in CENTRE else np.inf
-    known = IntrinsicsPrior.unshared(prior.mean[rows], std)
+        if np.isfinite(own_std):
+            mean[:, column], std[:, column] = (
+                cameras.intrinsics[rows, column],
+                own_std * units.get(column, 1.0),
+            )
+        else:
+            std[:, column] = CENTRE_STD * longest if column in CENTRE else np.inf
+    known = IntrinsicsPrior.unshared(mean, std)
     if np.isfinite(focal_spread):
         spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
         known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
@@ -99,6 +114,16 @@ def _adjust_per_view(
         prior=known,
         options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
     )
+
+
+def focal_change_by_richer_models(model: MetricEstimate, adjustment: MetricAdjustment) -> float:
+    """Largest relative change of a focal length if images have intrinsics of their own within ``OWN_STD``."""
+    model = _runs_of_views(model)
+    before = _adjust_per_view(model, adjustment, ()).cameras.intrinsics[:, FOCAL]
+    after = [
+        _adjust_per_view(model, adjustment, columns, own_std=OWN_STD) for columns in (CENTRE, (ASPECT, SKEW))
+    ]
+    return max(float(np.abs(np.log(a.cameras.intrinsics[:, FOCAL] / before)).max()) for a in after)
 
 
 @dataclass(frozen=True)

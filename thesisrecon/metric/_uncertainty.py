@@ -221,8 +221,9 @@ def intrinsic_intervals(
             if not variance > 0.0:
                 intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
                 continue
-            inflation, floor = _inflation(scatter, g, column), float(floors[g, column])
-            measured = float(inflation * np.sqrt(variance))
+            inflation, floor = _inflation(model, scatter, g, column), float(floors[g, column])
+            # A value that the images leave to its prior is as uncertain as the prior is wrong.
+            measured = float(np.hypot(inflation * np.sqrt(variance), scatter.pull[g, column]))
             std = min(float(np.hypot(measured, floor)), float(prior.std[g, column]))
             if floor > measured:
                 how = "bundle adjustment; the interval is the camera-model error floor"
@@ -281,8 +282,12 @@ def widen_by_camera_model(
     return tuple(answer)
 
 
-def _inflation(scatter: BlockScatter, g: int, column: int) -> float:
-    ratio = float(scatter.ratio[g, column])
+def _inflation(model: MetricEstimate, scatter: BlockScatter, g: int, column: int) -> float:
+    """Inflation by the scatter of many blocks; of few large ones as far as the model does not fit."""
+    ratio, large = float(scatter.ratio[g, column]), float(scatter.large_ratio[g, column])
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(ratio):
         return USUAL_INFLATION
-    return float(np.sqrt(ratio) * student_factor(scatter.blocks - 1))
+    small = float(np.sqrt(ratio) * student_factor(scatter.blocks - 1))
+    wide = float(np.sqrt(max(large, ratio, 1.0)) * student_factor(scatter.large_blocks - 1))
+    share = lack_of_fit(scatter, model.tail)
+    return (1.0 - share) * small + share * max(small, wide)

@@ -21,6 +21,7 @@ from thesisrecon.metric._adjustment import (
     with_initial_gate,
 )
 from thesisrecon.metric._camera_model import (
+    MAX_CHANGE,
     MAX_REMAINING,
     camera_differences,
     differences_of_images,
@@ -41,14 +42,17 @@ from thesisrecon.metric._model import (
     truncated_cost,
     upgraded_model,
     with_enough_points,
+    with_expected_centres,
     with_precise_points,
     with_tracks,
 )
 from thesisrecon.metric._resection import register_missing_cameras
 from thesisrecon.metric._shared_camera import (
+    FEW_VIEWS,
     SharedCameraTest,
     check_shared_cameras,
     contradicted_focal_priors,
+    focal_change_by_richer_models,
     inconsistent_principal_point,
 )
 from thesisrecon.metric._uncertainty import (
@@ -86,6 +90,10 @@ NOT_EXPLAINED = (
     "One value per image hardly predicts held-out observations better, so the shared values stay; their "
     "intervals contain the difference"
 )
+MODEL_DECIDES = (
+    "The focal length changes by {:.0%} if single images deviate from the camera model by 1 %, as with image "
+    "stabilisation or a rolling shutter. Add images from more directions"
+)
 NO_COMMON_POINTS = "shares no points with the model"
 
 
@@ -122,16 +130,29 @@ class MetricRefinement:
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
         intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
+        change = _focal_change(model, adjustment, calibration)
+        intervals = widen_by_camera_model(intervals, (change, 0.0), 1.0)
         model = with_tracks(model, reconstruction.tracks)
         check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
+        if change > MAX_CHANGE:
+            failed_checks.append(MODEL_DECIDES.format(change))
         views = np.flatnonzero(model.registered).tolist()
         warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
         return MetricResult(
             _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
             warnings, (*enlarged, *limitations),
         )  # fmt: skip
+
+
+def _focal_change(model: MetricEstimate, adjustment: MetricAdjustment, calibration: SelfCalibration) -> float:
+    """Relative change of focal lengths by richer camera models; 0 if images and motion need no test."""
+    report = calibration.identifiability
+    few = np.count_nonzero(model.registered) <= FEW_VIEWS
+    if not few and not (report is not None and report.critical):
+        return 0.0
+    return focal_change_by_richer_models(model, adjustment)
 
 
 def _start(
@@ -185,19 +206,17 @@ def settle_camera_model(
 
 
 def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finished:
-    """Adjust everything under the prior, then again with the hierarchical prior if there is one."""
+    """Adjust everything, then again with the noise that blocks of the scene show and a hierarchical prior."""
     model = _iterate_inliers(model, adjustment)
     scatter = adjustment.scatter(model)
     own = per_camera_estimates(model, adjustment, scatter)
     assert model.cameras.shared is not None
     hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
-    if hierarchical is None:
-        return model, adjustment, own, scatter
-    inflation = float(np.sqrt(max(scatter.median_ratio, 1.0)))
-    model, adjustment = apply_hierarchical_prior(
-        model, replace(adjustment, inflation=inflation), hierarchical
-    )
-    model = _iterate_inliers(model, adjustment)
+    # Correlated errors do not average out: without the inflation they would overrule every prior.
+    adjustment = replace(adjustment, inflation=float(np.sqrt(max(scatter.median_ratio, 1.0))))
+    if hierarchical is not None:
+        model, adjustment = apply_hierarchical_prior(model, adjustment, hierarchical)
+    model = _iterate_inliers(with_expected_centres(model, adjustment.prior), adjustment)
     return model, adjustment, own, adjustment.scatter(model)
 
 

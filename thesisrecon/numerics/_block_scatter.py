@@ -24,6 +24,8 @@ from thesisrecon.numerics._observations import Jacobians, Observations, Weightin
 # Number of pose unknowns tested besides all intrinsics.
 _MAX_POSES = 30
 _MAX_BLOCKS, _MIN_BLOCK_POINTS = 32, 12
+# Errors are correlated over large parts of the scene: their scatter is that of few large blocks.
+_LARGE_BLOCKS = 4
 # Number of unknowns above which matrices are sparse, if fewer than this fraction of the pairs of views share
 # points.
 _MANY, _SPARSE = 1200, 0.2
@@ -37,15 +39,24 @@ class BlockScatter:
     """Variances of the intrinsics (the focal relative) and their scatter between blocks of points.
 
     ``shared_variance`` (C,) would hold if all views shared one camera. ``ratio`` (G, C) is the scatter over
-    its expectation, NaN for fixed intrinsics. ``overdispersion`` is the scatter between blocks over that
-    between single points: 1 if the noise of different points is independent, for any distribution.
+    its expectation, NaN for fixed intrinsics; ``large_ratio`` is that of the ``large_blocks`` into which the
+    blocks merge. ``overdispersion`` is the scatter between blocks over that between single points: 1 if the
+    noise of different points is independent, for any distribution. ``pull`` (G, C) is the step by which the
+    prior moves the values.
     """
 
     variance: F64
     shared_variance: F64
     ratio: F64
+    large_ratio: F64
+    pull: F64
     overdispersion: float
     blocks: int
+
+    @property
+    def large_blocks(self) -> int:
+        """Number of large blocks."""
+        return min(self.blocks, _LARGE_BLOCKS)
 
     @property
     def median_ratio(self) -> float:
@@ -99,7 +110,7 @@ def block_scatter(
     o, group = observations, cameras.group
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
-    values = number_unknowns(cameras, used, free, prior)[0]
+    values, start, _ = number_unknowns(cameras, used, free, prior)
     views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
     # Centred and scaled to size 1.
     origin, scale = scene_frame(X[np.unique(o.point_index)])
@@ -113,15 +124,19 @@ def block_scatter(
     rows = solve(_unit_columns(S.shape[0], tested)).T
     block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
-    ratio = curvature * _block_ratio(system, rows, solve, block)
+    ratio, large = (curvature * _block_ratio(system, rows, solve, b) for b in (block, block % _LARGE_BLOCKS))
     alone = curvature * _point_ratio(system, rows)
     valid = np.isfinite(ratio) & (alone > 0.0)
     estimated, number = values.number >= 0, values.number
-    variance = np.diag(rows[len(poses) :, first:])
+    covariance = rows[len(poses) :, first:]
+    variance, pull = np.diag(covariance), covariance @ values.terms.gradient(start)
+    place_of = np.where(estimated, len(poses) + number, 0)
     return BlockScatter(
         np.append(variance, 0.0)[np.where(estimated, number, -1)],
         _shared_variances(S, variance, values, frame, views),
-        np.where(estimated, ratio[np.where(estimated, len(poses) + number, 0)], np.nan),
+        np.where(estimated, ratio[place_of], np.nan),
+        np.where(estimated, large[place_of], np.nan),
+        np.append(pull, 0.0)[np.where(estimated, number, -1)],
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )

@@ -69,8 +69,8 @@ _FOUND: Mapping[str, str] = {
         "distance to the scene, which determines the focal length but hardly any depth"
     ),
     TRANSLATION: (
-        "close to a pure translation: the camera rotated by at most {largest_rotation_deg:.1f} degrees, "
-        "which does not determine the focal length"
+        "close to a pure translation: the rotations (at most {largest_rotation_deg:.1f} degrees) move points "
+        "at infinity by {infinity_shift:.1%} of the image, which hardly determines the focal length"
     ),
     OPTICAL_AXIS: (
         "the camera rotated about its optical axis only and looked in one direction, which does not "
@@ -287,7 +287,8 @@ def _subsample(point: I64) -> I64:
     numbers, seen = np.unique(point, return_counts=True)
     order = numbers[np.argsort(-seen, kind="stable")]
     # Every k-th track rather than the longest ones, which may lie in one corner of the scene.
-    chosen = np.unique(np.arange(0, len(order), len(point) / _MAX_OBSERVATIONS).astype(np.int64))
+    count = min(int(len(order) * _MAX_OBSERVATIONS / len(point)) + 1, len(order))
+    chosen = np.arange(count) * len(order) // count
     return np.flatnonzero(np.isin(point, order[chosen]))
 
 

@@ -1,0 +1,42 @@
+"""A focal length that depends on deviations from the camera model has an interval that contains them."""
+
+import numpy as np
+import pytest
+
+from tests.metric.test_population import refine
+from tests.metric.verdict_scenes import fisheye_rig, rolling_video, stabilised_arc
+from tests.synthetic import make_scene
+from thesisrecon import reconstruct_from_tracks
+from thesisrecon.metric.refinement import MODEL_DECIDES
+
+MAX_SIGMAS = 3.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [stabilised_arc, rolling_video, fisheye_rig])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_wrong_focal_lengths_are_not_trusted_or_inside_their_interval(make, seed):
+    scene = make(seed)
+    result = reconstruct_from_tracks(scene.xy, [scene.size] * len(scene.xy))
+    focal = result.metric.intrinsics[0]["focal_px"]
+    sigmas = abs(focal.value - scene.focal) / focal.std
+    # The scenes are hard enough: without its richer models the interval was 3 to 15 times too narrow.
+    assert focal.std > 0.01 * focal.value
+    assert not result.metric.trusted or sigmas < MAX_SIGMAS
+
+
+def test_few_images_of_a_general_motion_keep_a_narrow_interval():
+    scene = make_scene(sigma_px=0.3, points=400, seed=4)
+    found = refine(scene)
+    assert found.intrinsics[0]["focal_px"].std < 0.005 * scene.K[0, 0, 0]
+    assert not any(MODEL_DECIDES[:24] in text for text in found.failed_checks)
+
+
+def test_values_left_to_their_prior_are_as_uncertain_as_its_pull():
+    """The principal point of a weak scene stays near the mean; the stated interval reaches to the truth."""
+    off = []
+    for seed in range(4):
+        scene = make_scene(sigma_px=2.0, points=60, seed=seed, principal_shift=(70.0, 0.0))
+        found = refine(scene).intrinsics[0]["principal_x_px"]
+        off.append((found.value - scene.K[0, 0, 2]) / found.std)
+    assert np.max(np.abs(off)) < MAX_SIGMAS
