@@ -45,7 +45,7 @@ SOURCES = {
         "selfcalibration/_identifiability.py": ("_failure", "_resolution", "_sentences"),
         "metric/_shared_camera.py": (
             "_focals_differ", "_centres_differ", "_untestable", "contradicted_focal_priors",
-            "inconsistent_principal_point",
+            "inconsistent_principal_point", "focal_decided_by_model",
         ),
         "metric/_camera_model.py": ("differences_of_images",),
         "metric/_uncertainty.py": ("warnings",),

@@ -209,10 +209,11 @@ def with_expected_centres(model: MetricEstimate, prior: IntrinsicsPrior) -> Metr
     first = np.unique(model.cameras.group, return_index=True)[1]
     mean, std = prior.mean[first][:, CENTRE], prior.std[first][:, CENTRE]
     intrinsics = model.cameras.intrinsics.copy()
-    far = (np.abs(intrinsics[:, CENTRE] - mean) > MAX_CENTRE_SIGMAS * std).any(axis=1)
+    off = np.abs(intrinsics[:, CENTRE] - mean)
+    far = np.any(off > MAX_CENTRE_SIGMAS * std, axis=1, keepdims=True)
     if not far.any():
         return model
-    intrinsics[:, CENTRE] = np.where(far[:, None], mean, intrinsics[:, CENTRE])
+    intrinsics[:, CENTRE] = np.where(far, mean, intrinsics[:, CENTRE])
     return replace(model, cameras=replace(model.cameras, intrinsics=intrinsics))
 
 

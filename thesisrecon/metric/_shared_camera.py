@@ -32,6 +32,8 @@ MAX_VIEWS, RUN = 200, 20
 OWN_STD = 0.01
 """Deviations of single images that a camera model may leave out: principal points in long sides
 (stabilisation), aspect ratio, and skew over the focal length (rolling shutter)."""
+MAX_FOCAL_CHANGE = 0.05
+"""Relative change of a focal length by such deviations up to which the camera model is accurate enough."""
 FEW_VIEWS = 6
 """Up to this number of views the intervals contain the effect of such deviations, as for critical motions."""
 FALSE_ALARM_RATE = 1e-3
@@ -124,6 +126,16 @@ def focal_change_by_richer_models(model: MetricEstimate, adjustment: MetricAdjus
         _adjust_per_view(model, adjustment, columns, own_std=OWN_STD) for columns in (CENTRE, (ASPECT, SKEW))
     ]
     return max(float(np.abs(np.log(a.cameras.intrinsics[:, FOCAL] / before)).max()) for a in after)
+
+
+def focal_decided_by_model(change: float) -> list[str]:
+    """A sentence if a focal length depends too much on deviations from the camera model."""
+    if change <= MAX_FOCAL_CHANGE:
+        return []
+    return [
+        f"The focal length changes by {change:.0%} if single images deviate from the camera model by 1 %, as "
+        "with image stabilisation or a rolling shutter. Add images from more directions"
+    ]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from thesisrecon.metric._adjustment import (
     with_initial_gate,
 )
 from thesisrecon.metric._camera_model import (
-    MAX_CHANGE,
     MAX_REMAINING,
     camera_differences,
     differences_of_images,
@@ -53,6 +52,7 @@ from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
     focal_change_by_richer_models,
+    focal_decided_by_model,
     inconsistent_principal_point,
 )
 from thesisrecon.metric._uncertainty import (
@@ -89,10 +89,6 @@ UNDETERMINED_REL = 0.1
 NOT_EXPLAINED = (
     "One value per image hardly predicts held-out observations better, so the shared values stay; their "
     "intervals contain the difference"
-)
-MODEL_DECIDES = (
-    "The focal length changes by {:.0%} if single images deviate from the camera model by 1 %, as with image "
-    "stabilisation or a rolling shutter. Add images from more directions"
 )
 NO_COMMON_POINTS = "shares no points with the model"
 
@@ -136,8 +132,7 @@ class MetricRefinement:
         check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
-        if change > MAX_CHANGE:
-            failed_checks.append(MODEL_DECIDES.format(change))
+        failed_checks += focal_decided_by_model(change)
         views = np.flatnonzero(model.registered).tolist()
         warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
         return MetricResult(
