@@ -283,7 +283,7 @@ def widen_by_camera_model(
 
 
 def _inflation(model: MetricEstimate, scatter: BlockScatter, g: int, column: int) -> float:
-    """Inflation by the scatter of many blocks; of few large ones as far as the model does not fit."""
+    """Inflation by the scatter of many blocks, and by that of few large ones if the model does not fit."""
     ratio, large = float(scatter.ratio[g, column]), float(scatter.large_ratio[g, column])
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(ratio):
         return USUAL_INFLATION
