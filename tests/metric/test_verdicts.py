@@ -39,3 +39,17 @@ def test_values_left_to_their_prior_are_as_uncertain_as_its_pull():
         found = refine(scene).intrinsics[0]["principal_x_px"]
         off.append((found.value - scene.K[0, 0, 2]) / found.std)
     assert np.max(np.abs(off)) < MAX_SIGMAS
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_images_zoomed_one_by_one_are_trusted_with_their_own_focal_lengths(seed):
+    scene = make_scene(views=10, points=400, sigma_px=0.3, zoom=0.3, seed=seed)
+    t = scene.tracks
+    inside = ((t.xy > 0) & (t.xy < scene.sizes[0] - 1)).all(axis=1)
+    xy = np.full((len(scene.R), len(scene.X), 2), np.nan)
+    xy[t.view_index[inside], t.point_index[inside]] = t.xy[inside]
+    result = reconstruct_from_tracks(xy, scene.sizes)
+    focal = np.array([camera.K[0, 0] for camera in result.cameras.values()])
+    assert np.ptp(focal) > 0.3 * focal.min()
+    assert np.abs(focal / scene.K[:, 0, 0] - 1.0).max() < 0.005
+    assert result.metric.trusted

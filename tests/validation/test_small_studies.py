@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Literal
 
 import numpy as np
@@ -26,7 +27,8 @@ from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.record import Metric
 from validation.scenes.many_tracks import GATE_PX, make_tracks
 from validation.scenes.many_views import walk
-from validation.studies import growth, timing
+from validation.studies import coverage_real, growth, timing
+from validation.studies.coverage_real import draw_neighbours
 from validation.studies.facades import KINDS, lens_error
 from validation.studies.growth import Cost, Meter
 from validation.studies.large_images import FORMATS, read_one, write_image
@@ -400,3 +402,20 @@ def test_a_file_of_numbers_is_not_replaced(tmp_path, capsys):
     assert run_studies(["critical-motions", "--json", str(tmp_path / "x.json")]) == 2
     assert "x.json exists already" in capsys.readouterr().err
     assert (tmp_path / "x.json").read_bytes() == b"of the user"
+
+
+def test_subsets_of_photographs_are_connected_by_verified_matches():
+    pairs = [SimpleNamespace(i=i, j=i + 1, accepted=i != 3, inliers=100) for i in range(7)]
+    matched = Matched("row", None, pairs, np.full((8, 2), 100), np.ones(8))
+    for seed in range(20):
+        drawn = draw_neighbours(matched, np.random.default_rng(seed), 3)
+        assert len(set(drawn)) == 3
+        assert drawn[-1] - drawn[0] == 2
+        assert not {3, 4} <= set(drawn)
+
+
+def test_coverage_counts_trusted_results_only():
+    right, wrong = np.array([0.5, 1.5, -3.0]), np.array([9.0, 9.0, 9.0])
+    trials = [coverage_real.Trial("a", 3, True, right), coverage_real.Trial("a", 3, False, wrong)]
+    row = coverage_real.table_row("a", trials)
+    assert row == ["a", 2, 1, "100", "100", "100", "0", "50", "50", "3.0"]

@@ -68,6 +68,7 @@ from thesisrecon.metric._uncertainty import (
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, Upgrade
+from thesisrecon.selfcalibration._identifiability import is_identifiable_by_other_cameras
 
 MIN_CHANGE = 0.002
 """Fraction of observations that become inliers or outliers in a round, below which the rounds end."""
@@ -128,6 +129,9 @@ class MetricRefinement:
         intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
         change = _focal_change(model, adjustment, calibration)
         intervals = widen_by_camera_model(intervals, (change, 0.0), 1.0)
+        if enlarged and is_identifiable_by_other_cameras(calibration.identifiability):
+            # The prior that the images contradicted was replaced.
+            calibration = replace(calibration, identifiable=True, reasons=())
         model = with_tracks(model, reconstruction.tracks)
         check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]

@@ -330,16 +330,12 @@ def _report(
     }
     undetermined = views[std >= MAX_FOCAL_STD]
     # A prior that fixes the focal length does so for any motion.
-    rotated = (
-        evidence["rotation_significance"] >= MIN_ROTATION_SIGNIFICANCE
-        and evidence["infinity_shift_beyond_roll"] >= MIN_INFINITY_SHIFT
-    )
     known_focal = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
     identifiable = (
         len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)
         and excess >= 0
-        and (rotated or known_focal)
-        and evidence["noise_ratio_to_projective"] < MAX_NOISE_RATIO
+        and (_has_rotated(evidence) or known_focal)
+        and not _has_excess_noise(evidence)
     )
     given = float(problem.prior.std[:, 0].max())
     sentences = _sentences(motion, evidence, identifiable=identifiable, focal_std=given)
@@ -432,6 +428,21 @@ def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, foca
         return [f"the cameras determine the focal length only to {_percent(std)}; {advice}"]
     # Rotating the camera does not help against a wrong prior of the intrinsics.
     return [] if _has_excess_noise(evidence) else [advice]
+
+
+def is_identifiable_by_other_cameras(report: IdentifiabilityReport | None) -> bool:
+    """Whether only the prior, such as one camera for zoomed images, contradicts the images."""
+    if report is None or not _has_excess_noise(report.evidence):
+        return False
+    determined = report.evidence["excess_equations"] >= 0 and not report.undetermined
+    return determined and _has_rotated(report.evidence)
+
+
+def _has_rotated(evidence: Mapping[str, float]) -> bool:
+    return (
+        evidence["rotation_significance"] >= MIN_ROTATION_SIGNIFICANCE
+        and evidence["infinity_shift_beyond_roll"] >= MIN_INFINITY_SHIFT
+    )
 
 
 def _has_excess_noise(evidence: Mapping[str, float]) -> bool:

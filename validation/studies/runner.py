@@ -39,6 +39,7 @@ MODULES = {
     "adjustment-size": "adjustment_size",
     "benchmark-table": "timing",
     "calibration-coverage": "coverage",
+    "coverage-real": "coverage_real",
     "calibration-real": "calibration_real",
     "cluster-efficiency": "cluster",
     "compile-time": "compile_time",
