@@ -336,6 +336,7 @@ class IdentifiabilityReport:
     evidence: Mapping[str, float]
     sentences: tuple[str, ...] = ()  #: what was found, what it means and what to do
     undetermined: tuple[int, ...] = ()  #: views whose own focal length is not determined
+    prior_contradicted: bool = False  #: determined but for the prior, such as one camera for zoomed images
 
 
 @dataclass(frozen=True)

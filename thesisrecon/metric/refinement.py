@@ -68,7 +68,6 @@ from thesisrecon.metric._uncertainty import (
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, Upgrade
-from thesisrecon.selfcalibration._identifiability import is_identifiable_by_other_cameras
 
 MIN_CHANGE = 0.002
 """Fraction of observations that become inliers or outliers in a round, below which the rounds end."""
@@ -129,7 +128,8 @@ class MetricRefinement:
         intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
         change = _focal_change(model, adjustment, calibration)
         intervals = widen_by_camera_model(intervals, (change, 0.0), 1.0)
-        if enlarged and is_identifiable_by_other_cameras(calibration.identifiability):
+        report = calibration.identifiability
+        if enlarged and report is not None and report.prior_contradicted:
             # The prior that the images contradicted was replaced.
             calibration = replace(calibration, identifiable=True, reasons=())
         model = with_tracks(model, reconstruction.tracks)

@@ -331,16 +331,18 @@ def _report(
     undetermined = views[std >= MAX_FOCAL_STD]
     # A prior that fixes the focal length does so for any motion.
     known_focal = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
-    identifiable = (
+    determined = (
         len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)
         and excess >= 0
         and (_has_rotated(evidence) or known_focal)
-        and not _has_excess_noise(evidence)
     )
+    contradicted = _has_excess_noise(evidence)
+    identifiable = determined and not contradicted
     given = float(problem.prior.std[:, 0].max())
     sentences = _sentences(motion, evidence, identifiable=identifiable, focal_std=given)
     views_without = tuple(int(v) for v in undetermined)
-    return IdentifiabilityReport(identifiable, motion, distance < 1.0, evidence, sentences, views_without)
+    found = (motion, distance < 1.0, evidence, sentences, views_without)
+    return IdentifiabilityReport(identifiable, *found, determined and contradicted)
 
 
 def _focal_std(fit: MetricBundleResult, problem: _Problem) -> F64:
@@ -428,14 +430,6 @@ def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, foca
         return [f"the cameras determine the focal length only to {_percent(std)}; {advice}"]
     # Rotating the camera does not help against a wrong prior of the intrinsics.
     return [] if _has_excess_noise(evidence) else [advice]
-
-
-def is_identifiable_by_other_cameras(report: IdentifiabilityReport | None) -> bool:
-    """Whether only the prior, such as one camera for zoomed images, contradicts the images."""
-    if report is None or not _has_excess_noise(report.evidence):
-        return False
-    determined = report.evidence["excess_equations"] >= 0 and not report.undetermined
-    return determined and _has_rotated(report.evidence)
 
 
 def _has_rotated(evidence: Mapping[str, float]) -> bool:
