@@ -7,6 +7,7 @@ import pytest
 from numba.core import types
 from numba.core.dispatcher import Dispatcher
 
+from thesisrecon import kernels
 from thesisrecon.kernels import copy_to, kernel
 from thesisrecon.runtime import _precompilation
 from thesisrecon.runtime._precompilation import kernel_and_types, listed_kernels, precompile
@@ -104,3 +105,28 @@ def test_a_run_calls_no_kernel_that_is_not_listed(tmp_path):
         [sys.executable, "-c", RUN, str(tmp_path / "out")], capture_output=True, text=True, check=True
     )
     assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("executable", ["/nonexistent/python", ""])
+def test_without_workers_this_process_compiles(monkeypatch, executable):
+    monkeypatch.setattr("thesisrecon.runtime._precompilation.sys.executable", executable)
+    monkeypatch.setenv("PATH", "")
+    assert _precompilation._compile_in_processes(["a.b()"], 2, lambda *_: None) == 0
+
+
+def test_without_a_home_the_cache_is_an_own_folder(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    for name in (kernels.CACHE_VARIABLE, "HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(kernels, "PACKAGE", tmp_path / "file")
+
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(kernels.Path, "home", no_home)
+    monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path))
+    own = kernels.cache_folder()
+    assert own.parent == tmp_path
+    assert own.stat().st_mode & 0o777 == 0o700
+    own.chmod(0o777)  # anybody may have put machine code there
+    assert kernels.cache_folder() == tmp_path / "file" / "__pycache__" / "kernels"

@@ -35,7 +35,7 @@ _CONTRAST_FLOOR = 64.0
 """Added to the variance of the grey levels, so that the noise of a dark frame does not count as sharpness."""
 _FRAMES_HELD, _COPY_BYTES = 3, 12
 """Decoded frames in memory at a time without those of threads, and bytes per pixel of their copies as RGB."""
-_MARGIN_PIXELS = 2**20
+_FRAME_BYTES, _MARGIN_PIXELS = 4, 2**20
 _UPRIGHT = {turn: EXIF_TRANSFORMS[k] for turn, k in ((90, 8), (-90, 6), (180, 3), (-180, 3))}
 """Transform to the upright image by the rotation (degrees, counter-clockwise) that a video states."""
 _INSTALL = 'install the extra video (pip install ".[video]" in the clone), or give a folder of its frames'
@@ -164,9 +164,12 @@ def _file_sharpness(path: Path) -> float:
 def _limit_memory(path: Path, video: Any, threads: int) -> None:
     """Set the threads of a decoder, each of which holds a frame; UsageError if a frame is too large."""
     codec = video.codec_context
-    each = max(4, codec.format.padded_bits_per_pixel / 8 if codec.format else 0)
+    each = max(_FRAME_BYTES, codec.format.padded_bits_per_pixel / 8 if codec.format else 0)
     fixed = _FRAMES_HELD * each + _COPY_BYTES
     size = codec.width * codec.height
+    if not size:
+        limit = f"{MAX_DECODED_BYTES / 2**30:.1f} GiB of memory; reduce the size of the frames"
+        raise UsageError(f"{path} contains no video frame that can be decoded within {limit}")
     if size * (fixed + each) > MAX_DECODED_BYTES:
         raise UsageError(
             f"{path} has frames of {codec.width} x {codec.height} pixels; decoding them takes "
@@ -189,7 +192,10 @@ def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[An
     damaged = 0
     try:
         # A stream, since FFmpeg reads some names as addresses, and playlists name other files.
-        with path.open("rb") as stream, av.open(stream) as container:
+        # To open a video FFmpeg decodes its first frame.
+        smallest = MAX_DECODED_BYTES // (_FRAMES_HELD * _FRAME_BYTES + _COPY_BYTES) + _MARGIN_PIXELS
+        options = {"max_pixels": str(smallest)}
+        with path.open("rb") as stream, av.open(stream, options=options) as container:
             if not container.streams.video:
                 raise UsageError(f"{path} contains no video frame that can be decoded")
             video = container.streams.video[0]
