@@ -119,7 +119,14 @@ def _adjust_per_view(
 
 
 def focal_change_by_richer_models(model: MetricEstimate, adjustment: MetricAdjustment) -> float:
-    """Largest relative change of a focal length if images have intrinsics of their own within ``OWN_STD``."""
+    """Largest relative change of a focal length if images have intrinsics of their own within ``OWN_STD``.
+
+    0 if each of more than ``FEW_VIEWS`` images has its own focal length: such cameras are rich enough.
+    """
+    assert model.cameras.shared is not None
+    focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
+    if len(np.unique(focal)) == len(focal) > FEW_VIEWS:
+        return 0.0
     model = _runs_of_views(model)
     before = _adjust_per_view(model, adjustment, ()).cameras.intrinsics[:, FOCAL]
     after = [
