@@ -1,4 +1,4 @@
-"""Which files may be replaced, what a refused command leaves, and folders that go while they are used."""
+"""Which files may be replaced, what a refused command leaves, and folders removed during a command."""
 
 import errno
 import json
@@ -199,11 +199,11 @@ def at(stage, action):
     """A listener that acts once when a part of the stage is done."""
     left = [action]
 
-    def hear(name, done, _):
+    def listen(name, done, _):
         if name == stage and done >= 1 and left:
             left.pop()()
 
-    return hear
+    return listen
 
 
 def run(out, **options):

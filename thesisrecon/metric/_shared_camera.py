@@ -16,6 +16,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
+from thesisrecon.metric._camera_model import MAX_CHANGE
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, SKEW, WIDTH, MetricEstimate
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
 from thesisrecon.numerics._block_scatter import BlockScatter
@@ -32,8 +33,6 @@ MAX_VIEWS, RUN = 200, 20
 OWN_STD = 0.01
 """Deviations of single images that a camera model may leave out: principal points in long sides
 (stabilisation), aspect ratio, and skew over the focal length (rolling shutter)."""
-MAX_FOCAL_CHANGE = 0.05
-"""Relative change of a focal length by such deviations up to which the camera model is accurate enough."""
 FEW_VIEWS = 6
 """Up to this number of views the intervals contain the effect of such deviations, as for critical motions."""
 FALSE_ALARM_RATE = 1e-3
@@ -118,14 +117,18 @@ def _adjust_per_view(
     )
 
 
-def focal_change_by_richer_models(model: MetricEstimate, adjustment: MetricAdjustment) -> float:
+def focal_change_by_richer_models(
+    model: MetricEstimate, adjustment: MetricAdjustment, *, critical: bool
+) -> float:
     """Largest relative change of a focal length if images have intrinsics of their own within ``OWN_STD``.
 
-    0 if each of more than ``FEW_VIEWS`` images has its own focal length: such cameras are rich enough.
+    Of more than ``FEW_VIEWS`` images only a shared focal length after a ``critical`` motion needs this test;
+    else the change is 0.
     """
     assert model.cameras.shared is not None
     focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
-    if len(np.unique(focal)) == len(focal) > FEW_VIEWS:
+    is_shared = len(np.unique(focal)) < len(focal)
+    if len(focal) > FEW_VIEWS and not (critical and is_shared):
         return 0.0
     model = _runs_of_views(model)
     before = _adjust_per_view(model, adjustment, ()).cameras.intrinsics[:, FOCAL]
@@ -137,7 +140,7 @@ def focal_change_by_richer_models(model: MetricEstimate, adjustment: MetricAdjus
 
 def focal_decided_by_model(change: float) -> list[str]:
     """A sentence if a focal length depends too much on deviations from the camera model."""
-    if change <= MAX_FOCAL_CHANGE:
+    if change <= MAX_CHANGE:
         return []
     return [
         f"The focal length changes by {change:.0%} if single images deviate from the camera model by 1 %, as "

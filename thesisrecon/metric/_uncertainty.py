@@ -90,9 +90,8 @@ def per_camera_estimates(
     value[:, FOCAL] = np.log(value[:, FOCAL])
     kind = np.unique(adjustment.prior.kind[first], return_inverse=True)[1].reshape(-1)
     registered = np.isin(np.arange(len(first)), group[model.registered])
-    inflation = np.sqrt(np.maximum(scatter.median_ratio, 1.0))
     kind = np.where(registered, kind, -1)
-    std = inflation * np.sqrt(np.maximum(scatter.variance, 0.0))
+    std = scatter.inflation * np.sqrt(np.maximum(scatter.variance, 0.0))
     return PerCameraEstimates(value, std, _std_floor(model, scatter), kind)
 
 

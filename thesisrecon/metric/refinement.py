@@ -47,7 +47,6 @@ from thesisrecon.metric._model import (
 )
 from thesisrecon.metric._resection import register_missing_cameras
 from thesisrecon.metric._shared_camera import (
-    FEW_VIEWS,
     SharedCameraTest,
     check_shared_cameras,
     contradicted_focal_priors,
@@ -126,9 +125,10 @@ class MetricRefinement:
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
         intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
-        change = _focal_change(model, adjustment, calibration)
-        intervals = widen_by_camera_model(intervals, (change, 0.0), 1.0)
         report = calibration.identifiability
+        critical = report is not None and report.critical
+        change = focal_change_by_richer_models(model, adjustment, critical=critical)
+        intervals = widen_by_camera_model(intervals, (change, 0.0), 1.0)
         if enlarged and report is not None and report.prior_contradicted:
             # The prior that the images contradicted was replaced.
             calibration = replace(calibration, identifiable=True, reasons=())
@@ -143,15 +143,6 @@ class MetricRefinement:
             _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
             warnings, (*enlarged, *limitations),
         )  # fmt: skip
-
-
-def _focal_change(model: MetricEstimate, adjustment: MetricAdjustment, calibration: SelfCalibration) -> float:
-    """Relative change of focal lengths by richer camera models; 0 if images and motion need no test."""
-    report = calibration.identifiability
-    few = np.count_nonzero(model.registered) <= FEW_VIEWS
-    if not few and not (report is not None and report.critical):
-        return 0.0
-    return focal_change_by_richer_models(model, adjustment)
 
 
 def _start(
@@ -212,7 +203,7 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     assert model.cameras.shared is not None
     hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
     # Correlated errors do not average out: without the inflation they would overrule every prior.
-    adjustment = replace(adjustment, inflation=float(np.sqrt(max(scatter.median_ratio, 1.0))))
+    adjustment = replace(adjustment, inflation=scatter.inflation)
     if hierarchical is not None:
         model, adjustment = apply_hierarchical_prior(model, adjustment, hierarchical)
     model = _iterate_inliers(with_expected_centres(model, adjustment.prior), adjustment)

@@ -64,6 +64,11 @@ class BlockScatter:
         known = self.ratio[np.isfinite(self.ratio)]
         return float(np.median(known)) if len(known) else 1.0
 
+    @property
+    def inflation(self) -> float:
+        """Factor on the noise that the blocks show, at least 1."""
+        return float(np.sqrt(max(self.median_ratio, 1.0)))
+
 
 def point_blocks(X: F64, used: B8) -> I64:
     """Divide points into blocks of neighbours by median splits along the longest axis; -1 if not used."""
