@@ -8,6 +8,7 @@ import pytest
 from hypothesis import settings
 
 from thesisrecon.cli.main import run_command
+from thesisrecon.errors import STRICT_VARIABLE
 from thesisrecon.runtime._run_folder import bytes_from_record
 
 # The same examples on every machine: whether a test passes is no matter of chance.
@@ -26,6 +27,14 @@ def _not_flushed():
     """Leave the flushing of files to the system: no test loses its power, and thousands of waits add up."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _strict():
+    """A figure, page or file that cannot be made is an error: nothing hides behind its warning."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(STRICT_VARIABLE, "1")
         yield
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import difflib
 import errno
-from collections.abc import Iterable
-from os import PathLike, fspath
-from typing import Any
+from collections.abc import Callable, Iterable
+from os import PathLike, environ, fspath
+from typing import Any, TypeVar
 
 REMEDIES = {
     errno.ENOSPC: "free space there",
@@ -26,6 +26,11 @@ REMEDIES = {
 WRITE_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors that only writing causes."""
 _MAX_SHOWN = 120
+NOT_MADE = "output-not-made"
+"""Code of the warning about a figure, page or file that could not be made; the result is complete without."""
+STRICT_VARIABLE = "THESISRECON_STRICT"
+"""Environment variable that makes these warnings errors, as in the tests of this package."""
+T = TypeVar("T")
 
 
 def counted(number: int, noun: str, shown: str = "") -> str:
@@ -158,3 +163,41 @@ class OutputError(UsageError):
 
     def __reduce__(self) -> tuple[type[OutputError], tuple[Any, ...]]:
         return type(self), (self.place, self.error, self.kept)
+
+
+def made(what: str, make: Callable[[], T], warnings: list[str], otherwise: T) -> T:
+    """Make one figure, page or file; an error costs a warning, not the result.
+
+    Parameters
+    ----------
+    what, make : str, callable
+        Name of the output in the warning, and the function that makes it.
+    warnings : list of str
+        Receives the warning, whose code is ``output-not-made``; one is enough for outputs of the same name.
+    otherwise : object
+        Returned after an error.
+
+    Returns
+    -------
+    object
+        Result of ``make``.
+
+    Raises
+    ------
+    UsageError
+        If another program changed a file of the folder, or removed the folder, in the meantime.
+    """
+    try:
+        return make()
+    except Exception as error:
+        refused = isinstance(error, UsageError) and not isinstance(error, OutputError)
+        if refused or environ.get(STRICT_VARIABLE):
+            raise
+        said = " ".join(str(error).split())
+        reason = said if isinstance(error, OutputError) else f"{type(error).__name__}: {said}".rstrip(": ")
+        text = (
+            f"output-not-made: {what} ({reason}); all else is complete, and the same command tries it again"
+        )
+        if not any(known.split(" (")[0] == text.split(" (")[0] for known in warnings):
+            warnings.append(text)
+        return otherwise

@@ -56,6 +56,7 @@ SOURCES = {
         "pipeline/_steps.py": ("_run_all",),
         "pipeline/_outputs.py": ("_write_model", "write_outputs"),
         "runtime/_run.py": ("_loaded",),
+        "errors.py": ("made",),
     },
 }  # fmt: skip
 """Functions and constants whose sentences are warnings, failed checks or reasons against an image."""

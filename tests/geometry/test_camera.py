@@ -85,6 +85,18 @@ def test_3_5_1_cameras_at_infinity_cannot_be_normalised():
             refuse(np.full((3, 4), np.nan))
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e-4, 1.0, 1e6])
+def test_whether_a_camera_is_finite_does_not_depend_on_the_unit_of_the_pixels(unit):
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        P, _, R, _ = random_camera(rng)
+        rows = np.diag([1.0, 1.0, unit])
+        at_infinity = P.copy()
+        at_infinity[2, :3] = 0.3 * P[0, :3] - 0.2 * P[1, :3]
+        assert matrix.finite_cameras(np.stack([rows @ P, rows @ at_infinity])).tolist() == [True, False]
+        np.testing.assert_allclose(matrix.decompose_camera(rows @ P)[1], R, atol=1e-6)
+
+
 @holds_for_every()
 def test_proposition_3_5_1_in_front_is_a_positive_t_of_a_normalised_camera(rng):
     P, _, R, centre = random_camera(rng)

@@ -80,6 +80,24 @@ def test_the_caption_states_omitted_points():
     assert "199 of 200 points are shown, without outliers." in render_report(replace(data, metric=metric))
 
 
+@pytest.mark.parametrize("count", [0, 1, 3, 8])
+@pytest.mark.parametrize("offset", [0.0, 1e-13, 1e-6])
+def test_affine_cameras_at_infinity_are_left_out_by_number(count, offset):
+    data = synthetic.made_up_run(points=200)
+    P = data.affine.P.copy()
+    views = np.flatnonzero(data.affine.registered)[:count]
+    # Nearly so: with the centre 1e6 or more units away.
+    P[views, 2, :3] = P[views, 0, :3] / 3000.0 + offset * P[views, 2, :3]
+    warnings = []
+    page = render_report(replace(data, affine=replace(data.affine, P=P)), warnings)
+    assert warnings == []
+    assert 'id="scene-figure"' in page
+    words = {0: [], 1: ["1 camera at infinity, or nearly so, is not drawn."]}
+    expected = words.get(count, [f"{count} cameras at infinity, or nearly so, are not drawn."])
+    assert re.findall(r"\d+ camera[^.]*at infinity[^.]*\.", page) == expected
+    assert ('id="affine-figure"' in page) == (count < 8)
+
+
 def test_a_failed_run_without_anything_has_a_page():
     failure = StageFailure("no photograph was found", "", "put JPEG files in the folder")
     page = render_report(ReportData("empty", (), (), "", {}, "0.1.0", failure=failure))

@@ -116,3 +116,14 @@ def test_points_and_camera_centres_are_written(tmp_path):
     assert (vertices["rgb"][-8:] == [255, 0, 0]).all()
     assert (vertices["rgb"][:-8] == 77).all()
     np.testing.assert_allclose(vertices["xyz"][:-8], affine.X[near, :3], rtol=1e-5)
+
+
+def test_cameras_at_infinity_are_left_out_of_the_file(tmp_path):
+    affine = upgrade_to_affine(projective_reconstruction(make_scene()), np.array([0.02, -0.03, 0.01, 1.0]))
+    P = affine.P.copy()
+    P[1, 2, :3] = P[1, 0, :3] + P[1, 1, :3]
+    P[2, 2, :3] = 0.0
+    write_affine(tmp_path / "a.ply", replace(affine, P=P), np.zeros((len(affine.X), 3), dtype=np.uint8))
+    head = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")[0].decode()
+    near = affine.valid & (np.abs(affine.X[:, :3]) < 1e3).all(axis=1)
+    assert f"element vertex {near.sum() + len(P) - 2}\n" in head

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry._conditioning import require_shapes
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
@@ -111,10 +111,25 @@ def _left_determinant(P: F64, caller: str) -> F64:
     """det M (...) of cameras (..., 3, 4); ``ValueError`` if one is 0 to rounding."""
     if not np.isfinite(P).all():
         raise ValueError(f"{caller} needs finite cameras; some entries are NaN or infinite")
-    det = np.linalg.det(P[..., :3])
-    if not (np.abs(det) > 1e-14 * np.linalg.norm(P[..., :3], axis=(-2, -1)) ** 3).all():
+    if not finite_cameras(P).all():
         raise ValueError(f"{caller} needs a finite camera; the left 3x3 part of P is singular")
-    return np.asarray(det)
+    return np.asarray(np.linalg.det(P[..., :3]))
+
+
+def finite_cameras(P: F64) -> B8:
+    """Whether the centres of cameras are finite: their left 3x3 parts are not singular to rounding.
+
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4)
+        Cameras; the scale of each row, and so the unit of the pixels, has no influence.
+
+    Returns
+    -------
+    ndarray (...) of bool
+    """
+    rows = np.linalg.norm(P[..., :3], axis=-1)
+    return np.asarray(np.abs(np.linalg.det(P[..., :3])) > 1e-14 * rows.prod(axis=-1))
 
 
 def principal_ray(P: F64) -> F64:

@@ -153,9 +153,11 @@ def write_atomically(path: Path, content: bytes, *, cached: bool = False) -> Non
             # Another program may have written it meanwhile.
             claim.require_own(path)
         partial.replace(path)
-    except (OSError, UsageError) as error:
+    except Exception as error:
         with suppress(OSError):
             partial.unlink()
+        if claim is not None:
+            claim.forget(path)
         raise OutputError(path, error) if isinstance(error, OSError) else error from None
 
 

@@ -168,11 +168,8 @@ class OutputFolder:
         return not same
 
     def _note(self, name: str, digest: str) -> None:
-        self.written[name] = digest
-        if digest in self.digests.setdefault(name, set()):
-            return
-        self.digests[name].add(digest)
-        if self._record >= 0:
+        new = digest not in self.digests.setdefault(name, set())
+        if new and self._record >= 0:
             before = os.fstat(self._record)
             try:
                 # A new line first: the last one of a killed command may be incomplete.
@@ -181,6 +178,13 @@ class OutputFolder:
                 raise OutputError(self.path / LOCK_FILE, error) from None
             # Its time is that at which the command began.
             os.utime(self._record, ns=(before.st_atime_ns, before.st_mtime_ns))
+        self.digests[name].add(digest)
+        self.written[name] = digest
+
+    def forget(self, path: Path) -> None:
+        """Forget a file whose writing failed, unless an older one is there."""
+        if not os.path.lexists(path):
+            self.written.pop(self.name_of(path), None)
 
     def make_parents(self, path: Path) -> None:
         """Create the folders of a file below this one, which is never created again."""

@@ -15,7 +15,8 @@ import numpy as np
 from thesisrecon import __version__
 from thesisrecon._settings import toml_from_config
 from thesisrecon.arrays import F32, U8
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import NOT_MADE, StageFailure, UsageError, counted, made
+from thesisrecon.geometry.camera_matrix import finite_cameras
 from thesisrecon.io._colmap_writing import COLMAP_FILES, write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import read_json, write_atomically, write_json, write_text
@@ -46,16 +47,16 @@ CONFIG = "config.toml"
 WRITTEN_FILES = (*REPLACED_FILES, CONFIG, *(f"group-[0-9]*/{name}" for name in (CONFIG, RUN_FILE)))
 """Files that a run writes beside the results of its stages."""
 MAX_AFFINE = 1e3
-"""Largest affine coordinate written to affine.ply, in median depths of the best observed view."""
+"""Largest affine coordinate in affine.ply, in median depths of the best observed view."""
 
 
 def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
-    """Write the affine points within ``MAX_AFFINE`` and the camera centres (red) as a PLY file."""
+    """Write the affine points and the camera centres (red) within ``MAX_AFFINE`` as a PLY file."""
     X = affine.X[:, :3]
     near = affine.valid & (np.abs(X) < MAX_AFFINE).all(axis=1)
-    P = affine.P[affine.registered]
+    P = affine.P[affine.registered & finite_cameras(affine.P)]
     centres = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]
-    centres = centres[np.isfinite(centres).all(axis=1)]
+    centres = centres[(np.abs(centres) < MAX_AFFINE).all(axis=1)]
     red = np.tile(np.array([255, 0, 0], dtype=np.uint8), (len(centres), 1))
     write_point_cloud(path, np.concatenate([X[near], centres]), np.concatenate([colors[near], red]))
 
@@ -114,18 +115,18 @@ def _described(run: Run, result: RunResult, until: str, failure: StageFailure | 
 
 
 def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
-    out = run.directory.path
+    """Write the records and the summary, then files and page, each on its own, and the summary again."""
+    out, config = run.directory.path, toml_from_config(run.config)
+    result = _described(run, result, until, failure)
+    _write_records(run.directory, result)
+    write_text(out / CONFIG, config)
     with run.clock("outputs"), ThreadPoolExecutor(1) as beside:
         # The file of the model is written while that of the page is made.
         for_page = beside.submit(_model_for_page, result, max(run.workers.threads - 1, 1))
         if run.workers.threads == 1:
             wait([for_page])
         max_mb = getattr(run.config.model, "max_glb_mb", SurfaceModel.max_glb_mb)
-        colors, affine, warnings = _write_results(run.directory, result, max_mb, run.workers.threads)
-        run.warnings.extend(warnings)
-        result = _described(run, result, until, failure)
-        config = toml_from_config(run.config)
-        write_text(out / CONFIG, config)
+        colors, affine, warnings = _write_exports(run.directory, result, max_mb, run.workers.threads)
         page = ReportData(
             title=run.title,
             images=result.images,
@@ -140,30 +141,35 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             metric=result.metric,
             colors=colors,
             affine=affine,
-            model=for_page.result(),
+            model=made("the model in report.html", for_page.result, warnings, None),
             held_out=result.held_out,
-            depth_maps=_thinned_maps(result),
+            depth_maps=made("a depth map in report.html", lambda: _thinned_maps(result), warnings, {}),
             until=None if until == "model" else until,
             failure=failure,
         )
-        write_text(out / PAGE, render_report(page))
+        made(PAGE, lambda: write_text(out / PAGE, render_report(page, warnings)), warnings, None)
     run.finish("outputs", counts={})
-    summary = {**result.summary, **_run_facts(run, until)}
-    result = replace(result, reports=tuple(run.reports.values()), summary=summary)
-    write_json(out / SUMMARY, result.summary)
-    return result
+    summary = {**result.summary, "warnings": [*result.warnings, *warnings], **_run_facts(run, until)}
+    # Without space for it, the summary that was written first stays.
+    made(SUMMARY, lambda: write_json(out / SUMMARY, summary), warnings, None)
+    summary["warnings"] = [*result.warnings, *warnings]
+    reports = tuple(run.reports.values())
+    return replace(result, reports=reports, summary=summary, warnings=tuple(summary["warnings"]))
 
 
 def save_result(result: RunResult, folder: Path, *, overwrite: bool) -> None:
     """Copy the result files of a run; those that no folder contains are written, except the page."""
+    warnings: list[str] = []
     with claim_folder(folder, overwrite=overwrite, names=RESULT_FILES):
         if (out := folder_with(result)) is not None:
             for path in (path for name in RESULT_FILES for path in sorted(out.glob(name))):
                 if path.is_file():
                     write_atomically(folder / path.relative_to(out), path.read_bytes())
             return
-        _write_results(RunDirectory(folder), result)
-        write_json(folder / SUMMARY, result.summary)
+        _write_records(RunDirectory(folder), result)
+        warnings = _write_exports(RunDirectory(folder), result)[2]
+    if lost := [text for text in warnings if text.startswith(NOT_MADE)]:
+        raise UsageError("; ".join(lost))
 
 
 def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, threads: int) -> list[str]:
@@ -175,39 +181,73 @@ def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, th
     directory.remove(SURFACE_FILES if mesh is None else SURFACE_FILES[1:])
     if mesh is None:
         return []
-    content = glb_bytes(mesh)
+    warnings: list[str] = []
+    content = made(path.name, lambda: glb_bytes(mesh), warnings, b"")
     if len(content) <= 1e6 * max_mb or not result.views:
-        write_atomically(path, content)
-        return []
-    write_atomically(whole, content)
-    texels = TextureAtlas.max_texels if mesh.texture is None else mesh.texture[..., 0].size
-    share, smaller = 1.0, mesh
-    while len(content) > 1e6 * max_mb:
-        share *= 0.9 * 1e6 * max_mb / len(content)
-        smaller = reduce_faces(mesh, int(share * len(mesh.faces)), threads=threads)
-        atlas = TextureAtlas(max_texels=int(share * texels))
-        content = glb_bytes(atlas.texture(smaller, result.views, threads=threads))
-    write_atomically(path, content)
-    tiles = counted(write_tiles(directory, mesh, smaller), "tile")
+        made(path.name, lambda: write_atomically(path, content), warnings, None) if content else None
+        return warnings
+    made(whole.name, lambda: write_atomically(whole, content), warnings, None)
+
+    def reduced() -> TexturedMesh:
+        texels = TextureAtlas.max_texels if mesh.texture is None else mesh.texture[..., 0].size
+        share, smaller, packed = 1.0, mesh, content
+        while len(packed) > 1e6 * max_mb:
+            share *= 0.9 * 1e6 * max_mb / len(packed)
+            smaller = reduce_faces(mesh, int(share * len(mesh.faces)), threads=threads)
+            atlas = TextureAtlas(max_texels=int(share * texels))
+            packed = glb_bytes(atlas.texture(smaller, result.views, threads=threads))
+        write_atomically(path, packed)
+        return smaller
+
+    if (smaller := made(path.name, reduced, warnings, None)) is None:
+        return warnings
+    tiles = made(TILES, lambda: write_tiles(directory, mesh, smaller), warnings, 0)
+    if not tiles:
+        directory.remove(TILE_FILES)
     faces = f"{len(smaller.faces)} of {len(mesh.faces)} faces"
     limit = f"model.max_glb_mb={max_mb:g}"
-    return [
-        f"model.glb is reduced to {faces} and fewer texels ({limit}); "
-        f"{tiles} ({TILES}) hold all in parts, and {whole.name} holds all"
-    ]
+    whole_in = [f"{counted(tiles, 'tile')} ({TILES}) hold all in parts"] if tiles else []
+    whole_in += [f"{whole.name} holds all"] if whole.is_file() else []
+    reduced_to = f"model.glb is reduced to {faces} and fewer texels ({limit})"
+    return [*warnings, "; ".join([reduced_to, *filter(None, [", and ".join(whole_in)])])]
 
 
-def _write_results(
+def _write_records(directory: RunDirectory, result: RunResult) -> None:
+    """Write ``cameras.json``, or remove old results, and the summary."""
+    if result.metric is None:
+        directory.remove(MODEL_FILES)
+    else:
+        write_json(directory.path / "cameras.json", cameras_table(result.cameras))
+    write_json(directory.path / SUMMARY, result.summary)
+
+
+def _write_exports(
     directory: RunDirectory, result: RunResult, max_mb: float = SurfaceModel.max_glb_mb, threads: int = 1
 ) -> tuple[U8 | None, Reconstruction | None, list[str]]:
-    """Write cameras, points and model, or remove old ones; return colours, affine points, warnings."""
-    if result.metric is None or result.projective is None or result.calibration is None:
-        directory.remove(MODEL_FILES)
+    """Write points and model, each file on its own; return colours, affine points, warnings."""
+    if result.metric is None:
         return None, None, []
-    colors = point_colors(result.metric.reconstruction, result.images)
-    warnings = _write_model(directory, result, result.metric.reconstruction, colors)
-    affine = upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
-    write_affine(directory.path / "affine.ply", affine, point_colors(affine, result.images))
+    warnings: list[str] = []
+    metric, images = result.metric.reconstruction, result.images
+    projective, calibration = result.projective, result.calibration
+    grey = np.full((len(metric.X), 3), 128, dtype=np.uint8)
+    colors = made("the colours of points.ply", lambda: point_colors(metric, images), warnings, grey)
+    points, shown = metric.X[metric.valid, :3] / metric.X[metric.valid, 3:], colors[metric.valid]
+    path = directory.path / "points.ply"
+    made(path.name, lambda: write_point_cloud(path, points, shown), warnings, None)
+    _write_model(directory, result, colors, warnings)
+    affine: Reconstruction | None = None
+    if projective is not None and calibration is not None:
+        plane = calibration.plane_at_infinity
+        affine = made("the affine points", lambda: upgrade_to_affine(projective, plane), warnings, None)
+    if affine is not None:
+        place, upgraded = directory.path / "affine.ply", affine
+        made(
+            place.name,
+            lambda: write_affine(place, upgraded, point_colors(upgraded, images)),
+            warnings,
+            None,
+        )
     return colors, affine, warnings + _write_surface(directory, result, max_mb, threads)
 
 
@@ -226,30 +266,29 @@ def _failure_warnings(result: RunResult) -> list[str]:
     return failed_checks
 
 
-def _write_model(
-    directory: RunDirectory, result: RunResult, reconstruction: Reconstruction, colors: U8
-) -> list[str]:
-    """Write ``sparse/0``, ``points.ply`` and ``cameras.json`` in original pixels; return warnings."""
-    warnings: list[str] = []
-    skewed = write_colmap_model(
-        directory.path / "sparse" / "0",
-        reconstruction,
-        [image.name for image in result.images],
-        colors=colors,
-        groups=result.groups,
-        scales=np.array([1 / image.scale for image in result.images]),
-        original_sizes=np.array([image.original_size for image in result.images]),
-    )
-    if skewed:
+def _write_model(directory: RunDirectory, result: RunResult, colors: U8, warnings: list[str]) -> None:
+    """Write ``sparse/0`` in original pixels, all of it or nothing; add warnings."""
+    images, metric = result.images, result.metric
+    assert metric is not None
+
+    def write() -> int:
+        return write_colmap_model(
+            directory.path / "sparse" / "0",
+            metric.reconstruction,
+            [image.name for image in images],
+            colors=colors,
+            groups=result.groups,
+            scales=np.array([1 / image.scale for image in images]),
+            original_sizes=np.array([image.original_size for image in images]),
+        )
+
+    if skewed := made("sparse/0", write, warnings, -1):
         directory.remove(COLMAP_FILES)
+    if skewed > 0:
         warnings.append(
             f"sparse/0 is not written: COLMAP has no camera model with skew, but {skewed} of "
-            f"{counted(int(reconstruction.registered.sum()), 'camera')} have skew; see cameras.json"
+            f"{counted(int(metric.reconstruction.registered.sum()), 'camera')} have skew; see cameras.json"
         )
-    X = reconstruction.X[reconstruction.valid]
-    write_point_cloud(directory.path / "points.ply", X[:, :3] / X[:, 3:], colors[reconstruction.valid])
-    write_json(directory.path / "cameras.json", cameras_table(result.cameras))
-    return warnings
 
 
 def _run_facts(run: Run, until: str) -> dict[str, Any]:

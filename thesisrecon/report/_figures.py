@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.camera_matrix import camera_centre, decompose_camera
+from thesisrecon.geometry.camera_matrix import camera_centre, decompose_camera, finite_cameras
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Reconstruction, TwoView
 from thesisrecon.sparse_model import SparseModel
@@ -30,6 +30,8 @@ _PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1
 _REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
 MAX_MATRIX, MAX_CELLS = 200, 100
 """Largest number of views in the matrix of pairs, and cells per side for more."""
+_FAR = 50.0
+"""Distance of an affine camera that is drawn as one at infinity, in radii of 80 % of the points."""
 MAX_PYRAMIDS = 250
 """Cameras that are drawn as pyramids; of more, these are evenly spread."""
 _MAX_ANNOTATED = 14
@@ -49,8 +51,13 @@ class Scene:
 
 
 def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS) -> Scene | None:
-    """3D view of a metric or affine reconstruction, thinned and without far points; None without a camera."""
-    views = np.flatnonzero(reconstruction.registered).astype(np.int64)
+    """3D view of a metric or affine reconstruction, thinned and without far points; None without a camera.
+
+    Affine cameras at infinity, or nearly so, are left out.
+    """
+    views = np.flatnonzero(reconstruction.registered & finite_cameras(reconstruction.P)).astype(np.int64)
+    if reconstruction.stratum != "metric":
+        views = views[_near(reconstruction, views)]
     if len(views) == 0:
         return None
     parts = [decompose_camera(reconstruction.P[i]) for i in views]
@@ -103,6 +110,15 @@ def upright_rotation(rotations: F64) -> F64:
         ahead = -y_axes[0] + (y_axes[0] @ up) * up
     ahead = ahead / np.linalg.norm(ahead)
     return np.stack([np.cross(ahead, up), ahead, up])
+
+
+def _near(reconstruction: Reconstruction, views: I64) -> B8:
+    """Whether the centres of these cameras are near the points, relative to their spread."""
+    X = reconstruction.X[reconstruction.valid & np.isfinite(reconstruction.X).all(axis=1), :3]
+    middle = np.median(X, axis=0) if len(X) else np.zeros(3)
+    radius = np.quantile(np.linalg.norm(X - middle, axis=1), 0.8) if len(X) else np.inf
+    centres = dehomogenize(camera_centre(reconstruction.P[views]))
+    return np.asarray(np.linalg.norm(centres - middle, axis=1) <= _FAR * radius)
 
 
 def _kept_points(X: F64, valid: B8, max_points: int) -> I64:

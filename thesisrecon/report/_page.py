@@ -14,14 +14,15 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from thesisrecon.arrays import F64
-from thesisrecon.records import StageReport, TwoView
+from thesisrecon.arrays import F64, U8
+from thesisrecon.errors import made
+from thesisrecon.records import Reconstruction, StageReport, TwoView
 from thesisrecon.report._assessment import (
     assess,
     count_of,
@@ -56,6 +57,7 @@ from thesisrecon.report._drawing import (
 from thesisrecon.report._figures import (
     MAX_POINTS,
     MAX_PYRAMIDS,
+    Figure,
     build_scene,
     histograms,
     pair_matrix_figure,
@@ -78,6 +80,7 @@ _INTRINSICS = {
     "k2": "k2",
     "k3": "k3",
 }
+T = TypeVar("T")
 _ALWAYS_SHOWN = ("focal_px", "principal_x_px", "principal_y_px", "k1")
 
 
@@ -155,24 +158,49 @@ def _embedded(rgb: NDArray[np.uint8]) -> str:
     return embed_jpeg(picture, quality=_FRAME_QUALITY).uri
 
 
-def render_report(data: ReportData) -> str:
-    """Render the page of a run; the same data gives the same text."""
+class _Pictures:
+    """Makes the pictures of a page, each on its own; ``warnings`` are about those that failed."""
+
+    def __init__(self, warnings: list[str]) -> None:
+        self.warnings = warnings
+
+    def make(self, what: str, draw: Callable[..., T], *given: Any, **options: Any) -> T | None:
+        return made(f"{what} in report.html", lambda: draw(*given, **options), self.warnings, None)
+
+
+def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
+    """Render the page of a run; the same data gives the same text.
+
+    Pictures that cannot be drawn are left out and added to ``warnings``.
+    """
+    pictures = _Pictures([] if warnings is None else warnings)
     best = data.best_reconstruction
     working = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
     everything = np.concatenate([np.zeros(0), *distances])
     overall = summarize_distances(everything)
-    limit_px, bars = histograms(distances, width=_HISTOGRAM_WIDTH, height=_HISTOGRAM_HEIGHT)
-    figures, shown = _figures(data)
+    size = {"width": _HISTOGRAM_WIDTH, "height": _HISTOGRAM_HEIGHT}
+    drawn = pictures.make("the histograms of the residuals", histograms, distances, **size)
+    limit_px, bars = drawn or (1.0, [""] * len(distances))
+    figures, shown, omitted = _figures(data, pictures)
     model = None
     if data.model is not None and len(data.model.faces) and data.metric is not None:
         names = [image.name for image in data.images]
-        model = viewer_data(data.model, data.metric.reconstruction, names)
-    depths = [(i, data.depth_maps[i]) for i in pictured(len(data.images)) if i in data.depth_maps]
+        model = pictures.make("the model", viewer_data, data.model, data.metric.reconstruction, names)
     side = depth_side(_sharing(len(data.depth_maps)))
+    depths = [
+        (i + 1, data.images[i].name, picture)
+        for i in pictured(len(data.images))
+        if i in data.depth_maps
+        and (picture := pictures.make("a depth map", draw_depth, data.depth_maps[i], side=side))
+    ]
+    held_out = None
+    if data.held_out is not None:
+        held_out = pictures.make("the held-out image", draw_held_out, data.held_out)
+    drawn_pairs = _drawn_pairs(data, pictures)
     figure_scripts, drawing = figure_content(figures)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
-    cards = _cards(data, distances, bars)
+    cards = _cards(data, distances, bars, pictures)
     return render_page(
         page_resource("template.html.j2"),
         [*figure_scripts, *model_scripts],
@@ -188,20 +216,22 @@ def render_report(data: ReportData) -> str:
         limit_px=limit_px,
         model=model,
         model_text=model_text(data.model) if data.model is not None else "",
-        depths=[(i + 1, data.images[i].name, draw_depth(depth, side=side)) for i, depth in depths],
-        held_out=draw_held_out(data.held_out) if data.held_out is not None else None,
+        depths=depths,
+        held_out=held_out,
         scale=SCALE,
         difference_limit=round(DIFFERENCE_LIMIT),
         **drawing,
         shown_points=shown,
+        omitted=omitted,
         most_points=MAX_POINTS,
         most_pyramids=MAX_PYRAMIDS,
         all_points=int(best.valid.sum()) if best is not None else 0,
         pair_selection=pair_selection_text(data),
-        drawn_pairs=_drawn_pairs(data),
+        drawn_pairs=drawn_pairs,
         listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:_MAX_LISTED_PAIRS],
         stages=_stages(data.reports),
-        warnings=_warnings(data),
+        warnings=_warnings(data, pictures.warnings),
+        limit_known=drawn is not None,
         self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
         summary_text=json.dumps(_shortened(data.summary), indent=2, ensure_ascii=False, default=str),
         model_scripts=model_scripts,
@@ -224,26 +254,42 @@ def _shortened(summary: Mapping[str, object]) -> dict[str, object]:
     }
 
 
-def _figures(data: ReportData) -> tuple[dict[str, Any], int]:
-    """The figures by element id (not "scene", which plotly.js uses), and the number of points in 3D."""
+def _figures(data: ReportData, pictures: _Pictures) -> tuple[dict[str, Any], int, int]:
+    """The figures by element id (not "scene", which plotly.js uses), the points in 3D, the cameras left out.
+
+    The cameras that are left out are those of the affine figure.
+    """
     names = [image.name for image in data.images]
     figures: dict[str, Any] = {}
-    scene = build_scene(data.metric.reconstruction) if data.metric is not None else None
-    if scene is not None:
-        figures["scene-figure"] = scene_figure(scene, names, data.colors)
-    if scene is not None and data.affine is not None:
-        affine, colors = (
-            build_scene(data.affine, max_points=_AFFINE_POINTS),
-            point_colors(data.affine, data.images),
+    points = omitted = 0
+
+    def draw_scene(best: Reconstruction, colors: U8 | None, most: int) -> tuple[Figure | None, int, int]:
+        scene, cameras = build_scene(best, max_points=most), int(best.registered.sum())
+        if scene is None:
+            return None, 0, cameras
+        return scene_figure(scene, names, colors), len(scene.points), cameras - len(scene.views)
+
+    if data.metric is not None:
+        best = data.metric.reconstruction
+        drawn = pictures.make("the figure of cameras and points", draw_scene, best, data.colors, MAX_POINTS)
+        if drawn is not None:
+            figures["scene-figure"], points, _ = drawn
+    if data.metric is not None and (affine := data.affine) is not None:
+        drawn = pictures.make(
+            "the figure of the affine stratum",
+            lambda: draw_scene(affine, point_colors(affine, data.images), _AFFINE_POINTS),
         )
-        if affine is not None:
-            figures["affine-figure"] = scene_figure(affine, names, colors)
+        if drawn is not None:
+            figures["affine-figure"], _, omitted = drawn
     if data.pairs:
-        figures["matrix-figure"] = pair_matrix_figure(data.pairs, names)
-    return figures, len(scene.points) if scene is not None else 0
+        matrix = pictures.make("the matrix of pairs", pair_matrix_figure, data.pairs, names)
+        figures["matrix-figure"] = matrix
+    return {name: figure for name, figure in figures.items() if figure is not None}, points, omitted
 
 
-def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict[str, Any]]:
+def _cards(
+    data: ReportData, distances: list[F64], bars: list[str], pictures: _Pictures
+) -> list[dict[str, Any]]:
     """Each image: its state, the reason, its residuals if it has a camera, and perhaps its picture."""
     cards, intrinsics = [], data.original_intrinsics
     shown = pictured(len(data.images))
@@ -259,7 +305,9 @@ def _cards(data: ReportData, distances: list[F64], bars: list[str]) -> list[dict
             "level": level,
             "reason": reason,
             "size": f"{width} × {height} px{processed}{masked}",
-            "picture": thumbnail(image, _sharing(len(data.images))) if i in shown else None,
+            "picture": pictures.make("a thumbnail", thumbnail, image, _sharing(len(data.images)))
+            if i in shown
+            else None,
             "residuals": summarize_distances(distances[i]),
             "bars": bars[i],
             "intrinsics": {name: plus_minus(v.value, v.std) for name, v in intrinsics[i].items()},
@@ -285,7 +333,7 @@ def _state(data: ReportData, i: int) -> tuple[str, str, str]:
     return "not registered", "bad", best.reasons[i] or "no reason was recorded"
 
 
-def _drawn_pairs(data: ReportData) -> list[dict[str, Any]]:
+def _drawn_pairs(data: ReportData, pictures: _Pictures) -> list[dict[str, Any]]:
     """Draw the accepted pairs with most and fewest verified matches, else the best rejected one."""
     accepted = [pair for pair in data.pairs if pair.accepted]
     drawable = accepted or [pair for pair in data.pairs if pair.inliers]
@@ -297,8 +345,8 @@ def _drawn_pairs(data: ReportData) -> list[dict[str, Any]]:
     for title, pair in titles:
         first, second = data.images[pair.i], data.images[pair.j]
         sides = {"names": (first.name, second.name), "numbers": (pair.i + 1, pair.j + 1)}
-        picture = draw_pair(pair, first, second)
-        drawn.append({"title": title, **sides, "facts": _pair_text(pair), "picture": picture})
+        if picture := pictures.make(f"the picture of the {title.lower()}", draw_pair, pair, first, second):
+            drawn.append({"title": title, **sides, "facts": _pair_text(pair), "picture": picture})
     return drawn
 
 
@@ -314,11 +362,11 @@ def _pair_text(pair: TwoView) -> str:
     return words
 
 
-def _warnings(data: ReportData) -> list[tuple[str, str]]:
+def _warnings(data: ReportData, of_page: Sequence[str]) -> list[tuple[str, str]]:
     """Return (stage, sentence) of every warning; those of the whole run are only in its summary."""
     found = [(report.stage, text) for report in data.reports for text in report.warnings]
     of_run, known = data.summary.get("warnings"), {text for _, text in found}
-    rest = of_run if isinstance(of_run, list | tuple) else ()
+    rest = [*(of_run if isinstance(of_run, list | tuple) else ()), *of_page]
     return found + [("run", str(text)) for text in rest if str(text) not in known]
 
 

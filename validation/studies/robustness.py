@@ -29,7 +29,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from thesisrecon.cli.main import run_command
-from thesisrecon.errors import REMEDIES
+from thesisrecon.errors import NOT_MADE, REMEDIES
 from thesisrecon.runtime._signals import CODES
 from validation.scenes.real import ROOT
 from validation.studies.runner import Part, Rows, report_progress, text_table
@@ -324,8 +324,10 @@ class Refusal:
 
     @property
     def wrong(self) -> str:
+        # Once cameras and summary are there, the run ends well, with warnings.
+        complete = self.code == 0 and NOT_MADE in self.said
         found = {
-            **_faults_of_end(self, REFUSED),
+            **({} if complete else _faults_of_end(self, REFUSED)),
             "names no place": " cannot be written: " not in self.said,
             "does not say what to do": not any(words in self.said for words in REMEDIES.values()),
             f"strange files: {', '.join(self.strange)}": bool(self.strange),
@@ -367,10 +369,11 @@ class SmallRuns:
         self.options = ["--max-size", str(size_px), "--until", until, "--threads", "1", *SMALL_MODEL]
 
     def run(self, out: Path) -> tuple[int, str]:
-        said = io.StringIO()
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        said, shown = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(shown):
             code = run_command(["reconstruct", str(self.images), "-o", str(out), *self.options])
-        return code, said.getvalue()
+        warnings = [line for line in shown.getvalue().splitlines() if NOT_MADE in line]
+        return code, said.getvalue() + "\n".join(warnings)
 
     def whole(self, out: Path) -> dict[str, bytes]:
         code, said = self.run(out)
