@@ -3,12 +3,13 @@
 import gc
 import logging
 import os
+import sys
 
 import pytest
 from hypothesis import settings
 
 from thesisrecon.cli.main import run_command
-from thesisrecon.errors import STRICT_VARIABLE
+from thesisrecon.errors import STRICT_VARIABLE, made
 from thesisrecon.runtime._run_folder import bytes_from_record
 
 # The same examples on every machine: whether a test passes is no matter of chance.
@@ -55,6 +56,27 @@ def refuses(error, words, call, *arguments, **options):
     """Require that a call raises the error with these words."""
     with pytest.raises(error, match=words):
         call(*arguments, **options)
+
+
+def before_each_output(monkeypatch, call):
+    """Call ``call(what)`` before each figure, page or file is made, in all modules."""
+
+    def tried(what, make, *rest):
+        return made(what, lambda: (call(what), make())[1], *rest)
+
+    for module in list(sys.modules.values()):
+        if getattr(module, "made", None) is made and not module.__name__.startswith("tests"):
+            monkeypatch.setattr(module, "made", tried)
+
+
+def failing(what, error):
+    """A function for :func:`before_each_output` that raises the error before this output."""
+
+    def call(name):
+        if name == what:
+            raise error
+
+    return call
 
 
 def same_pairs(one, other):

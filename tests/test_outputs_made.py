@@ -3,12 +3,12 @@
 import errno
 import json
 import re
-import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.conftest import refuses
+from tests.conftest import before_each_output, failing, refuses
 from tests.fake_stages import fake_config, photographs, read
 from thesisrecon import errors
 from thesisrecon.cli.main import run_command
@@ -17,6 +17,7 @@ from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.surface.model import SurfaceModel
 from validation.studies.robustness import disk_ends
 
+COURTYARD = Path(__file__).parents[1] / "fixtures" / "courtyard"
 ERRORS = {
     "error": ValueError("the left 3x3 part of P is singular"),
     "memory": MemoryError(),
@@ -28,17 +29,6 @@ RECORDS = {"cameras.json", "summary.json", "config.toml", "run.json"}
 @pytest.fixture(autouse=True)
 def _lenient(monkeypatch):
     monkeypatch.delenv(errors.STRICT_VARIABLE)
-
-
-def instead(monkeypatch, make):
-    """Call ``make(what)`` before each output is made, in all modules."""
-
-    def tried(what, original, *rest):
-        return made(what, lambda: (make(what), original())[1], *rest)
-
-    for module in list(sys.modules.values()):
-        if getattr(module, "made", None) is made and module.__name__.startswith("thesisrecon."):
-            monkeypatch.setattr(module, "made", tried)
 
 
 def run(out):
@@ -59,7 +49,7 @@ def whole(tmp_path_factory):
     """The names of all outputs that a run makes, its files and the elements of its page."""
     out, names = tmp_path_factory.mktemp("whole") / "out", []
     with pytest.MonkeyPatch.context() as patch:
-        instead(patch, names.append)
+        before_each_output(patch, names.append)
         result = run(out)
     assert not [text for text in result.warnings if NOT_MADE in text]
     return list(dict.fromkeys(names)), files(out), elements(out)
@@ -71,14 +61,6 @@ def elements(out):
     return re.findall(r'<section id="(\w+)"|id="(\w+-figure)"|(<img)', text)
 
 
-def failing(what, error):
-    def make(name):
-        if name == what:
-            raise error
-
-    return make
-
-
 @pytest.mark.parametrize("error", ERRORS)
 def test_each_output_that_fails_costs_one_warning(whole, tmp_path, monkeypatch, error):
     names, there, drawn = whole
@@ -88,7 +70,7 @@ def test_each_output_that_fails_costs_one_warning(whole, tmp_path, monkeypatch, 
     for k, what in enumerate(names):
         out = tmp_path / str(k)
         with monkeypatch.context() as patch:
-            instead(patch, failing(what, ERRORS[error]))
+            before_each_output(patch, failing(what, ERRORS[error]))
             result = run(out)
         (warning,) = [text for text in result.warnings if text.startswith(NOT_MADE)]
         assert warning.startswith(f"{NOT_MADE}: {what} (")
@@ -117,7 +99,7 @@ def test_several_outputs_that_fail_are_all_reported(whole, tmp_path, monkeypatch
     def make(_):
         raise MemoryError
 
-    instead(monkeypatch, make)
+    before_each_output(monkeypatch, make)
     result = run(tmp_path / "out")
     assert len(result.cameras) == 4
     assert files(tmp_path / "out") >= RECORDS
@@ -128,7 +110,7 @@ def test_several_outputs_that_fail_are_all_reported(whole, tmp_path, monkeypatch
 def test_an_interrupt_ends_the_run(whole, tmp_path, monkeypatch):
     for k, what in enumerate(whole[0]):
         with monkeypatch.context() as patch:
-            instead(patch, failing(what, KeyboardInterrupt()))
+            before_each_output(patch, failing(what, KeyboardInterrupt()))
             with pytest.raises(KeyboardInterrupt):
                 run(tmp_path / str(k))
 
@@ -161,12 +143,55 @@ def test_the_command_prints_the_warning_and_ends_well(tmp_path, monkeypatch, cap
     (tmp_path / "in").mkdir()
     for image in photographs(2):
         Image.fromarray(image.rgb).save(tmp_path / "in" / image.name)
-    instead(monkeypatch, failing("report.html", ERRORS["disk"]))
+    before_each_output(monkeypatch, failing("report.html", ERRORS["disk"]))
     assert (
         run_command(["reconstruct", f"{tmp_path / 'in'}", "-o", f"{tmp_path / 'out'}", "--until", "features"])
         == 0
     )
     assert f"warning: {NOT_MADE}: report.html (OSError" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory):
+    """Commands that write files beside those of a run, and the names of what each makes."""
+    place = tmp_path_factory.mktemp("commands")
+    frames = "--frames 2 --threads 1 --overwrite"
+    pair = " ".join(str(COURTYARD / "images" / f"000{k}.jpg") for k in (6, 7))
+    model = COURTYARD / "cameras.json"
+    run(place / "run")
+    lines = {
+        "render": f"render {place / 'run'} --size 40x30 {frames} -o {place / 'render'}",
+        "interpolate": f"interpolate {pair} --max-size 256 {frames} -o {place / 'interpolate'}",
+        "compare": f"compare {model} {model} --json {place / 'c.json'} --page {place / 'c.html'} --overwrite",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        names = {}
+        for command, line in lines.items():
+            before_each_output(patch, names.setdefault(command, []).append)
+            assert run_command(line.split()) == 0
+            patch.undo()
+    return {command: (line.split(), names[command]) for command, line in lines.items()}
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("command", ["render", "interpolate", "compare"])
+def test_other_commands_print_a_warning_and_end_well(commands, command, error, monkeypatch, capsys):
+    line, names = commands[command]
+    assert names
+    for what in names:
+        capsys.readouterr()
+        with monkeypatch.context() as patch:
+            before_each_output(patch, failing(what, ERRORS[error]))
+            assert run_command(line) == 0
+        said = capsys.readouterr().out
+        assert said.count(f"warning: {NOT_MADE}: {what} (") == said.count("warning:") == 1
+        if command != "compare":
+            listed = read(Path(line[-1]) / "frames.json")
+            assert len(listed["warnings"]) == 1
+            assert listed["files"][what] is None
+            assert all(digest for name, digest in listed["files"].items() if name != what)
+            assert run_command(line) == 0
+            assert "warnings" not in read(Path(line[-1]) / "frames.json")
 
 
 def test_the_refusal_of_a_foreign_file_is_no_warning():

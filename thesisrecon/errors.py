@@ -196,7 +196,7 @@ def made(what: str, make: Callable[[], T], warnings: list[str], otherwise: T) ->
         said = " ".join(str(error).split())
         reason = said if isinstance(error, OutputError) else f"{type(error).__name__}: {said}".rstrip(": ")
         text = (
-            f"output-not-made: {what} ({reason}); all else is complete, and the same command tries it again"
+            f"output-not-made: {what} ({reason}); other results are kept, and the same command tries it again"
         )
         if not any(known.split(" (")[0] == text.split(" (")[0] for known in warnings):
             warnings.append(text)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from thesisrecon.cli.common import Overwrite, cap_threads, parse_folder
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, made
 from thesisrecon.io._files import printable
 
 _MOST_ROWS = 60
@@ -47,8 +47,11 @@ def compare(
     if len(cameras) > _MOST_ROWS + 1:
         lines.append(f"and {len(cameras) - 1 - _MOST_ROWS} more cameras; --json writes all")
     files = {} if json is None else {json: json_text({"a": str(a), "b": str(b), **found.as_table()})}
+    warnings: list[str] = []
     if page is not None:
-        files |= {page: comparison_page(found, str(a), str(b))}
+        html = made(str(page), lambda: comparison_page(found, str(a), str(b)), warnings, "")
+        files |= {page: html} if html else {}
+    lines += [f"warning: {warning}" for warning in warnings]
     write_new(files, overwrite=overwrite)
     typer.echo("\n".join(printable(line) for line in lines))
 

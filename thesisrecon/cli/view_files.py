@@ -16,7 +16,7 @@ import numpy as np
 from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import UsageError, counted
+from thesisrecon.errors import UsageError, counted, made
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io._images import read_image
@@ -170,11 +170,11 @@ def render_run(
             # The last step is the animation.
             report("views", done, len(views) + 1)
 
-        with _described(outputs, path, {**given, "frames": listed}):
+        with _described(outputs, path, {**given, "frames": listed}) as warnings:
             Workers(threads).run(draw, [(k,) for k in range(len(views))], finished)
-            animation = _animate(folder, path, len(views))
-        finished(len(views), animation)
-    return _written(folder, len(views), size, animation)
+            _animate(folder, path, len(views), warnings)
+        finished(len(views), None)
+    return _written(folder, path, len(views), size, warnings)
 
 
 def interpolate_images(
@@ -203,18 +203,22 @@ def interpolate_images(
         listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(sequence.frame_metadata)]
         drawn = []
         content = {"method": method, **sequence.metadata, "frames": listed}
-        with _described(outputs, method, content):
+        with _described(outputs, method, content) as warnings:
             for k, caption in enumerate(sequence.captions):
                 rgb = sequence.draw(k, threads)
                 write_frame(folder, k + 1, rgb)
                 drawn.append((caption, rgb))
                 report("views", k + 1, frames + 2)
-            animation = _animate(folder, method, frames, milliseconds=_FRAME_MS)
+            _animate(folder, method, frames, warnings, milliseconds=_FRAME_MS)
             report("views", frames + 1, frames + 2)
             title = "Between " + " and ".join(image.name for image in images)
-            write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
+
+            def write_strip() -> None:
+                write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
+
+            made(STRIP, write_strip, warnings, None)
         report("views", frames + 2, frames + 2)
-    return _written(folder, frames, rgb.shape[1::-1], animation)
+    return _written(folder, method, frames, rgb.shape[1::-1], warnings)
 
 
 @contextmanager
@@ -247,14 +251,20 @@ def _file_names(name: str, frames: int) -> list[str]:
 
 
 @contextmanager
-def _described(outputs: OutputFolder, name: str, content: dict[str, Any]) -> Iterator[None]:
-    """Remove the files of an earlier command and write ``frames.json``, at the end with digests."""
+def _described(outputs: OutputFolder, name: str, content: dict[str, Any]) -> Iterator[list[str]]:
+    """Remove the files of an earlier command and write ``frames.json``, at the end with digests.
+
+    Yields the list of warnings about files that could not be made.
+    """
     names = _file_names(name, len(content["frames"]))
     outputs.remove([Path(old) for old in outputs.digests if old not in (FRAMES, *names)])
     # Written first, too, so that the files of an interrupted command are known.
     write_json(outputs.path / FRAMES, {**content, "files": dict.fromkeys(names)})
-    yield
-    write_json(outputs.path / FRAMES, {**content, "files": {name: outputs.written[name] for name in names}})
+    warnings: list[str] = []
+    yield warnings
+    noted = {"warnings": warnings} if warnings else {}
+    files = {name: outputs.written.get(name) for name in names}
+    write_json(outputs.path / FRAMES, {**content, **noted, "files": files})
 
 
 def _check_images(paths: Sequence[Path]) -> None:
@@ -268,14 +278,18 @@ def _check_images(paths: Sequence[Path]) -> None:
             raise UsageError(f"{first} is given twice; give different images")
 
 
-def _animate(folder: Path, name: str, frames: int, **options: int) -> Path:
-    files = [folder / frame_name(k + 1) for k in range(frames)]
-    return write_animation(folder / f"{name}{animation_suffix()}", files, **options)
+def _animate(folder: Path, name: str, frames: int, warnings: list[str], **options: int) -> None:
+    files, path = [folder / frame_name(k + 1) for k in range(frames)], folder / f"{name}{animation_suffix()}"
+    made(path.name, lambda: write_animation(path, files, **options), warnings, path)
 
 
-def _written(folder: Path, frames: int, size: Sequence[int], animation: Path) -> str:
-    files = f"{counted(frames, 'frame')} of {size[0]} x {size[1]} px and {animation.name}"
-    return f"{files} written to {printable(str(folder))}"
+def _written(folder: Path, name: str, frames: int, size: Sequence[int], warnings: list[str]) -> str:
+    files = f"{counted(frames, 'frame')} of {size[0]} x {size[1]} px"
+    animation = f"{name}{animation_suffix()}"
+    lost = any(f": {animation} (" in warning for warning in warnings)
+    files += "" if lost else f" and {animation}"
+    lines = [f"{files} written to {folder}", *(f"warning: {warning}" for warning in warnings)]
+    return "\n".join(map(printable, lines))
 
 
 def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:

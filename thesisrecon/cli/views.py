@@ -129,4 +129,5 @@ def interpolate(
             overwrite=overwrite,
         )
     typer.echo(written)
-    typer.echo(f"page: {printable(str(folder / STRIP))}")
+    if (page := folder / STRIP).is_file():
+        typer.echo(f"page: {printable(str(page))}")

@@ -182,9 +182,8 @@ class OutputFolder:
         self.written[name] = digest
 
     def forget(self, path: Path) -> None:
-        """Forget a file whose writing failed, unless an older one is there."""
-        if not os.path.lexists(path):
-            self.written.pop(self.name_of(path), None)
+        """Forget a file whose writing failed."""
+        self.written.pop(self.name_of(path), None)
 
     def make_parents(self, path: Path) -> None:
         """Create the folders of a file below this one, which is never created again."""

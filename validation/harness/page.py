@@ -6,13 +6,14 @@ import base64
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import PIL.Image
 
 from thesisrecon import __version__
-from thesisrecon.errors import counted
+from thesisrecon.errors import counted, made
 from thesisrecon.io._files import write_text
 from thesisrecon.report._page import plotly_script, render_page
 from validation.harness.overview import cost_ratio, overview
@@ -48,7 +49,9 @@ def write_pages(
     names = {
         key_of(stage, m): m.name for (stage, _), (judgement, _) in judged.items() for m in judgement.metrics
     }
-    for scene in scenes:
+    warnings: list[str] = []
+
+    def write_scene(scene: str) -> None:
         rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         sections = [
             _section(stages[name], rows, names) | _figures(options.place(name, scene), name, judgement)
@@ -68,6 +71,9 @@ def write_pages(
             failures=failures,
             environment=(),
         )
+
+    for scene in scenes:
+        made(f"scene-{slug(scene)}.html", partial(write_scene, scene), warnings, None)
     whole = [_section(stages[name], results.rows, names) for name in options.stages]
     write_page(
         options.out / "index.html",
@@ -80,7 +86,7 @@ def write_pages(
         links=links,
         verdict=_verdict(results.rows, results.missing),
         several=True,
-        failures=list(results.failures.items()),
+        failures=[*results.failures.items(), *(("page", text) for text in warnings)],
         environment=list(results.environment.items()),
     )
     return options.out / "index.html"

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import before_each_output, failing
 from tests.validation.harness.toy_stages import STAGES, WAYS
+from thesisrecon.errors import STRICT_VARIABLE
 from validation.command import main
 from validation.harness.gates import Gate, read_gates
 from validation.harness.page import write_pages
@@ -145,6 +147,17 @@ def test_the_pages_escape_their_input(ran):
     # Without plotly's own script.
     markup = "".join(html.split("<script>")[0] for html in (text, page))
     assert not re.search(r'(?:src|href)="(?!data:|#|scene-|index)', markup)
+
+
+@pytest.mark.parametrize("error", [ValueError("no figure"), MemoryError(), OSError(28, "No space left")])
+def test_a_page_of_a_scene_that_fails_is_listed_on_the_first_page(ran, tmp_path, monkeypatch, error):
+    options, judged, _ = ran
+    options = dataclasses.replace(options, out=tmp_path)
+    monkeypatch.delenv(STRICT_VARIABLE)
+    before_each_output(monkeypatch, failing("scene-yard.html", error))
+    index = write_pages(options, STAGES, judged, collect(options, judged, GATES))
+    assert "output-not-made: scene-yard.html" in index.read_text(encoding="utf-8")
+    assert not (tmp_path / "scene-yard.html").exists()
 
 
 def test_no_gate_without_its_reason(tmp_path):
