@@ -7,6 +7,8 @@ from tests.metric.test_population import refine
 from tests.metric.verdict_scenes import fisheye_rig, rolling_video, stabilised_arc
 from tests.synthetic import make_scene
 from thesisrecon import reconstruct_from_tracks
+from validation.scenes.moving import Lens, drive, hand_held
+from validation.studies.moving_cameras import measure
 
 MAX_SIGMAS = 3.0
 
@@ -53,3 +55,19 @@ def test_images_zoomed_one_by_one_are_trusted_with_their_own_focal_lengths(seed)
     assert np.ptp(focal) > 0.3 * focal.min()
     assert np.abs(focal / scene.K[:, 0, 0] - 1.0).max() < 0.005
     assert result.metric.trusted
+
+
+@pytest.mark.parametrize("lens", [Lens(), Lens(k1=0.015), Lens(aspect=1.005)])
+def test_the_interval_of_a_car_that_turns_contains_its_focal_length(lens):
+    trusted, error, std = measure(drive(0, lens))
+    assert trusted
+    assert std < 0.01
+    assert abs(error) < MAX_SIGMAS * std
+
+
+def test_a_rolling_shutter_widens_the_interval_of_a_video_by_its_effect():
+    straight, rolling = (measure(hand_held(1, Lens(readout=readout))) for readout in (0.0, 0.05))
+    assert straight[0]
+    assert straight[2] < 0.01
+    assert abs(rolling[1]) > 0.005
+    assert abs(rolling[1]) < 1.5 * rolling[2]

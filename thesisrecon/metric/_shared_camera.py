@@ -17,11 +17,19 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._camera_model import MAX_CHANGE
-from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, SKEW, WIDTH, MetricEstimate
+from thesisrecon.metric._model import (
+    ASPECT,
+    CENTRE,
+    FOCAL,
+    SKEW,
+    WIDTH,
+    MetricEstimate,
+    reproject_observations,
+)
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
 from thesisrecon.numerics._block_scatter import BlockScatter
 from thesisrecon.numerics._metric_bundle import MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics._metric_kernels import MetricCameras
+from thesisrecon.numerics._metric_kernels import MetricCameras, move_poses
 from thesisrecon.numerics._observations import Observations
 
 CENTRE_STD = 0.1
@@ -36,6 +44,11 @@ OWN_STD = 0.01
 FEW_VIEWS = 6
 """Up to this number of views the intervals contain the effect of such deviations, as for critical motions."""
 FALSE_ALARM_RATE = 1e-3
+MAX_VIDEO_STEP = 0.1
+"""Median displacement of points between consecutive images of a video, in long sides: a readout is a part of
+this time, and meaningless between photographs."""
+READOUT_STEP, SMALL = 0.02, 1e-3
+"""Steps of numerical derivatives, in times between consecutive images."""
 STD_FLOOR = 2e-3
 """Floor of the relative standard deviation of an own focal."""
 MIN_FOCAL_DIFFERENCE = 0.01
@@ -120,22 +133,75 @@ def _adjust_per_view(
 def focal_change_by_richer_models(
     model: MetricEstimate, adjustment: MetricAdjustment, *, critical: bool
 ) -> float:
-    """Largest relative change of a focal length if images have intrinsics of their own within ``OWN_STD``.
+    """Largest relative change of a focal length by richer camera models.
 
-    Of more than ``FEW_VIEWS`` images only a shared focal length after a ``critical`` motion needs this test;
-    else the change is 0.
+    If images have intrinsics of their own within ``OWN_STD``: of up to ``FEW_VIEWS`` images, and of a shared
+    focal length after a ``critical`` motion or if the images show own aspect ratios and skews, as unordered
+    images with a rolling shutter do. If the images are a video that shows a rolling shutter: by its readout.
     """
     assert model.cameras.shared is not None
     focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
-    is_shared = len(np.unique(focal)) < len(focal)
-    if len(focal) > FEW_VIEWS and not (critical and is_shared):
+    is_shared, few = len(np.unique(focal)) < len(focal), len(focal) <= FEW_VIEWS
+    if not (is_shared or few):
         return 0.0
     model = _runs_of_views(model)
-    before = _adjust_per_view(model, adjustment, ()).cameras.intrinsics[:, FOCAL]
-    after = [
-        _adjust_per_view(model, adjustment, columns, own_std=OWN_STD) for columns in (CENTRE, (ASPECT, SKEW))
-    ]
-    return max(float(np.abs(np.log(a.cameras.intrinsics[:, FOCAL] / before)).max()) for a in after)
+    before = _adjust_per_view(model, adjustment, ())
+    after = [_adjust_per_view(model, adjustment, (ASPECT, SKEW), own_std=OWN_STD)]
+    if few or critical:
+        after.append(_adjust_per_view(model, adjustment, CENTRE, own_std=OWN_STD))
+    elif not _beyond_chance(before.cost - after[0].cost, 2 * (len(focal) - 1)):
+        after = []
+    after += _adjust_rolling_shutter(model, adjustment, before)
+    focals = np.log([a.cameras.intrinsics[:, FOCAL] for a in (before, *after)])
+    return float(np.abs(focals - focals[0]).max())
+
+
+def _adjust_rolling_shutter(
+    model: MetricEstimate, adjustment: MetricAdjustment, before: MetricBundleResult
+) -> list[MetricBundleResult]:
+    """The adjustment with the readout time of a rolling shutter as one more unknown; empty without evidence.
+
+    A point in row y was seen when its camera had moved by (y / height - 1/2) of the readout, in times between
+    consecutive images. This displacement is subtracted from the observations.
+    """
+    t, index = model.tracks, np.flatnonzero(model.inlier)
+    view = t.view_index[index]
+    shift = _displacement_to_next(model, index)
+    if np.median(np.linalg.norm(shift, axis=1) / model.sizes[view].max(axis=1)) > MAX_VIDEO_STEP:
+        return []
+    shift *= (t.xy[index, 1] / model.sizes[view, 1] - 0.5)[:, None]
+
+    def adjusted(readout: float) -> MetricBundleResult:
+        xy = t.xy.copy()
+        xy[index] -= readout * shift
+        return _adjust_per_view(replace(model, tracks=replace(t, xy=xy)), adjustment, ())
+
+    # The cost near 0 is a parabola: the score test decides without a search.
+    low, high = adjusted(-READOUT_STEP).cost, adjusted(READOUT_STEP).cost
+    slope, curvature = (high - low) / 2.0, high + low - 2.0 * before.cost
+    if not (curvature > 0.0 and _beyond_chance(0.5 * slope**2 / curvature, 1)):
+        return []
+    found = scipy.optimize.minimize_scalar(
+        lambda readout: adjusted(readout).cost, bounds=(-1.0, 1.0), method="bounded", options={"xatol": 0.01}
+    )
+    after = adjusted(float(found.x))
+    return [after] if _beyond_chance(before.cost - after.cost, 1) else []
+
+
+def _displacement_to_next(model: MetricEstimate, index: I64) -> F64:
+    """Displacement (n, 2) px of observations ``index`` in the time between consecutive images."""
+    t, c, views = model.tracks, model.cameras, np.flatnonzero(model.registered)
+    a, b = views[np.clip(np.arange(len(views)) + np.array([[-1], [1]]), 0, len(views) - 1)]
+    step = np.zeros((len(c.R), 6))
+    turn = c.R[b] @ c.R[a].transpose(0, 2, 1)
+    step[views, :3] = scipy.spatial.transform.Rotation.from_matrix(turn).as_rotvec()
+    step[views, 3:] = -np.einsum("vab,vb->va", c.R[views], c.centres[b] - c.centres[a])
+    step[views] *= SMALL / (b - a)[:, None]
+    R, translation = np.empty_like(c.R), np.empty_like(c.t)
+    move_poses(np.ascontiguousarray(c.R), np.ascontiguousarray(c.t), step, R, translation)
+    moved = replace(model, cameras=replace(c, R=R, t=translation))
+    seen = (t.view_index[index], t.point_index[index])
+    return (reproject_observations(moved, *seen)[0] - reproject_observations(model, *seen)[0]) / SMALL
 
 
 def focal_decided_by_model(change: float) -> list[str]:
@@ -143,8 +209,8 @@ def focal_decided_by_model(change: float) -> list[str]:
     if change <= MAX_CHANGE:
         return []
     return [
-        f"The focal length changes by {change:.0%} if single images deviate from the camera model by 1 %, as "
-        "with image stabilisation or a rolling shutter. Add images from more directions"
+        f"The focal length changes by {change:.0%} if images deviate from the camera model as with image "
+        "stabilisation or a rolling shutter. Add images from more directions"
     ]
 
 
@@ -197,7 +263,7 @@ def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) ->
     before = _adjust_per_view(model, adjustment, ())
     if focals:
         alone = _adjust_per_view(model, adjustment, freed)
-        decrease = _decrease_beyond_chance(before, alone, focals, 1)
+        decrease = _beyond_chance(before.cost - alone.cost, sum(s.degrees_of_freedom for s in focals))
         apart = [s for s in focals if decrease and _focals_apart(alone, s)]
         misfit = max(decrease, 1.0) if not apart else 1.0
         found += [_focals_differ(views, alone, s) for s in apart]
@@ -210,7 +276,8 @@ def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) ->
         centres = [s for s in centres if not any(b & set(s.places.tolist()) for b in bent)]
     if centres:
         both = _adjust_per_view(model, adjustment, (*freed, *CENTRE))
-        for s in centres if _decrease_beyond_chance(before, both, centres, 2) else ():
+        freedom = 2 * sum(s.degrees_of_freedom for s in centres)
+        for s in centres if _beyond_chance(before.cost - both.cost, freedom) else ():
             off = _centres_off(model, adjustment, views, both, s)
             if np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
                 found.append(_centres_differ(s, off))
@@ -232,12 +299,9 @@ def _sets(model: MetricEstimate, adjustment: MetricAdjustment, views: I64, colum
     return [s for s in sets if len(s.places) >= 2]
 
 
-def _decrease_beyond_chance(
-    before: MetricBundleResult, after: MetricBundleResult, sets: list[_SharedGroup], values: int
-) -> float:
-    """Decrease in cost by one value per view, chi-square per degree of freedom; 0 if it may be chance."""
-    saved = 2.0 * (before.cost - after.cost) / USUAL_INFLATION**2
-    freedom = values * sum(s.degrees_of_freedom for s in sets)
+def _beyond_chance(decrease: float, freedom: int) -> float:
+    """``decrease`` in cost by more unknowns, chi-square per degree of freedom; 0 if it may be chance."""
+    saved = 2.0 * decrease / USUAL_INFLATION**2
     return saved / freedom if saved > scipy.special.chdtri(freedom, FALSE_ALARM_RATE) else 0.0
 
 

@@ -58,6 +58,7 @@ MODULES = {
     "kill-anywhere": "robustness",
     "large-images": "large_images",
     "main-job": "main_job",
+    "moving-cameras": "moving_cameras",
     "package": "package.steps",
     "record": "record",
     "rectification": "rectification",
