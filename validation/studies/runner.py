@@ -90,6 +90,7 @@ OF_PAGES = {
     ],
     "harsh": [["--trials", "8"]],
     "main-job": [["--repeats", "3"]],
+    "moving-cameras": [[], ["--trials", "8"]],
     "package": [["--steps", "build", "install", "imports", "typed", "quiet", "demo"]],
     "record": [],
     "subsets": [["--trials", "25"]],
