@@ -403,6 +403,9 @@ class MetricResult:
     failed_checks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  #: remarks on a trusted result, such as focals inferred from other cameras
     limitations: tuple[str, ...] = ()  #: differences between the images and the simplest camera model
+    identifiability: IdentifiabilityReport | None = (
+        None  #: of the returned cameras and points; None: not tested
+    )
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,10 @@ SOURCES = {
     },
     "Calibration": {
         "pipeline/_outputs.py": ("_failure_warnings",),
-        "selfcalibration/_identifiability.py": ("_failure", "_resolution", "_sentences"),
+        "numerics/_identifiability.py": (
+            "_failure", "_resolution", "identifiability_sentences", "excess_noise",
+        ),
+        "metric/refinement.py": ("_contradiction",),
         "metric/_shared_camera.py": (
             "_focals_differ", "_centres_differ", "_untestable", "contradicted_focal_priors",
             "inconsistent_principal_point", "focal_decided_by_model",

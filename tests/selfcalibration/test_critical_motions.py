@@ -7,10 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.records import Tracks, Upgrade
-from thesisrecon.selfcalibration._critical_motions import (
+from thesisrecon.geometry._critical_motions import (
     UpgradedCameras,
     _infinite_homography_shift,
     _planarity_ratio,
@@ -18,13 +15,18 @@ from thesisrecon.selfcalibration._critical_motions import (
     nearest_critical_motion,
     projective_infinity_shifts,
 )
-from thesisrecon.selfcalibration._frame import normalized_frame
-from thesisrecon.selfcalibration._identifiability import (
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.numerics._identifiability import (
     MAX_FOCAL_STD,
     MAX_NOISE_RATIO,
     MIN_INFINITY_SHIFT,
     MIN_ROTATION_SIGNIFICANCE,
-    _excess_equations,
+    excess_equations,
+)
+from thesisrecon.records import Tracks, Upgrade
+from thesisrecon.selfcalibration._frame import normalized_frame
+from thesisrecon.selfcalibration._identifiability import (
     check_identifiability,
     identifiability_without_calibration,
 )
@@ -125,7 +127,7 @@ def test_thickness_forgives_a_few_far_points():
 def test_the_counting_argument(known, views, spare):
     estimate = projective_reconstruction(make_scene(views=8))
     registered = np.arange(8) < views
-    assert _excess_equations(prior_for(estimate, known), registered) == spare
+    assert excess_equations(prior_for(estimate, known), registered) == spare
 
 
 def test_missing_equations_are_reported_with_their_number():

@@ -227,9 +227,8 @@ def self_check(
     }
     for name, (values, edge) in worst.items():
         check[name] = float(edge(values)) if np.isfinite(values).any() else np.nan
-    failed = [] if calibration.identifiable else list(calibration.reasons)
     failed_views, limitations = _failed_views(each, model)
-    return check, [*failed, *failed_views, *_failed_model(check)], limitations
+    return check, [*failed_views, *_failed_model(check)], limitations
 
 
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str], list[str]]:

@@ -65,7 +65,7 @@ MAX_OVERDISPERSION = 8.0
 """Variance ratio of blocks over points: 1.5 to 5 for correct models of real images, 11 to 28 if deformed."""
 
 
-def _runs_of_views(model: MetricEstimate) -> MetricEstimate:
+def runs_of_views(model: MetricEstimate) -> MetricEstimate:
     """The model with about ``MAX_VIEWS`` views, in runs of neighbours; itself if it has no more."""
     views = np.flatnonzero(model.registered)
     if len(views) <= MAX_VIEWS:
@@ -77,7 +77,7 @@ def _runs_of_views(model: MetricEstimate) -> MetricEstimate:
     return replace(model, registered=registered, inlier=inlier)
 
 
-def _subsample_inliers(model: MetricEstimate) -> Observations:
+def subsample_inliers(model: MetricEstimate) -> Observations:
     """Inliers of every n-th point, at most about ``MAX_OBSERVATIONS``."""
     t, index = model.tracks, np.flatnonzero(model.inlier)
     chosen = np.zeros(t.n_points, dtype=bool)
@@ -99,7 +99,7 @@ def _adjust_per_view(
     The own values are unknown, or within ``own_std`` of those of the model.
     """
     views, adjustment = np.flatnonzero(model.registered), replace(adjustment, hierarchical=None)
-    cameras, seen = model.cameras, _subsample_inliers(model)
+    cameras, seen = model.cameras, subsample_inliers(model)
     assert cameras.shared is not None
     rows = cameras.group[views]
     shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
@@ -144,7 +144,7 @@ def focal_change_by_richer_models(
     is_shared, few = len(np.unique(focal)) < len(focal), len(focal) <= FEW_VIEWS
     if not (is_shared or few):
         return 0.0
-    model = _runs_of_views(model)
+    model = runs_of_views(model)
     before = _adjust_per_view(model, adjustment, ())
     after = [_adjust_per_view(model, adjustment, (ASPECT, SKEW), own_std=OWN_STD)]
     if few or critical:
@@ -251,7 +251,7 @@ class _SharedGroup:
 
 def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) -> SharedCameraTest:
     """Test shared focals and principal points of two views or more by the decrease in cost (chi-square)."""
-    everywhere, model = model.registered, _runs_of_views(model)
+    everywhere, model = model.registered, runs_of_views(model)
     views = np.flatnonzero(model.registered)
     focal_std = np.full(len(model.registered), np.nan)
     contradicted = np.zeros(WIDTH, dtype=bool)
@@ -430,7 +430,7 @@ def _free_focals(model: MetricEstimate, adjustment: MetricAdjustment) -> tuple[F
     result = refine_metric_bundle(
         replace(cameras, shared=shared),
         model.X,
-        _subsample_inliers(model),
+        subsample_inliers(model),
         free=free,
         prior=IntrinsicsPrior.unshared(prior.mean, std),
         options=replace(options, covariance=True, noise_floor_px=model.sigma_px),

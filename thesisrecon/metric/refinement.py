@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry._critical_motions import measure_motion, nearest_critical_motion
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import (
     FOCAL_AND_CENTRE,
@@ -29,6 +30,7 @@ from thesisrecon.metric._camera_model import (
     with_own_values,
 )
 from thesisrecon.metric._checks import self_check
+from thesisrecon.metric._identifiability import check_returned, returned_cameras
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
@@ -65,6 +67,7 @@ from thesisrecon.metric._uncertainty import (
     widen_unverified_focals,
 )
 from thesisrecon.numerics._block_scatter import BlockScatter
+from thesisrecon.numerics._identifiability import excess_noise
 from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, Upgrade
 
@@ -125,15 +128,17 @@ class MetricRefinement:
         intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
         intervals = widen_unverified_focals(intervals, sharing.focal_std)
         intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
-        report = calibration.identifiability
-        critical = report is not None and report.critical
+        complete = with_tracks(model, reconstruction.tracks)
+        returned = returned_cameras(complete)
+        critical = nearest_critical_motion(measure_motion(returned))[1] < 1.0
         change = focal_change_by_richer_models(model, adjustment, critical=critical)
         intervals = widen_by_camera_model(intervals, (change, 0.0), 1.0)
-        if enlarged and report is not None and report.prior_contradicted:
-            # The prior that the images contradicted was replaced.
-            calibration = replace(calibration, identifiable=True, reasons=())
-        model = with_tracks(model, reconstruction.tracks)
+        report = check_returned(model, adjustment, returned, intervals)
+        model = complete
         check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
+        # An enlarged camera model replaces the prior that the images contradicted.
+        start = [] if enlarged else _contradiction(calibration)
+        failed_checks = [*([] if report.identifiable else report.sentences), *start, *failed_checks]
         failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
         failed_checks += inconsistent_principal_point(model, adjustment, scatter)
         failed_checks += focal_decided_by_model(change)
@@ -141,8 +146,17 @@ class MetricRefinement:
         warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
         return MetricResult(
             _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
-            warnings, (*enlarged, *limitations),
+            warnings, (*enlarged, *limitations), report,
         )  # fmt: skip
+
+
+def _contradiction(calibration: SelfCalibration) -> list[str]:
+    """A sentence if the images contradicted the prior of the intrinsics in self-calibration."""
+    report = calibration.identifiability
+    if report is None or not report.prior_contradicted:
+        return []
+    views = counted(int((calibration.K[:, 0, 0] > 0.0).sum()), "image")
+    return [f"In self-calibration of {views}, {excess_noise(report.evidence)}"]
 
 
 def _start(

@@ -258,8 +258,9 @@ def _failure_warnings(result: RunResult) -> list[str]:
     if result.metric is not None and not result.metric.trusted:
         own = tuple(dict.fromkeys(result.metric.failed_checks))
         failed_checks.append(f"The result failed its self-check and cannot be trusted: {'; '.join(own)}")
-    if result.calibration is not None and not result.calibration.identifiable:
-        # The self-check repeats the reasons of its calibration.
+    tested = result.metric is not None and result.metric.identifiability is not None
+    if result.calibration is not None and not result.calibration.identifiable and not tested:
+        # The self-check may repeat the reasons of its calibration.
         rest = [reason for reason in dict.fromkeys(result.calibration.reasons) if reason not in own]
         if rest or not own:
             failed_checks.append(f"The images do not determine the calibration: {'; '.join(rest)}")

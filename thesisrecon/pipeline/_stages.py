@@ -23,6 +23,7 @@ from thesisrecon.pipeline._state import PipelineState, name_images
 from thesisrecon.records import (
     DepthMap,
     HeldOut,
+    IdentifiabilityReport,
     MetricResult,
     PinholeView,
     Reconstruction,
@@ -125,8 +126,9 @@ def finish_projective(state: PipelineState) -> None:
         state.run.finish("projective", counts=_sizes_of(projective), metrics=sigma)
     if calibration is not None:
         counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
-        warnings = [name_images(text, state.names) for text in _critical(calibration)]
-        state.run.finish("selfcalibration", counts=counts, warnings=warnings)
+        # A metric model has its own report.
+        found = calibration.identifiability if state.result.metric is None else None
+        state.run.finish("selfcalibration", counts=counts, warnings=_critical(found))
 
 
 def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
@@ -143,9 +145,8 @@ def _calibrate(state: PipelineState, attempt: int) -> SelfCalibration:
     return calibration
 
 
-def _critical(calibration: SelfCalibration) -> tuple[str, ...]:
+def _critical(found: IdentifiabilityReport | None) -> tuple[str, ...]:
     """A warning about a critical motion that the prior resolves; others fail the self-check."""
-    found = calibration.identifiability
     resolved = found is not None and found.critical and found.identifiable
     return ("; ".join(found.sentences),) if found is not None and resolved else ()
 
@@ -193,7 +194,8 @@ def reconstruct_metric(state: PipelineState) -> None:
     attempt = next(k for k, result in enumerate(tried) if result is best)
     metric = register_more(state, attempt, best.metric)
     state.result = replace(best, metric=metric)
-    warnings = [name_images(text, state.names) for text in metric.warnings]
+    texts = (*_critical(metric.identifiability), *metric.warnings)
+    warnings = [name_images(text, state.names) for text in texts]
     found = metric.reconstruction
     state.run.finish(
         "metric", counts=_sizes_of(found), metrics={"sigma_px": found.sigma_px}, warnings=warnings

@@ -16,11 +16,13 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.records import (
     HeldOut,
+    IdentifiabilityReport,
     Image,
     IntrinsicInterval,
     MetricResult,
     PairChoice,
     Reconstruction,
+    SelfCalibration,
     StageReport,
     TexturedMesh,
     TwoView,
@@ -132,6 +134,10 @@ def summarize(result: RunResult) -> dict[str, Any]:
     original = [d / image.scale for d, image in zip(working, result.images, strict=True)]
     everything = np.concatenate([np.zeros(0), *original])
     views = [_view_summary(result, best, i, distances) for i, distances in enumerate(original)]
+    calibration = result.calibration
+    start = None if calibration is None else calibration.identifiability
+    returned = None if result.metric is None else result.metric.identifiability
+    tested = returned or calibration
     return {
         "failure": result.failure or None,
         "stratum": best.stratum if best is not None else None,
@@ -145,8 +151,9 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "trusted": result.metric.trusted if result.metric is not None else None,
         "failed_checks": list(result.metric.failed_checks) if result.metric is not None else [],
         "limitations": list(result.metric.limitations) if result.metric is not None else [],
-        "identifiable": result.calibration.identifiable if result.calibration is not None else None,
-        "motion": _motion(result),
+        "identifiable": None if tested is None else tested.identifiable,
+        "motion": _motion(returned or start),
+        "self_calibration": _start(calibration),
         "self_check": dict(result.metric.self_check) if result.metric is not None else {},
         "pairs": {
             "selection": result.pair_choice.how if result.pair_choice is not None else None,
@@ -165,8 +172,15 @@ def summarize(result: RunResult) -> dict[str, Any]:
     }
 
 
-def _motion(result: RunResult) -> dict[str, Any] | None:
-    found = None if result.calibration is None else result.calibration.identifiability
+def _start(calibration: SelfCalibration | None) -> dict[str, Any] | None:
+    """The report on the images in which self-calibration began, which may be a part of those returned."""
+    if calibration is None:
+        return None
+    facts = {"images": int((calibration.K[:, 0, 0] > 0.0).sum()), "identifiable": calibration.identifiable}
+    return facts | {"motion": _motion(calibration.identifiability)}
+
+
+def _motion(found: IdentifiabilityReport | None) -> dict[str, Any] | None:
     if found is None:
         return None
     evidence = {"evidence": dict(found.evidence), "sentences": list(found.sentences)}

@@ -37,6 +37,7 @@ TOLERANCES: Mapping[str, float] = {
     "axial_translation_over_distance": 0.025,
 }
 
+MAX_CAMERAS = 1000
 # Long sides; also used for points that rotate behind the camera.
 _MAX_SHIFT = 10.0
 
@@ -88,7 +89,13 @@ class UpgradedCameras:
 
 
 def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
-    """Return the measures of ``TOLERANCES`` by name, and the largest rotation (chapter 7)."""
+    """Return the measures of ``TOLERANCES`` by name, and the largest rotation (chapter 7).
+
+    Of more than ``MAX_CAMERAS`` cameras, evenly many are used: all pairs are compared.
+    """
+    if len(metric.R) > MAX_CAMERAS:
+        few = np.unique(np.rint(np.linspace(0, len(metric.R) - 1, MAX_CAMERAS)).astype(np.int64))
+        metric = UpgradedCameras(metric.focal[few], metric.R[few], metric.C[few], metric.X)
     axis, angle, spread = _common_rotation_axis(metric.R)
     H, offset = metric.infinite_homographies(), metric.C - metric.C.mean(axis=0)
     return {
@@ -127,7 +134,9 @@ def _tolerance_ratio(measures: Mapping[str, float], key: str) -> float:
 def _infinite_homography_shift(H: F64, *, roll: bool) -> float:
     """Rms shift (long sides) of points at infinity by H (V, 3, 3) beyond zoom and, with ``roll``, roll."""
     template = np.zeros_like(H)
-    template[:, 0, 0] = template[:, 1, 1] = (H[:, 0, 0] + H[:, 1, 1]) / 2.0
+    zoom = (H[:, 0, 0] + H[:, 1, 1]) / 2.0
+    # A roll of 180 degrees is no zoom, although it maps points as one with a negative scale.
+    template[:, 0, 0] = template[:, 1, 1] = zoom if roll else np.where(zoom * H[:, 2, 2] > 0.0, zoom, 0.0)
     template[:, 2, 2] = H[:, 2, 2]
     if roll:
         template[:, 1, 0] = (H[:, 1, 0] - H[:, 0, 1]) / 2.0
@@ -205,18 +214,18 @@ def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
 
 
 def _planarity_ratio(X: F64) -> float:
-    """Rms thickness of 95 % of the points (N, 3) about their best plane over their rms extent in it."""
+    """Rms thickness of 95 % of the points (N, 3) about their best plane over their rms extent in it.
+
+    Before, the farthest 5 % of the points are left out.
+    """
 
     def nearest(distance: F64) -> I64:
         return np.argsort(distance, kind="stable")[: max(int(0.95 * len(distance)), 4)]
 
+    X = X[nearest(np.linalg.norm(X - np.median(X, axis=0), axis=1))]
+    near = X
     for _ in range(3):
-        X = X[nearest(np.linalg.norm(X - np.median(X, axis=0), axis=1))]
-        if len(X) < 50:
-            break
-    centred = X - X.mean(axis=0)
-    for _ in range(3):
-        order = nearest(np.abs(centred @ np.linalg.svd(centred, full_matrices=False)[2][2]))
-        centred = centred[order] - centred[order].mean(axis=0)
-    s = np.linalg.svd(centred, compute_uv=False)
+        normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
+        near = X[nearest(np.abs((X - near.mean(axis=0)) @ normal))]
+    s = np.linalg.svd(near - near.mean(axis=0), compute_uv=False)
     return float(s[2] / max(float(s[1]), 1e-300))
