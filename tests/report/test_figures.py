@@ -269,3 +269,14 @@ def test_a_scene_without_points_still_shows_its_cameras():
     scene = figures.build_scene(replace(reconstruction, valid=nothing["valid"]))
     assert len(scene.points) == 0
     assert len(scene.centres) == 8
+
+
+@pytest.mark.parametrize("shrink", [1.0, 1e-2, 1e-6])
+def test_the_pyramids_of_affine_cameras_do_not_hide_the_points(shrink):
+    affine = made_up_run(points=200).affine
+    wide = affine.P.copy()
+    wide[:, :2] = np.diag([shrink, shrink]) @ wide[:, :2]
+    scene = figures.build_scene(replace(affine, P=wide))
+    edges = np.linalg.norm(scene.corners - scene.centres[:, None], axis=2)
+    everything = np.concatenate([scene.points, scene.centres])
+    assert edges.max() < 0.5 * np.linalg.norm(np.ptp(everything, axis=0))

@@ -32,6 +32,8 @@ MAX_MATRIX, MAX_CELLS = 200, 100
 """Largest number of views in the matrix of pairs, and cells per side for more."""
 _FAR = 50.0
 """Distance of an affine camera that is drawn as one at infinity, in radii of 80 % of the points."""
+_LONGEST_EDGE = 3.0
+"""Longest edge of a pyramid relative to its depth: that of a camera with a field of view of 140 degrees."""
 MAX_PYRAMIDS = 250
 """Cameras that are drawn as pyramids; of more, these are evenly spread."""
 _MAX_ANNOTATED = 14
@@ -133,10 +135,12 @@ def _kept_points(X: F64, valid: B8, max_points: int) -> I64:
 
 
 def _corner_rays(K: F64, size: NDArray[np.int64]) -> F64:
-    """Return the rays (4, 3) of unit depth through the image corners, clockwise from the top left."""
+    """Return rays (4, 3) through the image corners, clockwise from the top left, of unit depth or shorter."""
     width, height = float(size[0]), float(size[1])
     xy = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-    return homogenize(xy) @ np.linalg.inv(K).T
+    rays = homogenize(xy) @ np.linalg.inv(K).T
+    # Affine cameras may have any K: no pyramid is much longer than its depth.
+    return np.asarray(rays / max(1.0, float(np.linalg.norm(rays, axis=1).max()) / _LONGEST_EDGE))
 
 
 def _pyramid_depth(centres: F64, points: F64) -> float:
