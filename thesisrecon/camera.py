@@ -36,8 +36,9 @@ class Camera:
         Radial coefficients k1, k2, ...: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 +
         ...). None: no distortion.
     std : mapping of str to float, optional
-        Standard deviations of estimated intrinsics: "focal_px", "aspect", "skew_px", "principal_x_px",
-        "principal_y_px", "k1", "k2", "k3" (0: as assumed). None: unknown.
+        Standard deviations of estimated values: "focal_px", "aspect", "skew_px", "principal_x_px",
+        "principal_y_px", "k1", "k2", "k3" (0: as assumed), and of poses of a run "rotation_x_deg" and y, z
+        about the axes of the camera, "centre_x" and y, z along those of the model. None: unknown.
     as_stored : bool
         Whether the pixels are those of the image file as stored, as in COLMAP, and not after EXIF rotation.
 

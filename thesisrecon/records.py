@@ -393,7 +393,9 @@ class MetricResult:
     """Result of the metric stage.
 
     ``intrinsics`` has per view "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px",
-    "k1", "k2", "k3" (std 0: as assumed), and nothing where the view is not registered.
+    "k1", "k2", "k3" (std 0: as assumed), and nothing where the view is not registered. ``pose_std`` (V, 6):
+    standard deviations of the rotation about the x, y, z axes of the camera in rad, and of the centre along
+    the axes of the model in its units, after the similarity that aligns the cameras best; NaN where unknown.
     """
 
     reconstruction: Reconstruction
@@ -403,9 +405,9 @@ class MetricResult:
     failed_checks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  #: remarks on a trusted result, such as focals inferred from other cameras
     limitations: tuple[str, ...] = ()  #: differences between the images and the simplest camera model
-    identifiability: IdentifiabilityReport | None = (
-        None  #: of the returned cameras and points; None: not tested
-    )
+    #: of the returned cameras and points; None: not tested
+    identifiability: IdentifiabilityReport | None = None
+    pose_std: F64 | None = None
 
 
 @dataclass(frozen=True)

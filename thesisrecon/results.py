@@ -30,6 +30,8 @@ from thesisrecon.records import (
 )
 
 SUMMARY = "summary.json"
+POSE_NAMES = ("rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "centre_x", "centre_y", "centre_z")
+"""Names of the standard deviations of a pose in :attr:`thesisrecon.Camera.std`."""
 
 
 class SeenPoints(NamedTuple):
@@ -56,6 +58,25 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
         return interval
     shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0
     return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)
+
+
+def pose_deviations(metric: MetricResult, i: int) -> dict[str, float]:
+    """Return the standard deviations of a pose as in :attr:`thesisrecon.Camera.std`.
+
+    Parameters
+    ----------
+    metric, i : MetricResult, int
+        Result of the metric stage, and the number of the image.
+
+    Returns
+    -------
+    dict of str to float
+        Empty if unknown.
+    """
+    if metric.pose_std is None or not np.isfinite(metric.pose_std[i]).all():
+        return {}
+    values = np.concatenate([np.degrees(metric.pose_std[i, :3]), metric.pose_std[i, 3:]])
+    return dict(zip(POSE_NAMES, values.tolist(), strict=True))
 
 
 def folder_with(result: RunResult) -> Path | None:
@@ -102,6 +123,7 @@ class Cameras(Mapping[str, Camera]):
         one, intrinsics = self._images[i], self._metric.intrinsics[i]
         Rt = np.linalg.solve(r.K[i], r.P[i])
         std = {name: in_original_pixels(name, value, one.scale).std for name, value in intrinsics.items()}
+        std |= pose_deviations(self._metric, i)
         K = one.original_from_working @ r.K[i]
         lens = r.distortion[i]
         return Camera(K, Rt[:, :3], Rt[:, 3], one.original_size, lens, std, as_stored=self._as_stored)

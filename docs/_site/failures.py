@@ -53,7 +53,7 @@ SOURCES = {
         "metric/_camera_model.py": ("differences_of_images",),
         "metric/_uncertainty.py": ("warnings",),
     },
-    "The self-check": {"metric/_checks.py": ("_failed_model", "_failed_views")},
+    "The self-check": {"metric/_checks.py": ("_failed_join", "_failed_model", "_failed_views")},
     "Results and files": {
         "pipeline/_stages.py": ("reconstruct_metric", "estimate_depth_maps"),
         "pipeline/_steps.py": ("_run_all",),

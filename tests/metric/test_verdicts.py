@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from tests.metric.test_population import refine
-from tests.metric.verdict_scenes import fisheye_rig, rolling_video, stabilised_arc
+from tests.metric.verdict_scenes import fisheye_rig, rolling_video, stabilised_arc, two_sides
 from tests.synthetic import make_scene
 from thesisrecon import reconstruct_from_tracks
+from validation.metrics.intervals import pose_scores
 from validation.scenes.moving import Lens, drive, hand_held
 from validation.studies.moving_cameras import measure
 
@@ -71,3 +72,31 @@ def test_a_rolling_shutter_widens_the_interval_of_a_video_by_its_effect():
     assert straight[2] < 0.01
     assert abs(rolling[1]) > 0.005
     assert abs(rolling[1]) < 1.5 * rolling[2]
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_sides_of_an_object_that_look_similar_are_not_trusted_as_one(seed):
+    """All cameras are registered, with the right focal length, and half of them on the wrong side."""
+    alike, similar = two_sides(seed, 1.0), two_sides(seed, 0.3)
+    right = reconstruct_from_tracks(alike.xy, [alike.size] * len(alike.xy)).metric
+    assert right.trusted
+    assert right.self_check["joined_share_weakest"] > 0.9
+    wrong = reconstruct_from_tracks(similar.xy, [similar.size] * len(similar.xy)).metric
+    assert wrong.reconstruction.registered.all()
+    assert not wrong.trusted
+    assert wrong.self_check["joined_share_weakest"] < 0.5
+    assert "images image-8, image-9, image-10, image-11 and image-12" in wrong.failed_checks[0].lower()
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_errors_of_poses_are_as_large_as_stated(shared):
+    z = []
+    for seed in range(6):
+        scene = make_scene(sigma_px=0.5, points=300, seed=seed, zoom=0.0 if shared else 0.2)
+        found = refine(scene)
+        assert found.trusted
+        z.append(pose_scores(found, scene.R, scene.centres))
+    z = np.concatenate(z)
+    assert np.isfinite(z).all()
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.3
+    assert np.abs(z).max() < 4.5

@@ -84,6 +84,29 @@ def fisheye_rig(seed: int, views: int = 16) -> Observed:
     return Observed(np.where(inside[..., None], xy, np.nan) + rng.normal(0.0, 0.3, xy.shape), size, focal)
 
 
+def two_sides(seed: int, alike: float) -> Observed:
+    """Eight images of one side of an object and five of the other, joined by matches between them.
+
+    The share ``alike`` of the points is at the same place on both sides, the others nearly so.
+    """
+    rng, size, focal, n = np.random.default_rng(seed), (800, 600), 900.0, 600
+    X = rng.uniform([-2.0, -1.2, -2.0], [2.0, -0.2, 2.0], (n, 3))
+    other = X + np.where(rng.random(n) < alike, 0.0, 0.25)[:, None] * rng.normal(size=(n, 3))
+
+    def arc(angle: F64, height: F64) -> tuple[F64, F64]:
+        C = np.column_stack([8.0 * np.sin(angle), -8.0 * np.cos(angle), height])
+        return np.array([looking(-c) for c in C]), C
+
+    a, b = np.radians(np.linspace(-35.0, 35.0, 8)), np.radians(np.linspace(-20.0, 30.0, 5))
+    centre = np.tile((np.array(size) - 1) / 2, (8, 1))
+    one = project(X, *arc(a, 0.8 * np.sin(3.0 * a)), focal, size, centre)
+    two = project(other, *arc(b, 0.7 * np.cos(4.0 * b)), focal, size, centre[:5])
+    joined = np.where((rng.random(n) < 0.15)[:, None], two, np.nan)
+    rest = np.where(np.isnan(joined), two, np.nan)
+    xy = np.concatenate([np.hstack([one, np.full_like(one, np.nan)]), np.hstack([joined, rest])])
+    return Observed(xy + rng.normal(0.0, 0.3, xy.shape), size, focal)
+
+
 def looking(direction: F64) -> F64:
     """Return the rotation of a camera with level rows that looks along ``direction``."""
     z = np.asarray(direction) / np.linalg.norm(direction)

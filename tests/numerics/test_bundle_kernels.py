@@ -12,7 +12,7 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import _block_scatter, _levenberg_marquardt, _metric_kernels, _schur
 from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
-from thesisrecon.numerics._block_scatter import _gram_matrix, block_scatter
+from thesisrecon.numerics._block_scatter import _gram_matrix, block_scatter, pose_uncertainty
 from thesisrecon.numerics._elimination import ReducedSums, revert_crossing_points, sum_leverages
 from thesisrecon.numerics._levenberg_marquardt import invert_information
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
@@ -327,7 +327,7 @@ def _scatter(block, xy, *, free=FREE, loss=20.0, std=np.inf):
     options = BundleOptions(sigma_px=SIGMA, loss_px=loss * SIGMA, max_iterations=30, covariance=True)
     fit = refine_metric_bundle(block.cameras, block.X, seen, free=free, prior=prior, options=options)
     noise = (SIGMA, loss * SIGMA)
-    return fit, block_scatter(fit.cameras, fit.X, seen, free=free, prior=prior, noise=noise)
+    return fit, block_scatter(fit.cameras, fit.X, seen, free, prior, noise)
 
 
 def test_the_variance_is_that_of_bundle_adjustment():
@@ -392,7 +392,7 @@ def test_the_scatter_of_a_street_is_that_of_dense_information(monkeypatch, own):
     found = []
     for share in (0.0, 0.5):
         monkeypatch.setattr(_block_scatter, "_SPARSE", share)
-        found.append(block_scatter(fit.cameras, fit.X, walk.seen, free=free, prior=prior, noise=(0.5, 1.0)))
+        found.append(block_scatter(fit.cameras, fit.X, walk.seen, free, prior, (0.5, 1.0)))
     dense, sparse = found
     np.testing.assert_allclose(sparse.variance, dense.variance, rtol=1e-5)
     np.testing.assert_allclose(sparse.shared_variance, dense.shared_variance, rtol=1e-5)
@@ -407,3 +407,41 @@ def test_large_information_is_inverted_like_small(monkeypatch):
     monkeypatch.setattr(_levenberg_marquardt, "_MANY", 2)
     np.testing.assert_allclose(invert_information(information), small[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(invert_information(flat), small[1])
+
+
+def test_the_variance_of_poses_is_that_of_bundle_adjustment_and_grows_with_the_intrinsics():
+    block = make_block(points=200)
+    xy = block.xy + SIGMA * np.random.default_rng(0).normal(size=block.xy.shape)
+    fit, scatter = _scatter(block, xy)
+    seen = Observations(block.view, block.point, xy)
+    prior = IntrinsicsPrior.unshared(fit.cameras.intrinsics, np.full_like(fit.cameras.intrinsics, np.inf))
+    poses = pose_uncertainty(fit.cameras, fit.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA))
+    own = np.sqrt(np.diag(poses.covariance))
+    np.testing.assert_allclose(own, np.sqrt(scatter.variance[0][FREE]), rtol=1e-6)
+    R, covariance = fit.cameras.R, (SIGMA / fit.sigma_px) ** 2 * fit.pose_covariance
+    centre = np.einsum("vba,vbc,vcd->vad", R, covariance[:, 3:, 3:], R)
+    expected = np.concatenate([np.diagonal(c, axis1=1, axis2=2) for c in (covariance[:, :3, :3], centre)], 1)
+    np.testing.assert_allclose(poses.variances(1.0, own, 0.0), expected, rtol=0.03)
+    wider = poses.variances(1.0, 3.0 * own, 0.0) - poses.variances(1.0, own, 0.0)
+    np.testing.assert_allclose(wider, 8.0 * (poses.variances(1.0, own, 0.0) - poses.variance), rtol=1e-6)
+
+
+def test_faults_of_the_camera_model_move_the_poses_as_an_adjustment_does():
+    block, eps = make_block(points=200), 1e-4
+    q = block.cameras.intrinsics[block.cameras.group[block.view]]
+    exact, _ = _scatter(block, block.xy)
+    x, y = ((block.xy - q[:, 3:5]) / q[:, :1]).T
+    fields = [(0 * x, y), (y, 0 * x), (3 * x**2 + y**2, 2 * x * y), (2 * x * y, x**2 + 3 * y**2)]
+    seen = Observations(block.view, block.point, block.xy)
+    prior = IntrinsicsPrior.unshared(q[:1], np.full_like(q[:1], np.inf))
+    poses = pose_uncertainty(exact.cameras, exact.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA))
+    for n, field in enumerate(fields):
+        moved, _ = _scatter(block, block.xy + eps * q[:, :1] * np.array(field).T)
+        turned = np.swapaxes(moved.cameras.R, 1, 2) @ exact.cameras.R
+        angle = np.degrees(Rotation.from_matrix(turned).as_rotvec())
+        stated = np.degrees(eps * np.einsum("vba,vb->va", exact.cameras.R, poses.fault[:, :3, n]))
+        # Without the rotation of the whole, which no image determines.
+        assert np.abs(angle).max() > 0.0
+        np.testing.assert_allclose(
+            stated - stated.mean(axis=0), -(angle - angle.mean(axis=0)), atol=0.03 * np.abs(stated).max()
+        )

@@ -415,7 +415,8 @@ def test_subsets_of_photographs_are_connected_by_verified_matches():
 
 
 def test_coverage_counts_trusted_results_only():
-    right, wrong = np.array([0.5, 1.5, -3.0]), np.array([9.0, 9.0, 9.0])
-    trials = [coverage_real.Trial("a", 3, True, right), coverage_real.Trial("a", 3, False, wrong)]
+    right = np.array([0.5]), np.array([1.5, -3.0]), np.array([0.1, 2.2]), np.array([-0.2, 0.3])
+    wrong = tuple(np.full(len(z), 9.0) for z in right)
+    trials = [coverage_real.Trial("a", 3, 9.0, trusted, z) for trusted, z in ((True, right), (False, wrong))]
     row = coverage_real.table_row("a", trials)
-    assert row == ["a", 2, 1, "100", "100", "100", "0", "50", "50", "3.0"]
+    assert row == ["a", 2, 1, "100 100 100", "0 50 50", "50 50 100", "100 100 100", "0.5 3.0 2.2 0.3"]

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.metric._model import (
@@ -48,6 +49,10 @@ MIN_INLIER_RATIO = 0.5
 MIN_CONFIRMED_RATIO = 0.6
 """The same for points that other views determine. Correct cameras reach 0.9 (0.63 in blurred phone images),
 wrong ones stay below 0.5."""
+MIN_JOINED_SHARE = 0.5
+"""Share of inliers among the tracks that join two parts of the images: right models reach 0.6, and parts
+joined by matches between similar places stay below 0.45."""
+WEAKEST_JOINS = 20
 MAX_BEHIND = 0.05
 MAX_NOISE_RATIO = 3.0
 MAX_OWN_FOCAL = 0.03
@@ -134,6 +139,62 @@ def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
     all_ = np.bincount(view[counted], minlength=n)
     right = np.bincount(view[counted & good], minlength=n)
     return np.where(all_ > 0, right / np.maximum(all_, 1), np.nan)
+
+
+@dataclass(frozen=True)
+class Join:
+    """The ``views`` of the smaller of two parts; ``inliers`` of the ``tracks`` that both parts observe."""
+
+    views: I64
+    inliers: int
+    tracks: int
+
+    @property
+    def share(self) -> float:
+        """Share of inliers."""
+        return self.inliers / max(self.tracks, 1)
+
+
+def weakest_join(model: MetricEstimate) -> Join | None:
+    """Find the two parts of the images whose common tracks agree least with the model; None for one view.
+
+    Matches between similar sides of an object can join two parts whose own matches are right. Such a join is
+    an edge of the maximum spanning tree of the views; weights are common inliers times their share of the
+    common tracks.
+    """
+    t, views = model.tracks, np.flatnonzero(model.registered)
+    place = np.full(t.n_views, -1)
+    place[views] = np.arange(len(views))
+    k = np.flatnonzero(place[t.view_index] >= 0)
+    view, point, inlier = place[t.view_index[k]], t.point_index[k], model.inlier[k]
+
+    def common(of: B8) -> scipy.sparse.csr_matrix:
+        seen = scipy.sparse.csr_matrix(
+            (np.ones(int(of.sum())), (view[of], point[of])), (len(views), t.n_points)
+        )
+        return scipy.sparse.triu(seen @ seen.T, 1).tocsr()
+
+    both, agree = common(np.ones(len(k), dtype=bool)), common(inlier).tocoo()
+    weight = agree.data**2 / np.asarray(both[agree.row, agree.col]).ravel()
+    # Of least distances 1 / weight, since the tree of scipy is the minimum one.
+    graph = scipy.sparse.csr_matrix((1.0 / weight, (agree.row, agree.col)), both.shape)
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph).tocoo()
+    joins = []
+    for edge in np.argsort(-tree.data, kind="stable")[:WEAKEST_JOINS]:
+        rest = np.arange(len(tree.data)) != edge
+        parts = scipy.sparse.csr_matrix((tree.data[rest], (tree.row[rest], tree.col[rest])), tree.shape)
+        label = scipy.sparse.csgraph.connected_components(parts, directed=False)[1]
+        side = label == label[tree.row[edge]]
+        side = side if 2 * side.sum() <= len(side) else ~side
+        tracks = _on_both_sides(side[view], point, t.n_points)
+        agreeing = _on_both_sides(side[view[inlier]], point[inlier], t.n_points)
+        joins.append(Join(views[side], int(agreeing.sum()), int(tracks.sum())))
+    return min(joins, key=lambda join: join.share, default=None)
+
+
+def _on_both_sides(side: B8, point: I64, n: int) -> B8:
+    here, there = (np.bincount(point[rows], minlength=n) > 0 for rows in (side, ~side))
+    return np.asarray(here & there)
 
 
 def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
@@ -227,8 +288,21 @@ def self_check(
     }
     for name, (values, edge) in worst.items():
         check[name] = float(edge(values)) if np.isfinite(values).any() else np.nan
+    join = weakest_join(model)
+    check["joined_share_weakest"] = np.nan if join is None else join.share
     failed_views, limitations = _failed_views(each, model)
-    return check, [*failed_views, *_failed_model(check)], limitations
+    return check, [*failed_views, *_failed_join(join), *_failed_model(check)], limitations
+
+
+def _failed_join(join: Join | None) -> list[str]:
+    """A sentence if most tracks between two parts of the images contradict their join."""
+    if join is None or join.share >= MIN_JOINED_SHARE:
+        return []
+    return [
+        f"{_named(join.views)}: only {join.inliers} of the {join.tracks} points that join them to the other "
+        "images are inliers: they probably show another side of the scene that looks similar. Add images "
+        "between the two parts, or reconstruct them separately"
+    ]
 
 
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str], list[str]]:

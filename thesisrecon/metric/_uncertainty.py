@@ -20,7 +20,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
-from thesisrecon.numerics._block_scatter import BlockScatter
+from thesisrecon.numerics._block_scatter import BlockScatter, PoseUncertainty
 from thesisrecon.numerics._noise import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
 
@@ -207,6 +207,7 @@ def intrinsic_intervals(
 ) -> tuple[Mapping[str, IntrinsicInterval], ...]:
     """Value, standard deviation and source of each intrinsic of each view; +- 1.96 std is a 95 % interval."""
     floors, prior = _std_floor(model, scatter), adjustment.row_prior(model)
+    share = lack_of_fit(scatter, model.tail)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for view in range(len(model.registered)):
         if not model.registered[view]:
@@ -220,7 +221,8 @@ def intrinsic_intervals(
             if not variance > 0.0:
                 intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
                 continue
-            inflation, floor = _inflation(model, scatter, g, column), float(floors[g, column])
+            ratios = float(scatter.ratio[g, column]), float(scatter.large_ratio[g, column])
+            inflation, floor = _inflation(scatter, *ratios, share), float(floors[g, column])
             # A value that the images leave to its prior is as uncertain as the prior is wrong.
             measured = float(np.hypot(inflation * np.sqrt(variance), scatter.pull[g, column]))
             std = min(float(np.hypot(measured, floor)), float(prior.std[g, column]))
@@ -281,12 +283,38 @@ def widen_by_camera_model(
     return tuple(answer)
 
 
-def _inflation(model: MetricEstimate, scatter: BlockScatter, g: int, column: int) -> float:
-    """Inflation by the scatter of many blocks, and by that of few large ones if the model does not fit."""
-    ratio, large = float(scatter.ratio[g, column]), float(scatter.large_ratio[g, column])
+def pose_std(
+    model: MetricEstimate,
+    poses: PoseUncertainty,
+    scatter: BlockScatter,
+    intervals: Sequence[Mapping[str, IntrinsicInterval]],
+) -> F64:
+    """Standard deviations (V, 6) of rotations and centres as in ``MetricResult.pose_std``.
+
+    The errors that the stated ``intervals`` allow for move the poses too. Fixed aspect ratio, skew and
+    decentring may be wrong by the floor of the camera model.
+    """
+    number = poses.number
+    std = np.sqrt(np.diag(poses.covariance))
+    for view in poses.views:
+        for name, column in _COLUMNS.items():
+            unknown = number[model.cameras.group[view], column]
+            if unknown >= 0:
+                own = intervals[view][name]
+                std[unknown] = own.std / (own.value if column == FOCAL else 1.0)
+    known = [ratio[np.isfinite(ratio)] for ratio in (scatter.ratio, scatter.large_ratio)]
+    ratio, large = (float(np.median(values)) if len(values) else np.nan for values in known)
+    noise = _inflation(scatter, ratio, large, lack_of_fit(scatter, model.tail))
+    fault = MODEL_FLOOR_REL * np.sqrt(lack_of_fit(scatter, model.tail))
+    answer = np.full((len(model.registered), 6), np.nan)
+    answer[poses.views] = np.sqrt(poses.variances(noise, std, fault))
+    return answer
+
+
+def _inflation(scatter: BlockScatter, ratio: float, large: float, share: float) -> float:
+    """Inflation by the scatter of many blocks, and with ``share`` (lack of fit) by that of few large ones."""
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(ratio):
         return USUAL_INFLATION
     small = float(np.sqrt(ratio) * student_factor(scatter.blocks - 1))
     wide = float(np.sqrt(max(large, ratio, 1.0)) * student_factor(scatter.large_blocks - 1))
-    share = lack_of_fit(scatter, model.tail)
     return (1.0 - share) * small + share * max(small, wide)

@@ -63,6 +63,7 @@ from thesisrecon.metric._uncertainty import (
     focal_shrinkage,
     intrinsic_intervals,
     per_camera_estimates,
+    pose_std,
     widen_by_camera_model,
     widen_unverified_focals,
 )
@@ -144,9 +145,10 @@ class MetricRefinement:
         failed_checks += focal_decided_by_model(change)
         views = np.flatnonzero(model.registered).tolist()
         warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
+        poses = pose_std(final[0], adjustment.poses(final[0]), scatter, intervals)
         return MetricResult(
             _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
-            warnings, (*enlarged, *limitations), report,
+            warnings, (*enlarged, *limitations), report, poses,
         )  # fmt: skip
 
 

@@ -87,11 +87,15 @@ def point_blocks(X: F64, used: B8) -> I64:
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Weighted residuals (2K,), their Jacobian J (2K, D), and the part of it ``taken`` by the points."""
+    """Weighted residuals (2K,), their Jacobian J (2K, D), and the part of it ``taken`` by the points.
+
+    ``E`` (2K, 3N) are orthonormal columns that span the displacements by points.
+    """
 
     residual: F64
     J: scipy.sparse.csr_matrix
     taken: scipy.sparse.csr_matrix
+    E: scipy.sparse.csr_matrix
     point: I64
 
 
@@ -99,7 +103,6 @@ def block_scatter(
     cameras: MetricCameras,
     X: F64,
     observations: Observations,
-    *,
     free: B8,
     prior: IntrinsicsPrior,
     noise: tuple[float, float],
@@ -112,22 +115,13 @@ def block_scatter(
     The information uses the weights of Huber's loss instead of its second derivatives, which
     :func:`_loss_correction` corrects.
     """
-    o, group = observations, cameras.group
-    observed = np.bincount(o.view_index, minlength=len(group)) > 0
-    used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
-    values, start, _ = number_unknowns(cameras, used, free, prior)
-    views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
-    # Centred and scaled to size 1.
-    origin, scale = scene_frame(X[np.unique(o.point_index)])
-    frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
-    place = np.where(observed, np.cumsum(observed) - 1, -1)
-    system = _linearise(frame, scale * (X - origin), o, (values, place), noise)
-    S = _information(system, values.terms.information(values.size), o, len(views))
-    solve = _covariance(S, frame, views)
+    fit = _linearised_fit(cameras, X, observations, free, prior, noise)
+    system, solve, values, first, start = fit.system, fit.solve, fit.values, fit.first, fit.start
+    S = fit.information
     poses = np.arange(0, first, max(first // _MAX_POSES, 1))
     tested = np.concatenate([poses, np.arange(first, S.shape[0])])
     rows = solve(_unit_columns(S.shape[0], tested)).T
-    block = point_blocks(X, np.bincount(o.point_index, minlength=len(X)) > 0)
+    block = point_blocks(X, np.bincount(observations.point_index, minlength=len(X)) > 0)
     curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
     ratio, large = (curvature * _block_ratio(system, rows, solve, b) for b in (block, block % _LARGE_BLOCKS))
     alone = curvature * _point_ratio(system, rows)
@@ -138,13 +132,131 @@ def block_scatter(
     place_of = np.where(estimated, len(poses) + number, 0)
     return BlockScatter(
         np.append(variance, 0.0)[np.where(estimated, number, -1)],
-        _shared_variances(S, variance, values, frame, views),
+        _shared_variances(S, variance, values, fit.frame, fit.views),
         np.where(estimated, ratio[place_of], np.nan),
         np.where(estimated, large[place_of], np.nan),
         np.append(pull, 0.0)[np.where(estimated, number, -1)],
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )
+
+
+@dataclass(frozen=True)
+class PoseUncertainty:
+    """How the poses of the V ``views`` depend on noise, on the intrinsics and on faults of the camera model.
+
+    Rows are the rotation about the axes of the camera (rad) and the centre along those of the world, in the
+    inner gauge: after the similarity that moves the cameras least. ``variance`` (V, 6) is that for known
+    intrinsics, ``response`` (V, 6, n) the derivative by each of the n unknown intrinsics, ``covariance``
+    (n, n) theirs, ``number`` (G, C) theirs in the table, -1 if fixed. ``fault`` (V, 6, 4) is the change by a
+    unit of aspect ratio, of skew over focal length, and of either decentring coefficient (Brown 1966).
+    """
+
+    views: I64
+    variance: F64
+    response: F64
+    covariance: F64
+    number: I64
+    fault: F64
+
+    def variances(self, noise: float, std: F64, fault: float) -> F64:
+        """Total variances (V, 6) for a factor ``noise`` on standard deviations, and those of other causes.
+
+        ``std`` (n,) are those of the intrinsics, ``fault`` that of each fault of the camera model.
+        """
+        # The correlations stay those of the adjustment.
+        scaled = self.response * (std / np.sqrt(np.diag(self.covariance)))
+        intrinsics = np.einsum("vkm,vkm->vk", scaled @ self.covariance, scaled)
+        return np.asarray(noise**2 * self.variance + intrinsics + fault**2 * np.sum(self.fault**2, axis=2))
+
+
+def pose_uncertainty(
+    cameras: MetricCameras,
+    X: F64,
+    observations: Observations,
+    free: B8,
+    prior: IntrinsicsPrior,
+    noise: tuple[float, float],
+) -> PoseUncertainty:
+    """Propagate noise, intrinsics and faults of the camera model to the poses after an adjustment (6.7)."""
+    fit = _linearised_fit(cameras, X, observations, free, prior, noise)
+    n, D, first = len(fit.views), fit.information.shape[0], fit.first
+    R = fit.frame.R[fit.views]
+    # Rows to (rotation, centre): C = -R' t moves by -R' d if t moves by d.
+    turn = np.zeros((n, POSE_DOF, POSE_DOF))
+    turn[:, :3, :3], turn[:, 3:, 3:] = np.eye(3), -np.swapaxes(R, 1, 2) / fit.scale
+    S = scipy.sparse.csr_matrix(fit.information)
+    poses = S[:first, :first]
+    known = _covariance(
+        poses if scipy.sparse.issparse(fit.information) else poses.toarray(), fit.frame, fit.views
+    )
+    response = -known(S[:first, first:].toarray()).reshape(n, POSE_DOF, -1)
+    variance = np.zeros((n, POSE_DOF))
+    for v in range(n):
+        rows = np.arange(POSE_DOF * v, POSE_DOF * (v + 1))
+        own = known(_unit_columns(first, rows))[rows]
+        variance[v] = np.einsum("ka,ab,kb->k", turn[v], own, turn[v])
+    moved = fit.solve(np.asarray(fit.system.J.T @ _faults(fit, observations)))[:first]
+    return PoseUncertainty(
+        fit.views,
+        np.maximum(variance, 0.0),
+        turn @ response,
+        fit.solve(_unit_columns(D, np.arange(first, D)))[first:],
+        fit.values.number,
+        turn @ moved.reshape(n, POSE_DOF, -1),
+    )
+
+
+def _faults(fit: _Fit, o: Observations) -> F64:
+    """Weighted displacements (2K, 4) of the observations by the faults that the points do not absorb."""
+    rows = fit.frame.intrinsics[fit.frame.group[o.view_index]]
+    x, y = ((o.xy - rows[:, 3:5]) / rows[:, :1]).T
+    square, none = x * x + y * y, np.zeros_like(x)
+    fields = np.array(
+        [[none, y], [y, none], [square + 2.0 * x * x, 2.0 * x * y], [2.0 * x * y, square + 2.0 * y * y]]
+    )
+    # The columns of the principal point weight displacements by px.
+    weighted = np.einsum("krc,fck->krf", fit.centre_columns * rows[:, :1, None], fields).reshape(-1, 4)
+    return np.asarray(weighted - fit.system.E @ (fit.system.E.T @ weighted))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The linearised adjustment in a centred frame of size 1; the first ``first`` unknowns are the poses."""
+
+    system: _Linearised
+    information: F64 | scipy.sparse.csc_matrix
+    solve: _Solve
+    values: IntrinsicUnknowns
+    start: F64
+    frame: MetricCameras
+    scale: float
+    views: I64
+    first: int
+    centre_columns: F64
+
+
+def _linearised_fit(
+    cameras: MetricCameras,
+    X: F64,
+    o: Observations,
+    free: B8,
+    prior: IntrinsicsPrior,
+    noise: tuple[float, float],
+) -> _Fit:
+    group = cameras.group
+    observed = np.bincount(o.view_index, minlength=len(group)) > 0
+    used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
+    values, start, _ = number_unknowns(cameras, used, free, prior)
+    views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
+    # Centred and scaled to size 1.
+    origin, scale = scene_frame(X[np.unique(o.point_index)])
+    frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
+    place = np.where(observed, np.cumsum(observed) - 1, -1)
+    system, centre_columns = _linearise(frame, scale * (X - origin), o, (values, place), noise)
+    S = _information(system, values.terms.information(values.size), o, len(views))
+    solve = _covariance(S, frame, views)
+    return _Fit(system, S, solve, values, start, frame, scale, views, first, centre_columns)
 
 
 def _information(
@@ -185,7 +297,8 @@ def _linearise(
     o: Observations,
     columns: tuple[IntrinsicUnknowns, I64],
     noise: tuple[float, float],
-) -> _Linearised:
+) -> tuple[_Linearised, F64]:
+    """Linearise; also return the weighted derivatives (K, 2, 2) by the principal point."""
     (values, place), (sigma, loss), width = columns, noise, cameras.intrinsics.shape[1]
     model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
     weighting = Weighting(sigma, loss / sigma)
@@ -195,13 +308,14 @@ def _linearise(
     number = values.number[cameras.group[o.view_index]]
     poses = POSE_DOF * place[o.view_index][:, None] + np.arange(POSE_DOF)
     column = np.concatenate([poses, np.where(number >= 0, first + number, 0)], axis=1)
+    centre_columns = weighted.A[:, :, POSE_DOF + 3 : POSE_DOF + 5].copy()
     weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
     J = _sparse(weighted.A, column, first + values.size)
     B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
     E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
-    return _Linearised(
-        residual - E @ (E.T @ residual), J, scipy.sparse.csr_matrix(E.T @ J), np.repeat(o.point_index, 2)
-    )
+    taken = scipy.sparse.csr_matrix(E.T @ J)
+    system = _Linearised(residual - E @ (E.T @ residual), J, taken, E, np.repeat(o.point_index, 2))
+    return system, centre_columns
 
 
 def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:

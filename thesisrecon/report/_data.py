@@ -27,7 +27,7 @@ from thesisrecon.records import (
     TexturedMesh,
     TwoView,
 )
-from thesisrecon.results import RunResult, in_original_pixels
+from thesisrecon.results import RunResult, in_original_pixels, pose_deviations
 
 MAX_PICTURED = 100
 """Maximum number of images with thumbnails on the page, evenly spread; a table lists the others."""
@@ -242,6 +242,7 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
         for name, working in result.metric.intrinsics[i].items():
             interval = in_original_pixels(name, working, image.scale)
             view[name] = {"value": interval.value, "std": interval.std, "source": interval.source}
+        view["pose_std"] = pose_deviations(result.metric, i)
     return view
 
 

@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
+from thesisrecon.geometry._conditioning import scene_frame
+from thesisrecon.numerics._covariance import gauge_directions
 from thesisrecon.records import MetricResult
 
 NAMES = ("focal_px", "principal_x_px", "principal_y_px")
@@ -47,6 +50,38 @@ def interval_scores(metric: MetricResult, K: F64) -> IntervalScores:
         if "focal_px" in intervals:
             std_rel[view] = intervals["focal_px"].std / intervals["focal_px"].value
     return IntervalScores(z, std_rel)
+
+
+def pose_scores(metric: MetricResult, R: F64, C: F64) -> F64:
+    """Errors (V, 6) of rotations and centres in stated standard deviations; NaN where not registered.
+
+    The true poses, ``R`` (V, 3, 3) and ``C`` (V, 3), are first moved by the similarity that aligns them best,
+    rotations in rad and translations in sizes of the scene: only the differences that remain are errors.
+    """
+    model = metric.reconstruction
+    assert model.K is not None
+    assert metric.pose_std is not None
+    views = np.flatnonzero(model.registered)
+    Rt = np.linalg.solve(model.K[views], model.P[views])
+    X = model.X[model.valid]
+    origin, scale = scene_frame(X[:, :3] / X[:, 3:])
+    found, t = Rt[:, :, :3], scale * (Rt[:, :, 3] + Rt[:, :, :3] @ origin)
+    centres = -np.einsum("vba,vb->va", found, t)
+    U, _, Vt = np.linalg.svd(np.einsum("vab,vac->bc", R[views], found))
+    Q = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    true = C[views] @ Q
+    true = true - true.mean(axis=0)
+    middle = centres.mean(axis=0)
+    true = middle + true * (np.sum(true * (centres - middle)) / np.sum(true**2))
+    turned = Rotation.from_matrix(R[views] @ Q @ np.swapaxes(found, 1, 2)).as_rotvec()
+    shift = -np.einsum("vab,vb->va", found, true - centres)
+    error = np.concatenate([turned, shift], axis=1)
+    N = gauge_directions(found, t)
+    error -= (N @ (N.T @ error.ravel())).reshape(error.shape)
+    error[:, 3:] = -np.einsum("vba,vb->va", found, error[:, 3:]) / scale
+    z = np.full((len(model.registered), 6), np.nan)
+    z[views] = error / metric.pose_std[views]
+    return z
 
 
 def join_scores(scores: Sequence[IntervalScores]) -> IntervalScores:
