@@ -156,7 +156,7 @@ class Join:
 
 
 def weakest_join(model: MetricEstimate) -> Join | None:
-    """Find the two parts of the images whose common tracks agree least with the model; None for one view.
+    """Find the two parts of the images whose common tracks agree least with the model; None without any.
 
     Matches between similar sides of an object can join two parts whose own matches are right. Such a join is
     an edge of the maximum spanning tree of the views; weights are common inliers times their share of the
@@ -165,7 +165,8 @@ def weakest_join(model: MetricEstimate) -> Join | None:
     t, views = model.tracks, np.flatnonzero(model.registered)
     place = np.full(t.n_views, -1)
     place[views] = np.arange(len(views))
-    k = np.flatnonzero(place[t.view_index] >= 0)
+    # Points of nearly coincident cameras are never inliers.
+    k = np.flatnonzero(triangulable_observations(model))
     view, point, inlier = place[t.view_index[k]], t.point_index[k], model.inlier[k]
 
     def common(of: B8) -> scipy.sparse.csr_matrix:

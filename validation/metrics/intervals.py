@@ -76,7 +76,7 @@ def pose_scores(metric: MetricResult, R: F64, C: F64) -> F64:
     turned = Rotation.from_matrix(R[views] @ Q @ np.swapaxes(found, 1, 2)).as_rotvec()
     shift = -np.einsum("vab,vb->va", found, true - centres)
     error = np.concatenate([turned, shift], axis=1)
-    N = gauge_directions(found, t)
+    N = gauge_directions(np.asarray(found, dtype=np.float64), t)
     error -= (N @ (N.T @ error.ravel())).reshape(error.shape)
     error[:, 3:] = -np.einsum("vba,vb->va", found, error[:, 3:]) / scale
     z = np.full((len(model.registered), 6), np.nan)
