@@ -45,7 +45,7 @@ def cameras_table(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     listed = [
         {"name": name, "width": camera.size[0], "height": camera.size[1]}
         | {key: getattr(camera, key) for key in ("K", "distortion", "R", "t", "centre")}
-        | ({"std": camera.std} if camera.std else {})
+        | ({"std": dict(sorted(camera.std.items()))} if camera.std else {})
         for name, camera in cameras.items()
     ]
     convention = (

@@ -35,8 +35,6 @@ OVERDISPERSION_RANGE = (1.3, 1.8)
 """Overdispersion that pure noise does not reach, and that at which the model is certainly inexact."""
 TAIL_RANGE = (1.2, 1.6)
 """The same for the width of the tail of the residuals: 1 for normal noise, 2 to 3 for real images."""
-DIGITS = 6
-"""Significant digits of standard deviations of poses."""
 COLUMNS = (FOCAL, *CENTRE, K1)
 """Intrinsics with a hierarchical prior."""
 MIN_MEMBERS = 3
@@ -308,11 +306,8 @@ def pose_std(
     ratio, large = (float(np.median(values)) if len(values) else np.nan for values in known)
     noise = _inflation(scatter, ratio, large, lack_of_fit(scatter, model.tail))
     fault = MODEL_FLOOR_REL * np.sqrt(lack_of_fit(scatter, model.tail))
-    found = np.sqrt(poses.variances(noise, std, fault))
-    # Last digits of matrix products can depend on the alignment of memory, but runs must give the same bytes.
-    step = 10.0 ** (np.floor(np.log10(np.maximum(found, 1e-300))) - DIGITS + 1)
     answer = np.full((len(model.registered), 6), np.nan)
-    answer[poses.views] = np.round(found / step) * step
+    answer[poses.views] = np.sqrt(poses.variances(noise, std, fault))
     return answer
 
 
