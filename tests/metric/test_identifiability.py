@@ -28,7 +28,7 @@ from thesisrecon.selfcalibration._identifiability import check_identifiability
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SETS = (
     "truth/temple/images", "truth/lego/images", "truth/dino/images", "truth/kitti1/images",
-    "truth/fern/images", "strecha/fountain-P11/images", "strecha/Herz-Jesus-P8/images", "kermit",
+    "truth/fern/images", "strecha/fountain-P11/images", "strecha/Herz-Jesus-P8/images", "kermit/images",
 )  # fmt: skip
 WITHIN = 0.05
 
