@@ -1,4 +1,4 @@
-"""Names of NumPy array types, defined here only."""
+"""Names of NumPy array types, defined here only, and rows of arrays by the number of their image."""
 
 from __future__ import annotations
 
@@ -19,3 +19,9 @@ U32 = NDArray[np.uint32]
 U64 = NDArray[np.uint64]
 
 Stratum = Literal["projective", "affine", "metric"]
+
+
+def rows_of_views(view: I64, n_views: int) -> list[I64]:
+    """The rows of ``view`` (K,) with each view, in their order."""
+    ends = np.cumsum(np.bincount(view, minlength=n_views))
+    return np.split(np.argsort(view, kind="stable"), ends[:-1])

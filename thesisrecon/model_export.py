@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 import numpy as np
 
 from thesisrecon.alignment import as_sparse_model
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, rows_of_views
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -278,13 +278,14 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
     """The model with pinhole views, observations in their pixels, and names of files that can be written."""
     frames: dict[tuple[bytes, bytes, object], tuple[F64, tuple[int, int]]] = {}
     views, xy = list[SparseView](), model.xy.copy()
+    rows = rows_of_views(model.view_index, len(model.views))
     for i, view in enumerate(model.views):
         K, size = calibration(view)
         key = (K.tobytes(), coefficients(view).tobytes(), size)
         if key not in frames:
             frames[key] = _pinhole_frame(view, centred=bundler)
         K, size = frames[key]
-        here = model.view_index == i
+        here = rows[i]
         xy[here] = _normalized(view, xy[here]) @ K[:2, :2].T + K[:2, 2]
         views.append(
             replace(view, name=_file_name(view.name, plain=bundler), K=K, size=size, distortion=np.zeros(3))

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64, I64, U8
+from thesisrecon.arrays import B8, F64, I64, U8, rows_of_views
 from thesisrecon.geometry.camera_matrix import project_camera
 from thesisrecon.io._files import write_atomically
 from thesisrecon.records import Reconstruction
@@ -60,12 +60,13 @@ def write_colmap_model(
     kept &= np.bincount(point[kept], minlength=len(r.X))[point] >= 2
     view, point, xy = view[kept], point[kept], r.tracks.xy[kept]
     posed, distance = dict[int, _PosedImage](), np.zeros(len(view))
+    rows = rows_of_views(view, len(r.P))
     for i in np.flatnonzero(r.registered).tolist():
         width, height = (int(size) for size in original_sizes[i])
         camera = (int(groups[i]), width, height, *_camera_params(r.K[i], r.distortion[i], scales[i]))
         R, t = _pose(r.K[i], r.P[i])
         posed[i] = _PosedImage(names[i], R, t, camera)
-        here = view == i
+        here = rows[i]
         seen = project_camera(r.K[i], R, t, _points(r.X[point[here]]), distortion=r.distortion[i])
         distance[here] = np.linalg.norm((seen - xy[here]) * scales[i], axis=1)
     observed = _Observations(view, point, (xy + PIXEL_CENTRE) * scales[view, None], distance)
@@ -76,13 +77,14 @@ def write_colmap_model(
 def write_sparse_model(folder: str | Path, model: SparseModel, *, pinhole: bool = False) -> None:
     """Write a sparse model, without skew, as a binary COLMAP model; ``pinhole`` uses PINHOLE throughout."""
     posed, distance = dict[int, _PosedImage](), np.zeros(len(model.xy))
+    rows = rows_of_views(model.view_index, len(model.views))
     for i, view in enumerate(model.views):
         assert view.K is not None
         assert view.size is not None
         assert view.distortion is not None
         kind, params = _camera_params(view.K, view.distortion, 1.0, pinhole=pinhole)
         posed[i] = _PosedImage(view.name, view.R, view.t, (0, *view.size, kind, params))
-        here = model.view_index == i
+        here = rows[i]
         X = model.X[model.point_index[here]]
         seen = project_camera(view.K, view.R, view.t, X, distortion=view.distortion)
         distance[here] = np.linalg.norm(seen - model.xy[here], axis=1)
@@ -120,14 +122,14 @@ def _write(
     # One camera per group and set of intrinsics.
     cameras: dict[tuple[object, ...], int] = {}
     camera_parts, images, frames = list[bytes](), list[bytes](), list[bytes]()
-    row = np.zeros(len(view), dtype=np.int64)
+    row, rows = np.zeros(len(view), dtype=np.int64), rows_of_views(view, max(posed, default=-1) + 1)
     for i, (name, R, t, camera) in posed.items():
         _, width, height, model, params = camera
         if camera not in cameras:
             cameras[camera] = len(cameras) + 1
             head = (cameras[camera], _MODELS[model], width, height)
             camera_parts.append(struct.pack(f"<IiQQ{len(params)}d", *head, *params))
-        here = np.flatnonzero(view == i)
+        here = rows[i]
         row[here] = np.arange(len(here))
         quaternion = np.roll(scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True), 1)
         observations = np.empty(len(here), dtype=POINT_2D)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, rows_of_views
 from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.io._colmap_writing import PIXEL_CENTRE, colors_of
 from thesisrecon.io._exports import write_point_cloud
@@ -116,8 +116,7 @@ def write_bundler(folder: Path, model: SparseModel) -> Path:
 def _keys(model: SparseModel) -> list[int]:
     """Number of each observation among those of its view."""
     keys = np.zeros(len(model.view_index), np.int64)
-    for i in range(len(model.views)):
-        here = np.flatnonzero(model.view_index == i)
+    for here in rows_of_views(model.view_index, len(model.views)):
         keys[here] = np.arange(len(here))
     return keys.tolist()
 

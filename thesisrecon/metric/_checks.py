@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.metric._model import (
     MetricEstimate,
     inlier_mask,
@@ -22,7 +22,6 @@ from thesisrecon.metric._model import (
 from thesisrecon.metric._uncertainty import USUAL_INFLATION
 from thesisrecon.numerics._metric_bundle import MAX_SIGMAS_TO_MINIMUM
 from thesisrecon.numerics._noise import MAD_FACTOR, noise_from_distances
-from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.numerics._partial_bundle import refine_pose
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 

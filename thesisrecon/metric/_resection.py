@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import counted
 from thesisrecon.geometry.robust_resection import resect_calibrated
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
@@ -23,7 +23,6 @@ from thesisrecon.metric._model import (
     retriangulate_tracks,
     seen_views,
 )
-from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.numerics._partial_bundle import refine_pose
 
 ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)

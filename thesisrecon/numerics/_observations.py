@@ -88,12 +88,6 @@ class Observations(NamedTuple):
     xy: F64
 
 
-def rows_of_views(view: I64, n_views: int) -> list[I64]:
-    """The rows of ``view`` (K,) with each view, in their order."""
-    ends = np.cumsum(np.bincount(view, minlength=n_views))
-    return np.split(np.argsort(view, kind="stable"), ends[:-1])
-
-
 def cached_pair_order(first: ArrayLike, second: ArrayLike) -> I64:
     """Indices of view pairs in an order in which cached data of a view are reused.
 

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import scipy
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64, I64, rows_of_views
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._files import require_image_name
@@ -237,14 +238,15 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
     _, kept = np.unique(np.asarray(point, dtype=np.int64) * count + view, return_index=True)
     kept = kept[np.bincount(point[kept], minlength=tracks.n_points)[point[kept]] >= 2]
     view, point, xy = view[kept], point[kept], np.asarray(tracks.xy, dtype=np.float64)[kept]
-    here = [np.flatnonzero(view == i) for i in range(count)]
+    here = rows_of_views(view, count)
     corners = [_positions(xy[rows], i, views) for i, rows in enumerate(here)]
     found: list[Matches] = []
-    for i in range(count):
-        for j in range(i + 1, count):
-            _, a, b = np.intersect1d(point[here[i]], point[here[j]], return_indices=True)
-            if len(a) >= MIN_COMMON_POINTS:
-                found.append(_match_record((i, j), a, b, corners[i][a], corners[j][b]))
+    seen = scipy.sparse.csr_matrix((np.ones(len(view), dtype=np.int32), (view, point)))
+    common = scipy.sparse.triu(seen @ seen.T, 1).tocoo()
+    pairs = np.column_stack([common.row, common.col])[common.data >= MIN_COMMON_POINTS]
+    for i, j in pairs[np.lexsort(pairs.T[::-1])].tolist():
+        _, a, b = np.intersect1d(point[here[i]], point[here[j]], return_indices=True)
+        found.append(_match_record((i, j), a, b, corners[i][a], corners[j][b]))
     if not found:
         raise UsageError(
             f"no two images share {MIN_COMMON_POINTS} of the {counted(tracks.n_points, 'point')}"

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import F32, F64, I64, U8
+from thesisrecon.arrays import F32, F64, I64, U8, rows_of_views
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import distort, project
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.numerics._observations import rows_of_views
 from thesisrecon.records import (
     HeldOut,
     IdentifiabilityReport,
@@ -93,7 +92,8 @@ def reprojection_distances(reconstruction: Reconstruction) -> list[F64]:
     """Residual lengths |observed - reprojected| (px) per view, empty if it is not registered."""
     used = np.flatnonzero(reconstruction.used)
     views = reconstruction.tracks.view_index[used]
-    return [_distances_in_view(reconstruction, i, used[views == i]) for i in range(len(reconstruction.P))]
+    rows = rows_of_views(views, len(reconstruction.P))
+    return [_distances_in_view(reconstruction, i, used[here]) for i, here in enumerate(rows)]
 
 
 def _distances_in_view(reconstruction: Reconstruction, i: int, observations: I64) -> F64:
