@@ -133,7 +133,7 @@ def exit_code_of(command: Callable[[], object]) -> int:
         return _report("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
     except MemoryError:
         return _report(
-            "out of memory; close other programs, or reconstruct with a smaller --max-size or fewer --threads",
+            "out of memory; reconstruct with a smaller --max-size or fewer --threads",
             IMPOSSIBLE,
         )
     except OSError as error:
