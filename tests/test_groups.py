@@ -63,7 +63,7 @@ def test_each_group_has_a_model_and_the_largest_is_first(tmp_path):
     summary = read(tmp_path / "summary.json")
     entry = {"folder": "group-2", "images": 3, "registered": 3, "trusted": True, "failure": None}
     assert summary["groups"] == [entry | {"names": ["00.png", "01.png", "02.png"]}]
-    sentence = "The images form 2 groups that do not overlap: 4 images of this model, 3 in group-2"
+    sentence = "The images form 2 models without a common scale: 4 images in this model, 3 in group-2"
     assert sentence in summary["warnings"]
     said = summary_text(summary, tmp_path)
     assert f"group-2: 3 of 3 images registered; report: {tmp_path}" in said
@@ -136,3 +136,28 @@ def test_a_group_takes_the_pairs_of_the_whole_set_and_not_older_ones(tmp_path, m
     monkeypatch.setattr(_matching_stages, "reject_repeated_structure", reject_first)
     run(tmp_path, overwrite=True)
     assert [pair.accepted for pair in load(tmp_path / "group-2").pairs] == [False, True, True]
+
+
+@dataclass(frozen=True)
+class ProjectiveOfAFew(ProjectiveOfSize):
+    """Registers the first three of the views of its pairs."""
+
+    def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
+        found = super().reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt)
+        few = found.registered & (found.registered.cumsum() <= 3)
+        reasons = tuple("" if there else "sees 5 points" for there in few)
+        return replace(found, registered=few, reasons=reasons)
+
+
+def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
+    config = fake_config(projective=ProjectiveOfAFew())
+    result = reconstruction.reconstruct(photographs(8), tmp_path, config=config, until="metric")
+    assert [group["registered"] for group in result.summary["groups"]] == [3]
+    sentence = "The images form 2 models without a common scale: 3 images in this model, 3 in group-2"
+    assert sentence in result.summary["warnings"]
+    assert "is reconstructed in group-2" in result.refused["03.png"]
+    assert result.refused["07.png"] == "sees 5 points"
+    off = replace(config, images=ImageOptions(groups=False))
+    result = reconstruction.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
+    assert "groups" not in result.summary
+    assert not (tmp_path / "off" / "group-2").exists()

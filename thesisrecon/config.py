@@ -395,7 +395,7 @@ class ImageOptions:
     max_size_px : int
         Larger images are reduced to this long side.
     groups : bool
-        Reconstruct each group of 3 or more images without overlap with the others.
+        Reconstruct each group of 3 or more images with too little overlap with the others.
     part_views : int
         Maximum number of images (approximately) that are reconstructed together. Larger sets are divided
         into overlapping parts if a division separates few of the common points; 0: never.

@@ -22,6 +22,7 @@ from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.numerics._observations import Observations, sort_observations
 from thesisrecon.pipeline._image_pair import values_at, verify_matches
 from thesisrecon.pipeline._matching_stages import finish_matches
+from thesisrecon.pipeline._parts import tracks_of_part
 from thesisrecon.pipeline._stages import finish_tracks, require_accepted_pair
 from thesisrecon.pipeline._state import PipelineState
 from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView
@@ -349,5 +350,7 @@ def take_tracks(given: Given, state: PipelineState) -> None:
     require_accepted_pair(state)
     tracks, run = given.tracks, state.run
     assert tracks is not None
+    if state.views is not None:
+        tracks = tracks_of_part(tracks, np.array(state.views))
     key = run.key("tracks", "given", tracks.view_index, tracks.point_index, tracks.xy)
     finish_tracks(state, run.cached("tracks", "tracks", key, lambda: tracks))

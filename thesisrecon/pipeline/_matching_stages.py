@@ -228,10 +228,25 @@ def split_groups(state: PipelineState) -> None:
     views, links = len(state.result.images), [(p.i, p.j) for p in state.result.pairs if p.accepted]
     if not links or not state.config.images.groups:
         return
+    large = _groups(views, links, MIN_GROUP)
+    state.groups = large if len(large) > 1 else ()
+
+
+def _groups(views: int, links: Sequence[tuple[int, int]], fewest: int) -> list[list[int]]:
+    """The groups of ``fewest`` or more views, the largest first."""
     label = connected_groups(views, links)
     groups = [np.flatnonzero(label == k).tolist() for k in range(label.max() + 1)]
-    large = sorted((group for group in groups if len(group) >= MIN_GROUP), key=lambda group: -len(group))
-    state.groups = large if len(large) > 1 else ()
+    return sorted((group for group in groups if len(group) >= fewest), key=lambda group: -len(group))
+
+
+def groups_left_over(state: PipelineState) -> list[list[int]]:
+    """The groups of images that overlap with each other but are not registered in the model of this run."""
+    model = state.result.best_reconstruction
+    if model is None or not model.registered.any() or not state.config.images.groups:
+        return []
+    missing = ~model.registered
+    links = [(p.i, p.j) for p in state.used_pairs if p.accepted and missing[p.i] and missing[p.j]]
+    return _groups(len(missing), links, MIN_GROUP)
 
 
 def take_group(whole: PipelineState, views: Sequence[int], state: PipelineState) -> None:

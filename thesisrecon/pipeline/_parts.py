@@ -171,7 +171,8 @@ def _rows_of_part(tracks: Tracks, views: I64, points: I64) -> I64:
     return np.flatnonzero(np.isin(tracks.view_index, views) & np.isin(tracks.point_index, points))
 
 
-def _tracks_of_part(tracks: Tracks, views: I64) -> Tracks:
+def tracks_of_part(tracks: Tracks, views: I64) -> Tracks:
+    """The tracks of some views, with views and points renumbered."""
     points = points_of_part(tracks, views)
     view, point = np.full(tracks.n_views, -1), np.full(tracks.n_points, -1)
     view[views], point[points] = np.arange(len(views)), np.arange(len(points))
@@ -194,7 +195,7 @@ def input_of_part(
         for p in inside
     )
     rows = {name: getattr(prior, name)[views] for name in ("mean", "std", "shared", "kind")}
-    return PartInput(_tracks_of_part(tracks, views), renumbered, sizes[views], replace(prior, **rows))
+    return PartInput(tracks_of_part(tracks, views), renumbered, sizes[views], replace(prior, **rows))
 
 
 def reconstruct_part(
@@ -244,7 +245,7 @@ def align_parts(
     of the ``models`` are those of ``tracks``.
     """
     models = [
-        replace(model, tracks=_tracks_of_part(tracks, views))
+        replace(model, tracks=tracks_of_part(tracks, views))
         for model, views in zip(models, parts, strict=True)
     ]
     order = sorted(range(len(parts)), key=lambda p: -int(models[p].registered.sum()))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import B8
+from thesisrecon.arrays import B8, F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
@@ -124,6 +124,10 @@ class PipelineState:
     prepared: Sequence[Any] | None = None
     groups: Sequence[Sequence[int]] = ()
     """Views of the groups of images that do not overlap, the largest first; empty if there is one."""
+    views: Sequence[int] | None = None
+    """Numbers of the images in the run that this one is a part of."""
+    focals: F64 | None = None
+    """Focal lengths of the same cameras in another model, and relative standard deviations (V, 2), or NaN."""
 
     @property
     def config(self) -> PipelineConfig:
@@ -156,7 +160,11 @@ class PipelineState:
         """Prior of the intrinsics at working size."""
         scales = np.array([image.scale for image in self.result.images])
         sizes = [image.original_size for image in self.result.images]
-        return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
+        prior = prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
+        if self.focals is not None:
+            better = self.focals[:, 1] < prior.std[:, 0]
+            prior.mean[better, 0], prior.std[better, 0] = self.focals[better].T
+        return prior
 
     def require_images(self) -> None:
         """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from typing import Any
 
+import numpy as np
+
 from thesisrecon._settings import tables_from_config
+from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import camera_numbers
 from thesisrecon.io._images import ImageSet
 from thesisrecon.pipeline._matching_stages import (
     find_features,
+    groups_left_over,
     match_pairs,
     select_pairs,
     split_groups,
@@ -61,11 +66,12 @@ def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Itera
 
 
 def run_steps(state: PipelineState, steps: Sequence[Step], *, surface_required: bool) -> RunResult:
-    """Run the steps for the largest group of images, then for the others; write outputs, of failures too."""
+    """Run the steps for the largest group of images, then for the rest; write outputs, of failures too."""
     failure = _failure_of(state, (_begin, *steps), surface_required=surface_required)
     state.prepared = None
-    if split_groups in steps:
-        _run_groups(state, steps[steps.index(split_groups) + 1 :], surface_required=surface_required)
+    if further := steps[len(STEPS["matches"]) :]:
+        again = [step for step in further if step is not split_groups]
+        _run_groups(state, again, surface_required=surface_required)
     result = write_outputs(state.run, state.result, until=state.until, failure=failure)
     if failure is not None:
         raise failure
@@ -90,54 +96,84 @@ def _failure_of(
 
 
 def _run_groups(state: PipelineState, steps: Sequence[Step], *, surface_required: bool) -> None:
-    """Reconstruct the other groups in folders of their own; remove the results of groups that are gone."""
-    run, folder = state.run, state.run.directory.path
-    for number, views in enumerate(state.groups[1:], 2):
-        run.groups.append(_run_group(state, f"group-{number}", views, steps, surface_required))
-    for number in count(max(len(state.groups), 1) + 1):
+    """Reconstruct the other groups and the images left over, in folders; remove those that are gone."""
+    run, folder, places = state.run, state.run.directory.path, dict[int, str]()
+    camera = _focals(state)
+    pending = deque[tuple[Sequence[int], F64 | None]]((views, None) for views in state.groups[1:])
+    pending.extend((views, camera) for views in groups_left_over(state))
+    while pending:
+        (views, focals), name = pending.popleft(), f"group-{len(run.groups) + 2}"
+        part = _run_group(state, name, views, focals, steps, surface_required)
+        pending.extend(([views[k] for k in rest], camera) for rest in groups_left_over(part))
+        if (model := part.result.best_reconstruction) is not None:
+            places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
+    for number in count(len(run.groups) + 2):
         if not (folder / f"group-{number}" / RESULT_FILES[0]).exists():
             break
         RunDirectory(folder / f"group-{number}").remove(RESULT_FILES)
     if run.groups:
-        others = ", ".join(f"{group['images']} in {group['folder']}" for group in run.groups)
-        here = counted(len(state.groups[0]), "image")
-        groups = f"The images form {len(state.groups)} groups that do not overlap"
-        run.warnings.append(f"{groups}: {here} of this model, {others}")
-        state.result = _with_group_reasons(state)
+        here = state.result.best_reconstruction
+        registered = counted(0 if here is None else int(here.registered.sum()), "image")
+        others = ", ".join(f"{group['registered']} in {group['folder']}" for group in run.groups)
+        models = f"The images form {len(run.groups) + 1} models without a common scale"
+        run.warnings.append(f"{models}: {registered} in this model, {others}")
+        state.result = _with_group_reasons(state.result, places)
+
+
+def _focals(state: PipelineState) -> F64 | None:
+    """Focal length and its relative standard deviation (V, 2) from a trusted model; NaN: not estimated."""
+    metric, shared = state.result.metric, state.prior.group
+    if metric is None or not metric.trusted:
+        return None
+    found = np.full((len(shared), 2), np.nan)
+    for view in np.flatnonzero(metric.reconstruction.registered)[::-1]:
+        focal = metric.intrinsics[view]["focal_px"]
+        found[shared == shared[view]] = focal.value, focal.std / focal.value
+    return found
 
 
 def _run_group(
-    whole: PipelineState, name: str, views: Sequence[int], steps: Sequence[Step], surface_required: bool
-) -> dict[str, Any]:
-    """Reconstruct a group as a run of its own; return its entry in the summary of the whole."""
+    whole: PipelineState,
+    name: str,
+    views: Sequence[int],
+    focals: F64 | None,
+    steps: Sequence[Step],
+    surface_required: bool,
+) -> PipelineState:
+    """Reconstruct a group as a run of its own, and add its entry to the summary of the whole.
+
+    ``focals`` (V, 2) are focal lengths that another model of the same cameras determined, and their relative
+    standard deviations.
+    """
     directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared, part=True)
     run = whole.run.inside(directory)
     inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
-    state = PipelineState(run, inputs, empty_result(run, inputs), whole.until)
+    state = PipelineState(run, inputs, empty_result(run, inputs), whole.until, views=views)
+    state.focals = None if focals is None else focals[list(views)]
     identity = identity_of(run, inputs)
     with directory.claim(identity, overwrite=True):
         directory.adopt(identity, overwrite=True, results=RESULT_FILES)
         take_group(whole, views, state)
         failure = _failure_of(state, steps, surface_required=surface_required)
-        result = write_outputs(run, state.result, until=state.until, failure=failure)
-    facts = {fact: result.summary[fact] for fact in ("images", "registered", "trusted", "failure")}
-    return {"folder": name, "names": state.names, **facts}
+        state.prepared = None
+        state.result = write_outputs(run, state.result, until=state.until, failure=failure)
+    facts = {fact: state.result.summary[fact] for fact in ("images", "registered", "trusted", "failure")}
+    whole.run.groups.append({"folder": name, "names": state.names, **facts})
+    return state
 
 
-def _with_group_reasons(state: PipelineState) -> RunResult:
-    """The result in which the reason against each image of another group is that group."""
-    folder_of = {i: f"group-{n}" for n, group in enumerate(state.groups[1:], 2) for i in group}
+def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResult:
+    """The result in which the reason against each image that another model contains is that model."""
 
     def named(found: Reconstruction) -> Reconstruction:
         reasons = [
-            f"is reconstructed in {folder_of[i]}: it overlaps with none of these images"
-            if i in folder_of
+            f"is reconstructed in {places[i]}: it overlaps too little with the images of this model"
+            if i in places
             else reason
             for i, reason in enumerate(found.reasons)
         ]
         return replace(found, reasons=tuple(reasons))
 
-    result = state.result
     if result.projective is not None:
         result = replace(result, projective=named(result.projective))
     if result.metric is not None:
