@@ -77,6 +77,7 @@ OF_PAGES = {
         ["--sizes", "12", "--until", "dense"],
         ["--scene", "street", "--sizes", "72", "--set", "images.part_views=30"],
     ],
+    "coverage-real": [["--trials", "60"]],
     "critical-motions": [["--trials", "200"]],
     "epipolar": [["--trials", "2000"]],
     "epipolar-methods": [["--trials", "500"]],
