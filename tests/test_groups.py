@@ -161,3 +161,11 @@ def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
     result = reconstruction.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
     assert "groups" not in result.summary
     assert not (tmp_path / "off" / "group-2").exists()
+
+
+def test_a_projective_run_leaves_no_images_over(tmp_path):
+    """It may end at the core of a large set, whose other images the metric stage registers."""
+    config = fake_config(projective=ProjectiveOfAFew())
+    result = reconstruction.reconstruct(photographs(8), tmp_path, config=config, until="projective")
+    assert "groups" not in result.summary
+    assert not list(tmp_path.glob("group-*"))

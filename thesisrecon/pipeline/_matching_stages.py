@@ -244,6 +244,9 @@ def groups_left_over(state: PipelineState) -> list[list[int]]:
     model = state.result.best_reconstruction
     if model is None or not model.registered.any() or not state.config.images.groups:
         return []
+    # A projective run may end at the core of a large set.
+    if state.until == "projective":
+        return []
     missing = ~model.registered
     links = [(p.i, p.j) for p in state.used_pairs if p.accepted and missing[p.i] and missing[p.j]]
     return _groups(len(missing), links, MIN_GROUP)
