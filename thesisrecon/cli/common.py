@@ -132,10 +132,7 @@ def exit_code_of(command: Callable[[], object]) -> int:
         # Only if called by another program: the command itself exits in `install_signal_handlers`.
         return _report("; ".join((REASONS[SIGINT], *map(str, stop.args))), CODES[SIGINT])
     except MemoryError:
-        return _report(
-            "out of memory; reconstruct with a smaller --max-size or fewer --threads",
-            IMPOSSIBLE,
-        )
+        return _report("out of memory; reconstruct with a smaller --max-size or fewer --threads", IMPOSSIBLE)
     except OSError as error:
         if error.errno in WRITE_ERRNOS:
             # The kernel cache and redirected output can fill a disk too.

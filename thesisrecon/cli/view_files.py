@@ -172,9 +172,9 @@ def render_run(
 
         with _described(outputs, path, {**given, "frames": listed}) as warnings:
             Workers(threads).run(draw, [(k,) for k in range(len(views))], finished)
-            _animate(folder, path, len(views), warnings)
-        finished(len(views), None)
-    return _written(folder, path, len(views), size, warnings)
+            animation = _animate(folder, path, len(views), warnings)
+        finished(len(views), animation)
+    return _written(folder, len(views), size, animation, warnings)
 
 
 def interpolate_images(
@@ -209,7 +209,7 @@ def interpolate_images(
                 write_frame(folder, k + 1, rgb)
                 drawn.append((caption, rgb))
                 report("views", k + 1, frames + 2)
-            _animate(folder, method, frames, warnings, milliseconds=_FRAME_MS)
+            animation = _animate(folder, method, frames, warnings, milliseconds=_FRAME_MS)
             report("views", frames + 1, frames + 2)
             title = "Between " + " and ".join(image.name for image in images)
 
@@ -218,7 +218,7 @@ def interpolate_images(
 
             made(STRIP, write_strip, warnings, None)
         report("views", frames + 2, frames + 2)
-    return _written(folder, method, frames, rgb.shape[1::-1], warnings)
+    return _written(folder, frames, rgb.shape[1::-1], animation, warnings)
 
 
 @contextmanager
@@ -278,16 +278,16 @@ def _check_images(paths: Sequence[Path]) -> None:
             raise UsageError(f"{first} is given twice; give different images")
 
 
-def _animate(folder: Path, name: str, frames: int, warnings: list[str], **options: int) -> None:
+def _animate(folder: Path, name: str, frames: int, warnings: list[str], **options: int) -> Path | None:
     files, path = [folder / frame_name(k + 1) for k in range(frames)], folder / f"{name}{animation_suffix()}"
-    made(path.name, lambda: write_animation(path, files, **options), warnings, path)
+    return made(path.name, lambda: write_animation(path, files, **options), warnings, None)
 
 
-def _written(folder: Path, name: str, frames: int, size: Sequence[int], warnings: list[str]) -> str:
+def _written(
+    folder: Path, frames: int, size: Sequence[int], animation: Path | None, warnings: list[str]
+) -> str:
     files = f"{counted(frames, 'frame')} of {size[0]} x {size[1]} px"
-    animation = f"{name}{animation_suffix()}"
-    lost = any(f": {animation} (" in warning for warning in warnings)
-    files += "" if lost else f" and {animation}"
+    files += "" if animation is None else f" and {animation.name}"
     lines = [f"{files} written to {folder}", *(f"warning: {warning}" for warning in warnings)]
     return "\n".join(map(printable, lines))
 
