@@ -12,7 +12,7 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics import _block_scatter, _levenberg_marquardt, _metric_kernels, _schur
 from thesisrecon.numerics import _projective_kernels as kernels
 from thesisrecon.numerics import _reduced_solvers as solvers
-from thesisrecon.numerics._block_scatter import _gram_matrix, block_scatter, pose_uncertainty
+from thesisrecon.numerics._block_scatter import _gram_matrix, block_scatter, linearise_fit, pose_uncertainty
 from thesisrecon.numerics._elimination import ReducedSums, revert_crossing_points, sum_leverages
 from thesisrecon.numerics._levenberg_marquardt import invert_information
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
@@ -327,7 +327,7 @@ def _scatter(block, xy, *, free=FREE, loss=20.0, std=np.inf):
     options = BundleOptions(sigma_px=SIGMA, loss_px=loss * SIGMA, max_iterations=30, covariance=True)
     fit = refine_metric_bundle(block.cameras, block.X, seen, free=free, prior=prior, options=options)
     noise = (SIGMA, loss * SIGMA)
-    return fit, block_scatter(fit.cameras, fit.X, seen, free, prior, noise)
+    return fit, block_scatter(linearise_fit(fit.cameras, fit.X, seen, free, prior, noise))
 
 
 def test_the_variance_is_that_of_bundle_adjustment():
@@ -392,7 +392,7 @@ def test_the_scatter_of_a_street_is_that_of_dense_information(monkeypatch, own):
     found = []
     for share in (0.0, 0.5):
         monkeypatch.setattr(_block_scatter, "_SPARSE", share)
-        found.append(block_scatter(fit.cameras, fit.X, walk.seen, free, prior, (0.5, 1.0)))
+        found.append(block_scatter(linearise_fit(fit.cameras, fit.X, walk.seen, free, prior, (0.5, 1.0))))
     dense, sparse = found
     np.testing.assert_allclose(sparse.variance, dense.variance, rtol=1e-5)
     np.testing.assert_allclose(sparse.shared_variance, dense.shared_variance, rtol=1e-5)
@@ -415,7 +415,7 @@ def test_the_variance_of_poses_is_that_of_bundle_adjustment_and_grows_with_the_i
     fit, scatter = _scatter(block, xy)
     seen = Observations(block.view, block.point, xy)
     prior = IntrinsicsPrior.unshared(fit.cameras.intrinsics, np.full_like(fit.cameras.intrinsics, np.inf))
-    poses = pose_uncertainty(fit.cameras, fit.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA))
+    poses = pose_uncertainty(linearise_fit(fit.cameras, fit.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA)))
     own = np.sqrt(np.diag(poses.covariance))
     np.testing.assert_allclose(own, np.sqrt(scatter.variance[0][FREE]), rtol=1e-6)
     R, covariance = fit.cameras.R, (SIGMA / fit.sigma_px) ** 2 * fit.pose_covariance
@@ -434,7 +434,7 @@ def test_faults_of_the_camera_model_move_the_poses_as_an_adjustment_does():
     fields = [(0 * x, y), (y, 0 * x), (3 * x**2 + y**2, 2 * x * y), (2 * x * y, x**2 + 3 * y**2)]
     seen = Observations(block.view, block.point, block.xy)
     prior = IntrinsicsPrior.unshared(q[:1], np.full_like(q[:1], np.inf))
-    poses = pose_uncertainty(exact.cameras, exact.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA))
+    poses = pose_uncertainty(linearise_fit(exact.cameras, exact.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA)))
     for n, field in enumerate(fields):
         moved, _ = _scatter(block, block.xy + eps * q[:, :1] * np.array(field).T)
         turned = np.swapaxes(moved.cameras.R, 1, 2) @ exact.cameras.R

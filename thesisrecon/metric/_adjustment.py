@@ -12,8 +12,10 @@ from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
 from thesisrecon.numerics._block_scatter import (
     BlockScatter,
+    LinearisedFit,
     PoseUncertainty,
     block_scatter,
+    linearise_fit,
     pose_uncertainty,
 )
 from thesisrecon.numerics._metric_bundle import (
@@ -141,17 +143,21 @@ class MetricAdjustment:
 
     def scatter(self, model: MetricEstimate) -> BlockScatter:
         """Covariance of the cameras, and the scatter of their estimates between blocks of the scene."""
-        return block_scatter(model.cameras, model.X, *self._weighted(model))
+        return block_scatter(self._linearised(model))
 
     def poses(self, model: MetricEstimate) -> PoseUncertainty:
         """Covariance of the poses, and what the intrinsics and faults of the camera model change in them."""
-        return pose_uncertainty(model.cameras, model.X, *self._weighted(model))
+        return pose_uncertainty(self._linearised(model))
 
-    def _weighted(
-        self, model: MetricEstimate
-    ) -> tuple[Observations, B8, IntrinsicsPrior, tuple[float, float]]:
-        noise = self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px
-        return _inlier_observations(model), self.free(model), self.row_prior(model), noise
+    def _linearised(self, model: MetricEstimate) -> LinearisedFit:
+        return linearise_fit(
+            model.cameras,
+            model.X,
+            _inlier_observations(model),
+            free=self.free(model),
+            prior=self.row_prior(model),
+            noise=(self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px),
+        )
 
 
 def _shares_a_lens(model: MetricEstimate) -> B8:

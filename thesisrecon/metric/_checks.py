@@ -154,18 +154,18 @@ class Join:
         return self.inliers / max(self.tracks, 1)
 
 
-def weakest_join(model: MetricEstimate) -> Join | None:
+def weakest_join(model: MetricEstimate, near: B8) -> Join | None:
     """Find the two parts of the images whose common tracks agree least with the model; None without any.
 
     Matches between similar sides of an object can join two parts whose own matches are right. Such a join is
     an edge of the maximum spanning tree of the views; weights are common inliers times their share of the
-    common tracks.
+    common tracks. Only ``near`` observations (K,) count, by :func:`triangulable_observations`: points
+    of nearly coincident cameras are never inliers.
     """
     t, views = model.tracks, np.flatnonzero(model.registered)
     place = np.full(t.n_views, -1)
     place[views] = np.arange(len(views))
-    # Points of nearly coincident cameras are never inliers.
-    k = np.flatnonzero(triangulable_observations(model))
+    k = np.flatnonzero(near)
     view, point, inlier = place[t.view_index[k]], t.point_index[k], model.inlier[k]
 
     def common(of: B8) -> scipy.sparse.csr_matrix:
@@ -288,7 +288,7 @@ def self_check(
     }
     for name, (values, edge) in worst.items():
         check[name] = float(edge(values)) if np.isfinite(values).any() else np.nan
-    join = weakest_join(model)
+    join = weakest_join(model, near)
     check["joined_share_weakest"] = np.nan if join is None else join.share
     failed_views, limitations = _failed_views(each, model)
     return check, [*failed_views, *_failed_join(join), *_failed_model(check)], limitations

@@ -89,7 +89,8 @@ def point_blocks(X: F64, used: B8) -> I64:
 class _Linearised:
     """Weighted residuals (2K,), their Jacobian J (2K, D), and the part of it ``taken`` by the points.
 
-    ``E`` (2K, 3N) are orthonormal columns that span the displacements by points.
+    ``E`` (2K, 3N) are orthonormal columns that span the displacements by points, ``centre_columns`` (K, 2, 2)
+    the derivatives by the principal point.
     """
 
     residual: F64
@@ -97,16 +98,10 @@ class _Linearised:
     taken: scipy.sparse.csr_matrix
     E: scipy.sparse.csr_matrix
     point: I64
+    centre_columns: F64
 
 
-def block_scatter(
-    cameras: MetricCameras,
-    X: F64,
-    observations: Observations,
-    free: B8,
-    prior: IntrinsicsPrior,
-    noise: tuple[float, float],
-) -> BlockScatter:
+def block_scatter(fit: LinearisedFit) -> BlockScatter:
     """Measure the scatter of the intrinsics' gradients between blocks of points after an adjustment (6.7).
 
     Let S_b be the information of block b on the cameras (its points eliminated), g_b its gradient and C the
@@ -115,14 +110,13 @@ def block_scatter(
     The information uses the weights of Huber's loss instead of its second derivatives, which
     :func:`_loss_correction` corrects.
     """
-    fit = _linearised_fit(cameras, X, observations, free, prior, noise)
     system, solve, values, first, start = fit.system, fit.solve, fit.values, fit.first, fit.start
     S = fit.information
     poses = np.arange(0, first, max(first // _MAX_POSES, 1))
     tested = np.concatenate([poses, np.arange(first, S.shape[0])])
     rows = solve(_unit_columns(S.shape[0], tested)).T
-    block = point_blocks(X, np.bincount(observations.point_index, minlength=len(X)) > 0)
-    curvature = _loss_correction(system.residual.reshape(-1, 2), noise[1] / noise[0])
+    block = point_blocks(fit.X, np.bincount(fit.observations.point_index, minlength=len(fit.X)) > 0)
+    curvature = _loss_correction(system.residual.reshape(-1, 2), fit.loss_sigmas)
     ratio, large = (curvature * _block_ratio(system, rows, solve, b) for b in (block, block % _LARGE_BLOCKS))
     alone = curvature * _point_ratio(system, rows)
     valid = np.isfinite(ratio) & (alone > 0.0)
@@ -170,16 +164,8 @@ class PoseUncertainty:
         return np.asarray(noise**2 * self.variance + intrinsics + fault**2 * np.sum(self.fault**2, axis=2))
 
 
-def pose_uncertainty(
-    cameras: MetricCameras,
-    X: F64,
-    observations: Observations,
-    free: B8,
-    prior: IntrinsicsPrior,
-    noise: tuple[float, float],
-) -> PoseUncertainty:
+def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
     """Propagate noise, intrinsics and faults of the camera model to the poses after an adjustment (6.7)."""
-    fit = _linearised_fit(cameras, X, observations, free, prior, noise)
     n, D, first = len(fit.views), fit.information.shape[0], fit.first
     R = fit.frame.R[fit.views]
     # Rows to (rotation, centre): C = -R' t moves by -R' d if t moves by d.
@@ -196,7 +182,7 @@ def pose_uncertainty(
         rows = np.arange(POSE_DOF * v, POSE_DOF * (v + 1))
         own = known(_unit_columns(first, rows))[rows]
         variance[v] = np.einsum("ka,ab,kb->k", turn[v], own, turn[v])
-    moved = fit.solve(np.asarray(fit.system.J.T @ _faults(fit, observations)))[:first]
+    moved = fit.solve(np.asarray(fit.system.J.T @ _faults(fit)))[:first]
     return PoseUncertainty(
         fit.views,
         np.maximum(variance, 0.0),
@@ -207,8 +193,9 @@ def pose_uncertainty(
     )
 
 
-def _faults(fit: _Fit, o: Observations) -> F64:
+def _faults(fit: LinearisedFit) -> F64:
     """Weighted displacements (2K, 4) of the observations by the faults that the points do not absorb."""
+    o, columns = fit.observations, fit.system.centre_columns
     rows = fit.frame.intrinsics[fit.frame.group[o.view_index]]
     x, y = ((o.xy - rows[:, 3:5]) / rows[:, :1]).T
     square, none = x * x + y * y, np.zeros_like(x)
@@ -216,14 +203,20 @@ def _faults(fit: _Fit, o: Observations) -> F64:
         [[none, y], [y, none], [square + 2.0 * x * x, 2.0 * x * y], [2.0 * x * y, square + 2.0 * y * y]]
     )
     # The columns of the principal point weight displacements by px.
-    weighted = np.einsum("krc,fck->krf", fit.centre_columns * rows[:, :1, None], fields).reshape(-1, 4)
+    weighted = np.einsum("krc,fck->krf", columns * rows[:, :1, None], fields).reshape(-1, 4)
     return np.asarray(weighted - fit.system.E @ (fit.system.E.T @ weighted))
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """The linearised adjustment in a centred frame of size 1; the first ``first`` unknowns are the poses."""
+class LinearisedFit:
+    """A linearised adjustment in a centred frame of size 1; the first ``first`` unknowns are the poses.
 
+    ``X`` are the points before, and ``loss_sigmas`` is the width of Huber's loss.
+    """
+
+    X: F64
+    observations: Observations
+    loss_sigmas: float
     system: _Linearised
     information: F64 | scipy.sparse.csc_matrix
     solve: _Solve
@@ -233,17 +226,17 @@ class _Fit:
     scale: float
     views: I64
     first: int
-    centre_columns: F64
 
 
-def _linearised_fit(
+def linearise_fit(
     cameras: MetricCameras,
     X: F64,
     o: Observations,
     free: B8,
     prior: IntrinsicsPrior,
     noise: tuple[float, float],
-) -> _Fit:
+) -> LinearisedFit:
+    """Linearise an adjustment at its minimum; ``noise`` is the standard deviation and the loss width."""
     group = cameras.group
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
@@ -253,10 +246,12 @@ def _linearised_fit(
     origin, scale = scene_frame(X[np.unique(o.point_index)])
     frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
     place = np.where(observed, np.cumsum(observed) - 1, -1)
-    system, centre_columns = _linearise(frame, scale * (X - origin), o, (values, place), noise)
+    system = _linearise(frame, scale * (X - origin), o, (values, place), noise)
     S = _information(system, values.terms.information(values.size), o, len(views))
     solve = _covariance(S, frame, views)
-    return _Fit(system, S, solve, values, start, frame, scale, views, first, centre_columns)
+    return LinearisedFit(
+        X, o, noise[1] / noise[0], system, S, solve, values, start, frame, scale, views, first
+    )
 
 
 def _information(
@@ -297,8 +292,7 @@ def _linearise(
     o: Observations,
     columns: tuple[IntrinsicUnknowns, I64],
     noise: tuple[float, float],
-) -> tuple[_Linearised, F64]:
-    """Linearise; also return the weighted derivatives (K, 2, 2) by the principal point."""
+) -> _Linearised:
     (values, place), (sigma, loss), width = columns, noise, cameras.intrinsics.shape[1]
     model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
     weighting = Weighting(sigma, loss / sigma)
@@ -314,8 +308,8 @@ def _linearise(
     B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
     E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
     taken = scipy.sparse.csr_matrix(E.T @ J)
-    system = _Linearised(residual - E @ (E.T @ residual), J, taken, E, np.repeat(o.point_index, 2))
-    return system, centre_columns
+    residual -= E @ (E.T @ residual)
+    return _Linearised(residual, J, taken, E, np.repeat(o.point_index, 2), centre_columns)
 
 
 def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
