@@ -28,18 +28,18 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx_gallery.gen_gallery",
-    "_site.mathml",
-    "_site.failures",
-    "_site.interface",
-    "_site.modules",
-    "_site.theory_tables",
-    "_site.pictures",
+    "_ext.mathml",
+    "_ext.failures",
+    "_ext.interface",
+    "_ext.modules",
+    "_ext.theory_tables",
+    "_ext.pictures",
 ]
-exclude_patterns = ["_build", "_site", "**/GALLERY_HEADER.*", "tutorial/*.ipynb", "tutorial/*.py"]
+exclude_patterns = ["_build", "_ext", "**/GALLERY_HEADER.*", "tutorial/*.ipynb", "tutorial/*.py"]
 nitpicky = True
 highlight_language = "none"  # blocks of Python say so
 smartquotes = False  # x2' is the transpose of x2
-templates_path = ["_site/templates"]
+templates_path = ["_ext/templates"]
 
 myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
@@ -55,7 +55,7 @@ numpydoc_xref_param_type = False
 
 html_theme = "furo"
 html_title = "thesisrecon"
-html_static_path = ["_site/static"]
+html_static_path = ["_ext/static"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False

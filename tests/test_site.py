@@ -26,8 +26,8 @@ def site():
     """The modules that make pages; those that need Sphinx are imported where it is installed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(DOCS))
-        yield lambda name: importlib.import_module(f"_site.{name}")
-    for name in [name for name in sys.modules if name.split(".")[0] == "_site"]:
+        yield lambda name: importlib.import_module(f"_ext.{name}")
+    for name in [name for name in sys.modules if name.split(".")[0] == "_ext"]:
         del sys.modules[name]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from docs._site import theory
+from docs._ext import theory
 
 PAGES = Path(__file__).parent.parent / "docs" / "theory"
 SECTIONS = {

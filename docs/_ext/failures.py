@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from _site.code import PACKAGE, summary, tree_of, write
+from _ext.code import PACKAGE, summary, tree_of, write
 
 REMEDIES = Path(__file__).with_name("remedies.toml")
 SOURCES = {

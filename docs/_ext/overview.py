@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from PIL import Image, ImageDraw
 
-from _site.code import ROOT
+from _ext.code import ROOT
 
 IMAGES = ROOT / "fixtures" / "courtyard" / "images"
 HEIGHT, GAP = 420, 12

@@ -6,8 +6,8 @@ import ast
 import os
 from pathlib import Path
 
-from _site import overview
-from _site.code import ROOT
+from _ext import overview
+from _ext.code import ROOT
 
 BLUE, RED, GREY = "#2b6cb0", "#c53030", "#555555"
 

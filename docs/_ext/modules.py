@@ -10,8 +10,8 @@ from pathlib import Path
 from sphinx.util.nodes import make_refnode
 
 import thesisrecon
-from _site.code import PACKAGE, summary, write
-from _site.examples import RETURNED_BY
+from _ext.code import PACKAGE, summary, write
+from _ext.examples import RETURNED_BY
 
 LEFT_OUT = ("cli", "report", "runtime")
 """Folders without functions for callers."""

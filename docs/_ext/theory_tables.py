@@ -8,7 +8,7 @@ from docutils import nodes
 from sphinx.roles import XRefRole
 from sphinx.util.docutils import SphinxDirective
 
-from _site import theory
+from _ext import theory
 
 
 class CodeRole(XRefRole):

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from numpydoc.docscrape import NumpyDocString
 
-from _site.code import write
+from _ext.code import write
 from thesisrecon import _settings, config
 from thesisrecon.cli.main import app as command_line
 
