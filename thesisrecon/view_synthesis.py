@@ -140,10 +140,10 @@ def synthesize_view(
     >>> import numpy as np
     >>> import thesisrecon
     >>> R, t = 2.0 * np.eye(3), np.zeros(3)
-    >>> thesisrecon.synthesize_view("a.jpg", "b.jpg", R, t)  # doctest: +IGNORE_EXCEPTION_DETAIL
+    >>> thesisrecon.synthesize_view("a.jpg", "b.jpg", R, t)
     Traceback (most recent call last):
         ...
-    ValueError: the rotation is not orthogonal
+    ValueError: a rotation has R'R = I and det R = 1; this one is off by 3, det 8
     """
     # Checked before the matching, which takes minutes.
     rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)

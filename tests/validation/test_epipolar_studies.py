@@ -31,7 +31,7 @@ from validation.studies.epipolar_methods import (
 from validation.studies.runner import run_study
 
 BY_NAME = {m.name: m for m in METHODS}
-CRITERIA = ("gradient (5.4)", "epipolar distance (5.6)", "gold standard")
+CRITERIA = ("Sampson (5.4)", "epipolar distance (5.6)", "gold standard")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_wrong_matches_are_for_robust_methods_alone():
     trial = make_trial(setting, 0)
     assert len(trial.xy1) == 100
     assert len(trial.exact1) == 80
-    some = [BY_NAME[name] for name in (GOLD, "Algorithm 2, gradient", "least median of squares", DEFAULT)]
+    some = [BY_NAME[name] for name in (GOLD, "Algorithm 2, Sampson", "least median of squares", DEFAULT)]
     results = {r.label: r for r in run_methods([setting], some, 8)}
     assert GOLD not in results
     assert results[f"{DEFAULT}, 3 sigma"].rms_ratio < 1.4

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the thesis, from images to a textured model: the only place that composes all stages."""
+"""Algorithm 1 of the thesis: from images to cameras, points and a textured model."""
 
 from __future__ import annotations
 

@@ -101,8 +101,8 @@ OWN = (
     Method("eight-point, raw pixels, rank 3", _linear(normalized=False, rank_two=False)),
     Method(RAW, _linear(normalized=False)),
     Method(NORMALISED, _linear(normalized=True)),
-    Method("gradient (5.4), thesis' rows", _refined("sampson", "row")),
-    Method("gradient (5.4), orthonormal", _refined("sampson", "orthonormal")),
+    Method("Sampson (5.4), thesis' rows", _refined("sampson", "row")),
+    Method("Sampson (5.4), orthonormal", _refined("sampson", "orthonormal")),
     Method("epipolar distance (5.6), thesis' rows", _refined("epipolar-distance", "row")),
     Method("epipolar distance (5.6), orthonormal", _refined("epipolar-distance", "orthonormal")),
     Method("gold standard, thesis' rows", _refined("reprojection", "row")),
@@ -112,10 +112,10 @@ OWN = (
         Method(f"Algorithm 2, {label}", _robust(partial(_thesis, **variant)), robust=True, thresholded=True)
         for label, variant in (
             ("seven-point search alone", {"rounds": 0}),
-            ("gradient", {}),
+            ("Sampson", {}),
             ("epipolar distance", {"epipolar_distance": True}),
-            ("gradient, test of both lines", {"inlier_test": "epipolar-distance"}),
-            ("gradient, test of the sum", {"inlier_test": "symmetric-distance"}),
+            ("Sampson, test of both lines", {"inlier_test": "epipolar-distance"}),
+            ("Sampson, test of the sum", {"inlier_test": "symmetric-distance"}),
         )
     ),
     Method("least median of squares", _robust(lambda _: LeastMedianOfSquares()), robust=True),
