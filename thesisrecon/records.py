@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, I64, Stratum
+from thesisrecon.errors import counted
 from thesisrecon.geometry._conditioning import resizing_transform
 
 
@@ -270,6 +271,25 @@ class Reconstruction:
         where = (t.view_index[keep], t.point_index[keep])
         seen = scipy.sparse.csr_array((np.ones(len(where[0])), where), (t.n_views, t.n_points))
         return np.asarray((seen @ seen.T).toarray())
+
+    def with_reasons(self, min_points: int) -> Reconstruction:
+        """Give each unregistered view without a reason the number of reconstructed points that it sees.
+
+        Parameters
+        ----------
+        min_points : int
+            Number of points that were needed to register a view.
+
+        Returns
+        -------
+        Reconstruction
+        """
+        t, reasons = self.tracks, list(self.reasons)
+        seen = np.bincount(t.view_index[self.valid[t.point_index]], minlength=t.n_views)
+        for view in np.flatnonzero(~self.registered):
+            few = f"sees {counted(seen[view], 'point')} of the model (fewer than {min_points} while it grew)"
+            reasons[view] = reasons[view] or (few if seen[view] else "shares no points with the model")
+        return replace(self, reasons=tuple(reasons))
 
     @classmethod
     def from_cameras(

@@ -30,9 +30,8 @@ SOURCES = {
         "projective/incremental.py": (
             "OUTSIDE_CORE", "add_next_camera", "_try_camera", "_covariance_test", "_discard_camera",
         ),
-        "projective/_model.py": ("to_reconstruction",),
+        "records.py": ("with_reasons",),
         "metric/_resection.py": ("_register_missing", "_register", "_register_again"),
-        "metric/refinement.py": ("NO_COMMON_POINTS",),
         "pipeline/_steps.py": ("_with_group_reasons",),
     },
     "Pairs of images": {

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tests.metric.test_population import true_calibration
+from tests.metric.test_population import true_calibration, with_few_points
 from tests.metric.verdict_scenes import looking, project
 from tests.synthetic import looking_along, make_scene, projective_reconstruction, with_poses
 from thesisrecon import reconstruct, reconstruct_from_tracks
@@ -83,6 +83,15 @@ def assert_written(folder):
     R, t = (np.array([camera[name] for camera in cameras["cameras"]]) for name in ("R", "t"))
     X = np.asarray(trimesh.load(folder / "points.ply").vertices)
     assert_returned(summary, R, -np.einsum("vba,vb->va", R, t), X)
+
+
+def assert_points_seen(found):
+    """Reasons against images name the number of returned points that these observe."""
+    few = [v for v, reason in enumerate(found.reasons) if reason.startswith("sees ")]
+    for view in few:
+        points = found.tracks.point_index[found.tracks.view_index == view]
+        assert found.reasons[view].startswith(f"sees {found.valid[points].sum()} point")
+    return few
 
 
 def grown(scene, first, *, report=None):
@@ -167,6 +176,21 @@ def test_a_general_start_does_not_excuse_a_degenerate_end():
     assert any("pure translation" in text for text in metric.failed_checks)
 
 
+def test_the_reason_against_an_image_counts_the_returned_points():
+    """Image 7 sees 12 points; eight are matched too badly to be in the model."""
+    scene = with_few_points(make_scene(points=300, seed=6), 7, 12)
+    t, rng = scene.tracks, np.random.default_rng(0)
+    bad = np.isin(t.point_index, t.point_index[t.view_index == 7][:8])
+    xy = t.xy + rng.normal(0.0, np.where(bad, 12.0, 0.3)[:, None], t.xy.shape)
+    whole = projective_reconstruction(replace(scene, tracks=replace(t, xy=xy)))
+    found = MetricRefinement().refine(
+        restrict_views(whole, np.arange(8) != 7), true_calibration(scene), prior=prior_for(whole),
+        rng=np.random.default_rng(0),
+    ).reconstruction  # fmt: skip
+    assert assert_points_seen(found) == [7]
+    assert found.valid[t.point_index[t.view_index == 7]].sum() < 12
+
+
 def test_a_toy_on_a_table_is_no_plane():
     rng = np.random.default_rng(0)
     table = rng.uniform(-1.0, 1.0, (900, 3)) * [1.0, 1.0, 0.002]
@@ -220,4 +244,5 @@ def test_stated_numbers_of_photographs_are_those_of_the_written_cameras(name, tm
         pytest.skip(f"{DATA / name} is missing")
     result = reconstruct(DATA / name, tmp_path, until="metric", max_size=512)
     assert_written(tmp_path)
+    assert_points_seen(result.metric.reconstruction)
     assert result.summary["motion"]["nearest_critical"] == result.metric.identifiability.motion

@@ -181,7 +181,7 @@ def test_a_photograph_of_other_points_is_refused_with_its_share():
     inlier[wrong] = False
     result = refine(spoiled, cameras="shared", start=replace(start, inlier=inlier))
     assert not result.reconstruction.registered[6]
-    assert "matches agree" in result.reconstruction.reasons[6]
+    assert "matches agreed" in result.reconstruction.reasons[6]
     assert result.reconstruction.registered.sum() == 7
     assert not result.intrinsics[6]
 

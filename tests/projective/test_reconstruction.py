@@ -300,7 +300,7 @@ def test_a_beginning_in_a_corner_gives_way_to_one_that_reaches_more():
     assert reconstruct(both, pairs, max_initial_pairs=1).registered.sum() == 3
     found = reconstruct(both, pairs)
     np.testing.assert_array_equal(found.registered, np.arange(9) < 6)
-    assert all("sees only 0 points" in reason or "shares no" in reason for reason in found.reasons[6:])
+    assert all("shares no points" in reason for reason in found.reasons[6:])
 
 
 def test_each_attempt_starts_differently_and_the_last_ends_the_search():

@@ -137,10 +137,6 @@ def _register_missing(
     for views in (reached, missing & ~reached) if seen_views(t) > MANY_VIEWS else (missing,):
         for view in sorted(np.flatnonzero(views).tolist(), key=lambda v: -counts[v]):
             if counts[view] < MIN_POINTS:
-                rejected[view] = (
-                    f"sees only {counted(counts[view], 'point')} of the model (at least {MIN_POINTS} "
-                    "needed): too little overlap"
-                )
                 continue
             added = _register(model, view, rows[view], rng)
             if isinstance(added, str):
@@ -164,7 +160,7 @@ def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Genera
     found = _pose_and_focal(model, k, row, 2.0 * EARLY_SIGMAS * model.gate_px, zooms, rng)
     support = 0 if found is None else int(found[3].sum())
     if found is None or support < MIN_POINTS or support < 0.3 * len(k):
-        return f"only {support} of its {counted(len(k), 'point')} are inliers of one camera"
+        return f"its resection had {support} inliers among {counted(len(k), 'point')}"
     R, translation, start, inlier = found
     pose = refine_pose(
         R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
@@ -189,7 +185,9 @@ def _register_again(
     wrong = model.registered & (share < MIN_INLIER_RATIO)
     if wrong.any():
         for view in np.flatnonzero(wrong):
-            rejected[int(view)] = f"only {share[view]:.0%} of its matches agree with the other images"
+            rejected[int(view)] = (
+                f"was removed because only {share[view]:.0%} of its matches agreed with the other images"
+            )
         model = replace(model, registered=model.registered & ~wrong)
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
     return model, rejected

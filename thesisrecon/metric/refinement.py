@@ -47,7 +47,7 @@ from thesisrecon.metric._model import (
     with_precise_points,
     with_tracks,
 )
-from thesisrecon.metric._resection import register_missing_cameras
+from thesisrecon.metric._resection import MIN_POINTS, register_missing_cameras
 from thesisrecon.metric._shared_camera import (
     SharedCameraTest,
     check_shared_cameras,
@@ -93,7 +93,6 @@ NOT_EXPLAINED = (
     "One value per image hardly predicts held-out observations better, so the shared values stay; their "
     "intervals contain the difference"
 )
-NO_COMMON_POINTS = "shares no points with the model"
 
 
 @dataclass(frozen=True)
@@ -119,8 +118,7 @@ class MetricRefinement:
         costs = np.array([truncated_cost(m, gate) for m in models])
         model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
         reasons = tuple(
-            "" if model.registered[v] else rejected.get(v, reconstruction.reasons[v] or NO_COMMON_POINTS)
-            for v in range(len(model.registered))
+            "" if model.registered[v] else rejected.get(v, "") for v in range(len(model.registered))
         )
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         final, sharing, enlarged, difference = settle_camera_model(finish_metric(model, adjustment))
@@ -286,4 +284,4 @@ def _as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> Recon
     norms = residual_norms(model)
     sigma = noise_from_distances(norms) if len(norms) else model.sigma_px
     seen = (registered, model.valid, model.inlier, model.tracks, model.sizes)
-    return Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion)
+    return Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion).with_reasons(MIN_POINTS)

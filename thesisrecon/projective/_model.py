@@ -219,15 +219,12 @@ def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
     return P / np.where(norm > 0, norm, 1.0), X / np.where(length > 0, length, 1.0)
 
 
-def to_reconstruction(model: ProjectiveModel) -> Reconstruction:
+def to_reconstruction(model: ProjectiveModel, min_points: int) -> Reconstruction:
     """Return the reconstruction record, with a reason for every unregistered view."""
-    for view in np.flatnonzero(~model.registered):
-        if not model.reasons[view]:
-            model.reasons[view] = "shares no points with the model"
     valid = model.valid
     X = np.where(valid[:, None], model.X, 0.0)
     P = np.where(model.registered[:, None, None], model.P, 0.0)
     return Reconstruction(
         "projective", P, X, model.registered, valid, model.used & valid[model.tracks.point_index],
         model.tracks, model.sizes, model.sigma_px, tuple(model.reasons),
-    )  # fmt: skip
+    ).with_reasons(min_points)  # fmt: skip

@@ -174,7 +174,7 @@ class Factorization:
         selected, keep = working_tracks(tracks, pairs, points_per_view=self.growth.points_per_view)
         model = self._core(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)
-        return expand_to_all_tracks(to_reconstruction(model), tracks, keep)
+        return expand_to_all_tracks(to_reconstruction(model, self.growth.min_points), tracks, keep)
 
     def _core(self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64) -> ProjectiveModel:
         """Reconstruct the core that grows from ``start`` by factorization and adjust it."""

@@ -147,7 +147,7 @@ class IncrementalProjective:
         best = self._best_model(selected, inside, sizes, ranked[attempt:], rng)
         for view in np.flatnonzero(~core):
             best.reasons[view] = OUTSIDE_CORE
-        return expand_to_all_tracks(to_reconstruction(best), tracks, keep, core)
+        return expand_to_all_tracks(to_reconstruction(best, self.min_points), tracks, keep, core)
 
     def _core(self, pairs: Sequence[TwoView], n_views: int, attempt: int) -> B8:
         """(V,) the views to reconstruct: all of a small set, else a core, larger at each attempt."""
@@ -247,10 +247,7 @@ class IncrementalProjective:
             if coverage[view] <= 0.0:
                 return None
             if counts[view] < self.min_points:
-                model.reasons[view] = (
-                    f"sees only {counted(counts[view], 'point')} of the model (at "
-                    f"least {self.min_points} needed)"
-                )
+                model.reasons[view] = ""
             elif self._try_camera(model, int(view), rng):
                 return int(view)
         return None
@@ -262,7 +259,7 @@ class IncrementalProjective:
         P, inlier = resect_projective(X, xy, threshold_px=early * model.sigma_px, rng=rng)
         if P is None or inlier.sum() < self.min_points or inlier.mean() < _MIN_INLIER_RATIO:
             model.reasons[view] = (
-                f"only {int(inlier.sum())} of {len(k)} points of the model are inliers of its resection"
+                f"its resection had {int(inlier.sum())} inliers among {counted(len(k), 'point')}"
             )
             return False
         model.deferred[view], P = self._covariance_test(model, view, P, X[inlier], xy[inlier])
@@ -301,7 +298,7 @@ class IncrementalProjective:
         counts, shares = model.inlier_ratios()
         shares[~model.registered] = 1.0
         view = int(np.argmin(shares))
-        reason = f"only {counts[view]} of its points are inliers of the finished model ({shares[view]:.0%})"
+        reason = f"was removed because only {counts[view]} of its points were inliers ({shares[view]:.0%})"
         if shares[view] >= _MIN_INLIER_RATIO:
             threshold, ratio = self.outlier_sigmas[0] * model.sigma_px, self.min_epipolar_inlier_ratio
             found = _find_inconsistent_view(
@@ -310,7 +307,7 @@ class IncrementalProjective:
             if found is None:
                 return False
             view, share = found
-            reason = f"only {share:.0%} of its verified matches agree with the epipolar geometry of the model"
+            reason = f"was removed because only {share:.0%} of its verified matches agreed with others"
         model.registered[view] = False
         model.rejected[view] = True
         model.reasons[view] = reason

@@ -54,4 +54,4 @@ class SequentialProjective:
         while incremental.add_next_camera(model, rng) is not None:
             pass
         adjust_all(model, 10, self.outlier_sigmas)
-        return to_reconstruction(model)
+        return to_reconstruction(model, self.min_points)
