@@ -83,7 +83,7 @@ class PerCameraEstimates:
 def per_camera_estimates(
     model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter
 ) -> PerCameraEstimates:
-    """Intrinsics of each camera of a model that was adjusted without hierarchical prior."""
+    """Intrinsics of each camera, and their scatter without hierarchical prior."""
     group = model.cameras.group
     first = np.unique(group, return_index=True)[1]
     value = model.cameras.intrinsics.copy()

@@ -221,7 +221,9 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     if hierarchical is not None:
         model, adjustment = apply_hierarchical_prior(model, adjustment, hierarchical)
     model = _iterate_inliers(with_expected_centres(model, adjustment.prior), adjustment)
-    return model, adjustment, own, adjustment.scatter(model)
+    alone, scatter = replace(adjustment, hierarchical=None), adjustment.scatter(model)
+    own = per_camera_estimates(model, alone, scatter if hierarchical is None else alone.scatter(model))
+    return model, adjustment, own, scatter
 
 
 def _selected(model: MetricEstimate) -> MetricEstimate:
