@@ -10,6 +10,7 @@ from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import counted
 from thesisrecon.geometry.robust_resection import resect_calibrated
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
+from thesisrecon.metric._confirmed_pose import confirmed_pose
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
@@ -30,7 +31,7 @@ ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
 """k1 is free from the start: with k1 fixed, gates wide enough for right points would accept wrong ones."""
 MIN_POINTS = 15
-"""Points of the model that a missing camera must see."""
+"""Points of the model that a missing camera must see, unless other matches confirm its pose."""
 MIN_SHARE = 0.2
 """In large sets, views with a smaller fraction of their points in the model are registered last: they may
 show another place with repeated structure."""
@@ -128,16 +129,16 @@ def _adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B
 def _register_missing(
     model: MetricEstimate, rng: np.random.Generator, allowed: B8, rows: list[I64]
 ) -> tuple[MetricEstimate, dict[int, str]]:
-    """Register every ``allowed`` view that sees enough of the model by calibrated resection."""
+    """Register every ``allowed`` view that sees enough, those of few points if no other is registered."""
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
     missing = allowed & ~model.registered
     reached = missing & (counts >= MIN_SHARE * np.array([len(k) for k in rows]))
     rejected: dict[int, str] = {}
-    for views in (reached, missing & ~reached) if seen_views(t) > MANY_VIEWS else (missing,):
+    few = missing & (counts < MIN_POINTS)
+    parts = (reached, missing & ~reached) if seen_views(t) > MANY_VIEWS else (missing,)
+    for views in (*(part & ~few for part in parts), few):
         for view in sorted(np.flatnonzero(views).tolist(), key=lambda v: -counts[v]):
-            if counts[view] < MIN_POINTS:
-                continue
             added = _register(model, view, rows[view], rng)
             if isinstance(added, str):
                 rejected[view] = added
@@ -157,17 +158,24 @@ def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Genera
     focals = cameras.shared[:, 0]
     alone = not model.registered[focals[cameras.group] == focals[row]].any()
     zooms = ZOOMS if alone else (1.0,)
-    found = _pose_and_focal(model, k, row, 2.0 * EARLY_SIGMAS * model.gate_px, zooms, rng)
+    gate, enough = 2.0 * EARLY_SIGMAS * model.gate_px, len(k) >= MIN_POINTS
+    found = _pose_and_focal(model, k, row, gate, zooms, rng) if enough else None
     support = 0 if found is None else int(found[3].sum())
-    if found is None or support < MIN_POINTS or support < 0.3 * len(k):
-        return f"its resection had {support} inliers among {counted(len(k), 'point')}"
-    R, translation, start, inlier = found
-    pose = refine_pose(
-        R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
-        free=(np.arange(len(start)) == 0) & alone, loss_px=2.0 * model.sigma_px, iterations=20,
-    )  # fmt: skip
     Rs, ts, intrinsics = cameras.R.copy(), cameras.t.copy(), cameras.intrinsics.copy()
-    Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
+    if found is not None and support >= MIN_POINTS and support >= 0.3 * len(k):
+        R, translation, start, inlier = found
+        pose = refine_pose(
+            R, translation, start, model.X[t.point_index[k]][inlier], t.xy[k][inlier],
+            free=(np.arange(len(start)) == 0) & alone, loss_px=2.0 * model.sigma_px, iterations=20,
+        )  # fmt: skip
+        Rs[view], ts[view], intrinsics[row] = pose.R, pose.t, pose.intrinsics
+    elif not alone and (confirmed := confirmed_pose(model, view, rows, rng)) is not None:
+        Rs[view], ts[view] = confirmed
+    elif enough:
+        return f"its resection had {support} inliers among {counted(len(k), 'point')}"
+    else:
+        # The number of points is counted at the end.
+        return ""
     registered = model.registered | (np.arange(len(Rs)) == view)
     return replace(model, cameras=replace(cameras, R=Rs, t=ts, intrinsics=intrinsics), registered=registered)
 
