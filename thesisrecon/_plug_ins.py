@@ -22,7 +22,7 @@ from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import noise_scale
 from thesisrecon.epipolar._refinement import fundamental_covariance
-from thesisrecon.errors import StageFailure, UsageError, in_words, unknown_word
+from thesisrecon.errors import Notice, StageFailure, UsageError, in_words, unknown_word
 from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, PairChoice
 
@@ -252,9 +252,7 @@ class FunctionFundamental(FunctionAdapter):
         )
 
     def _failure(self, what: str, count: int) -> StageFailure:
-        return StageFailure(
-            f"the function {name_of(self)} found no epipolar geometry", f"{what} in {count} matches"
-        )
+        return StageFailure(Notice("no-geometry-of-function", name_of(self)), f"{what} in {count} matches")
 
 
 FUNCTIONS: Mapping[str, tuple[type[FunctionAdapter], tuple[str, ...], str]] = {

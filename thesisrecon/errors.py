@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import difflib
 import errno
+import tomllib
 from collections.abc import Callable, Iterable
+from functools import cache
 from os import PathLike, environ, fspath
+from pathlib import Path
 from typing import Any, TypeVar
 
 REMEDIES = {
@@ -101,13 +104,46 @@ def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
     return f"unknown {what} {in_words(word)}; {hint}"
 
 
+class Notice(str):
+    """Text of a warning, failed check or reason of ``messages.toml``, which states cause and remedy too.
+
+    Parameters
+    ----------
+    code, *values : str, object
+        Key of the message, kept as an attribute, and the values of its text.
+    """
+
+    code: str
+
+    def __new__(cls, code: str, *values: object) -> Notice:
+        return cls.of(code, _texts()[code].format(*values))
+
+    @classmethod
+    def of(cls, code: str, text: str) -> Notice:
+        """Return a text as the message of a code."""
+        notice = super().__new__(cls, text)
+        notice.code = code
+        return notice
+
+    def __reduce__(self) -> tuple[Callable[[str, str], Notice], tuple[str, str]]:
+        return Notice.of, (self.code, str(self))
+
+
+@cache
+def _texts() -> dict[str, str]:
+    """Text of each code; "{}" stands for a value."""
+    tables = tomllib.loads(Path(__file__).with_name("messages.toml").read_text(encoding="utf-8"))
+    return {code: text for table in tables.values() for code, (text, _) in table.items()}
+
+
 class StageFailure(Exception):
     """Data that a stage cannot process (a wrong call is a ``ValueError``); exit code 3 on the command line.
 
     Parameters
     ----------
     reason, evidence, advice : str
-        What happened, what was measured (with numbers and units), and what to do, as clauses.
+        What happened, what was measured (with numbers and units), and what to do, as clauses. A reason
+        without advice is a :class:`Notice`.
 
     Examples
     --------
@@ -195,9 +231,7 @@ def made(what: str, make: Callable[[], T], warnings: list[str], otherwise: T) ->
             raise
         said = " ".join(str(error).split())
         reason = said if isinstance(error, OutputError) else f"{type(error).__name__}: {said}".rstrip(": ")
-        text = (
-            f"output-not-made: {what} ({reason}); other results are kept, and the same command tries it again"
-        )
+        text = Notice("output-not-made", what, reason)
         if not any(known.split(" (")[0] == text.split(" (")[0] for known in warnings):
             warnings.append(text)
         return otherwise

@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, I64, Stratum
-from thesisrecon.errors import counted
+from thesisrecon.errors import Notice, counted
 from thesisrecon.geometry._conditioning import resizing_transform
 
 
@@ -287,8 +287,8 @@ class Reconstruction:
         t, reasons = self.tracks, list(self.reasons)
         seen = np.bincount(t.view_index[self.valid[t.point_index]], minlength=t.n_views)
         for view in np.flatnonzero(~self.registered):
-            few = f"sees {counted(seen[view], 'point')} of the model (fewer than {min_points} while it grew)"
-            reasons[view] = reasons[view] or (few if seen[view] else "shares no points with the model")
+            few = Notice("few-common-points", counted(seen[view], "point"), min_points)
+            reasons[view] = reasons[view] or (few if seen[view] else Notice("no-common-points"))
         return replace(self, reasons=tuple(reasons))
 
     @classmethod

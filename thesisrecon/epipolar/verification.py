@@ -10,7 +10,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar._degeneracy import assess_degeneracy
 from thesisrecon.epipolar._planes import SUBSET, count_transferred, induced_homography
 from thesisrecon.epipolar.configuration import MINIMUM, Configuration, classify_configuration
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry._conditioning import unit_norm
 from thesisrecon.geometry._homography import homography_linear, homography_residuals
 from thesisrecon.geometry.two_view import epipoles
@@ -81,14 +81,13 @@ class PairVerification:
     def _objection(self, verified: int, candidates: int) -> str:
         """Reason to reject the pair, empty if there is none."""
         if verified < self.min_inliers:
-            return (
-                f"only {verified} of {counted(candidates, 'match')} agree with one epipolar geometry "
-                f"(at least {self.min_inliers} are needed to exclude chance and repeated patterns)"
-            )
+            return Notice("few-inliers", verified, counted(candidates, "match"), self.min_inliers)
         if verified < self.min_inlier_ratio * candidates:
-            return (
-                f"only {100.0 * verified / candidates:.0f} % of {counted(candidates, 'match')} agree with "
-                f"one epipolar geometry (at least {100.0 * self.min_inlier_ratio:.0f} % are needed)"
+            return Notice(
+                "low-inlier-ratio",
+                100.0 * verified / candidates,
+                counted(candidates, "match"),
+                100.0 * self.min_inlier_ratio,
             )
         return ""
 
@@ -105,7 +104,7 @@ def _assess_pair(
     except StageFailure:
         return "", None
     if kind in (Configuration.PLANE, Configuration.ROTATION):
-        reason = f"one homography explains the matches ({kind.value})"
+        reason = Notice("one-homography", kind.value)
         degeneracy = replace(degeneracy, determined=False, reasons=(reason, *degeneracy.reasons))
     return kind.value, degeneracy
 

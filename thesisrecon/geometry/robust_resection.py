@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry._conditioning import (
     centred_frame,
     require_calibration,
@@ -116,7 +116,7 @@ def resect(
         )
     needed, unknown = (6, 11) if K is None else (4, 6)
     if len(X) < needed:
-        raise StageFailure("too few points for resection", f"{counted(len(X), 'point')}, {needed} are needed")
+        raise StageFailure(Notice("few-resection-points"), f"{counted(len(X), 'point')}, {needed} are needed")
     extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if not extent[2 if K is None else 1] > _FLAT * extent[0]:
         place = "in one plane" if K is None else "on one line"

@@ -22,7 +22,7 @@ import numpy as np
 import PIL.Image
 from scipy.ndimage import gaussian_laplace
 
-from thesisrecon.errors import UsageError, counted
+from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import FRAMES_FOLDER, printable, read_json, write_json
 from thesisrecon.io._images import MAX_DECODED_BYTES, decode_file, list_images
@@ -208,4 +208,4 @@ def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[An
     except (av.FFmpegError, OSError) as error:
         raise UsageError(f"{path} cannot be read as a video: {error.strerror}") from None
     if damaged:
-        warnings.append(f"{path.name}: {counted(damaged, 'packet')} of the video cannot be decoded")
+        warnings.append(Notice("damaged-video", path.name, counted(damaged, "packet")))

@@ -26,7 +26,7 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, U8
-from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.errors import Notice, StageFailure, UsageError
 from thesisrecon.io._files import (
     IMAGE_NAME_RULE,
     SPECIAL_FILE,
@@ -230,7 +230,7 @@ def read_images(
 
     def read(item: tuple[str, Any]) -> DecodedImage | str:
         if not is_image_name(item[0]):
-            return f"has to be renamed: {IMAGE_NAME_RULE}"
+            return Notice("file-name", IMAGE_NAME_RULE)
         try:
             return _read(*item, max_size_px, as_stored)
         except UnusableImage as refusal:
@@ -242,7 +242,7 @@ def read_images(
     for decoded in (r for r in results if not isinstance(r, str)):
         first = distinct.setdefault(decoded.digest, decoded)
         if first is not decoded:
-            refused[decoded.image.name] = f"has the same pixels as {first.image.name}"
+            refused[decoded.image.name] = Notice("duplicate", first.image.name)
     # The items are in the order of their names.
     return ImageSet(tuple(distinct.values()), {name: refused[name] for name, _ in items if name in refused})
 
@@ -293,12 +293,10 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
     decoded = with_digest(decoded)
     rgb, mask = decoded.image.rgb, decoded.image.mask
     if min(rgb.shape[:2]) < MIN_SIDE:
-        raise UnusableImage(
-            f"has only {rgb.shape[1]} x {rgb.shape[0]} pixels; the minimum is {MIN_SIDE} x {MIN_SIDE}"
-        )
+        raise UnusableImage(Notice("too-small", rgb.shape[1], rgb.shape[0], MIN_SIDE, MIN_SIDE))
     used = rgb.reshape(-1, 3) if mask is None else rgb[mask]
     if len(used) and np.ptp(used, axis=0).max() < BLANK_RANGE:
-        raise UnusableImage("is blank: all its pixels have nearly the same colour")
+        raise UnusableImage(Notice("blank"))
     return decoded
 
 
@@ -320,13 +318,11 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
     try:
         found = path.stat()
     except OSError as error:
-        raise UnusableImage(f"cannot be read: {error.strerror}") from None
+        raise UnusableImage(Notice("unreadable", error.strerror)) from None
     if not stat.S_ISREG(found.st_mode):
-        raise UnusableImage(f"is {SPECIAL_FILE}, not a file")
+        raise UnusableImage(Notice("not-a-file", SPECIAL_FILE))
     if found.st_size > MAX_FILE_BYTES:
-        raise UnusableImage(
-            f"is a file of {found.st_size / 2**30:.1f} GiB; the limit is {MAX_FILE_BYTES / 2**30:.0f} GiB"
-        )
+        raise UnusableImage(Notice("file-too-large", found.st_size / 2**30, MAX_FILE_BYTES / 2**30))
     try:
         # Opened here, since Pillow does not close files that it cannot read.
         with path.open("rb") as stream:
@@ -342,19 +338,19 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
         raise
     except PIL.Image.DecompressionBombError:
         limit = 2 * (PIL.Image.MAX_IMAGE_PIXELS or 0) // 10**6
-        raise UnusableImage(f"claims more than {limit} megapixels") from None
+        raise UnusableImage(Notice("too-many-pixels", limit)) from None
     except PIL.UnidentifiedImageError:
         if path.suffix.lower() in RAW_SUFFIXES:
             raise UnusableImage(RAW_FILE) from None
         if path.suffix.lower() in _HEIF_SUFFIXES and "HEIF" not in _formats():
-            raise UnusableImage("is a HEIC image: install pillow-heif, the extra heif, to read it") from None
-        raise UnusableImage("is not an image of a known format") from None
+            raise UnusableImage(Notice("heic")) from None
+        raise UnusableImage(Notice("unknown-format")) from None
     except MemoryError:
-        raise UnusableImage("does not fit in memory") from None
+        raise UnusableImage(Notice("too-large-for-memory")) from None
     except Exception as error:
         # Decoders raise errors of any kind on damaged files; the other images are still read.
         raise UnusableImage(
-            f"cannot be decoded: {printable(getattr(error, 'strerror', None) or str(error))}"
+            Notice("undecodable", printable(getattr(error, "strerror", None) or str(error)))
         ) from None
 
 
@@ -370,7 +366,7 @@ def _decoded_image(name: str, max_size_px: int, as_stored: bool, file: PIL.Image
     known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
     focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
     image = _image(name, stored, max_size_px)
-    return DecodedImage(image, "", focal, "only the first frame is used" if several else "")
+    return DecodedImage(image, "", focal, Notice("several-frames") if several else "")
 
 
 def may_be_transparent(path: Path) -> bool:
@@ -383,10 +379,12 @@ def may_be_transparent(path: Path) -> bool:
 
 def _too_large(file: PIL.Image.Image, needed: int) -> str:
     kind = "progressive JPEG" if file.format == "JPEG" else file.format
-    return (
-        f"has {file.size[0] * file.size[1] / 1e6:.0f} megapixels; decoding a {kind} of this size takes "
-        f"{needed / 2**30:.1f} GiB of memory, more than the limit of {MAX_DECODED_BYTES / 2**30:.1f} GiB; "
-        "save it as PNG or TIFF"
+    return Notice(
+        "decoding-memory",
+        file.size[0] * file.size[1] / 1e6,
+        kind,
+        needed / 2**30,
+        MAX_DECODED_BYTES / 2**30,
     )
 
 
@@ -454,4 +452,4 @@ def _full_image(side: Any) -> Image:
     try:
         return _image("", StoredImage(PIL.Image.fromarray(side)), _ANY_SIZE)
     except UnusableImage as refusal:
-        raise StageFailure(f"an image {refusal}") from None
+        raise StageFailure(Notice("unusable-image", refusal)) from None

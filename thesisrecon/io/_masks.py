@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import B8
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import Notice, UsageError
 from thesisrecon.io._files import printable
 from thesisrecon.io._images import (
     DecodedImage,
@@ -26,7 +26,7 @@ from thesisrecon.records import Image
 
 _NAMES = "the mask of IMG.jpg is IMG.jpg.png, or IMG with any suffix"
 
-USELESS_MASKS = "the masks leave out no pixel of any image"
+USELESS_MASKS = Notice("useless-masks")
 
 
 def check_masks_folder(masks: Path, images: Path | None) -> Path:
@@ -58,7 +58,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], lis
     if not mask_of:
         raise UsageError(f"no file in {folder} is named like an image; {_NAMES}")
     others = [path.name for paths in files.values() for path in paths if path not in owner]
-    return mask_of, [f"{name} is a mask of no image" for name in others]
+    return mask_of, [Notice("unused-mask", name) for name in others]
 
 
 def add_masks(

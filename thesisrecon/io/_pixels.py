@@ -18,6 +18,7 @@ import PIL.Image
 from PIL.Image import Transpose
 
 from thesisrecon.arrays import B8, F64, U8
+from thesisrecon.errors import Notice
 
 _STRIPE_ROWS = 256
 """Rows converted at a time."""
@@ -185,7 +186,7 @@ def resized_to(image: StoredImage, max_size_px: int) -> U8:
     long, short = max_size_px, math.floor(min(width, height) * scale)
     size = (long, short) if width >= height else (short, long)
     if min(size) < 1:
-        raise UnusableImage(f"has {width} x {height} pixels: too narrow to be reduced to {max_size_px}")
+        raise UnusableImage(Notice("too-narrow", width, height, max_size_px))
     return _resized(image, size, (min(width, size[0] / scale), min(height, size[1] / scale)))
 
 
@@ -195,7 +196,7 @@ def opaque_part(levels: U8) -> tuple[U8, B8 | None]:
         return levels, None
     mask = levels[:, :, 3] >= OPAQUE
     if not mask.any():
-        raise UnusableImage("is blank: all its pixels are transparent; save it without its alpha channel")
+        raise UnusableImage(Notice("transparent"))
     rgb = np.ascontiguousarray(levels[:, :, :3])
     rgb[~mask] = 128
     return rgb, None if mask.all() else mask

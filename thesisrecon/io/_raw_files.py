@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import Any, BinaryIO
 
+from thesisrecon.errors import Notice
 from thesisrecon.io._pixels import UnusableImage
 
 RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".rw2", ".rwl", ".orf", ".raf"),
     *(".pef", ".srw", ".3fr", ".fff", ".iiq", ".erf", ".kdc", ".dcr", ".mrw", ".mos", ".mef", ".x3f", ".gpr"),
 )
-RAW_FILE = "is a raw file: convert it to JPEG, PNG or TIFF"
+RAW_FILE = Notice("raw-file")
 RAW_SIGNATURE = re.compile(
     rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|\0MRM|II\x1a\0\0\0HEAPCCDR|....ftypcrx |II\*\0....CR\x02\0",
     re.DOTALL,
@@ -51,9 +52,7 @@ def refuse_raw_file(stream: BinaryIO, suffix: str) -> None:
         raise UnusableImage(RAW_FILE)
     reduced = first.get(_SUBFILE, (0,))[0] & 1 or first.get(_OLD_SUBFILE, (0,))[0] == 2
     if (reduced and len(pages) > 1) or any(_enlarges(_size(page), size) for page in pages[1:]):
-        raise UnusableImage(
-            f"begins with a reduced image of {size[0]} x {size[1]} pixels: save the full image alone"
-        )
+        raise UnusableImage(Notice("reduced-image", size[0], size[1]))
 
 
 def _size(tags: _Tags) -> tuple[int, int]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.errors import Notice
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
@@ -102,15 +103,9 @@ def differences_of_images(model: MetricEstimate, columns: tuple[int, ...]) -> st
     centre = (rows[:, CENTRE] - (model.sizes[views] - 1) / 2) / longest
     apart = f"principal points up to {np.ptp(centre, axis=0).max():.1%} of the long side apart"
     if FOCAL not in columns:
-        return (
-            f"Each image has its own principal point: the images contradict a shared one ({apart}, as with "
-            "optical stabilisation or images cropped one by one)"
-        )
+        return Notice("own-centre", apart)
     focal = rows[:, FOCAL] / longest[:, 0]
-    return (
-        f"Each image has its own intrinsics: the images contradict shared ones (focal lengths up to "
-        f"{focal.max() / focal.min() - 1.0:.1%} and {apart}, as with focus, zoom or several cameras)"
-    )
+    return Notice("own-intrinsics", focal.max() / focal.min() - 1.0, apart)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
+from thesisrecon.errors import Notice
 from thesisrecon.metric._model import (
     MetricEstimate,
     inlier_mask,
@@ -298,11 +299,7 @@ def _failed_join(join: Join | None) -> list[str]:
     """A sentence if most tracks between two parts of the images contradict their join."""
     if join is None or join.share >= MIN_JOINED_SHARE:
         return []
-    return [
-        f"{_named(join.views)}: only {join.inliers} of the {join.tracks} points that join them to the other "
-        "images are inliers: they probably show another side of the scene that looks similar. Add images "
-        "between the two parts, or reconstruct them separately"
-    ]
+    return [Notice("doubtful-join", _named(join.views), join.inliers, join.tracks)]
 
 
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str], list[str]]:
@@ -317,35 +314,21 @@ def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str
         left[taken] = False
         return taken
 
-    failed = []
+    failed: list[str] = []
     if len(wrong := take(views.confirmed < MIN_CONFIRMED_RATIO)):
-        failed.append(
-            f"{_named(wrong)}: only {_range(views.confirmed[wrong])} of the points that other images "
-            "determine agree: the camera or its matches are wrong. Leave the image out, or add images "
-            "between it and the rest"
-        )
+        failed.append(Notice("view-unconfirmed", _named(wrong), _range(views.confirmed[wrong])))
     if len(wrong := take(~(views.inlier_ratio >= MIN_INLIER_RATIO))):
-        failed.append(
-            f"{_named(wrong)}: only {_range(views.inlier_ratio[wrong])} of the matches are inliers: the "
-            "camera, or one it is matched with, is wrong"
-        )
+        failed.append(Notice("view-inliers", _named(wrong), _range(views.inlier_ratio[wrong])))
     if len(wrong := take(views.behind > MAX_BEHIND)):
-        failed.append(f"{_named(wrong)}: {_range(views.behind[wrong])} of the points lie behind the camera")
+        failed.append(Notice("points-behind", _named(wrong), _range(views.behind[wrong])))
     for view in take((np.abs(views.focal_off) > MAX_OWN_FOCAL) & (views.focal_off_sigmas > MAX_OWN_SIGMAS)):
         off = float(np.expm1(views.focal_off[view]))
-        failed.append(
-            f"Image #{view}: its own focal length is {abs(off):.1%} "
-            f"{'longer' if off > 0.0 else 'shorter'} than the model's: it is from another camera or zoomed, "
-            "or the model is deformed"
-        )
-    limitations = []
+        failed.append(Notice("own-focal", view, abs(off), "longer" if off > 0.0 else "shorter"))
+    limitations: list[str] = []
     if len(noisy := take(views.noise_ratio > MAX_NOISE_RATIO)):
         # Blur and motion cause noise as well; a wrong camera loses matches or needs another focal length.
         ratio = views.noise_ratio[noisy].max()
-        limitations.append(
-            f"{_named(noisy)}: reprojection noise is {ratio:.1f} times that of the other images, as with "
-            "blur, motion or a rolling shutter"
-        )
+        limitations.append(Notice("noisy-view", _named(noisy), ratio))
     return failed, limitations
 
 
@@ -369,21 +352,12 @@ def _failed_model(check: Mapping[str, float]) -> list[str]:
     shift, aspect_std = check["principal_shift_undetermined"], check["aspect_std_max"]
     far = check["sigmas_to_minimum"]
     passed = {
-        f"Bundle adjustment has not converged: its cameras are {far:.2g} standard deviations from the "
-        "minimum, but should be within 0.1. Adjust the result again by bundle_adjust, or add images": (
-            not far > MAX_SIGMAS_TO_MINIMUM
-        ),
-        f"Focal lengths of {low:.2f} to {high:.2f} long sides are implausible for images": (
-            _FOCAL_RANGE[0] < low and high < _FOCAL_RANGE[1]
-        ),
-        f"A focal length is determined only to {std:.0%}": std < _MAX_FOCAL_STD,
-        f"Only {share:.0%} of the triangulable matches are inliers": share > _MIN_MODEL_INLIER_RATIO,
-        f"The reprojection noise is {noise:.2%} of the long side": noise < _MAX_SIGMA_REL,
-        f"A principal point is {shift:.0%} of the long side away from the image centre, and the images "
-        "hardly determine it": shift < _MAX_PRINCIPAL_SHIFT,
-        f"The aspect ratio of the pixels is determined only to {aspect_std:.0%}, and the model is stretched "
-        "by its error. Use intrinsics.aspect = known, or add images from other heights": (
-            aspect_std < _MAX_ASPECT_STD
-        ),
+        Notice("not-converged", far): not far > MAX_SIGMAS_TO_MINIMUM,
+        Notice("implausible-focal", low, high): _FOCAL_RANGE[0] < low and high < _FOCAL_RANGE[1],
+        Notice("focal-std", std): std < _MAX_FOCAL_STD,
+        Notice("low-model-inliers", share): share > _MIN_MODEL_INLIER_RATIO,
+        Notice("large-noise", noise): noise < _MAX_SIGMA_REL,
+        Notice("centre-shift", shift): shift < _MAX_PRINCIPAL_SHIFT,
+        Notice("aspect-std", aspect_std): aspect_std < _MAX_ASPECT_STD,
     }
     return [sentence for sentence, ok in passed.items() if not ok]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
-from thesisrecon.errors import counted
+from thesisrecon.errors import Notice, counted
 from thesisrecon.geometry.robust_resection import resect_calibrated
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
 from thesisrecon.metric._confirmed_pose import confirmed_pose
@@ -172,7 +172,7 @@ def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Genera
     elif not alone and (confirmed := confirmed_pose(model, view, rows, rng)) is not None:
         Rs[view], ts[view] = confirmed
     elif enough:
-        return f"its resection had {support} inliers among {counted(len(k), 'point')}"
+        return Notice("resection-inliers", support, counted(len(k), "point"))
     else:
         # The number of points is counted at the end.
         return ""
@@ -193,9 +193,7 @@ def _register_again(
     wrong = model.registered & (share < MIN_INLIER_RATIO)
     if wrong.any():
         for view in np.flatnonzero(wrong):
-            rejected[int(view)] = (
-                f"was removed because only {share[view]:.0%} of its matches agreed with the other images"
-            )
+            rejected[int(view)] = Notice("contradicted-by-others", share[view])
         model = replace(model, registered=model.registered & ~wrong)
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
     return model, rejected

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.errors import Notice
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._camera_model import MAX_CHANGE
@@ -208,10 +209,7 @@ def focal_decided_by_model(change: float) -> list[str]:
     """A sentence if a focal length depends too much on deviations from the camera model."""
     if change <= MAX_CHANGE:
         return []
-    return [
-        f"The focal length changes by {change:.0%} if images deviate from the camera model as with image "
-        "stabilisation or a rolling shutter. Add images from more directions"
-    ]
+    return [Notice("focal-by-camera-model", change)]
 
 
 @dataclass(frozen=True)
@@ -341,9 +339,13 @@ def _focals_differ(views: I64, alone: MetricBundleResult, s: _SharedGroup) -> tu
     focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s)
     low, high = int(focal.argmin()), int(focal.argmax())
     return (
-        f"The images contradict a shared focal length: that of image #{views[s.places[high]]} is "
-        f"{focal[high] / focal[low] - 1.0:.1%} longer than that of image #{views[s.places[low]]} (1 sigma: "
-        f"{max(std[low], std[high]):.1%})",
+        Notice(
+            "shared-focal-contradicted",
+            views[s.places[high]],
+            focal[high] / focal[low] - 1.0,
+            views[s.places[low]],
+            max(std[low], std[high]),
+        ),
         "Use one camera per image (cameras = per-image), or leave the zoomed images out",
     )
 
@@ -351,24 +353,19 @@ def _focals_differ(views: I64, alone: MetricBundleResult, s: _SharedGroup) -> tu
 def _centres_differ(s: _SharedGroup, off: F64) -> tuple[str, str]:
     if s.known:
         return (
-            "The images contradict the given principal point: those of "
-            f"{len(s.places)} views are up to {np.abs(off).max():.1%} of the long side away",
+            Notice("given-centre-contradicted", len(s.places), np.abs(off).max()),
             "Leave it out, or use one camera per image (cameras = per-image) if the images were cropped "
             "individually",
         )
     return (
-        f"The images contradict a shared principal point: those of {len(s.places)} views are "
-        f"up to {np.ptp(off, axis=0).max():.1%} of the long side apart",
+        Notice("shared-centre-contradicted", len(s.places), np.ptp(off, axis=0).max()),
         "Use one camera per image (cameras = per-image) if the images were cropped individually",
     )
 
 
 def _untestable(std: float) -> str:
     alone = f"only to {std:.0%} (1 sigma)" if np.isfinite(std) and std < 1.0 else "not at all"
-    return (
-        f"The shared focal length cannot be verified: single images determine their own {alone}. The "
-        f"interval allows for zoom differences of {ZOOM_STD:.0%}. Add images from more directions"
-    )
+    return Notice("untestable-shared-focal", alone, ZOOM_STD)
 
 
 def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustment) -> list[str]:
@@ -378,7 +375,7 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustmen
     if len(given) == 0:
         return []
     focal, std, number = _free_focals(model, adjustment)
-    failed_checks = []
+    failed_checks: list[str] = []
     for k in np.unique(number[given]):
         view = int(given[number[given] == k][0])
         mean, deviation = float(prior.mean[view, 0]), float(prior.std[view, 0])
@@ -386,9 +383,14 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustmen
         if abs(off) > MIN_FOCAL_DIFFERENCE and abs(off) > MAX_SIGMAS * float(np.hypot(std[view], deviation)):
             whose = "" if len(np.unique(number[given])) == 1 else f" of image #{view}"
             failed_checks.append(
-                f"The images contradict the given focal length{whose}: their estimate is "
-                f"{abs(np.expm1(off)):.1%} {'longer' if off > 0 else 'shorter'} (1 sigma: {std[view]:.1%}). "
-                f"Leave it out{'' if deviation == 0.0 else ', or set a larger focal_std_rel'}"
+                Notice(
+                    "given-focal-contradicted",
+                    whose,
+                    abs(np.expm1(off)),
+                    "longer" if off > 0 else "shorter",
+                    std[view],
+                    "" if deviation == 0.0 else ", or set a larger focal_std_rel",
+                )
             )
     return failed_checks
 
@@ -408,12 +410,7 @@ def inconsistent_principal_point(
     if not sigmas[worst] > MAX_CENTRE_SIGMAS:
         return []
     share = float(off[worst].max() / model.sizes[views[worst]].max())
-    return [
-        f"The principal point of image #{views[worst]} is {share:.0%} of the long side off "
-        f"({sigmas[worst]:.0f} sigma of its prior) and blocks of the scene disagree "
-        f"{scatter.overdispersion:.0f} times more than their noise: images were zoomed or cropped "
-        "individually, or the model is deformed"
-    ]
+    return [Notice("deformed-by-centre", views[worst], share, sigmas[worst], scatter.overdispersion)]
 
 
 def _free_focals(model: MetricEstimate, adjustment: MetricAdjustment) -> tuple[F64, F64, I64]:

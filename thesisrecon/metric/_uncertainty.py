@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.errors import Notice
 from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.numerics._block_scatter import BlockScatter, PoseUncertainty
@@ -178,8 +179,7 @@ class FocalShrinkage:
             ", and the other cameras of its kind hardly constrain it",
         )
         return tuple(
-            f"Image #{view}: its own matches determine the focal length only to {self.own_std[view]:.0%} "
-            f"(1 sigma){others[view]}"
+            Notice("borrowed-focal", view, self.own_std[view], others[view])
             for view in registered
             if self.own_std[view] > least
         )

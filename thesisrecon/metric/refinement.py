@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry._critical_motions import measure_motion, nearest_critical_motion
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import (
@@ -156,7 +156,7 @@ def _contradiction(calibration: SelfCalibration) -> list[str]:
     if report is None or not report.prior_contradicted:
         return []
     views = counted(int((calibration.K[:, 0, 0] > 0.0).sum()), "image")
-    return [f"In self-calibration of {views}, {excess_noise(report.evidence)}"]
+    return [Notice("start-contradicts-prior", views, excess_noise(report.evidence))]
 
 
 def _start(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.errors import Notice
 from thesisrecon.geometry._critical_motions import (
     OPTICAL_AXIS,
     PARALLEL_AXES,
@@ -234,12 +235,9 @@ def identifiability_sentences(
     """What was found, what it means and what to do, as clauses; empty for a general motion."""
     is_critical = bool(motion) and evidence["critical_motion_distance"] < 1.0
     calibrated = "focal_std_rel" in evidence
-    sentences = []
+    sentences: list[str] = []
     if evidence["excess_equations"] < 0:
-        sentences.append(
-            f"too few images for the unknown intrinsics: {-evidence['excess_equations']:.0f} equations are "
-            "missing; add images, or let them share one camera"
-        )
+        sentences.append(Notice("too-few-equations", -evidence["excess_equations"]))
     if is_critical:
         found = (_FOUND if calibrated else _FOUND_PROJECTIVE)[motion]
         sentences.append(found.format(**evidence))
@@ -252,31 +250,17 @@ def identifiability_sentences(
 
 def excess_noise(evidence: Mapping[str, float]) -> str:
     """A clause on a prior of the intrinsics that the images contradict."""
-    return (
-        f"metric cameras with the given prior leave {evidence['noise_ratio_to_projective']:.1f} times "
-        "the noise of projective ones: images were zoomed or cropped individually, or come from "
-        "different cameras; estimate each camera separately (cameras = per-image)"
-    )
+    return Notice("excess-noise", evidence["noise_ratio_to_projective"])
 
 
 def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
     """Return clauses on how the focal length is determined in spite of the critical motion."""
     std, free_std = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
     if motion in _RESOLVED_BY_ASPECT and free_std > 2.0 * std:
-        return [
-            "square pixels and a central principal point resolve it if the cameras are as assumed: the "
-            f"focal length is known to {_percent(std)} with them and to {_percent(free_std)} without; to "
-            f"depend less on them, {_ADVICE[motion]}"
-        ]
+        return [Notice("resolved-by-square-pixels", _percent(std), _percent(free_std), _ADVICE[motion])]
     if motion in (PLANE, ROTATION):
-        return [
-            f"the focal length is known to {_percent(std)} if the cameras are as assumed; for reliable "
-            f"depths, {_ADVICE[motion]}"
-        ]
-    return [
-        "if the cameras are as assumed, the departure from this motion determines the focal "
-        f"length to {_percent(std)}"
-    ]
+        return [Notice("resolved-by-prior", _percent(std), _ADVICE[motion])]
+    return [Notice("resolved-by-departure", _percent(std))]
 
 
 def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, focal_std: float) -> list[str]:
@@ -286,18 +270,14 @@ def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, foca
         given = " more exactly" if focal_std < float("inf") else ""
         advice += f", or give the focal length{given}"
     if "focal_std_rel" not in evidence:
-        untested = "the cameras see too few common points to test whether they determine the focal length"
-        return [advice] if motion else [f"{untested}; {advice}"]
+        return [advice] if motion else [Notice("untested-focal", advice)]
     std = evidence["focal_std_rel_median"]
     if evidence["rotation_significance"] < MIN_ROTATION_SIGNIFICANCE and std < MAX_FOCAL_STD:
-        return [f"the rotations are within image noise and do not determine the focal length; {advice}"]
+        return [Notice("rotations-within-noise", advice)]
     if evidence["infinity_shift_beyond_roll"] < MIN_INFINITY_SHIFT and std < MAX_FOCAL_STD:
-        return [
-            f"the rotations move points at infinity by only {evidence['infinity_shift_beyond_roll']:.2%} of "
-            f"the image, within the errors of a lens model, and do not determine the focal length; {advice}"
-        ]
+        return [Notice("small-rotations", evidence["infinity_shift_beyond_roll"], advice)]
     if std >= MAX_FOCAL_STD:
-        return [f"the cameras determine the focal length only to {_percent(std)}; {advice}"]
+        return [Notice("uncertain-focal", _percent(std), advice)]
     # Rotating the camera does not help against a wrong prior of the intrinsics.
     return [] if _has_excess_noise(evidence) else [advice]
 

@@ -13,7 +13,7 @@ from thesisrecon._plug_ins import FunctionMatcher, matches_of
 from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import B8, F64
 from thesisrecon.config import KINDS, PipelineConfig
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry._conditioning import unit_norm
 from thesisrecon.io._images import read_image
 from thesisrecon.matching._prepared import Found, select_found, select_matches
@@ -67,7 +67,7 @@ def match_pair(
     images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
     pair = match_images(config, (images[0], images[1]), seed)
     if not pair.accepted:
-        raise StageFailure("the two images do not match", pair.reason)
+        raise StageFailure(Notice("unmatched-pair"), pair.reason)
     given = (isinstance(image1, Image), isinstance(image2, Image))
     T1, T2 = (np.eye(3) if one else im.original_from_working for one, im in zip(given, images, strict=True))
     return _transformed(pair, T1, T2)

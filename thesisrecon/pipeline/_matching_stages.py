@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import counted
+from thesisrecon.errors import Notice, counted
 from thesisrecon.matching._prepared import strongest_corners, strongest_share
 from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.matching.growth import SeedsAndGrowth
@@ -51,7 +51,7 @@ def finish_features(state: PipelineState, features: Sequence[Features]) -> None:
     state.result = replace(state.result, features=tuple(features))
     found = [len(f.xy) for f in features]
     few = [(image, n) for image, n in zip(images, found, strict=True) if n < MIN_CORNERS]
-    poor = [f"{image.name} has only {counted(n, 'corner')}" for image, n in few]
+    poor = [Notice("few-corners", image.name, counted(n, "corner")) for image, n in few]
     counts = {"images": len(images), "corners": sum(found), "fewest_in_one_image": min(found)}
     state.run.finish("features", counts=counts, warnings=poor)
 
@@ -210,7 +210,7 @@ def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
     kinds = Counter(pair.configuration for pair in undetermined)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     of_all = f"{len(undetermined)} of {len(accepted)} accepted pairs"
-    return [f"The epipolar geometry of {of_all} is degenerate ({listed})"]
+    return [Notice("degenerate-pairs", of_all, listed)]
 
 
 def _prepared_oblique(state: PipelineState) -> PreparedViews:

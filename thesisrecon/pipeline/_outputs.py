@@ -15,7 +15,7 @@ import numpy as np
 from thesisrecon import __version__
 from thesisrecon._settings import toml_from_config
 from thesisrecon.arrays import F32, U8
-from thesisrecon.errors import NOT_MADE, StageFailure, UsageError, counted, made
+from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, counted, made
 from thesisrecon.geometry.camera_matrix import finite_cameras
 from thesisrecon.io._colmap_writing import COLMAP_FILES, write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
@@ -68,7 +68,7 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
     if later is None:
         return _write(run, result, until, failure)
     kept = "its summary and report are kept"
-    run.warnings.append(f"the folder holds the result of this run up to {later}: {kept}")
+    run.warnings.append(Notice("older-outputs", later, kept))
     return _described(run, result, until, failure)
 
 
@@ -257,13 +257,13 @@ def _failure_warnings(result: RunResult) -> list[str]:
     own: tuple[str, ...] = ()
     if result.metric is not None and not result.metric.trusted:
         own = tuple(dict.fromkeys(result.metric.failed_checks))
-        failed_checks.append(f"The result failed its self-check and cannot be trusted: {'; '.join(own)}")
+        failed_checks.append(Notice("failed-self-check", "; ".join(own)))
     tested = result.metric is not None and result.metric.identifiability is not None
     if result.calibration is not None and not result.calibration.identifiable and not tested:
         # The self-check may repeat the reasons of its calibration.
         rest = [reason for reason in dict.fromkeys(result.calibration.reasons) if reason not in own]
         if rest or not own:
-            failed_checks.append(f"The images do not determine the calibration: {'; '.join(rest)}")
+            failed_checks.append(Notice("undetermined-calibration", "; ".join(rest)))
     return failed_checks
 
 
@@ -287,8 +287,7 @@ def _write_model(directory: RunDirectory, result: RunResult, colors: U8, warning
         directory.remove(COLMAP_FILES)
     if skewed > 0:
         warnings.append(
-            f"sparse/0 is not written: COLMAP has no camera model with skew, but {skewed} of "
-            f"{counted(int(metric.reconstruction.registered.sum()), 'camera')} have skew; see cameras.json"
+            Notice("no-colmap-skew", skewed, counted(int(metric.reconstruction.registered.sum()), "camera"))
         )
 
 

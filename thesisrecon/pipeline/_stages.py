@@ -13,7 +13,7 @@ import numpy as np
 from thesisrecon._code_digest import code_digest
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
@@ -201,7 +201,7 @@ def reconstruct_metric(state: PipelineState) -> None:
         "metric", counts=_sizes_of(found), metrics={"sigma_px": found.sigma_px}, warnings=warnings
     )
     if len(tried) > 1:
-        state.run.warnings.append(f"{len(tried)} initial pairs were tried; the best result is used")
+        state.run.warnings.append(Notice("several-starts", len(tried)))
 
 
 def best_result(tried: Sequence[RunResult]) -> RunResult:
@@ -298,7 +298,7 @@ def estimate_depth_maps(state: PipelineState) -> None:
     known = [float(mask.mean()) for mask in finite]
     counts = {"views": len(order), "depths": int(sum(mask.sum() for mask in finite))}
     empty = [result.images[i].name for i, share in zip(order, known, strict=True) if not share]
-    warnings = [f"Image {name} has no depth values" for name in empty]
+    warnings = [Notice("no-depth-values", name) for name in empty]
     metrics = {"median_share_known": float(np.median(known))}
     run.finish("dense", counts=counts, metrics=metrics, warnings=warnings)
     if not counts["depths"]:

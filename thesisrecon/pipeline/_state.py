@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
 from thesisrecon.numerics._observations import cached_pair_order
@@ -181,6 +181,7 @@ class PipelineState:
 def name_images(text: str, names: Sequence[str]) -> str:
     """Replace the image numbers (``#number``) in a sentence of a stage by file names."""
     # A file name such as "a #1.jpg" in the sentence is left alone.
-    return re.sub(
+    named = re.sub(
         r"(?<![^\s(])#(\d+)(?!\.?\w)", lambda m: names[int(m[1])] if int(m[1]) < len(names) else m[0], text
     )
+    return Notice.of(text.code, named) if isinstance(text, Notice) else named

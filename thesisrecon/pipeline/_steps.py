@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon._settings import tables_from_config
 from thesisrecon.arrays import F64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.intrinsics import camera_numbers
 from thesisrecon.io._images import ImageSet
 from thesisrecon.pipeline._matching_stages import (
@@ -115,8 +115,8 @@ def _run_groups(state: PipelineState, steps: Sequence[Step], *, surface_required
         here = state.result.best_reconstruction
         registered = counted(0 if here is None else int(here.registered.sum()), "image")
         others = ", ".join(f"{group['registered']} in {group['folder']}" for group in run.groups)
-        models = f"The images form {len(run.groups) + 1} models without a common scale"
-        run.warnings.append(f"{models}: {registered} in this model, {others}")
+        models = Notice("several-models", len(run.groups) + 1)
+        run.warnings.append(Notice("sizes-of-models", models, registered, others))
         state.result = _with_group_reasons(state.result, places)
 
 
@@ -167,9 +167,7 @@ def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResu
 
     def named(found: Reconstruction) -> Reconstruction:
         reasons = [
-            f"is reconstructed in {places[i]}: it overlaps too little with the images of this model"
-            if i in places
-            else reason
+            Notice("other-group", places[i]) if i in places else reason
             for i, reason in enumerate(found.reasons)
         ]
         return replace(found, reasons=tuple(reasons))
@@ -190,7 +188,7 @@ def _run_all(state: PipelineState, steps: Sequence[Step], *, surface_required: b
         except StageFailure as failure:
             if surface_required or step not in SURFACE_STEPS:
                 raise
-            state.run.warnings.append(f"No surface model was built: {failure}")
+            state.run.warnings.append(Notice("no-surface", failure))
             return
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon._settings import Config, Pairs, Settings, build_config
 from thesisrecon.arrays import F64
-from thesisrecon.errors import UsageError, counted
+from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._frames import FrameSource
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
@@ -183,9 +183,9 @@ def _refusals(refused: Mapping[str, str]) -> list[str]:
     found: list[str] = []
     for reason, files in names.items():
         if len(files) > _MAX_LISTED:
-            found.append(f"{files[0]} and {len(files) - 1} more files are left out: each {reason}")
+            found.append(Notice("files-left-out", files[0], len(files) - 1, reason))
         else:
-            found += [f"{name} is left out: it {reason}" for name in files]
+            found += [Notice("image-left-out", name, reason) for name in files]
     return found
 
 
@@ -198,6 +198,5 @@ def _exif_warnings(options: IntrinsicsOptions, exif_focal_px: F64) -> list[str]:
     instead = ": it is estimated instead, one value per camera (constant)"
     rest = instead if options.focal == "known" else ""
     if missing == total:
-        found = f"No EXIF focal length was found in {counted(total, 'image')}"
-        return [f"{found}{rest or ': no focal prior is used'}"]
-    return [f"{missing} of the {total} images have no EXIF focal length{rest or ' and no focal prior'}"]
+        return [Notice("no-exif-focal", counted(total, "image"), rest or ": no focal prior is used")]
+    return [Notice("missing-exif-focal", missing, total, rest or " and no focal prior")]

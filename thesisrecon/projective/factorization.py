@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry._conditioning import normalizing_transform
 from thesisrecon.geometry._homography import homography_linear, homography_sampson_residuals
 from thesisrecon.geometry.camera_matrix import orient_signs
@@ -190,7 +190,7 @@ class Factorization:
             table, edges = _complete_tracks(xy, tree)
         if table.shape[1] < _MIN_POINTS:
             raise StageFailure(
-                "the initial images share too few tracks for a factorization",
+                Notice("few-common-tracks"),
                 f"{table.shape[1]} tracks, at least {_MIN_POINTS} are needed",
             )
         depths = depths_from_fundamentals(table, {e: F[v] for e, v in zip(edges, tree, strict=True)}, edges)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.errors import StageFailure, counted, require_at_least
+from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
 from thesisrecon.geometry.robust_resection import resect_projective
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.numerics._partial_bundle import refine_camera
@@ -77,7 +77,7 @@ def _find_inconsistent_view(
 _MIN_INLIER_RATIO = 0.3
 # Quantile over all points of the projection standard deviations that is tested.
 _STD_QUANTILE = 0.8
-OUTSIDE_CORE = "is outside the core: it is registered after self-calibration"
+OUTSIDE_CORE = Notice("outside-core")
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class IncrementalProjective:
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             raise StageFailure(
-                "no other initial pair is left", f"all {len(ranked)} accepted image pairs were tried"
+                Notice("no-other-initial-pair"), f"all {len(ranked)} accepted image pairs were tried"
             )
         selected, keep = working_tracks(
             tracks_of_views(tracks, core), inside, points_per_view=self.points_per_view
@@ -258,9 +258,7 @@ class IncrementalProjective:
         X, xy = model.X[t.point_index[k]], t.xy[k]
         P, inlier = resect_projective(X, xy, threshold_px=early * model.sigma_px, rng=rng)
         if P is None or inlier.sum() < self.min_points or inlier.mean() < _MIN_INLIER_RATIO:
-            model.reasons[view] = (
-                f"its resection had {int(inlier.sum())} inliers among {counted(len(k), 'point')}"
-            )
+            model.reasons[view] = Notice("resection-inliers", int(inlier.sum()), counted(len(k), "point"))
             return False
         model.deferred[view], P = self._covariance_test(model, view, P, X[inlier], xy[inlier])
         if model.deferred[view]:
@@ -285,10 +283,7 @@ class IncrementalProjective:
         quantile = float(np.quantile(std_px, _STD_QUANTILE))
         if quantile < limit:
             return False, P
-        model.reasons[view] = (
-            f"its {len(X)} points lie near one plane and do not determine its camera before calibration "
-            f"(predicted standard deviation {min(quantile, 1e6):.0f} px, limit {limit:.0f} px)"
-        )
+        model.reasons[view] = Notice("planar-resection", len(X), min(quantile, 1e6), limit)
         return True, P
 
     def _discard_camera(self, model: ProjectiveModel, pairs: Sequence[TwoView]) -> bool:
@@ -298,7 +293,7 @@ class IncrementalProjective:
         counts, shares = model.inlier_ratios()
         shares[~model.registered] = 1.0
         view = int(np.argmin(shares))
-        reason = f"was removed because only {counts[view]} of its points were inliers ({shares[view]:.0%})"
+        reason = Notice("few-inlier-points", counts[view], shares[view])
         if shares[view] >= _MIN_INLIER_RATIO:
             threshold, ratio = self.outlier_sigmas[0] * model.sigma_px, self.min_epipolar_inlier_ratio
             found = _find_inconsistent_view(
@@ -307,7 +302,7 @@ class IncrementalProjective:
             if found is None:
                 return False
             view, share = found
-            reason = f"was removed because only {share:.0%} of its verified matches agreed with others"
+            reason = Notice("epipolar-contradiction", share)
         model.registered[view] = False
         model.rejected[view] = True
         model.reasons[view] = reason

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from numpy.random import Generator
 
 from thesisrecon.arrays import I64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.projective._model import adjust_all, to_reconstruction
 from thesisrecon.projective._track_selection import require_pair_with_parallax
 from thesisrecon.projective.incremental import IncrementalProjective
@@ -41,7 +41,7 @@ class SequentialProjective:
         candidates = sorted(neighbours or accepted, key=lambda p: (-p.inliers, p.i, p.j))
         if attempt >= len(candidates):
             raise StageFailure(
-                "no initial pair is left", f"{counted(len(candidates), 'image pair')} accepted"
+                Notice("no-initial-pair"), f"{counted(len(candidates), 'image pair')} accepted"
             )
         incremental = IncrementalProjective(
             min_points=self.min_points,

@@ -16,7 +16,7 @@ import numpy as np
 from thesisrecon._code_digest import code_digest
 from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import OutputError, UsageError, WorkersLost, unknown_word
+from thesisrecon.errors import Notice, OutputError, UsageError, WorkersLost, unknown_word
 from thesisrecon.records import StageReport
 from thesisrecon.runtime._executors import Workers, available_threads
 from thesisrecon.runtime._run_folder import ChangedRecord, RunDirectory, StageFolder, key_of
@@ -169,8 +169,7 @@ class Run:
             yield record
         if changed:
             more, were = (f" and {len(changed) - 1} more", "were") if len(changed) > 1 else ("", "was")
-            how = f"damaged or changed by another program and {were} computed again"
-            self.warnings.append(f"{changed[0]}{more} {were} {how}")
+            self.warnings.append(Notice("changed-files", changed[0], more, were, were))
 
     def map_cached(
         self,

@@ -10,7 +10,7 @@ from typing import ParamSpec
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.records import IdentifiabilityReport, Reconstruction, SelfCalibration, Upgrade
 from thesisrecon.selfcalibration._frame import ReferenceFrame, metric_from_calibration
 from thesisrecon.selfcalibration._identifiability import (
@@ -195,7 +195,7 @@ def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction,
         )
     sentences = identifiability_without_calibration(reconstruction, frame.prior).sentences
     advice = "; ".join(sentences) or "take images from more directions and rotate the camera between them"
-    return StageFailure("self-calibration failed", evidence, advice)
+    return StageFailure(Notice("self-calibration"), evidence, advice)
 
 
 def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_std: F64) -> F64:

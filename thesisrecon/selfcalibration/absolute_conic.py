@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry.conics import calibration_from_image
 from thesisrecon.selfcalibration._frame import (
     HOMOGRAPHY_NOISE,
@@ -112,7 +112,7 @@ def _homographies(frame: ReferenceFrame, plane: F64) -> F64:
     H = infinite_homographies(frame, plane[None])[0]
     if not np.isfinite(H).all():
         raise StageFailure(
-            "the plane at infinity passes through a camera centre",
+            Notice("plane-through-camera"),
             f"image #{int(frame.views[~np.isfinite(H).all(axis=(1, 2))][0])} has no infinite homography",
         )
     return np.asarray(H, dtype=np.float64)

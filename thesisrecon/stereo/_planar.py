@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import F64
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -105,7 +105,7 @@ def hartley(pair: EpipolarPair) -> PlanarRectification:
     through epipole and centre, and the least squares are linear in the first row.
     """
     if len(pair.matches[0]) < MIN_MATCHES:
-        raise StageFailure("Hartley's rectification needs matches", f"{len(pair.matches[0])} are given")
+        raise StageFailure(Notice("rectification-without-matches"), f"{len(pair.matches[0])} are given")
     low, high = _admissible_lines(pair)
     middle = pair.pencil.centres[1][None]
     phi = float(pair.pencil.angles(1, middle, about=0.5 * (low + high))[0])

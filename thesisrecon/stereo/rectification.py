@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, U8
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.stereo._epipolar_pair import (
     EpipolarPair,
     Size,
@@ -138,7 +138,7 @@ def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectific
     Rectification
     """
     best: Rectification | None = None
-    least, failure = (True, np.inf), StageFailure("no method of rectification is given")
+    least, failure = (True, np.inf), StageFailure(Notice("no-rectification-method"))
     for method in methods:
         try:
             found = method(pair)

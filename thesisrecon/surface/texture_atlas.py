@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry._image_filters import resample, smooth
 from thesisrecon.numerics._on_demand import OnDemand
@@ -86,7 +86,7 @@ class TextureAtlas:
             if shows_part(mesh, views):
                 evidence = "images show parts of faces, but none shows a face completely"
                 raise StageFailure("the surface has no texture", evidence, "subdivide the mesh")
-            raise StageFailure("the surface has no texture", "no image shows any part of it")
+            raise StageFailure(Notice("no-texture"), "no image shows any part of it")
         chart = label_charts(label, neighbours)
         scale = 1.0
         while True:
