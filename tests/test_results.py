@@ -7,7 +7,7 @@ import pytest
 
 import thesisrecon
 from tests.conftest import same_pairs
-from tests.given_scene import SIZE, given_scene
+from tests.pipeline.given_scene import SIZE, given_scene
 from thesisrecon.errors import UsageError
 from thesisrecon.io._models import read_cameras
 

@@ -143,7 +143,7 @@ class StageFailure(Exception):
     ----------
     reason, evidence, advice : str
         What happened, what was measured (with numbers and units), and what to do, as clauses. A reason
-        without advice is a :class:`Notice`.
+        without advice is a ``Notice``.
 
     Examples
     --------

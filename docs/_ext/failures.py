@@ -71,9 +71,9 @@ def page() -> str:
     """Return the page of all failures and warnings."""
     lines = [HEAD]
     for title, messages in TABLES.items():
-        rows = [(re.sub("{[^}]*}", "…", text), remedy) for text, remedy in messages.values()]
+        rows = [(f"`{code}`", re.sub("{[^}]*}", "…", text), why) for code, (text, why) in messages.items()]
         lines += [FAILURES] if title == EXPLAINED else []
-        lines += table(title, ("message", "cause and remedy"), rows)
+        lines += table(title, ("code", "message", "cause and remedy"), rows)
     for folder, rows in sorted(stage_failures().items(), key=lambda found: FOLDERS.index(found[0])):
         title = summary(PACKAGE / folder / "__init__.py").rstrip(".") if folder else "Functions of arrays"
         lines += table(title, ("reason", "evidence", "what to do"), rows)
@@ -94,7 +94,8 @@ def table(title: str, head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) ->
 HEAD = """# When a run fails or warns
 
 This page is made from the code, so it holds every message; "…" stands for a value. Search it for a
-few words of your message.
+few words of your message, or for its code: a warning of `result.warnings` is a `str` with the attribute
+`code`, unless it was read from a file.
 
 A run ends in one of four ways:
 

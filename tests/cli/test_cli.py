@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fake_stages import kept_bytes, read
+from tests.pipeline.fake_stages import kept_bytes, read
 from thesisrecon._settings import build_config
 from thesisrecon.cli import common, runs
 from thesisrecon.cli.main import run_command

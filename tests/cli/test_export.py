@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.test_alignment import make_model, true_positions
+from tests.api.test_alignment import make_model, true_positions
 from thesisrecon import export
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._models import read_model

@@ -8,8 +8,8 @@ import PIL.Image
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from tests.bad_input import files
 from tests.conftest import refuses
-from tests.hostile import files
 from thesisrecon import reconstruct
 from thesisrecon.errors import UsageError
 from thesisrecon.io._frames import FrameSource

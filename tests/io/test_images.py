@@ -8,8 +8,8 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from tests.bad_input import files
 from tests.conftest import refuses
-from tests.hostile import files
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
 from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame

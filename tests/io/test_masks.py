@@ -4,8 +4,8 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from tests.bad_input import files
 from tests.conftest import refuses
-from tests.hostile import files
 from thesisrecon.errors import UsageError
 from thesisrecon.io._images import read_images
 from thesisrecon.io._masks import add_masks, check_masks_folder

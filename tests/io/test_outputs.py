@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import refuses
-from tests.fake_stages import fake_config, photographs
+from tests.pipeline.fake_stages import fake_config, photographs
 from thesisrecon import load, reconstruct
 from thesisrecon.errors import OutputError, StageFailure, UsageError
 from thesisrecon.io._files import write_atomically, write_new

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from tests.api.test_alignment import make_model, true_positions
 from tests.conftest import refuses
-from tests.test_alignment import make_model, true_positions
 from thesisrecon import UsageError, align_to_positions
 from thesisrecon.io._positions import read_positions
 

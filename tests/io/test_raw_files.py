@@ -5,8 +5,8 @@ import struct
 import numpy as np
 import pytest
 
+from tests.bad_input import files
 from tests.conftest import refuses
-from tests.hostile import files
 from thesisrecon import reconstruct
 from thesisrecon.errors import UsageError
 from thesisrecon.io._images import list_images, read_images

@@ -8,8 +8,8 @@ import PIL.Image
 import pytest
 
 import thesisrecon
+from tests.bad_input import files
 from tests.conftest import refuses
-from tests.hostile import files
 from tests.io.test_raw_files import tiff
 from thesisrecon import reconstruct
 from thesisrecon.errors import StageFailure, UsageError

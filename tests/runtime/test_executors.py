@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests import fake_stages as fakes
 from tests.conftest import LOCAL, address
-from tests.fake_stages import fake_config, photographs
+from tests.pipeline import fake_stages as fakes
+from tests.pipeline.fake_stages import fake_config, photographs
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io._files import read_json

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import refuses
-from tests.fake_stages import fake_config, photographs
+from tests.pipeline.fake_stages import fake_config, photographs
 from thesisrecon import records
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import read_json, write_atomically

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.fake_stages import fake_config, interrupt_at, photographs
+from tests.pipeline.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._files import write_json

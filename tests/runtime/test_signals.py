@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fake_stages import fake_config, photographs
+from tests.pipeline.fake_stages import fake_config, photographs
 from thesisrecon.cli.main import run_command
 from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime._executors import ProcessPool

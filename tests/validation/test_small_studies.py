@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from tests.fake_stages import CALLS, fake_config, photographs
+from tests.pipeline.fake_stages import CALLS, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError

@@ -1,0 +1,570 @@
+"""Exports are read back by the programs themselves or by a reader of the format, and project known points."""
+
+import json
+import shutil
+import struct
+import threading
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import PIL.Image
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.pipeline import fake_stages as fakes
+from thesisrecon import Camera, UsageError, export, model_export, reconstruct
+from thesisrecon.cli.main import run_command
+from thesisrecon.io._exports import write_image
+from thesisrecon.io._images import read_image
+from thesisrecon.io._pixels import MemoryBudget
+from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.stereo._resampling import undistort_image
+
+SIZE = (160, 120)
+NAMES = ["a b.png", "sub/c.png", "d.tif", "é.png"]
+WRITTEN = {"a b.png": "a b.png", "sub/c.png": "sub/c.png", "d.tif": "d.tif.png", "é.png": "é.png"}
+SLOPE = np.array([1.37, 1.83])
+"""Grey levels per pixel of the test images; no whole numbers, so that rounding is not the same everywhere."""
+BARREL, PINCUSHION = np.array([-0.15, 0.03, 0.01]), np.array([0.1, 0.0, 0.0])
+
+
+def make_model(*distortions, skew=0.0):
+    """Four views of forty points, with exact observations, by two cameras in turn."""
+    rng = np.random.default_rng(3)
+    X, views = rng.uniform(-1, 1, (40, 3)), []
+    for i, name in enumerate(NAMES):
+        fx, fy = (150.0, 152.0) if i % 2 else (140.0, 140.0)
+        K = np.array([[fx, skew, 76.2 + i % 2], [0.0, fy, 61.7], [0.0, 0.0, 1.0]])
+        R = Rotation.from_rotvec(rng.normal(0, 0.3, 3)).as_matrix()
+        views.append(
+            SparseView(name, R, np.array([*rng.normal(0, 0.2, 2), 4.5]), K, SIZE, distortions[i % 2])
+        )
+    view, point = (grid.ravel() for grid in np.meshgrid(np.arange(4), np.arange(40)))
+    xy = np.array([camera(views[i]).project(X[j : j + 1])[0] for i, j in zip(view, point, strict=True)])
+    colors = rng.integers(0, 256, (40, 3), dtype=np.uint8)
+    return SparseModel(views, X, colors, view.astype(np.int64), point.astype(np.int64), xy)
+
+
+def camera(view):
+    return Camera(view.K, view.R, view.t, view.size, view.distortion)
+
+
+@pytest.fixture
+def images(tmp_path):
+    """Images whose red and green are proportional to their pixel coordinates."""
+    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    rgb = np.rint(np.stack([x * SLOPE[0], y * SLOPE[1], 0 * x], axis=-1)).astype(np.uint8)
+    for name in NAMES:
+        path = tmp_path / "originals" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        PIL.Image.fromarray(rgb).save(path)
+    return tmp_path / "originals"
+
+
+def pixels_of(path):
+    with PIL.Image.open(path) as image:
+        return np.asarray(image).astype(float)
+
+
+# Readers: image name -> (projection of points in our pixels, size or None).
+
+
+def read_colmap(folder):
+    import pycolmap
+
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+
+    def reader(image):
+        return lambda X: np.array([image.project_point(x) for x in X]) - 0.5
+
+    return {i.name: (reader(i), (i.camera.width, i.camera.height)) for i in model.images.values()}
+
+
+def read_nerfstudio(folder):
+    """As the loader of a splatting trainer: poses with OpenGL axes, intrinsics of frame or file."""
+    table = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
+    found = {}
+    for frame in table["frames"]:
+        given = {**table, **frame}
+        world_to_camera = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
+        assert not any(given[name] for name in ("k1", "k2", "p1", "p2"))
+
+        def project(X, given=given, T=world_to_camera):
+            x, y, z = (X @ T[:3, :3].T + T[:3, 3]).T
+            pixel = [given["fl_x"] * x / z + given["cx"], given["fl_y"] * y / z + given["cy"]]
+            return np.array(pixel).T - 0.5
+
+        assert (folder / frame["file_path"]).is_file()
+        found[frame["file_path"].removeprefix("images/")] = project, (given["w"], given["h"])
+    return found
+
+
+class Archive:
+    """Reader of OpenMVS's archive: little-endian values, counted texts and lists."""
+
+    def __init__(self, data):
+        self.data, self.at = data, 0
+
+    def take(self, form):
+        values = struct.unpack_from(f"<{form}", self.data, self.at)
+        self.at += struct.calcsize(f"<{form}")
+        return values if len(values) > 1 else values[0]
+
+    def text(self):
+        return self.take(f"{self.take('Q')}s").decode()
+
+    def list(self, read):
+        return [read() for _ in range(self.take("Q"))]
+
+    def matrix(self):
+        return np.array(self.take("9d")).reshape(3, 3)
+
+    def camera(self):
+        return self.text(), self.take("2I"), self.matrix(), self.matrix(), self.take("3d")
+
+    def platform(self):
+        return (
+            self.text(),
+            self.list(self.camera),
+            self.list(lambda: (self.matrix(), np.array(self.take("3d")))),
+        )
+
+
+def read_openmvs(folder):
+    archive = Archive((folder / "scene.mvs").read_bytes())
+    assert (archive.take("4s"), archive.take("2I")) == (b"MVSI", (2, 0))
+    ((_, cameras, poses),) = archive.list(archive.platform)
+    images = archive.list(lambda: (archive.text(), archive.take("3I")))
+    points = archive.list(lambda: (archive.take("3f"), archive.list(lambda: archive.take("If"))))
+    assert archive.list(lambda: archive.take("3f")) == []
+    colors = archive.list(lambda: archive.take("3B"))
+    assert [archive.take("Q") for _ in range(3)] == [0, 0, 0]
+    np.testing.assert_array_equal(np.array(archive.take("16d")).reshape(4, 4), np.eye(4))
+    assert archive.at == len(archive.data)
+    expected = make_model(BARREL, PINCUSHION)
+    np.testing.assert_allclose([X for X, _ in points], expected.X, rtol=1e-6)
+    assert [[i for i, _ in seen] for _, seen in points] == [[0, 1, 2, 3]] * 40
+    np.testing.assert_array_equal(np.array(colors)[:, ::-1], expected.colors)
+    found = {}
+    for name, (_, number, pose) in images:
+        _, size, K, R, C = cameras[number]
+        np.testing.assert_array_equal(np.column_stack([R, C]), np.eye(3, 4))
+
+        def project(X, K=K, pose=poses[pose]):
+            x = (X - pose[1]) @ pose[0].T @ K.T
+            return x[:, :2] / x[:, 2:]
+
+        found[name.removeprefix("images/")] = project, size
+    return found
+
+
+def read_bundler(folder):
+    words = iter((folder / "bundle.out").read_text().split("\n", 1)[1].split())
+    names = (folder / "list.txt").read_text(encoding="utf-8").splitlines()
+    cameras, points = int(next(words)), int(next(words))
+    parameters = np.array([[float(next(words)) for _ in range(15)] for _ in range(cameras)])
+    found = {}
+    for name, (f, k1, k2, *pose) in zip(names, parameters, strict=True):
+        width, height = pixels_of(folder / name).shape[1::-1]
+        assert (k1, k2) == (0.0, 0.0)
+
+        def project(X, f=f, pose=pose, middle=((width - 1) / 2, (height - 1) / 2)):
+            P = X @ np.reshape(pose[:9], (3, 3)).T + pose[9:]
+            return -f * P[:, :2] / P[:, 2:] * [1, -1] + middle
+
+        found[name.removeprefix("images/")] = project, (width, height)
+    for _ in range(points):
+        X = np.array([[float(next(words)) for _ in range(3)]])
+        assert all(0 <= int(next(words)) < 256 for _ in range(3))
+        for i in range(int(next(words))):
+            assert int(next(words)) == i
+            next(words)
+            project, (width, height) = found[names[i].removeprefix("images/")]
+            seen = [float(next(words)) + (width - 1) / 2, (height - 1) / 2 - float(next(words))]
+            np.testing.assert_allclose(project(X)[0], seen, atol=1e-6, rtol=0)
+    assert next(words, None) is None
+    return found
+
+
+def read_opencv(folder):
+    import cv2
+
+    file, found = cv2.FileStorage(str(folder / "poses.yml"), cv2.FILE_STORAGE_READ), {}
+    poses = file.getNode("images")
+    for i in range(poses.size()):
+        pose = poses.at(i)
+        stored = cv2.FileStorage(str(folder / pose.getNode("camera").string()), cv2.FILE_STORAGE_READ)
+        K, k = stored.getNode("camera_matrix").mat(), stored.getNode("distortion_coefficients").mat()
+        rvec, t = cv2.Rodrigues(pose.getNode("R").mat())[0], pose.getNode("T").mat()
+        size = tuple(int(stored.getNode(f"image_{side}").real()) for side in ("width", "height"))
+
+        def project(X, args=(rvec, t, K, k)):
+            return cv2.projectPoints(X, *args)[0][:, 0]
+
+        found[pose.getNode("name").string()] = project, size
+    return found
+
+
+@pytest.mark.parametrize(
+    ("to", "read"),
+    [
+        pytest.param("colmap-undistorted", read_colmap, marks=pytest.mark.references),
+        ("nerfstudio", read_nerfstudio),
+        ("openmvs", read_openmvs),
+        ("bundler", read_bundler),
+    ],
+)
+def test_undistorted_exports_project_known_points(tmp_path, images, to, read):
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path / "out", to=to, images=images)
+    found = read(tmp_path / "out")
+    for view in model.views:
+        name = WRITTEN[view.name].replace(" ", "_") if to == "bundler" else WRITTEN[view.name]
+        project, (width, height) = found[name]
+        xy = project(model.X)
+        pinhole = Camera(view.K, view.R, view.t, view.size)
+        if to == "bundler":
+            # One focal length and another principal point.
+            centred = (pinhole.project(model.X) - view.K[:2, 2]) * view.K[0, 0] / np.diag(view.K)[:2]
+            middle = np.array([width - 1, height - 1]) / 2
+            np.testing.assert_allclose(xy, centred + middle, atol=1e-6, rtol=0)
+        else:
+            offset = pinhole.project(model.X) - xy
+            np.testing.assert_allclose(offset, np.tile(np.rint(offset[0]), (40, 1)), atol=1e-6, rtol=0)
+        # The image content is where the distorted camera sees it, and no pixel is outside of the original.
+        pixels = pixels_of(tmp_path / "out" / "images" / name)
+        assert pixels.shape == (height, width, 3)
+        assert (pixels[1:-1, 1:-1, :2].sum(axis=2) > 0).all()
+        inside = np.flatnonzero(((xy > 1) & (xy < [width - 2, height - 2])).all(axis=1))
+        x0, y0 = np.floor(xy[inside]).astype(int).T
+        fx, fy = (xy[inside] - np.column_stack([x0, y0])).T[:, :, None]
+        rows = [(1 - fx) * pixels[y, x0] + fx * pixels[y, x0 + 1] for y in (y0, y0 + 1)]
+        seen = ((1 - fy) * rows[0] + fy * rows[1])[:, :2] / SLOPE
+        error = seen - camera(view).project(model.X[inside])
+        assert len(inside) > 30
+        assert np.abs(error).max() < 1.0
+        assert np.abs(error.mean(axis=0)).max() < 0.2
+
+
+MASKED = np.s_[30:70, 40:90]
+"""Rows and columns that the mask of one image leaves out."""
+
+
+@pytest.mark.parametrize(
+    ("to", "mask_names"),
+    [
+        ("colmap-undistorted", {name: f"masks/{name}.png" for name in WRITTEN.values()}),
+        ("nerfstudio", {name: f"masks/{name}.png" for name in WRITTEN.values()}),
+        (
+            "openmvs",
+            {name: f"masks/{name.split('/')[-1].rpartition('.')[0]}.mask.png" for name in WRITTEN.values()},
+        ),
+    ],
+)
+def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path, images, to, mask_names):
+    """One image of four has a mask; programs want one for every image."""
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[MASKED] = 0
+    (tmp_path / "given").mkdir()
+    PIL.Image.fromarray(mask).save(tmp_path / "given" / "c.png.png")
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path / "out", to=to, images=images, masks=tmp_path / "given")
+    for name, file in mask_names.items():
+        written = pixels_of(tmp_path / "out" / file)
+        rgb = pixels_of(tmp_path / "out" / "images" / name)
+        assert written.shape == rgb.shape[:2]
+        assert set(np.unique(written)) <= {0.0, 255.0}
+        if name != "sub/c.png":
+            assert (written == 255).all()
+            continue
+        # The colours of a pixel tell its place in the original.
+        x, y = rgb[..., 0] / SLOPE[0], rgb[..., 1] / SLOPE[1]
+        inside = (x > 41) & (x < 88) & (y > 31) & (y < 68)
+        outside = (x < 38) | (x > 91) | (y < 28) | (y > 71)
+        assert inside.sum() > 1000
+        assert (written[inside] == 0).all()
+        assert (written[outside] == 255).all()
+    if to == "nerfstudio":
+        table = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
+        found = {frame["file_path"].removeprefix("images/"): frame["mask_path"] for frame in table["frames"]}
+        assert found == mask_names
+    if to == "openmvs":
+        alike = replace(model, views=[replace(model.views[0], name="c.jpg"), *model.views[1:]])
+        with pytest.raises(
+            UsageError, match=r"two images of the model would have the mask masks/c\.mask\.png"
+        ):
+            export(alike, tmp_path / "alike", to=to, images=images, masks=tmp_path / "given")
+
+
+def test_the_masks_of_a_run_are_exported_with_it(tmp_path, capsys):
+    names = [image.name for image in fakes.photographs(4)]
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    for image in fakes.photographs(4):
+        PIL.Image.fromarray(image.rgb).save(tmp_path / "images" / image.name)
+        mask = np.full(image.rgb.shape[:2], 255, np.uint8)
+        mask[:, :9] = 0
+        PIL.Image.fromarray(mask).save(tmp_path / "masks" / f"{image.name}.png")
+    out, config = tmp_path / "out", fakes.fake_config()
+    reconstruct(tmp_path / "images", out, config=config, until="metric", masks=tmp_path / "masks")
+    report = export(out, tmp_path / "a", to="colmap-undistorted")
+    assert report.notes == ()
+    assert all((pixels_of(tmp_path / "a" / "masks" / f"{name}.png")[:, 0] == 0).all() for name in names)
+    assert "Bundler has none" in export(out, tmp_path / "b", to="bundler").notes[0]
+    command = ["export", str(out), "--to", "nerfstudio", "-o"]
+    assert run_command([*command, str(tmp_path / "e")]) == 0
+    assert "note" not in capsys.readouterr().out
+    assert len(list((tmp_path / "e" / "masks").iterdir())) == len(names)
+    (tmp_path / "masks").rename(tmp_path / "moved")
+    assert run_command([*command, str(tmp_path / "c")]) == 0
+    assert "is gone; give --masks" in capsys.readouterr().out
+    assert not (tmp_path / "c" / "masks").exists()
+    export(out, tmp_path / "d", to="openmvs", masks=tmp_path / "moved")
+    assert len(list((tmp_path / "d" / "masks").iterdir())) == len(names)
+
+
+@pytest.mark.references
+@pytest.mark.parametrize(("to", "read"), [("colmap", read_colmap), ("opencv", read_opencv)])
+def test_exports_with_distortion_project_known_points(tmp_path, to, read):
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path, to=to)
+    found = read(tmp_path)
+    for view in model.views:
+        project, size = found[view.name]
+        assert size == SIZE
+        np.testing.assert_allclose(project(model.X), camera(view).project(model.X), atol=1e-6, rtol=0)
+
+
+def kalibr_cameras(file):
+    cameras = []
+    for line in file.read_text().splitlines():
+        key, value = line.strip().split(": ") if ": " in line else (line.strip(" :"), None)
+        if value is None:
+            assert key == f"cam{len(cameras)}"
+            cameras.append({})
+        else:
+            cameras[-1][key] = json.loads(value) if value[0] == "[" else value
+    return cameras
+
+
+def test_kalibr_cameras_project_known_points(tmp_path):
+    model = make_model(np.array([-0.1, 0.02, 0.0]), BARREL)
+    report = export(model, tmp_path, to="kalibr")
+    cameras = kalibr_cameras(report.file)
+    assert len(cameras) == 2
+    assert len(report.notes) == 1
+    limit_px = float(report.notes[0].split()[-5])
+    for view, given, tolerance in zip(model.views, cameras, (1e-6, limit_px), strict=False):
+        assert (given["camera_model"], given["distortion_model"]) == ("pinhole", "radtan")
+        assert given["resolution"] == [*SIZE]
+        fu, fv, pu, pv = given["intrinsics"]
+        k1, k2, p1, p2 = given["distortion_coeffs"]
+        assert (p1, p2) == (0.0, 0.0)
+        x = model.X @ view.R.T + view.t
+        x = x[:, :2] / x[:, 2:]
+        r2 = np.sum(x**2, axis=1, keepdims=True)
+        xy = x * (1 + k1 * r2 + k2 * r2**2) * [fu, fv] + [pu, pv]
+        assert np.abs(xy - camera(view).project(model.X)).max() <= tolerance
+    assert limit_px < 0.1
+
+
+def test_a_colmap_model_is_an_input_and_equal_cameras_are_shared(tmp_path, images):
+    """Intrinsics of one camera stand at the top of transforms.json; a pinhole image is not resampled."""
+    model = make_model(np.zeros(3), np.zeros(3))
+    views = [replace(view, K=model.views[0].K) for view in model.views]
+    export(replace(model, views=views), tmp_path / "colmap", to="colmap")
+    report = export(tmp_path / "colmap", tmp_path / "out", to="nerfstudio", images=images)
+    table = json.loads(report.file.read_text(encoding="utf-8"))
+    assert (table["w"], table["h"], table["cx"]) == (*SIZE, pytest.approx(76.7))
+    assert [sorted(frame) for frame in table["frames"]] == [["file_path", "transform_matrix"]] * 4
+    original, written = images / "a b.png", tmp_path / "out" / "images" / "a b.png"
+    np.testing.assert_array_equal(pixels_of(original), pixels_of(written))
+    ply = (tmp_path / "out" / table["ply_file_path"]).read_bytes()
+    body = np.frombuffer(ply.split(b"end_header\n")[1], [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    np.testing.assert_allclose(body["xyz"], model.X, rtol=1e-6)
+    np.testing.assert_array_equal(body["rgb"], model.colors)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_images_of_a_colmap_model_are_used_as_stored(tmp_path, images, orientation):
+    """COLMAP ignores the EXIF rotation of images and masks."""
+    mask, exif = np.full(SIZE[::-1], 255, np.uint8), PIL.Image.Exif()
+    mask[MASKED], exif[0x0112] = 0, orientation
+    for folder, options in (("plain", {}), ("rotated", {"exif": exif})):
+        for name in NAMES:
+            path = tmp_path / folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            PIL.Image.fromarray(pixels_of(images / name).astype(np.uint8)).save(path, **options)
+        (tmp_path / f"{folder}-masks").mkdir()
+        PIL.Image.fromarray(mask).save(tmp_path / f"{folder}-masks" / "c.png.png", **options)
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path / "colmap", to="colmap")
+    for source, folder in ((model, "plain"), (tmp_path / "colmap", "rotated")):
+        given = {"images": tmp_path / folder, "masks": tmp_path / f"{folder}-masks"}
+        export(source, tmp_path / f"{folder}-out", to="nerfstudio", **given)
+    for path in (tmp_path / "plain-out").rglob("*.png"):
+        found = pixels_of(tmp_path / "rotated-out" / path.relative_to(tmp_path / "plain-out"))
+        np.testing.assert_array_equal(found, pixels_of(path))
+    if orientation == 6:
+        with pytest.raises(UsageError, match=r"has \(120, 160\) pixels after EXIF rotation"):
+            export(model, tmp_path / "other", to="nerfstudio", images=tmp_path / "rotated")
+
+
+@pytest.mark.references
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_result_is_exported_with_or_without_its_folder(tmp_path, kept):
+    run = reconstruct(fakes.photographs(4), tmp_path / "run", config=fakes.fake_config(), until="metric")
+    result = run if kept else replace(run, out=None)
+    found = read_opencv(export(result, tmp_path / "out", to="opencv").file.parent)
+    assert list(found) == list(result.cameras)
+    for name, (project, size) in found.items():
+        assert size == result.cameras[name].size
+        expected = result.cameras[name].project(result.points)
+        np.testing.assert_allclose(project(result.points), expected, atol=1e-6, rtol=0)
+    with pytest.raises(UsageError, match="give it with --images"):
+        export(result, tmp_path / "out", to="nerfstudio")
+
+
+@pytest.mark.references
+def test_skew_is_resampled_away_or_refused(tmp_path, images):
+    model = make_model(PINCUSHION, PINCUSHION, skew=3.0)
+    export(model, tmp_path / "out", to="colmap-undistorted", images=images)
+    project, _ = read_colmap(tmp_path / "out")["é.png"]
+    pixels = pixels_of(tmp_path / "out" / "images" / "é.png")
+    xy, expected = project(model.X), camera(model.views[3]).project(model.X)
+    inside = ((xy > 1) & (xy < np.array(pixels.shape[1::-1]) - 2)).all(axis=1)
+    x, y = np.rint(xy[inside]).astype(int).T
+    assert np.abs(pixels[y, x, :2] / SLOPE - expected[inside]).max() < 1.2
+    with pytest.raises(UsageError, match="opencv has no camera model with skew"):
+        export(model, tmp_path / "other", to="opencv")
+
+
+def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
+    model = make_model(BARREL, PINCUSHION)
+    other = replace(model, views=[replace(model.views[0], distortion=None), *model.views[1:]])
+    twice = replace(model, views=[replace(view, name="a b.png") for view in model.views])
+    small = replace(model, views=[replace(view, size=(150, 120)) for view in model.views])
+    lost = replace(model, views=[replace(view, K=None) for view in model.views])
+    wild = replace(model, views=[replace(view, distortion=np.array([-400.0, 0, 0])) for view in model.views])
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{}")
+    cases = [
+        (model, "nerfstdio", images, "did you mean nerfstudio"),
+        (model, "nerfstudio", None, "give it with --images"),
+        (model, "openmvs", tmp_path / "run", "4 of the 4 images of the model are not in"),
+        (other, "kalibr", None, "lens model of image a b.png is unknown"),
+        (lost, "colmap", None, "no intrinsics"),
+        (twice, "bundler", images, "two images of the model would be written as a_b.png"),
+        (small, "bundler", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
+        (wild, "openmvs", images, "the camera is not plausible"),
+        (replace(model, views=[]), "opencv", None, "no camera"),
+    ]
+    for bad, to, source, words in cases:
+        with pytest.raises(UsageError, match=words):
+            export(bad, tmp_path / "out", to=to, images=source)
+    with pytest.raises(UsageError, match="holds a run"):
+        export(model, tmp_path / "run", to="opencv")
+
+
+def test_an_export_does_not_replace_its_input(tmp_path, images):
+    model = make_model(BARREL, PINCUSHION)
+    export(model, tmp_path, to="colmap")
+    (tmp_path / "masks").mkdir()
+    PIL.Image.fromarray(np.full(SIZE[::-1], 255, np.uint8)).save(tmp_path / "masks" / "c.png.png")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    def refused(source, to, **given):
+        with pytest.raises(UsageError, match="would replace the originals"):
+            export(source, tmp_path, to=to, **given)
+
+    refused(model, "nerfstudio", images=images, masks=tmp_path / "masks")
+    for source in ("", "sparse", "sparse/0"):
+        refused(tmp_path / source, "colmap")
+        refused(tmp_path / source, "colmap-undistorted", images=images)
+    command = ["export", str(tmp_path / "sparse" / "0"), "-o", str(tmp_path), "--to", "colmap"]
+    assert run_command([*command, "--scale", *NAMES[:2], "2"]) == 2
+    (tmp_path / "images").symlink_to(images)
+    refused(model, "nerfstudio", images=images)
+    (tmp_path / "images").unlink()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    # Next to the model is no problem for formats without a sparse folder.
+    export(tmp_path / "sparse" / "0", tmp_path, to="nerfstudio", images=images)
+
+
+@pytest.mark.parametrize(("total", "together"), [(1e6, 1), (1e9, 4)])
+def test_images_are_undistorted_within_the_memory_budget(tmp_path, images, monkeypatch, total, together):
+    """An image of 160 x 120 px takes 0.6 MB."""
+    working, most, gate = [], [], threading.Barrier(together)
+
+    def read(*arguments, **options):
+        working.append(1)
+        most.append(len(working))
+        gate.wait(60)
+        return read_image(*arguments, **options)
+
+    def write(*arguments):
+        write_image(*arguments)
+        working.pop()
+
+    monkeypatch.setattr(model_export, "_budget", MemoryBudget(int(total)))
+    monkeypatch.setattr(model_export, "read_image", read)
+    monkeypatch.setattr(model_export, "write_image", write)
+    export(make_model(BARREL, PINCUSHION), tmp_path / "out", to="nerfstudio", images=images, threads=4)
+    assert len(most) == 4
+    assert max(most) == together
+
+
+def test_undistorting_an_image_takes_little_memory():
+    rgb, K = np.zeros((2000, 400, 3), np.uint8), make_model(BARREL, BARREL).views[0].K
+    undistort_image(rgb[:40], K, BARREL, K, (40, 40))
+    tracemalloc.start()
+    undistort_image(rgb, K, BARREL, K, (400, 2000))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Two images in single precision, and the positions of a strip.
+    assert peak < 30 * rgb[..., 0].size
+
+
+def test_an_image_ends_where_the_lens_model_folds_back(tmp_path, images):
+    """r (1 - 9 r^2) grows up to r = 0.19; beyond it two points of the scene would fall on one pixel."""
+    model = make_model(np.array([-9.0, 0.0, 0.0]), PINCUSHION)
+    export(model, tmp_path / "out", to="nerfstudio", images=images)
+    project, (width, height) = read_nerfstudio(tmp_path / "out")["a b.png"]
+    view = model.views[0]
+    X = Camera(view.K, view.R, view.t, SIZE).unproject(view.K[None, :2, 2], np.ones(1))
+    centre = project(X)[0]
+    reach = np.hypot(*np.maximum(centre, [width - 1, height - 1] - centre)) / 140.0
+    assert 0.17 < reach < 1 / np.sqrt(27)
+
+
+def test_coordinates_far_from_the_origin_are_reported(tmp_path, images):
+    model = make_model(BARREL, PINCUSHION)
+    report = export(replace(model, X=model.X + 5e6), tmp_path, to="nerfstudio", images=images)
+    assert "rounded to 0.5" in report.notes[0]
+
+
+@pytest.mark.parametrize("to", ["colmap-undistorted", "openmvs", "bundler"])
+def test_transparent_pixels_of_images_are_masks_in_exports(tmp_path, images, to):
+    model = make_model(BARREL, PINCUSHION)
+    folder = tmp_path / "images"
+    shutil.copytree(images, folder)
+    (name,) = (name for name in model.names if name.endswith("c.png"))
+    rgb = np.asarray(PIL.Image.open(folder / name).convert("RGB"))
+    alpha = np.full(rgb.shape[:2], 255, np.uint8)
+    PIL.Image.fromarray(np.dstack([rgb, alpha])).save(folder / name)
+    assert export(model, tmp_path / "opaque", to=to, images=folder).file.exists()
+    assert not (tmp_path / "opaque" / "masks").exists()
+    alpha[MASKED] = 0
+    PIL.Image.fromarray(np.dstack([rgb, alpha])).save(folder / name)
+    report = export(model, tmp_path / "out", to=to, images=folder)
+    if to == "bundler":
+        assert report.notes == ("no masks are written: Bundler has none",)
+        assert not (tmp_path / "out" / "masks").exists()
+        return
+    (tmp_path / "masks").mkdir()
+    PIL.Image.fromarray(alpha).save(tmp_path / "masks" / "c.png.png")
+    export(model, tmp_path / "given", to=to, images=images, masks=tmp_path / "masks")
+    for file in sorted((tmp_path / "given" / "masks").rglob("*.png")):
+        same = tmp_path / "out" / file.relative_to(tmp_path / "given")
+        np.testing.assert_array_equal(pixels_of(same), pixels_of(file))

@@ -1,0 +1,281 @@
+"""Views between photographs: the front door, what is refused, and the command."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+
+import thesisrecon
+from tests.conftest import refuses
+from tests.synthetic import texture
+from thesisrecon import view_interpolation as between
+from thesisrecon.cli import view_files as sequences
+from thesisrecon.cli.main import run_command
+from thesisrecon.cli.view_files import interpolate_images
+from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.records import DisparityMap, Image
+from thesisrecon.stereo._planar import PlanarRectification
+from thesisrecon.stereo.depth import MultiViewStereo
+from thesisrecon.views.interpolation import InterpolatedPair
+
+COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
+SHIFT = 6
+
+
+@pytest.fixture(scope="module")
+def wall():
+    """A textured wall from two places, ``SHIFT`` px apart."""
+    rgb = np.stack([texture(90, 170, seed) for seed in (0, 1, 2)], axis=-1).astype(np.uint8)
+    return rgb[:, :160], np.ascontiguousarray(rgb[:, SHIFT : 160 + SHIFT])
+
+
+def known_map(d):
+    return DisparityMap(d, np.ones(d.shape, np.float32), 0.0)
+
+
+def interpolated_sequence(images, frames):
+    return sequences.interpolated_sequence(images, frames, config=PipelineConfig(), seed=0)
+
+
+def photograph(seed, size=(40, 30)):
+    rgb = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    return Image(f"{seed}.jpg", rgb, size)
+
+
+def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities(wall, tmp_path):
+    left, right = wall
+    expected = np.roll(left, -SHIFT // 2, axis=1)[:, 10:-20].astype(int)
+    d = np.full(left.shape[:2], SHIFT, dtype=np.float32)
+    for known in (None, d, (d, d), (known_map(d), known_map(d))):
+        view = thesisrecon.interpolate_view(left, right, 0.5, disparity=known)
+        assert view.dtype == np.uint8
+        assert view.shape == left.shape
+        assert np.abs(view[:, 10:-20] - expected).mean() < 2.0
+    for name, image in (("left", left), ("right", right)):
+        PIL.Image.fromarray(image).save(tmp_path / f"{name}.png")
+    again = thesisrecon.interpolate_view(tmp_path / "left.png", tmp_path / "right.png", 0.5, disparity=d)
+    np.testing.assert_array_equal(again, thesisrecon.interpolate_view(left, right, 0.5, disparity=d))
+    np.testing.assert_array_equal(thesisrecon.interpolate_view(left, right, 1, disparity=d), right)
+    grey = thesisrecon.interpolate_view(left[..., 0], right[..., 0], 0.5, disparity=d)
+    assert grey.shape == left.shape
+
+
+def test_wrong_calls_of_the_front_door_are_refused(wall):
+    left, right = wall
+    refuses(ValueError, "between 0", thesisrecon.interpolate_view, left, right, 1.5)
+    refuses(ValueError, "the same size", thesisrecon.interpolate_view, left, right[:-3], 0.5)
+    refuses(ValueError, "uint8", thesisrecon.interpolate_view, left.astype(float), right, 0.5)
+    with pytest.raises(ValueError, match="shape of the images"):
+        thesisrecon.interpolate_view(left, right, 0.5, disparity=np.zeros((3, 4), np.float32))
+    d = np.zeros(left.shape[:2], np.float32)
+    odd: Any
+    for odd in ([d, d], d[..., None]):
+        with pytest.raises(ValueError, match=r"\(H, W\), or a tuple"):
+            thesisrecon.interpolate_view(left, right, 0.5, disparity=odd)
+    refuses(UsageError, "no image file", thesisrecon.interpolate_view, Path("nowhere.png"), right, 0.5)
+
+
+def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monkeypatch):
+    a, b = photograph(0), photograph(1)
+    with pytest.raises(UsageError, match=r"0\.jpg and 0\.jpg are the same image"):
+        between.prepare_pair(a, Image("0.jpg", a.rgb.copy(), a.size))
+    with pytest.raises(UsageError, match=r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
+        between.prepare_pair(a, photograph(2, (40, 20)))
+    refuses(UsageError, "same image", interpolated_sequence, [a, b, a], 3)
+    with pytest.raises(UsageError, match=r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
+        interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
+    # Forward motion: both epipoles at (21, 14).
+    e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
+    xy = rng.uniform((0.0, 0.0), (40.0, 30.0), (100, 2))
+    ahead = e + rng.uniform(1.05, 1.3, (100, 1)) * (xy - e)
+    pair = SimpleNamespace(F=cross_matrix(np.append(e, 1.0)), xy1=xy, xy2=ahead)
+    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
+    with pytest.raises(
+        StageFailure, match=r"moved towards the scene or away from it; .*\(21, 14\) px, inside 0\.jpg"
+    ):
+        between.prepare_pair(a, b)
+    # An image and its copy: any F fits.
+    pair.xy2 = xy + rng.normal(0.0, 0.01, xy.shape)
+    refuses(StageFailure, "no parallax", between.prepare_pair, a, b)
+
+
+def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
+    class Dense:
+        failure = StageFailure("too distorted", "a number", "rectify in polar coordinates")
+
+        def match_two_views(self, *_, **__):
+            raise self.failure
+
+    F = cross_matrix(np.array([1.0, 0.0, 0.0]))
+    pair = SimpleNamespace(F=F, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
+    config = PipelineConfig()
+    monkeypatch.setattr(MultiViewStereo, "match_two_views", Dense.match_two_views)
+    monkeypatch.setattr(MultiViewStereo, "failure", Dense.failure, raising=False)
+    with pytest.raises(StageFailure, match=r"too distorted; a number; take the images side by side"):
+        between.prepare_pair(photograph(0), photograph(1), config=config)
+    monkeypatch.setattr(MultiViewStereo, "failure", StageFailure("no parallax"))
+    refuses(StageFailure, "no parallax", between.prepare_pair, photograph(0), photograph(1), config=config)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "possible"), [(0.0, True), (-80.0, True), (100.0, False), (180.0, False)]
+)
+def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeypatch, degrees, possible):
+    """Halfway between an image and one upside down the frame of the view would be a point."""
+    c, s, middle = np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), np.array([19.5, 14.5])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    turn[:2, 2] = middle - turn[:2, :2] @ middle
+    known = DisparityMap(np.zeros((30, 40), np.float32), np.ones((30, 40), np.float32), 0.2)
+    frame = PlanarRectification(np.stack([np.eye(3), turn]), (40, 30))
+    dense = SimpleNamespace(frame=frame, left=known, right=known)
+    pair = SimpleNamespace(
+        F=cross_matrix(np.array([1.0, 0.0, 0.0])), xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2))
+    )
+    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
+    monkeypatch.setattr(MultiViewStereo, "match_two_views", lambda *_, **__: dense)
+    if possible:
+        assert between.prepare_pair(photograph(0), photograph(1)).view(0.5).shape == (30, 40, 3)
+        return
+    with pytest.raises(StageFailure, match=f"rolled against each other; by {degrees:.0f} degrees"):
+        between.prepare_pair(photograph(0), photograph(1))
+
+
+def test_records_are_matched_at_their_own_size_and_without_masked_pixels():
+    """``max_size_px`` is for files and arrays."""
+    images = [photograph_of_courtyard(k) for k in (6, 7)]
+    large, small = (
+        between.prepare_pair(*images, config=PipelineConfig(images=ImageOptions(max_size_px=side)))
+        for side in (320, 128)
+    )
+    np.testing.assert_array_equal(small.view(0.5), large.view(0.5))
+    nothing = np.zeros((240, 320), dtype=bool)
+    masked = [replace(image, mask=nothing) for image in images]
+    refuses(StageFailure, "do not match", between.prepare_pair, *masked)
+
+
+def photograph_of_courtyard(k):
+    with PIL.Image.open(COURTYARD / f"000{k}.jpg") as picture:
+        return Image(f"{k}.jpg", np.asarray(picture.resize((320, 240))), (320, 240))
+
+
+@pytest.fixture
+def still(monkeypatch):
+    """Photographs of one place: every pixel stays, and what is related is noted."""
+    related = []
+
+    def prepare_pair(first, second, **_):
+        related.append((first.name, second.name))
+        nothing = known_map(np.zeros(first.rgb.shape[:2], np.float32))
+        return InterpolatedPair((first.rgb, second.rgb), np.stack([np.eye(3)] * 2), nothing, nothing)
+
+    monkeypatch.setattr(sequences, "prepare_pair", prepare_pair)
+    return related
+
+
+def even(name, level):
+    return Image(name, np.full((24, 32, 3), level, dtype=np.uint8), (32, 24))
+
+
+def test_a_film_of_two_goes_from_one_to_the_other(still):
+    film = interpolated_sequence([even("a", 100), even("b", 200)], 5)
+    assert film.captions[1] == "75 % a, 25 % b"
+    assert film.frame_metadata[4] == {"weights": [0.0, 1.0]}
+    levels = [float(film.draw(k, 1).mean()) for k in range(5)]
+    assert levels[0] == 100.0
+    assert levels[4] == 200.0
+    # Exposures are mixed by their ratio, in which neither photograph is the darker one's.
+    assert levels == sorted(levels)
+    assert film.metadata["violating_monotonicity"] == [0.0]
+    assert "0.0 % of these violate monotonicity" in film.notes[0]
+    assert still == [("a", "b")]
+    assert interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ["50 % a, 50 % b"]
+
+
+def test_a_film_of_three_crosses_the_triangle(still):
+    film = interpolated_sequence([even("a", 100), even("b", 200), even("c", 50)], 5)
+    assert [place["weights"] for place in film.frame_metadata] == [
+        [1.0, 0.0, 0.0], [0.75, 0.25, 0.0], [0.5, 0.5, 0.0], [0.25, 0.25, 0.5], [0.0, 0.0, 1.0],
+    ]  # fmt: skip
+    assert still == [("a", "b"), ("the interpolated view", "c")]
+    levels = [float(film.draw(k, 1).mean()) for k in range(5)]
+    assert levels[0] == 100.0
+    assert levels[4] == 50.0
+    assert levels[1] < levels[2] > levels[3] > levels[4]
+    assert len(film.notes) == 2
+
+
+def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
+    photographs = [str(COURTYARD / f"000{k}.jpg") for k in (6, 7)]
+    out = tmp_path / "früm one to other"
+    options = ["--frames", "3", "--max-size", "512", "--threads", "2", "-o", str(out)]
+    assert run_command(["interpolate", *photographs, *options]) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines()[0] == f"3 frames of 512 x 384 px and interpolation.webp written to {out}"
+    names = ["frame-0001.png", "frame-0002.png", "frame-0003.png", "frames.json", "interpolation.webp"]
+    assert sorted(path.name for path in out.iterdir()) == [*names, "strip.html"]
+    reported = json.loads((out / "frames.json").read_text(encoding="utf-8"))
+    assert reported["images"] == ["0006.jpg", "0007.jpg"]
+    assert reported["frames"][1] == {"name": "frame-0002.png", "weights": [0.5, 0.5]}
+    assert 0.0 < reported["violating_monotonicity"][0] < 0.3
+    assert reported["known"][0] > 0.3
+    with PIL.Image.open(out / "interpolation.webp") as film:
+        assert film.n_frames == 3
+    page = (out / "strip.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert "http" not in page.replace("http-equiv", "")
+    assert "violate monotonicity" in page
+    frames = []
+    for k in range(3):
+        with PIL.Image.open(out / names[k]) as picture:
+            frames.append(np.asarray(picture).astype(float))
+    # Halfway there is no ghost of either end: mixtures of two photographs are dull.
+    contrast = [np.abs(np.diff(frame, axis=1)).mean() for frame in frames]
+    assert contrast[1] > 0.8 * min(contrast[0], contrast[2])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words", "code"),
+    [
+        (["0004.jpg", "0004.jpg"], "is given twice", 2),
+        (["0004.jpg", "copy.jpg"], "0004.jpg and copy.jpg are the same image", 2),
+        (["0004.jpg", "nowhere.jpg"], "there is no image file", 2),
+        (["0004.jpg", "text.jpg"], "text.jpg is not an image", 3),
+        (["0004.jpg", "small.jpg"], "the same size; 0004.jpg is 1024 x 768 and small.jpg is 512 x 384 px", 2),
+        (["0004.jpg", "noise.png", "--max-size", "256"], "do not match", 3),
+        (["0004.jpg"], "2 or 3 images; got 1", 2),
+        (["0004.jpg", "folder"], "is a folder", 2),
+        (["0000.jpg", "0001.jpg", "0002.jpg", "0003.jpg"], "2 or 3 images; got 4", 2),
+        (["0004.jpg", "0005.jpg", "--path", "orbit"], "--path", 2),
+        (["0004.jpg", "0005.jpg", "--frames", "0"], "'--frames'", 2),
+        (["0004.jpg", "0005.jpg", "--max-size", "9"], "--max-size takes at least 64 px", 2),
+        (["0004.jpg", "0005.jpg", "--method", "guessing"], "--method", 2),
+        (["folder", "0004.jpg"], "is a folder", 2),
+    ],
+)
+def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_path, refused):
+    (tmp_path / "copy.jpg").write_bytes((COURTYARD / "0004.jpg").read_bytes())
+    (tmp_path / "text.jpg").write_text("no picture", encoding="utf-8")
+    (tmp_path / "folder").mkdir()
+    with PIL.Image.open(COURTYARD / "0005.jpg") as picture:
+        picture.resize((512, 384)).save(tmp_path / "small.jpg")
+    noise = np.random.default_rng(0).integers(0, 256, (768, 1024, 3), dtype=np.uint8)
+    PIL.Image.fromarray(noise).save(tmp_path / "noise.png")
+    places = {word: (COURTYARD if (COURTYARD / word).is_file() else tmp_path) / word for word in arguments}
+    placed = [places[word] if "." in word or word == "folder" else word for word in arguments]
+    out = tmp_path / "out"
+    assert words in refused(["interpolate", *placed, "-o", out], code)
+    assert not out.exists()
+
+
+def test_a_folder_of_other_files_is_refused(tmp_path):
+    photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    refuses(UsageError, "which this command did not create", interpolate_images, tmp_path, photographs)

@@ -1,0 +1,62 @@
+"""Fixtures that run a command line within bounds of time and memory."""
+
+import resource
+import signal
+
+import pytest
+
+from tests.bad_input import files
+from thesisrecon.cli.main import run_command
+from validation.command import main as run_validation
+
+GROWTH_MB = 600
+"""Largest growth of peak memory; an image of 89 megapixels takes 360."""
+
+
+@pytest.fixture
+def bounded():
+    """Limit the time and the memory growth of each test."""
+
+    def stop(*_):
+        raise TimeoutError("it hangs")
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    old = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, old)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < GROWTH_MB * 2**10
+
+
+@pytest.fixture
+def run_cli(capsys):
+    """Run a command line, check its exit code and message, and return the message."""
+
+    def run(arguments, code):
+        capsys.readouterr()
+        found = run_command(arguments)
+        said = capsys.readouterr()
+        assert found == code, said.err
+        if code == 0:
+            assert said.err == ""
+            return said.out
+        files.require_sentence(said.err.replace(files.TOO_LONG, "..."))
+        assert said.err.startswith("thesisrecon: ")
+        return said.err
+
+    return run
+
+
+@pytest.fixture
+def validated(capsys):
+    """Run a validation command that must end with exit code 2, and return its message."""
+
+    def run(arguments):
+        assert run_validation(arguments) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        files.require_sentence(said.err)
+        return said.err
+
+    return run

@@ -1,0 +1,164 @@
+"""Bad input through the command line gets one sentence and exit code 2 or 3, and nothing is lost."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from thesisrecon.cli.main import run_command
+
+COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
+SMALL = ["--max-size", "320", "--threads", "2", "--until", "metric"]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def reconstruct(folder, tmp_path, capsys):
+    """Run the command, require its exit code, and return its sentence (none if it succeeds) and summary."""
+
+    def run(code=0):
+        found = run_command(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *SMALL])
+        sentence = capsys.readouterr().err
+        assert found == code, sentence
+        assert "Traceback" not in sentence
+        assert sentence.count("\n") == (code != 0)
+        return sentence, json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+
+    return run
+
+
+def courtyard(n):
+    return sorted(COURTYARD.iterdir())[:n]
+
+
+def picture(k):
+    with PIL.Image.open(courtyard(k + 1)[k]) as file:
+        return file.convert("RGB")
+
+
+TWO_REGISTERED = {"stratum": "projective", "registered": 2}
+
+
+@pytest.mark.parametrize(
+    ("copies", "words", "found"),
+    [
+        ({"a.jpg": 0}, "1 usable image; at least two different ones are needed", {"images": 1}),
+        ({"a.jpg": 0, "b.jpg": 0}, "b.jpg has the same pixels as a.jpg", {}),
+        ({"a.jpg": 0, "b.jpg": 1}, "self-calibration needs at least 3 registered images", TWO_REGISTERED),
+    ],
+)
+def test_too_few_images(copies, words, found, folder, reconstruct):
+    for name, k in copies.items():
+        shutil.copy(courtyard(2)[k], folder / name)
+    sentence, summary = reconstruct(3)
+    assert words in sentence
+    assert found.items() <= summary.items()
+
+
+def test_damaged_files_among_good_ones(folder, reconstruct):
+    """A text named .jpg and a truncated JPEG are refused with their reasons; the others go on to cameras."""
+    for path in courtyard(4):
+        shutil.copy(path, folder / f"good {path.name}")
+    (folder / "letter.jpg").write_text("dear reader")
+    whole = courtyard(6)[5].read_bytes()
+    (folder / "cut off.jpg").write_bytes(whole[: len(whole) // 2])
+    _, summary = reconstruct()
+    assert summary["registered"] == 4
+    reasons = {entry["name"]: entry["reason"] for entry in summary["refused"]}
+    assert "not an image" in reasons["letter.jpg"]
+    assert "truncated" in reasons["cut off.jpg"]
+    page = (folder.parent / "out" / "report.html").read_text(encoding="utf-8")
+    assert "letter.jpg" in page
+
+
+def test_every_kind_of_pixel_in_one_scene(folder, reconstruct):
+    """16-bit, grey, RGBA and CMYK images, an EXIF rotation, spaces and letters beyond ASCII: all become
+    cameras.
+    """
+    grey = np.asarray(picture(0).convert("L")).astype(np.uint16) * 257
+    PIL.Image.fromarray(grey).save(folder / "a sixteen bits.png")
+    picture(1).convert("L").save(folder / "b größe.png")
+    picture(2).convert("RGBA").save(folder / "c 写真.png")
+    picture(3).convert("CMYK").save(folder / "d.tif")
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 6
+    picture(4).transpose(PIL.Image.Transpose.ROTATE_90).save(folder / "e.jpg", exif=exif, quality=95)
+    _, summary = reconstruct()
+    cameras = {camera["name"]: camera for camera in summary["cameras"]}
+    assert list(cameras) == ["a sixteen bits.png", "b größe.png", "c 写真.png", "d.tif", "e.jpg"]
+    assert all(camera["registered"] for camera in cameras.values())
+    assert cameras["e.jpg"]["width_px"] == picture(4).size[0]
+    assert {camera["camera"] for camera in cameras.values()} == {0}
+
+
+def test_mixed_sizes_are_different_cameras(folder, reconstruct):
+    for k in range(4):
+        scale = 0.75 if k % 2 else 1.0
+        image = picture(k)
+        image.resize((int(image.size[0] * scale), int(image.size[1] * scale))).save(folder / f"{k}.png")
+    _, summary = reconstruct()
+    assert summary["registered"] == 4
+    focals = [c["focal_px"]["value"] / c["width_px"] for c in summary["cameras"]]
+    assert [c["camera"] for c in summary["cameras"]] == [0, 1, 0, 1]
+    assert np.ptp(focals) < 0.1 * np.mean(focals)
+
+
+def test_images_without_common_corners(folder, reconstruct):
+    """Noise, and a soft gradient that passes for a photograph but has no corner to match."""
+    rng, ramp = np.random.default_rng(0), np.linspace(0, 255, 400)[None, :] * np.ones((300, 1))
+    for k in range(2):
+        PIL.Image.fromarray(rng.integers(0, 256, (300, 400, 3), dtype=np.uint8)).save(folder / f"{k}.png")
+        PIL.Image.fromarray(np.roll(ramp, 40 * k, axis=0).astype(np.uint8) // (k + 1)).save(
+            folder / f"r{k}.png"
+        )
+    sentence, summary = reconstruct(3)
+    assert "no two images could be matched" in sentence
+    assert summary["pairs"]["matched"] == 6
+
+
+SIZE = (480, 360)
+K = np.array([[480.0, 0.0, 239.5], [0.0, 480.0, 179.5], [0.0, 0.0, 1.0]])
+K_PICTURE = np.array([[800.0, 0.0, 511.5], [0.0, 800.0, 383.5], [0.0, 0.0, 1.0]])
+
+
+def rotation(x, y):
+    """About the x axis after the y axis, in radians."""
+    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+    return about_x @ about_y
+
+
+def seen_through(H):
+    """The first photograph of the courtyard where pixel x shows its pixel H x."""
+    perspective, bicubic = PIL.Image.Transform.PERSPECTIVE, PIL.Image.Resampling.BICUBIC
+    coefficients = tuple((H / H[2, 2]).ravel()[:8].tolist())
+    return picture(0).transform(SIZE, perspective, coefficients, bicubic, fillcolor=(128, 128, 128))
+
+
+def test_a_flat_poster_has_no_parallax(folder, reconstruct):
+    """Four cameras walk round a plane, the poster z = 1: x ~ K R (X - C)."""
+    for k, angle in enumerate((-0.4, -0.15, 0.15, 0.4)):
+        R = rotation(0.1 * (-1) ** k, angle)
+        C = np.array([-np.sin(angle), 0.1 * (-1) ** k, 1 - np.cos(angle)])
+        image_from_poster = K @ R @ np.column_stack([[1, 0, 0], [0, 1, 0], np.array([0, 0, 1]) - C])
+        seen_through(K_PICTURE @ np.linalg.inv(image_from_poster)).save(folder / f"{k}.png")
+    sentence, summary = reconstruct(3)
+    assert "no parallax" in sentence
+    assert summary["pairs"]["accepted"] >= 3
+
+
+def test_a_camera_that_only_turns_has_no_parallax(folder, reconstruct):
+    for k, (x, y) in enumerate([(-0.05, -0.18), (0.04, -0.06), (0.0, 0.07), (-0.03, 0.19)]):
+        seen_through(K_PICTURE @ rotation(x, y).T @ np.linalg.inv(K)).save(folder / f"{k}.png")
+    sentence, summary = reconstruct(3)
+    assert "no parallax" in sentence
+    assert summary["pairs"]["accepted"] >= 3

@@ -1,0 +1,123 @@
+"""``thesisrecon render`` and ``interpolate`` with invalid models, cameras and images."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.bad_input import files
+from tests.bad_input.files import links, picture, pipe, sparse, writes
+
+pytestmark = pytest.mark.usefixtures("bounded")
+
+
+def camera(**changes):
+    return writes(json.dumps({"cameras": [files.CAMERA | changes]}))
+
+
+NO_CAMERAS = [
+    ("pipe", pipe), ("device", links("/dev/zero")), ("deep", writes(files.deep_json())),
+    ("list", writes("[]")), ("none", writes('{"cameras": []}')), ("numbers", writes('{"cameras": [1, 2]}')),
+    ("K of words", camera(K="soup")), ("K of rows of other lengths", camera(K=[[1, 2], [3]])),
+    ("K singular", camera(K=np.zeros((3, 3)).tolist())),
+    ("K turned", camera(K=[[0, 1, 0], [1, 0, 0], [0, 0, 1]])),
+    ("K beyond numbers", camera(K=[[10**400, 0, 0], [0, 1, 0], [0, 0, 1]])),
+    ("K of NaN", camera(K=[[float("nan"), 0, 0], [0, 1, 0], [0, 0, 1]])),
+    ("R no rotation", camera(R=np.ones((3, 3)).tolist())),
+    ("R a mirror", camera(R=np.diag([1.0, 1.0, -1.0]).tolist())),
+    ("t infinite", camera(t=[float("inf"), 0, 0])), ("width infinite", camera(width=float("inf"))),
+    ("width beyond", camera(width=10**15)), ("height below", camera(height=-5)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("make", [make for _, make in NO_CAMERAS], ids=[name for name, _ in NO_CAMERAS])
+def test_render_rejects_invalid_cameras(make, tmp_path, run_cli):
+    (tmp_path / "model.glb").write_bytes(files.glb(*files.triangle()))
+    make(tmp_path / "cameras.json")
+    said = run_cli(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
+    assert "cameras.json" in said
+    assert not (tmp_path / "views").exists()
+
+
+def numbered(values):
+    """A triangle whose corners or faces are these numbers."""
+    header, data = files.triangle()
+    new = values.tobytes()
+    return files.glb(header, new + data[36:] if values.dtype == "<f4" else data[:36] + new)
+
+
+def textured(blob):
+    header, data = files.triangle(
+        images=[{"bufferView": 2, "mimeType": "image/png"}],
+        textures=[{"source": 0}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+    )
+    header["bufferViews"] += [{"buffer": 0, "byteOffset": 48, "byteLength": len(blob)}]
+    header["buffers"] = [{"byteLength": 48 + len(blob)}]
+    return files.glb(header, data + blob)
+
+
+def changed(**changes):
+    return files.glb(*files.triangle(**changes))
+
+
+DEEP = b"glTF" + np.array([2, 9, 400_000, 0x4E4F534A], "<u4").tobytes() + b"[" * 400_000
+ACCESSOR = {"componentType": 5126, "type": "VEC3"}
+NO_MODELS = [
+    ("device", links("/dev/zero"), "no model yet"),
+    ("10 TiB", sparse(10**13, b"glTF"), "is larger than"),
+    ("text", writes("dear reader, dear reader"), "it is not a GLB"),
+    ("short", writes(b"glTF"), "it ends after 4 bytes"),
+    ("deep", writes(DEEP), "JSON"),
+    ("list", writes(files.glb([1, 2])), "its header is not a JSON object"),
+    ("nothing", writes(files.glb({})), "it must hold one mesh with one primitive"),
+    ("file", writes(changed(buffers=[{"uri": "/etc/passwd", "byteLength": 48}])), "refers to another file"),
+    ("a picture", writes(changed(images=[{"uri": "/dev/zero"}])), "it refers to another file"),
+    ("no view", writes(changed(accessors=[ACCESSOR | {"count": 10}])), "it claims 10 elements in"),
+    ("count", writes(changed(accessors=[ACCESSOR | {"count": 10**12, "bufferView": 0}])), "it claims 10000"),
+    ("count in words", writes(changed(accessors=[ACCESSOR | {"count": "many"}])), "it claims many elements"),
+    ("itself", writes(changed(nodes=[{"children": [0], "mesh": 0}])), "its nodes are cyclic"),
+    ("circle", writes(changed(nodes=[{"children": [1]}, {"children": [0]}])), "its nodes are cyclic"),
+    ("net", writes(changed(nodes=[{"children": [2]}, {"children": [2]}, {"mesh": 0}])), "not a tree"),
+    ("a thousand times", writes(changed(nodes=[{"mesh": 0}] * 1000)), "instantiates its mesh several times"),
+    ("faces beyond", writes(numbered(np.array([0, 1, 9], "<u4"))), "faces refer to missing vertices"),
+    ("corners of NaN", writes(numbered(np.full((3, 3), np.nan, "<f4"))), "it holds no surface"),
+    ("program", writes(textured(b"%!PS-Adobe-3.0 EPSF-3.0\n")), "its texture is not a JPEG or PNG"),
+    ("bomb", writes(textured(files.png(30_000, 30_000))), "its texture is not a JPEG or PNG"),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), [m[1:] for m in NO_MODELS], ids=[m[0] for m in NO_MODELS])
+def test_render_rejects_invalid_models(make, words, tmp_path, run_cli):
+    make(tmp_path / "model.glb")
+    camera()(tmp_path / "cameras.json")
+    said = run_cli(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
+    assert "model" in said
+    assert words in said
+    assert not (tmp_path / "views").exists()
+
+
+BETWEEN = [
+    ("device", ["/dev/zero", "a.png"], 2, "there is no image file /dev/zero"),
+    ("pipe", ["pipe.png", "a.png"], 2, "there is no image file"),
+    ("round", ["round.png", "a.png"], 2, "there is no image file"),
+    ("round twice", ["round.png", "round.png"], 2, "there is no image file"),
+    ("linked", ["linked.png", "a.png"], 2, "is given twice"),
+    ("bomb", ["bomb.png", "a.png"], 3, "claims more than 178 megapixels"),
+    ("too long", [files.TOO_LONG, "a.png"], 2, "File name too long"),
+    ("frames", ["a.png", "b.png", "--frames", "1000000000"], 2, "'--frames'"),
+    ("background", ["a.png", "--background", "#" * 9000], 2, "--background"),
+]
+
+
+@pytest.mark.parametrize(("words", "code", "said"), [b[1:] for b in BETWEEN], ids=[b[0] for b in BETWEEN])
+def test_interpolation_rejects_files_that_are_not_images(words, code, said, tmp_path, run_cli, monkeypatch):
+    folder = files.folder_of(tmp_path, "in")
+    (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
+    (folder / "bomb.png").write_bytes(files.png(30_000, 30_000))
+    pipe(folder / "pipe.png")
+    (folder / "round.png").symlink_to("round.png")
+    (folder / "linked.png").symlink_to("a.png")
+    monkeypatch.chdir(folder)
+    assert said in run_cli(["interpolate", *words, "--threads", "1"], code)
+    assert not (folder / "views").exists()

@@ -1,0 +1,431 @@
+"""Functions and objects from outside as stages: calls, refusals, text form, stored results."""
+
+# ruff: noqa: ARG001, ARG002, ARG005 (functions and methods take what their stage passes)
+
+import functools
+import importlib
+import linecache
+import logging
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import refuses
+from tests.pipeline.fake_stages import photographs
+from tests.synthetic import one_by_one
+from thesisrecon import match_pair, reconstruct
+from thesisrecon._plug_ins import FunctionFundamental, FunctionMatcher
+from thesisrecon._settings import build_config, config_from_toml, tables_from_config, toml_from_config
+from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.verification import PairVerification
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.matching.pair_selection import OverlapEstimate
+from thesisrecon.matching.strength import StrengthOfMatch
+from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
+from thesisrecon.records import Features
+
+COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
+SMALL = ImageOptions(max_size_px=400)
+FEW = PairVerification(min_inliers=20)
+
+
+def images(count):
+    return sorted(COURTYARD.iterdir())[:count]
+
+
+def positions(image, step=5):
+    y, x = np.mgrid[8 : image.shape[0] - 8 : step, 8 : image.shape[1] - 8 : step]
+    return np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
+
+
+def strong(image, count=300):
+    """Positions of large gradients."""
+    gray = image.astype(np.float64).sum(axis=2)
+    xy = positions(image, 2)
+    dy, dx = np.gradient(gray)
+    rows = np.argsort(-np.minimum(np.abs(dx), np.abs(dy))[xy[:, 1].astype(int), xy[:, 0].astype(int)])
+    return xy[rows[:count]]
+
+
+def windows(image, xy):
+    gray = image.astype(np.float64).sum(axis=2)
+    at = xy.astype(int)
+    found = np.stack([gray[y - 7 : y + 8, x - 7 : x + 8].ravel() for x, y in at])
+    found -= found.mean(axis=1, keepdims=True)
+    return found / (np.linalg.norm(found, axis=1, keepdims=True) + 1e-9)
+
+
+def mutual(image1, image2, ratio=0.9):
+    """A matcher in a few lines: mutual best windows at strong gradients, of any position."""
+    xy1, xy2 = strong(image1), strong(image2)
+    similarity = windows(image1, xy1) @ windows(image2, xy2).T
+    best, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    second, first = np.sort(similarity, axis=1)[:, -2:].T
+    good = (back[best] == np.arange(len(xy1))) & (1.0 - first < ratio * (1.0 - second))
+    return xy1[good], xy2[best[good]], first[good]
+
+
+@pytest.fixture(scope="module")
+def by_function(tmp_path_factory):
+    config = PipelineConfig(images=SMALL, features=strong, matching=mutual, verification=FEW)
+    return reconstruct(images(3), tmp_path_factory.mktemp("function") / "out", config=config, until="matches")
+
+
+def test_functions_detect_and_match(by_function):
+    assert [len(f.xy) for f in by_function.features] == [300] * 3
+    assert all(pair.candidates >= pair.inliers for pair in by_function.pairs)
+    assert by_function.pairs[0].accepted
+    assert (by_function.pairs[0].index1 == -1).all()
+    pair = match_pair(*images(2), config=PipelineConfig(images=SMALL, matching=mutual, verification=FEW))
+    assert pair.inliers == by_function.pairs[0].inliers
+
+
+def test_matches_of_a_function_are_joined_to_tracks(by_function, caplog):
+    tracks = PlainTracks().build(
+        [None] * 3, by_function.pairs, map_all=one_by_one, rng=np.random.default_rng(0)
+    )
+    assert (np.bincount(tracks.point_index) == 3).sum() > 5
+    with caplog.at_level(logging.INFO):
+        assert PipelineConfig(matching=mutual).tracks == PlainTracks()
+    assert "not aligned" in caplog.text
+    assert PipelineConfig(matching=mutual, tracks=PlainTracks(merge_px=3.0)).tracks.merge_px == 3.0
+    with caplog.at_level(logging.WARNING):
+        aligned = AlignedTracks().build(
+            [None] * 3, by_function.pairs, map_all=one_by_one, rng=np.random.default_rng(0)
+        )
+    np.testing.assert_array_equal(aligned.xy, tracks.xy)
+
+
+def test_a_function_estimates_f_and_the_library_adds_noise_and_covariance(by_function):
+    pair = by_function.pairs[0]
+    reference = LocallyOptimisedRansac().estimate(pair.xy1, pair.xy2, np.random.default_rng(0))
+    method = FunctionFundamental(
+        lambda xy1, xy2: (3.0 * reference.F, reference.inliers[:, None].astype(np.uint8))
+    )
+    fit = method.estimate(pair.xy1, pair.xy2, np.random.default_rng(0))
+    np.testing.assert_allclose(fit.F, reference.F * np.sign((fit.F * reference.F).sum()), atol=1e-10)
+    assert fit.sigma_px == pytest.approx(reference.sigma_px, rel=0.5)
+    ratio = np.trace(fit.covariance) / np.trace(reference.covariance)
+    assert 0.1 < ratio < 10.0
+    nothing = FunctionFundamental(lambda xy1, xy2: (None, None))
+    refuses(StageFailure, "returned no F", nothing.estimate, pair.xy1, pair.xy2, None)
+
+
+def test_a_function_selects_pairs_by_name_or_number(tmp_path):
+    for n, chosen in enumerate((lambda names: [(0, np.int64(2))], lambda names: [(names[2], names[0])])):
+        config = PipelineConfig(images=SMALL, features=strong, pairs=chosen, matching=mutual)
+        result = reconstruct(images(3), tmp_path / str(n), config=config, until="matches")
+        assert result.pair_choice.pairs.tolist() == [[0, 2]]
+
+
+def called(stage, function):
+    """Call a stage of two images with this function."""
+    config = PipelineConfig(**{stage: function})
+    one, two = photographs(2)
+    if stage == "features":
+        return config.features.detect(one)
+    if stage == "pairs":
+        return config.pairs.select(["a", "b"], [], map_all=None, rng=None)
+    if stage == "epipolar":
+        xy = np.random.default_rng(0).uniform(0.0, 99.0, (2, 30, 2))
+        return config.epipolar.estimate(*xy, None)
+    views = [config.matching.prepare(image, None) for image in (one, two)]
+    return config.matching.match(*views, pair=(0, 1), estimate_fundamental=None, rng=None)
+
+
+POINT = np.full((1, 2), 5.0)
+F = np.diag([1.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("stage", "returned", "words"),
+    [
+        ("features", np.ones((4, 3)), r"xy of shape \(4, 3\) instead of \(N, 2\)"),
+        ("features", np.full((4, 2), np.nan), "not finite"),
+        ("features", np.full((4, 2), 97.0), "outside the image of 96 x 80 px"),
+        ("features", (POINT, [1.0, 2.0]), "1 positions and 2 values of scale"),
+        ("features", (POINT, [0.0]), "not positive"),
+        ("features", (1, 2, 3, 4), "4 values"),
+        ("features", "corners", "no array of numbers"),
+        ("matching", None, "NoneType"),
+        ("matching", (POINT, np.ones((2, 2))), "1 xy1 and 2 xy2"),
+        ("matching", (POINT, POINT, [np.inf]), "score that is not finite"),
+        ("matching", (POINT, -POINT), r"xy2 with \(-5, -5\) outside the image"),
+        ("pairs", [(0, 0)], "with itself"),
+        ("pairs", [("a", "c")], "no pair of the 2 images"),
+        ("pairs", [(0, 1, 2)], "no pair of the 2 images"),
+        ("pairs", [], "no pairs"),
+        ("epipolar", F, "ndarray"),
+        ("epipolar", (F, np.ones(29)), r"inliers of shape \(29,\) for 30 matches"),
+        ("epipolar", (np.ones((9, 3)), np.ones(30)), r"F of shape \(9, 3\)"),
+        ("epipolar", (np.zeros((3, 3)), np.ones(30)), "rank below 2"),
+    ],
+)  # fmt: skip
+def test_a_wrong_result_gets_one_sentence(stage, returned, words):
+    refuses(
+        UsageError,
+        f"the function chosen returned .*{words}.*; it must return",
+        called,
+        stage,
+        give(returned, stage),
+    )
+
+
+def give(returned, stage):
+    if stage in ("matching", "epipolar"):
+
+        def chosen(one, two):
+            return returned
+    else:
+
+        def chosen(one):
+            return returned
+
+    return chosen
+
+
+class Extracted:
+    """A matcher that is no dataclass: features once an image, then pairs of them."""
+
+    def __init__(self, ratio):
+        self.ratio = ratio
+
+    def prepare(self, image, features):
+        xy = strong(image.rgb)
+        return xy, windows(image.rgb, xy)
+
+    def match(self, view1, view2, **_):
+        similarity = view1[1] @ view2[1].T
+        best = similarity.argmax(axis=1)
+        good = (similarity.argmax(axis=0)[best] == np.arange(len(best))) & (
+            similarity.max(axis=1) > self.ratio
+        )
+        return view1[0][good], view2[0][best[good]]
+
+
+class Incomplete:
+    def prepare(self, image, features):
+        raise NotImplementedError
+
+    def detect(self):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("stage", "value", "words"),
+    [
+        ("matching", Incomplete(), "prepare and match, or a function of image1, image2; .*no match"),
+        ("features", Incomplete(), r"method detect of features=Incomplete .*\(image\); it takes \(\)"),
+        ("matching", Extracted, r"got the class Extracted: write Extracted\(\)"),
+        ("matching", lambda image: image, r"2 arguments \(image1, image2\); it takes \(image\)"),
+        ("features", mutual, "1 arguments"),
+        ("tracks", mutual, "only features, pairs, matching, epipolar take a plain function, got mutual"),
+        ("metric", "metric-refinement", "got 'metric-refinement', which has no refine"),
+        ("images", {"max_size_px": 3}, r"images takes ImageOptions\(...\)"),
+    ],
+)  # fmt: skip
+def test_a_method_is_checked_when_the_configuration_is_built(stage, value, words):
+    refuses(UsageError, words, PipelineConfig, **{stage: value})
+
+
+def test_an_object_that_is_no_dataclass_works(tmp_path):
+    def run(ratio, out):
+        config = PipelineConfig(images=SMALL, features=strong, matching=Extracted(ratio), verification=FEW)
+        result = reconstruct(images(2), tmp_path / out, config=config, until="matches", overwrite=True)
+        return result, result.pairs[0].candidates
+
+    result, loose = run(0.6, "a")
+    assert result.settings["matching"] == {"kind": "Extracted"}
+    assert run(0.6, "a")[0].summary["resumed"] == ["features", "pairs", "matches"]
+    assert run(0.9, "a")[1] == run(0.9, "b")[1] < loose
+
+
+class Wrong(Extracted):
+    def match(self, view1, view2, **_):
+        return self.ratio
+
+
+def test_an_object_is_checked_like_a_function(tmp_path):
+    config = PipelineConfig(images=SMALL, matching=Wrong((np.ones((3, 2)), np.ones((2, 2)))))
+    refuses(
+        UsageError, "method match of Wrong returned 3 xy1 and 2 xy2", match_pair, *images(2), config=config
+    )
+    matches = FunctionMatcher(mutual).match(
+        *[FunctionMatcher(mutual).prepare(image, None) for image in photographs(2)],
+        pair=(0, 1), estimate_fundamental=None, rng=None,
+    )  # fmt: skip
+    matches.index1[:1] = 7**7
+    assert len(matches.xy1)
+    config = PipelineConfig(images=SMALL, features=strong, matching=Corrupt(matches))
+    refuses(UsageError, "indices that are not corners", match_pair, *images(2), config=config)
+
+
+class Corrupt(Wrong):
+    def prepare(self, image, features):
+        return FunctionMatcher(mutual).prepare(image, features)
+
+
+def test_features_without_seeds_get_a_sentence_where_seeds_are_needed(tmp_path):
+    features = [Features(POINT, np.ones(1, np.float32), np.ones(1, np.float32))] * 31
+    given = {"map_all": one_by_one, "rng": np.random.default_rng(0)}
+    names = [str(n) for n in range(31)]
+    refuses(UsageError, "pairs.kind=all-pairs", OverlapEstimate().select, names, features, **given)
+    config = PipelineConfig(images=SMALL, features=strong)
+    refuses(UsageError, "needs features with seeds", match_pair, *images(2), config=config)
+
+
+FILE = """
+from dataclasses import dataclass
+from tests.config.test_plug_ins import mutual
+from beside import RATIO
+
+def loose(image1, image2):
+    return mutual(image1, image2, RATIO)
+
+@dataclass(frozen=True)
+class Mutual:
+    ratio: float = 0.9
+    def prepare(self, image, features):
+        return image.rgb
+    def match(self, view1, view2, **_):
+        return mutual(view1, view2, self.ratio)
+
+strict = Mutual(0.5)
+"""
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    (tmp_path / "beside.py").write_text("RATIO = 0.95\n", encoding="utf-8")
+    (tmp_path / "plugged.py").write_text(FILE, encoding="utf-8")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path / "plugged.py"
+    for name in ("beside", "plugged"):
+        sys.modules.pop(name, None)
+
+
+def test_code_in_a_file_is_chosen_by_text_and_replayed(file, tmp_path):
+    for name, fields in (("loose", {}), ("Mutual", {"ratio": 0.9}), ("strict", {"ratio": 0.5})):
+        config = build_config(settings=[f"matching.kind=plugged.py:{name}"])
+        kind = f"{file}:{'Mutual' if fields else name}"
+        assert tables_from_config(config)["matching"] == {"kind": kind, **fields}
+        assert config_from_toml(toml_from_config(config)) == config
+        assert config_from_toml(f'[matching]\nkind = "plugged.py:{name}"\n') == config
+    config = build_config(settings={"matching.kind": "plugged.py:Mutual", "matching.ratio": 0.7})
+    assert config.matching.ratio == 0.7
+    settings = ["matching.kind=plugged.py:loose", "verification.min_inliers=20"]
+    given = {"max_size": 400, "until": "matches", "seed": 2}
+    result = reconstruct(images(2), tmp_path / "out", set=settings, **given)
+    again = reconstruct(images(2), tmp_path / "out", config=tmp_path / "out" / "config.toml", **given)
+    assert again.summary["resumed"] == ["features", "pairs", "matches"]
+    other = reconstruct(
+        images(2), tmp_path / "b", set=settings, max_size=400, until="matches", seed=2, executor="processes"
+    )
+    assert other.pairs[0].candidates == result.pairs[0].candidates > 20
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("matching.kind=nowhere.py:f", "there is no file nowhere.py"),
+        ("matching.kind=plugged.py:mutal", "unknown name in plugged.py 'mutal'; did you mean"),
+        ("matching.kind=broken.py:f", "broken.py cannot be imported: ZeroDivisionError"),
+        ("matching.kind=plugged.py:RATIO", "matching takes an object"),
+        ("matching.kind=plugged", "path/to/file.py:name"),
+        ("features.kind=plugged.py:loose", "1 arguments"),
+    ],
+)
+def test_a_wrong_name_of_code_gets_a_sentence(file, setting, words):
+    (file.parent / "broken.py").write_text("1 / 0\n", encoding="utf-8")
+    refuses(UsageError, words, build_config, settings=[setting])
+    wrong = ["matching.kind=plugged.py:loose", "matching.ratio=0.5"]
+    refuses(UsageError, "has no settings", build_config, settings=wrong)
+    wrong = ["matching.kind=plugged.py:Mutual", "matching.rato=0.5"]
+    refuses(UsageError, "did you mean matching.ratio", build_config, settings=wrong)
+
+
+def test_a_function_of_a_prompt_cannot_be_replayed(tmp_path):
+    toml = toml_from_config(PipelineConfig(matching=defined("def f(a, b): pass")))
+    assert "f (defined in a running program, not in a file)" in toml
+    refuses(UsageError, "the function f was .*matching.kind=path/to/file.py:f", config_from_toml, toml)
+    out = tmp_path / "out"
+    lines = [lambda a, b: mutual(a, b), functools.partial(mutual, ratio=0.8)]
+    for line in lines:
+        config = PipelineConfig(images=SMALL, features=strong, matching=line)
+        assert reconstruct(images(2), out, config=config, until="matches", overwrite=True).pairs
+    given = {"config": config, "until": "matches", "overwrite": True, "executor": "processes", "threads": 1}
+    given["config"] = PipelineConfig(images=SMALL, features=lambda image: strong(image))
+    refuses(UsageError, "cannot be sent to another process", reconstruct, images(2), out, **given)
+
+
+def defined(text, name="f", file="<stdin>"):
+    """What a prompt or a notebook cell defines."""
+    scope = {"__name__": "__main__", "mutual": mutual}
+    exec(compile(text, file, "exec"), scope)
+    return scope[name]
+
+
+def at_a_prompt(ratio, _tmp_path):
+    return defined(f"def f(a, b):\n    return mutual(a, b, {ratio})")
+
+
+def in_a_notebook_cell(ratio, _tmp_path):
+    text = f"RATIO = {ratio}\ndef f(a, b):\n    return mutual(a, b, RATIO)"
+    file = f"<ipython-input-{ratio}>"
+    linecache.cache[file] = (len(text), None, text.splitlines(True), file)
+    return defined(text, file=file)
+
+
+def with_an_edited_helper(ratio, tmp_path):
+    (tmp_path / "edited_helper.py").write_text(f"def limit(): return {ratio}  # {ratio}", encoding="utf-8")
+    sys.modules.pop("edited_helper", None)
+    importlib.invalidate_caches()
+    return defined("import edited_helper\ndef f(a, b):\n    return mutual(a, b, edited_helper.limit())")
+
+
+def closure(ratio, _tmp_path):
+    def f(a, b):
+        return mutual(a, b, ratio)
+
+    return f
+
+
+def a_lambda(ratio, _tmp_path):
+    return defined(f"f = lambda a, b: mutual(a, b, {ratio})")
+
+
+def a_class_at_a_prompt(ratio, _tmp_path):
+    text = re.sub(r"from (tests|beside).*\n", "", FILE).replace("0.9", str(ratio))
+    return defined(text + "\nf = Mutual()")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [at_a_prompt, in_a_notebook_cell, with_an_edited_helper, closure, a_lambda, a_class_at_a_prompt],
+)
+def test_an_edited_variant_takes_no_stored_results(make, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # two edits within a second
+
+    def matched(ratio, out="out"):
+        config = PipelineConfig(images=SMALL, features=HarrisCorners(), matching=make(ratio, tmp_path))
+        result = reconstruct(images(2), tmp_path / out, config=config, until="matches", overwrite=True)
+        return result.pairs[0].candidates, result.summary["resumed"]
+
+    loose, _ = matched(0.8)
+    strict, resumed = matched(0.5)
+    assert loose > strict == matched(0.5, "fresh")[0]
+    assert "matches" not in resumed
+    # The same code finds its results again.
+    assert "matches" in matched(0.5)[1]
+
+
+def test_strength_of_match_takes_the_features_of_a_function():
+    config = PipelineConfig(images=SMALL, features=strong, matching=StrengthOfMatch(), verification=FEW)
+    assert match_pair(*images(2), config=config).inliers >= 20

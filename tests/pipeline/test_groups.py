@@ -1,0 +1,171 @@
+"""Folders with several groups of images that do not overlap, with fake stages: one model for each."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+
+from tests.conftest import refuses
+from tests.pipeline import fake_stages as fakes
+from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
+from thesisrecon import load
+from thesisrecon.cli.runs import summary_text
+from thesisrecon.config import ImageOptions
+from thesisrecon.errors import StageFailure
+from thesisrecon.pipeline import _matching_stages, reconstruction
+
+GROUPS = [range(3), range(3, 7), range(7, 9)]
+
+
+@dataclass(frozen=True)
+class GroupVerifier(fakes.FakeVerifier):
+    def verify(self, matches, fit, rng):
+        together = any(matches.i in group and matches.j in group for group in GROUPS)
+        return replace(super().verify(matches, fit, rng), accepted=together)
+
+
+@dataclass(frozen=True)
+class ProjectiveOfSize(fakes.FakeProjective):
+    """Registers the views of its pairs; fails for so many of them."""
+
+    impossible: int = 0
+
+    def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
+        found = super().reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt)
+        seen = [
+            any(view in (pair.i, pair.j) for pair in pairs if pair.accepted) for view in range(len(sizes))
+        ]
+        if sum(seen) == self.impossible:
+            raise StageFailure("no initial pair")
+        reasons = tuple("" if there else "sees 0 points" for there in seen)
+        return replace(found, registered=found.registered & seen, reasons=reasons)
+
+
+@pytest.fixture(autouse=True)
+def _forget_calls():
+    CALLS.clear()
+
+
+def run(out, impossible=0, **given):
+    config = fake_config(verification=GroupVerifier(), projective=ProjectiveOfSize(impossible=impossible))
+    config = replace(config, images=ImageOptions(groups=given.pop("groups", True)))
+    return reconstruction.reconstruct(photographs(9), out, config=config, until="metric", **given)
+
+
+def files_of(out):
+    return kept_bytes(out), kept_bytes(out / "group-2")
+
+
+def test_each_group_has_a_model_and_the_largest_is_first(tmp_path):
+    result = run(tmp_path, threads=1)
+    assert list(result.cameras) == ["03.png", "04.png", "05.png", "06.png"]
+    assert "is reconstructed in group-2" in result.refused["00.png"]
+    assert result.refused["08.png"] == "sees 0 points"
+    summary = read(tmp_path / "summary.json")
+    entry = {"folder": "group-2", "images": 3, "registered": 3, "trusted": True, "failure": None}
+    assert summary["groups"] == [entry | {"names": ["00.png", "01.png", "02.png"]}]
+    sentence = "The images form 2 models without a common scale: 4 images in this model, 3 in group-2"
+    assert sentence in summary["warnings"]
+    said = summary_text(summary, tmp_path)
+    assert f"group-2: 3 of 3 images registered; report: {tmp_path}" in said
+    assert "not registered: 00.png" not in said
+    assert '<a href="group-2/report.html">group-2</a>' in (tmp_path / "report.html").read_text("utf-8")
+    assert not (tmp_path / "group-3").exists()
+    other = load(tmp_path / "group-2")
+    assert list(other.cameras) == ["00.png", "01.png", "02.png"]
+    assert [(pair.i, pair.j) for pair in other.pairs] == [(0, 1), (0, 2), (1, 2)]
+    assert (tmp_path / "group-2" / "report.html").is_file()
+    calls = [call for call in CALLS if call.startswith(("detect", "match"))]
+    assert len(calls) == len(set(calls)) == 9 + 36
+
+
+def test_groups_are_resumed_to_the_same_bytes(tmp_path):
+    run(tmp_path / "whole", threads=1)
+    stopped = []
+
+    def interrupt(stage, done, _total):
+        stopped.append((stage, done))
+        if stopped.count(("projective", 0)) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cut", threads=1, progress=interrupt)
+    CALLS.clear()
+    run(tmp_path / "cut", threads=3)
+    assert files_of(tmp_path / "cut") == files_of(tmp_path / "whole")
+    assert not [call for call in CALLS if call.startswith(("detect", "match"))]
+    CALLS.clear()
+    run(tmp_path / "cut")
+    assert CALLS == []
+
+
+def test_groups_can_be_turned_off(tmp_path):
+    run(tmp_path)
+    result = run(tmp_path, groups=False, overwrite=True)
+    assert len(result.cameras) == 9
+    assert "groups" not in result.summary
+    assert not (tmp_path / "group-2" / "summary.json").exists()
+
+
+def test_a_replaced_run_leaves_no_result_of_its_groups(tmp_path):
+    run(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, seed=1, overwrite=True, threads=1, progress=interrupt_at("features", 9))
+    assert not list(tmp_path.rglob("summary.json"))
+    assert (tmp_path / "group-2" / "06-metric").is_dir()
+
+
+def test_a_group_that_fails_leaves_the_others_whole(tmp_path):
+    result = run(tmp_path / "second", impossible=3)
+    assert len(result.cameras) == 4
+    assert result.summary["groups"][0]["failure"] == "no initial pair."
+    assert "group-2: no initial pair; report" in summary_text(result.summary, tmp_path)
+    assert read(tmp_path / "second" / "group-2" / "summary.json")["failure"] == "no initial pair."
+    refuses(StageFailure, "no initial pair", run, tmp_path / "first", impossible=4)
+    assert read(tmp_path / "first" / "summary.json")["groups"][0]["registered"] == 3
+    assert len(load(tmp_path / "first" / "group-2").cameras) == 3
+
+
+def test_a_group_takes_the_pairs_of_the_whole_set_and_not_older_ones(tmp_path, monkeypatch):
+    """A pair may be rejected, or matched again, because of images that were added."""
+    run(tmp_path)
+    reject = _matching_stages.reject_repeated_structure
+
+    def reject_first(pairs, views):
+        return [replace(p, accepted=p.accepted and (p.i, p.j) != (0, 1)) for p in reject(pairs, views)]
+
+    monkeypatch.setattr(_matching_stages, "reject_repeated_structure", reject_first)
+    run(tmp_path, overwrite=True)
+    assert [pair.accepted for pair in load(tmp_path / "group-2").pairs] == [False, True, True]
+
+
+@dataclass(frozen=True)
+class ProjectiveOfAFew(ProjectiveOfSize):
+    """Registers the first three of the views of its pairs."""
+
+    def reconstruct(self, tracks, pairs, sizes, *, rng, attempt=0):
+        found = super().reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt)
+        few = found.registered & (found.registered.cumsum() <= 3)
+        reasons = tuple("" if there else "sees 5 points" for there in few)
+        return replace(found, registered=few, reasons=reasons)
+
+
+def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
+    config = fake_config(projective=ProjectiveOfAFew())
+    result = reconstruction.reconstruct(photographs(8), tmp_path, config=config, until="metric")
+    assert [group["registered"] for group in result.summary["groups"]] == [3]
+    sentence = "The images form 2 models without a common scale: 3 images in this model, 3 in group-2"
+    assert sentence in result.summary["warnings"]
+    assert "is reconstructed in group-2" in result.refused["03.png"]
+    assert result.refused["07.png"] == "sees 5 points"
+    off = replace(config, images=ImageOptions(groups=False))
+    result = reconstruction.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
+    assert "groups" not in result.summary
+    assert not (tmp_path / "off" / "group-2").exists()
+
+
+def test_a_projective_run_leaves_no_images_over(tmp_path):
+    """It may end at the core of a large set, whose other images the metric stage registers."""
+    config = fake_config(projective=ProjectiveOfAFew())
+    result = reconstruction.reconstruct(photographs(8), tmp_path, config=config, until="projective")
+    assert "groups" not in result.summary
+    assert not list(tmp_path.glob("group-*"))

@@ -1,0 +1,272 @@
+"""The documentation site: pages for every exported name, an example on each, every command and setting."""
+
+import ast
+import importlib
+import inspect
+import re
+import shlex
+import sys
+import typing
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import thesisrecon
+from thesisrecon.config import KINDS
+
+DOCS = Path(__file__).parents[2] / "docs"
+README = DOCS.parent / "README.md"
+EXPORTED = sorted(set(thesisrecon.__all__) - {"__version__"})
+
+
+@pytest.fixture(scope="module")
+def site():
+    """The modules that make pages; those that need Sphinx are imported where it is installed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(DOCS))
+        yield lambda name: importlib.import_module(f"_ext.{name}")
+    for name in [name for name in sys.modules if name.split(".")[0] == "_ext"]:
+        del sys.modules[name]
+
+
+def test_every_exported_name_has_a_page_with_an_example(site):
+    listed = re.findall(r"^   (\w+)$", (DOCS / "reference" / "api.md").read_text("utf-8"), re.M)
+    assert sorted(listed) == EXPORTED
+    borrowed = site("examples").RETURNED_BY
+    own = {name for name in EXPORTED if ">>>" in (getattr(thesisrecon, name).__doc__ or "")}
+    assert own | set(borrowed) == set(EXPORTED)
+    assert not own & set(borrowed)
+    assert set(borrowed.values()) <= own
+
+
+def test_the_pages_of_commands_and_settings_name_all_of_them(site):
+    interface = site("interface")
+    commands, settings = interface.command_page(), interface.settings_page()
+    for command, option in (("reconstruct", "--from"), ("export", "--to"), ("interpolate", "--frames")):
+        assert re.search(rf"^## {command}$.*?`{option}`", commands, re.M | re.S)
+    for stage, kinds in KINDS.items():
+        assert f"## {stage}\n" in settings
+        assert all(f"`{stage}.kind={word}`" in settings for word in kinds)
+    rows = re.findall(r"^\| (`.*)", settings, re.M)
+    assert len(rows) > 100
+    assert [row for row in rows if row.rstrip().endswith("|  |")] == []
+
+
+def test_every_message_of_the_code_has_a_remedy_on_the_page_of_failures(site):
+    failures = site("failures")
+    known = {code: message for table in failures.TABLES.values() for code, message in table.items()}
+    source = "".join(path.read_text("utf-8") for path in failures.PACKAGE.rglob("*.py"))
+    assert {*re.findall(r'Notice\(\s*"([^"]+)"', source)} == set(known)
+    assert all(text and remedy for text, remedy in known.values())
+    # Messages are sorted by heading: a remedy cannot refer to the one above it.
+    assert not re.search("as above", " ".join(remedy for _, remedy in known.values()), re.I)
+    of_stages = [row for rows in failures.stage_failures().values() for row in rows]
+    assert len(of_stages) > 60
+    assert [reason for reason, _, advice in of_stages if not re.search(r"\w", advice)] == []
+    page = failures.page()
+    assert all(f"| {reason} |" in page for reason, _, _ in of_stages)
+
+
+CODE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.M | re.S)
+PAGES = sorted(path for path in DOCS.rglob("*.md") if not {"_build", "modules", "generated"} & {*path.parts})
+RUN_BY = {
+    "development/ablations.md": (2, "validation/ablation/test_own.py"),
+    "recipes/compare.md": (1, "project/test_tasks.py"),
+    "recipes/export.md": (3, "project/test_tasks.py"),
+    "recipes/plain-arrays.md": (2, "api/test_dense_model.py"),
+    "recipes/plug-ins.md": (3, "project/test_plug_in_examples.py"),
+    "recipes/tasks.md": (10, "project/test_tasks.py"),
+    "reference/conventions.md": (1, "project/test_site.py"),
+    "start/first-reconstruction.md": (1, "project/test_site.py"),
+}
+"""Page -> its blocks of Python and the tests that run all of them."""
+TABLE = re.compile(r"^\|.*\n\| ---", re.M)
+STAMP = re.compile(r"^Command: `([^`]+)`[^.]*\. Commit ([0-9a-f]{8});", re.M)
+NOT_MEASURED = {"data.md", "index.md", "validation.md"}
+"""Pages of evidence whose tables say what there is, not how large it is."""
+
+
+def test_every_block_of_python_is_run_by_a_test():
+    found = {}
+    for path in PAGES:
+        count = [language for language, _ in CODE.findall(path.read_text("utf-8"))].count("python")
+        if count:
+            found[str(path.relative_to(DOCS))] = count
+    assert found == {page: count for page, (count, _) in RUN_BY.items()}
+    for page, (_, test) in RUN_BY.items():
+        assert Path(page).name in (Path(__file__).parents[1] / test).read_text("utf-8"), page
+
+
+def _python_of_the_readme():
+    first, calls = [text for kind, text in CODE.findall(README.read_text("utf-8")) if kind == "python"]
+    return first, calls
+
+
+def test_the_calls_of_the_readme_fit_the_functions():
+    """Its names stand for data of the reader, so it cannot run: arguments and named attributes must exist."""
+    _, block = _python_of_the_readme()
+    lines, attributes, tree = block.splitlines(), 0, ast.parse(block)
+    whole = {getattr(statement, "value", None) for statement in tree.body}
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    calls = [call for call in calls if ast.unparse(call.func).startswith("thesisrecon.")]
+    for call in calls:
+        function = getattr(thesisrecon, call.func.attr)
+        inspect.signature(function).bind(*call.args, **{keyword.arg: None for keyword in call.keywords})
+        if call not in whole:
+            continue
+        made = function if isinstance(function, type) else typing.get_type_hints(function)["return"]
+        comment = lines[call.end_lineno - 1].partition("  # ")[2]
+        for name in re.findall(r"(?:^|[ ;,])\.(\w+)", comment):
+            fields = getattr(made, "__dataclass_fields__", {})
+            assert name in fields or hasattr(made, name), f"{call.func.attr}: .{name}"
+            attributes += 1
+    assert len(calls) >= 15
+    assert attributes >= 15
+
+
+def test_lines_of_code_fit_the_page():
+    made = {DOCS / "development" / "architecture.md", DOCS / "evidence" / "scaling.md"}
+    long = [
+        f"{path.relative_to(DOCS)}: {line}"
+        for path in PAGES
+        for _, text in CODE.findall(path.read_text("utf-8"))
+        for line in text.splitlines()
+        if len(line) > 92 and path not in made
+    ]
+    assert long == []
+
+
+def commands_of(text):
+    """Command lines of a page in backticks or in blocks, without what stands for something else."""
+    code = [line for _, block in CODE.findall(text) for line in block.replace("\\\n", " ").splitlines()]
+    code += re.findall(r"`([^`\n]+)`", re.sub(CODE, "", text))
+    for line in code:
+        words = shlex.split(re.sub(r"[\[\]|]", " ", line), comments=True)
+        if words[:1] == ["thesisrecon"] or "validation" in words[:3]:
+            yield words[words.index("validation" if "validation" in words else "thesisrecon") :]
+
+
+def test_commands_of_the_pages_exist(site):
+    """Names of commands, studies and ablations, and all options."""
+    pytest.importorskip("validation.studies.runner")
+    from validation.ablation.command import STUDIES
+    from validation.command import _parser
+    from validation.studies.runner import MODULES, load_study, study_parser
+
+    sections = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", site("interface").command_page(), re.M | re.S))
+    shipped, tried = {file.stem for file in STUDIES.glob("*.toml")}, 0
+    for path in [*PAGES, README]:
+        for program, *words in commands_of(path.read_text("utf-8")):
+            where = f"{path.name}: {' '.join([program, *words])}"
+            options = [word.split("=")[0] for word in words if re.match("--?[a-z]", word)]
+            tried += 1
+            if program == "thesisrecon":
+                if words and words[0].islower() and not words[0].startswith("-"):
+                    assert words[0] in sections, where
+                    known = f"{sections[words[0]]} `--help`"
+                    assert [o for o in options if f"`{o}`" not in known] == [], where
+            elif words[:1] == ["study"]:
+                if words[1:2] and words[1] in MODULES:
+                    if "--help" not in words:
+                        study_parser(words[1], load_study(words[1])).parse_args(words[2:])
+                else:
+                    assert words[1:2] in ([], ["all"], ["NAME"], ["--list"]), where
+            elif words:
+                parsed = _parser().parse_args(words if {"-o", "--out"} & {*words} else [*words, "-o", "OUT"])
+                if parsed.command == "ablate":
+                    assert parsed.study in ("NAME", "STUDY.toml", *shipped), where
+    assert tried > 60
+    named = {name for path in PAGES for name in re.findall(r"`study ([a-z-]+)", path.read_text("utf-8"))}
+    assert named - {*MODULES, "all"} == set()
+
+
+def test_all_studies_run_with_the_options_of_the_pages():
+    """`study all` makes the tables of the chapters and of the evidence."""
+    pytest.importorskip("validation.studies.runner")
+    from validation.studies.runner import MODULES, OF_PAGES, load_study, study_parser
+
+    def options(name, words):
+        return vars(study_parser(name, load_study(name)).parse_args([*words, "-o", "OUT"]))
+
+    pages = [p for p in PAGES if p.parent.name in ("theory", "evidence") and p.stem != "index"]
+    shown = [words for page in pages for words in commands_of(page.read_text("utf-8"))]
+    shown = [words[2:] for words in shown if words[1:2] == ["study"] and words[2:3] and words[2] in MODULES]
+    assert len(shown) > 15
+    for name, *words in shown:
+        given = words[: words.index("-o")] if "-o" in words else words
+        run = [options(name, all_options) for all_options in OF_PAGES.get(name, [[]])]
+        assert options(name, given) in run, (name, words)
+
+
+def sections_with_tables(text):
+    """The sections of a page that have a table, and the number of the tables."""
+    for section in re.split(r"^(?=##? )", text, flags=re.M):
+        if count := len(TABLE.findall(section)):
+            yield section, count
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "evidence").glob("*.md")), ids=lambda page: page.stem)
+def test_every_table_of_evidence_names_its_command(page):
+    for section, count in sections_with_tables(page.read_text("utf-8")):
+        title = section.partition("\n")[0]
+        if page.name in NOT_MEASURED or title in ("## Complexity", "## Rules", "## Tests"):
+            continue
+        assert STAMP.search(section), (title, count)
+
+
+def test_papers_that_pages_name_are_among_the_references():
+    listed = re.split(r"^- ", (DOCS / "reference" / "literature.md").read_text("utf-8"), flags=re.M)
+    named = {
+        (path.name, found[1], found[2])
+        for path in PAGES
+        for found in re.finditer(r"\(([A-Z]\w+)[^()]{0,50}? ((?:19|20)\d\d)\b", path.read_text("utf-8"))
+        if path.parent.name in ("theory", "recipes", "start") and path.name != "literature.md"
+    }
+    assert len(named) > 8
+    missing = {
+        (page, name, year) for page, name, year in named if not any(name in r and year in r for r in listed)
+    }
+    assert missing == set()
+
+
+def block(page, number=0):
+    """One Python block of a page."""
+    return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text("utf-8"), re.S)[number]
+
+
+def test_the_example_of_the_conventions_runs():
+    exec(compile(block("reference/conventions.md"), "conventions.md", "exec"), {})
+
+
+def test_points_are_undistorted_as_the_page_of_exports_shows(monkeypatch):
+    K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
+    camera = thesisrecon.Camera(K, np.eye(3), np.ones(3), (640, 480), distortion=(0.1, 0.0, 0.0))
+    monkeypatch.setattr(thesisrecon, "load", lambda _: SimpleNamespace(cameras={"0000.jpg": camera}))
+    names = {}
+    exec(compile(block("recipes/export.md", 1), "export.md", "exec"), names)
+    back = camera.project(names["pinhole"].unproject(names["undistorted"], np.ones(2)))
+    assert np.allclose(back, names["xy"])
+    assert np.abs(names["undistorted"] - names["xy"]).max() > 1.0
+
+
+@pytest.mark.slow
+def test_the_first_lines_of_the_readme_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fixtures").symlink_to(DOCS.parent / "fixtures")
+    names = {}
+    exec(compile(_python_of_the_readme()[0], "README.md", "exec"), names)
+    assert len(names["result"].cameras) == 14
+    assert names["camera"].K[0, 0] == pytest.approx(908.6, rel=2e-3)
+
+
+@pytest.mark.slow
+def test_the_first_reconstruction_runs_as_it_stands(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fixtures").symlink_to(DOCS.parent / "fixtures")
+    names = {}
+    exec(compile(block("start/first-reconstruction.md"), "first-reconstruction.md", "exec"), names)
+    assert names["result"].summary["trusted"]
+    assert names["camera"].K[0, 0] == pytest.approx(908.6, rel=2e-3)
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"report.html", "cameras.json", "sparse"}
