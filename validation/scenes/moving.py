@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
+from validation.scenes.image_files import write_png
+from validation.scenes.pose import Pose
+from validation.scenes.raycast import trace
+from validation.scenes.sensor import PER_PIXEL, Sensor, expose, integrate_pixels
+from validation.scenes.street import build_corner
 
 CAR, PHONE = (1241, 376), (640, 480)
 
@@ -36,6 +43,47 @@ class Moving:
 def drive(seed: int, lens: Lens, views: int = 17) -> Moving:
     """A car turns a corner of 45 to 100 degrees between house fronts; 0.3 px of noise."""
     rng, focal = np.random.default_rng([7, seed]), 718.9
+    R, C, ahead = _corner(rng, views)
+    X = np.concatenate([_street(C[0], ahead[0], -5.0, rng), _street(C[-1], ahead[-1], -20.0, rng)])
+    near = np.linalg.norm(X[:, None, :2] - C[None, :, :2], axis=2).min(axis=1)
+    X = X[(near > 4.0) | (X[:, 2] == 0.0)]
+    xy = _tracked(_project(X, R, C, focal, CAR, lens), rng, 350, 0.8)
+    return Moving(xy + rng.normal(0.0, 0.3, xy.shape), CAR, focal)
+
+
+def render_drive(folder: Path, seed: int, lens: Lens, views: int = 14, width: int = 640) -> float:
+    """Write images of such a drive through rendered streets; return the focal length.
+
+    The rendered samples are interpolated for k1 and the aspect ratio of the lens.
+    """
+    R, C, ahead = _corner(np.random.default_rng([7, seed]), views)
+    world, size, n, sensor = build_corner(C, ahead), (width, width * CAR[1] // CAR[0]), PER_PIXEL, Sensor()
+    f, (cx, cy) = 718.9 * width / CAR[0], (np.array(size) - 1) / 2
+    K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+    pixels = (np.indices((n * size[1], n * size[0]))[::-1] + 0.5) / n - 0.5
+    place = n * (straighten(pixels, f, size, lens)[::-1] + 0.5) - 0.5
+    folder.mkdir()
+    for v in range(views):
+        light = trace(world, Pose(K, R[v], C[v]), size, per_pixel=n)[0]
+        bent = [map_coordinates(channel, place, mode="nearest") for channel in np.moveaxis(light, 2, 0)]
+        seen = integrate_pixels(np.stack(bent, axis=2), n, sensor.blur_px)
+        rng = np.random.default_rng([13, seed, v])
+        write_png(folder / f"{v:02d}.png", expose(seen, sensor, gains=(0.82, 0.82, 0.82), rng=rng))
+    return float(f)
+
+
+def straighten(xy: F64, focal: float, size: tuple[int, int], lens: Lens) -> F64:
+    """Pinhole pixels (2, ...) of those with the k1 and the aspect ratio of a lens."""
+    place, centre = np.moveaxis(xy, 0, -1), (np.array(size) - 1) / 2
+    place = (place - centre) * [np.sqrt(lens.aspect), 1.0 / np.sqrt(lens.aspect)]
+    scale = np.ones(xy.shape[1:])
+    for _ in range(6):
+        scale = 1.0 + lens.k1 * np.sum(place**2, axis=-1) / (focal * scale) ** 2
+    return np.moveaxis(place / scale[..., None] + centre, -1, 0)
+
+
+def _corner(rng: np.random.Generator, views: int) -> tuple[F64, F64, F64]:
+    """R (V, 3, 3), C and the directions ahead (V, 3) of a car that turns a corner."""
     corner = np.radians(rng.choice([-1, 1]) * rng.uniform(45.0, 100.0))
     share = np.clip((np.arange(views) - 0.2 * views) / (0.6 * views), 0.0, 1.0)
     heading = corner * share**2 * (3.0 - 2.0 * share)
@@ -43,12 +91,7 @@ def drive(seed: int, lens: Lens, views: int = 17) -> Moving:
     C = np.cumsum(rng.uniform(0.6, 1.1) * ahead, axis=0)
     C[:, 2] = 1.65 + rng.normal(0.0, 0.01, views)
     pitch_roll = Rotation.from_euler("zx", np.radians(rng.normal(0.0, 0.3, (views, 2)))).as_matrix()
-    R = pitch_roll @ np.array([_level(z) for z in ahead])
-    X = np.concatenate([_street(C[0], ahead[0], -5.0, rng), _street(C[-1], ahead[-1], -20.0, rng)])
-    near = np.linalg.norm(X[:, None, :2] - C[None, :, :2], axis=2).min(axis=1)
-    X = X[(near > 4.0) | (X[:, 2] == 0.0)]
-    xy = _tracked(_project(X, R, C, focal, CAR, lens), rng, 350, 0.8)
-    return Moving(xy + rng.normal(0.0, 0.3, xy.shape), CAR, focal)
+    return pitch_roll @ np.array([_level(z) for z in ahead]), C, ahead
 
 
 def hand_held(seed: int, lens: Lens, views: int = 20, path: float = 0.4) -> Moving:
