@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
-from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres import CeresOptions, bundle_adjuster, colmap_model

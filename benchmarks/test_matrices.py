@@ -17,13 +17,13 @@ from benchmarks.references import (
     opencv_undistortion,
     poselib_three_points,
 )
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.geometry._homography import homography_linear
 from thesisrecon.geometry.camera_matrix import distort, project_camera, undistort
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.geometry.similarity import estimate_similarity
-from thesisrecon.geometry.triangulation import triangulate
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
 from validation.references.triangulation import colmap_points
 from validation.scenes.triangulation import beside, cameras_of

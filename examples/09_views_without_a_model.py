@@ -15,8 +15,7 @@ import numpy as np
 from PIL import Image
 
 import thesisrecon
-from thesisrecon.view_interpolation import prepare_pair
-from thesisrecon.view_synthesis import match_images, prepare_trilinear_views
+from thesisrecon.api.views import match_images, prepare_pair, prepare_trilinear_views
 from thesisrecon.views.trilinear import VirtualCamera
 
 folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"

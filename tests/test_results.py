@@ -8,8 +8,8 @@ import pytest
 import thesisrecon
 from tests.conftest import same_pairs
 from tests.pipeline.given_scene import SIZE, given_scene
+from thesisrecon.api.models import read_cameras
 from thesisrecon.errors import UsageError
-from thesisrecon.io._models import read_cameras
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_pairs_that_were_given_the_other_way_round_are_read_back(run, tmp_path):
 
 def test_a_loaded_result_is_saved_as_the_run_wrote_it(run, tmp_path):
     result = run[1]
-    thesisrecon.load(result.out).save(tmp_path / "copy")
+    thesisrecon.save(thesisrecon.load(result.out), tmp_path / "copy")
     for name in ("cameras.json", "points.ply", "summary.json", "sparse/0/images.bin"):
         assert (tmp_path / "copy" / name).read_bytes() == (result.out / name).read_bytes()
 
@@ -87,7 +87,7 @@ def test_a_result_without_a_folder_is_saved(run, tmp_path):
     scene, kept = run
     result = thesisrecon.reconstruct_from_matches(scene.keypoints, scene.matches, scene.sizes)
     assert result.out is None
-    result.save(str(tmp_path / "saved"))
+    thesisrecon.save(result, str(tmp_path / "saved"))
     saved = read_cameras(tmp_path / "saved" / "cameras.json")
     assert np.allclose(saved["image-2"].K, kept.cameras[2].K)
     assert (tmp_path / "saved" / "points.ply").read_bytes() == (kept.out / "points.ply").read_bytes()
@@ -106,7 +106,7 @@ def test_results_of_one_folder_stay_apart_and_outlive_it(run, tmp_path):
     for _ in ("replaced", "removed"):
         assert thesisrecon.compare_models(first, second).summary["focal_error_rel"]["max"] > 1e-6
         assert thesisrecon.compare_models(first, kept).summary["focal_error_rel"]["max"] == 0.0
-        first.save(tmp_path / "copy")
+        thesisrecon.save(first, tmp_path / "copy")
         for name in ("cameras.json", "points.ply", "sparse/0/images.bin", "sparse/0/points3D.bin"):
             assert (tmp_path / "copy" / name).read_bytes() == (kept.out / name).read_bytes()
         shutil.rmtree(out, ignore_errors=True)

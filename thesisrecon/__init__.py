@@ -1,70 +1,31 @@
-"""Metric 3D reconstruction from uncalibrated images by the classical algorithms of multiple-view geometry."""
+"""Metric 3D reconstruction from uncalibrated images by the classical algorithms of multiple-view geometry.
+
+The stub ``__init__.pyi`` is the one list of public names and of the modules that define them. A module is
+imported when one of its names is first used, so that ``import thesisrecon`` takes no time.
+"""
 
 from __future__ import annotations
 
-# Not from typing, whose import takes longer than that of this package.
-TYPE_CHECKING = False
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from thesisrecon.api import *  # noqa: F403
+import re
+from importlib import import_module
+from pathlib import Path
 
 __version__ = "0.1.0"
 
-__all__ = [  # noqa: F405
-    "BundleAdjustment", "Camera", "DepthMap", "DisparityMap", "FundamentalEstimate", "FundamentalFit",
-    "Image", "ModelComparison", "PipelineConfig", "Reconstruction", "RunResult", "SelfCalibration",
-    "StageFailure", "TexturedMesh", "Tracks", "TwoView", "UsageError", "__version__", "absolute_dual_quadric",
-    "align_to_positions", "bundle_adjust", "cheirality", "compare_models", "depth_maps",
-    "draw_epipolar_lines", "epipolar_lines", "estimate_fundamental", "estimate_homography",
-    "estimate_trifocal", "export", "fuse_depth_maps", "interpolate_view", "kruppa", "load", "match_pair",
-    "match_rectified", "plane_at_infinity", "read_cameras", "reconstruct", "reconstruct_from_colmap",
-    "reconstruct_from_matches", "reconstruct_from_tracks", "rectify", "render", "resect", "scaled",
-    "self_calibrate", "synthesize_view", "texture", "triangulate", "upgrade_affine", "write_mesh",
-]  # fmt: skip
-
-_HOMES = {
-    "BundleAdjustment": "bundle_adjustment",
-    "Camera": "camera",
-    "DepthMap": "records",
-    "FundamentalEstimate": "epipolar.estimation",
-    "ModelComparison": "comparison",
-    "Reconstruction": "records",
-    "RunResult": "results",
-    "StageFailure": "errors",
-    "Tracks": "records",
-    "UsageError": "errors",
-    "align_to_positions": "alignment",
-    "bundle_adjust": "bundle_adjustment",
-    "cheirality": "geometry.camera_matrix",
-    "compare_models": "comparison",
-    "depth_maps": "dense_model",
-    "epipolar_lines": "geometry.two_view",
-    "estimate_fundamental": "epipolar.estimation",
-    "estimate_homography": "epipolar.homography",
-    "estimate_trifocal": "epipolar.trifocal_estimation",
-    "export": "model_export",
-    "fuse_depth_maps": "dense_model",
-    "kruppa": "selfcalibration.kruppa",
-    "read_cameras": "io._models",
-    "resect": "geometry.robust_resection",
-    "scaled": "alignment",
-    "texture": "dense_model",
-    "triangulate": "geometry.triangulation",
-    "write_mesh": "io._meshes",
+_MODULES = {
+    name: module
+    for module, name in re.findall(
+        r"^from (\S+) import (\w+) as", Path(__file__).with_suffix(".pyi").read_text("utf-8"), re.MULTILINE
+    )
 }
-"""Modules of the names that do not import the configuration, which takes long; the others are in `api`."""
+__all__ = sorted([*_MODULES, "__version__"])
 
 
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
         raise AttributeError(f"module 'thesisrecon' has no attribute {name!r}")
-    # Imported on first use, so that `import thesisrecon` takes no time.
-    from importlib import import_module
-
-    return getattr(import_module(f"thesisrecon.{_HOMES.get(name, 'api')}"), name)
+    return getattr(import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

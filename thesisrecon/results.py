@@ -11,7 +11,6 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.camera import Camera
-from thesisrecon.io._files import as_read, read_json
 from thesisrecon.records import (
     DepthMap,
     Features,
@@ -77,22 +76,6 @@ def pose_deviations(metric: MetricResult, i: int) -> dict[str, float]:
         return {}
     values = np.concatenate([np.degrees(metric.pose_std[i, :3]), metric.pose_std[i, 3:]])
     return dict(zip(POSE_NAMES, values.tolist(), strict=True))
-
-
-def folder_with(result: RunResult) -> Path | None:
-    """Return the output folder of a result if the folder still contains this result.
-
-    Parameters
-    ----------
-    result : RunResult
-        Compared by its summary, which contains times and so differs from that of every other run.
-
-    Returns
-    -------
-    Path or None
-    """
-    out = result.out
-    return out if out is not None and read_json(out / SUMMARY) == as_read(result.summary) else None
 
 
 def _number_of(image: str | int, images: tuple[Image, ...]) -> int:
@@ -265,23 +248,3 @@ class RunResult:
         row = np.cumsum(r.valid) - 1
         xy = (r.tracks.xy[seen] + 0.5) / self.images[i].scale - 0.5
         return SeenPoints(xy, row[r.tracks.point_index[seen]])
-
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
-        """Write ``cameras.json``, ``points.ply``, ``sparse/0``, ``model.glb`` and ``summary.json``.
-
-        Parameters
-        ----------
-        folder : path
-            Created if missing.
-        overwrite : bool
-            Replace files of these names that thesisrecon did not write, or that were changed since.
-
-        Raises
-        ------
-        UsageError, OutputError
-            If a file would be replaced; if a file cannot be written.
-        """
-        # Imported on use, because the writers import this module.
-        from thesisrecon.pipeline._outputs import save_result
-
-        save_result(self, Path(folder), overwrite=overwrite)

@@ -15,6 +15,12 @@ from _ext.examples import RETURNED_BY
 
 LEFT_OUT = ("cli", "report", "runtime")
 """Folders without functions for callers."""
+PUBLIC = """# Public functions and records
+
+Each name is `thesisrecon.NAME` and has a page with its parameters, shapes, units and an example that runs.
+[Plain arrays](../recipes/plain-arrays.md) shows them side by side; the [modules](modules/index) behind them
+hold the algorithms of each chapter.
+"""
 
 
 def public_modules() -> list[Path]:
@@ -22,7 +28,7 @@ def public_modules() -> list[Path]:
     found = []
     for path in sorted(PACKAGE.rglob("*.py"), key=lambda p: (len(p.relative_to(PACKAGE).parts), p)):
         parts = path.relative_to(PACKAGE).parts
-        if not path.name.startswith("_") and parts[0] not in LEFT_OUT and path.name != "api.py":
+        if not path.name.startswith("_") and parts[0] not in LEFT_OUT:
             found.append(path)
     return found
 
@@ -49,6 +55,17 @@ def write_pages(folder: Path) -> None:
         about = summary(PACKAGE / group / "__init__.py") if group else ""
         lines += [f"## {title}", "", about, "", "```{toctree}", ":maxdepth: 1", "", *names, "```", ""]
     write(folder / "index.md", "\n".join(lines))
+
+
+def write_public_names(path: Path) -> None:
+    """Write the page of the public names, in the groups and the order of ``thesisrecon/__init__.pyi``."""
+    lines = [PUBLIC]
+    for group in (PACKAGE / "__init__.pyi").read_text(encoding="utf-8").split("\n# ")[1:]:
+        title, names = group.partition("\n")[0], re.findall(r" as (\w+)$", group, re.MULTILINE)
+        lines += [f"## {title}", "", "```{eval-rst}", ".. currentmodule:: thesisrecon", ".. autosummary::"]
+        lines += ["   :toctree: generated", "   :nosignatures:", "", *(f"   {name}" for name in names)]
+        lines += ["```", ""]
+    write(path, "\n".join(lines))
 
 
 def skip_aliases(app, what, name, obj, skip, options):
@@ -102,6 +119,7 @@ def resolve(app, env, node, contnode):
 def setup(app):
     """Write the pages before the sources are read, and connect what reads docstrings."""
     app.connect("builder-inited", lambda app: write_pages(Path(app.srcdir) / "reference" / "modules"))
+    app.connect("builder-inited", lambda app: write_public_names(Path(app.srcdir) / "reference" / "api.md"))
     app.connect("autodoc-skip-member", skip_aliases)
     app.connect("autodoc-process-docstring", add_example, priority=300)
     app.connect("autodoc-process-docstring", escape_bars, priority=400)

@@ -38,18 +38,7 @@ _EQUATIONS = {"3": 42, "4": 1, "5": 6}
 
 
 # Folders and files that hold no theory, in the package and in the tests.
-_OTHER = (
-    "cli",
-    "bad_input",
-    "config",
-    "config.py",
-    "io",
-    "pipeline",
-    "project",
-    "report",
-    "runtime",
-    "validation",
-)
+_OTHER = ("cli", "config.py", "hostile", "io", "pipeline", "report", "runtime", "validation")
 
 
 @dataclass(frozen=True)
@@ -123,14 +112,9 @@ def _tree(path: Path) -> ast.Module:
 @cache
 def exported() -> dict[str, str]:
     """Exported name -> the module that it comes from, without the package."""
-    homes: dict[str, str] = {}
-    for node in ast.walk(_tree(ROOT / "thesisrecon" / "api.py")):
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("thesisrecon"):
-            homes |= {name.name: str(node.module).partition(".")[2] for name in node.names}
-    own = [
-        node.name for node in _tree(ROOT / "thesisrecon" / "api.py").body if isinstance(node, ast.FunctionDef)
-    ]
-    return homes | dict.fromkeys(own, "api")
+    stub = (ROOT / "thesisrecon" / "__init__.pyi").read_text(encoding="utf-8")
+    listed = re.findall(r"^from thesisrecon\.(\S+) import (\w+) as", stub, re.MULTILINE)
+    return {name: module for module, name in listed}
 
 
 def _full(dotted: str) -> str:

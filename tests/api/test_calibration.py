@@ -10,7 +10,7 @@ import thesisrecon
 from tests.conftest import refuses
 from tests.synthetic import make_scene
 from thesisrecon import Reconstruction
-from thesisrecon.calibration import METHODS
+from thesisrecon.api.calibrate import METHODS
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.two_view import fundamental_from_cameras

@@ -12,8 +12,9 @@ import PIL.Image
 import pytest
 from scipy.spatial.transform import Rotation
 
+import thesisrecon.api.export as export_module
 from tests.pipeline import fake_stages as fakes
-from thesisrecon import Camera, UsageError, export, model_export, reconstruct
+from thesisrecon import Camera, UsageError, export, reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._images import read_image
@@ -507,9 +508,9 @@ def test_images_are_undistorted_within_the_memory_budget(tmp_path, images, monke
         write_image(*arguments)
         working.pop()
 
-    monkeypatch.setattr(model_export, "_budget", MemoryBudget(int(total)))
-    monkeypatch.setattr(model_export, "read_image", read)
-    monkeypatch.setattr(model_export, "write_image", write)
+    monkeypatch.setattr(export_module, "_budget", MemoryBudget(int(total)))
+    monkeypatch.setattr(export_module, "read_image", read)
+    monkeypatch.setattr(export_module, "write_image", write)
     export(make_model(BARREL, PINCUSHION), tmp_path / "out", to="nerfstudio", images=images, threads=4)
     assert len(most) == 4
     assert max(most) == together

@@ -13,7 +13,7 @@ import pytest
 import thesisrecon
 from tests.conftest import refuses
 from tests.synthetic import texture
-from thesisrecon import view_interpolation as between
+from thesisrecon.api import views as between
 from thesisrecon.cli import view_files as sequences
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import interpolate_images

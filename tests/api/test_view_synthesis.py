@@ -9,11 +9,11 @@ import pytest
 
 import thesisrecon
 from tests.conftest import refuses
+from thesisrecon.api.views import match_images, prepare_trilinear_views
 from thesisrecon.cli.view_files import interpolate_images, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
-from thesisrecon.view_synthesis import match_images, prepare_trilinear_views
 from thesisrecon.views.trilinear import VirtualCamera, camera_at
 from validation.scenes.real import load_fixture_scene
 

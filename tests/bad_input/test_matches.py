@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
+from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.epipolar.configuration import classify_configuration
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
 from thesisrecon.epipolar.refinement import refine_fundamental

@@ -12,6 +12,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
+import thesisrecon
 from tests.bad_input import files
 from tests.pipeline.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import load, reconstruct
@@ -69,7 +70,7 @@ def cli(*arguments):
 
 
 def save(place, out, *more):
-    load(place / "same").save(out, overwrite=bool(more))
+    thesisrecon.save(load(place / "same"), out, overwrite=bool(more))
 
 
 def python(function):

@@ -13,8 +13,8 @@ from thesisrecon.cli.main import app
 PACKAGE = Path(thesisrecon.__file__).parent
 WRITERS = ("reconstruct", "demo", "compare", "render", "interpolate", "export")
 COMMANDS = {
-    "alignment.py": ("export",),
-    "model_export.py": ("export",),
+    "api/models.py": ("export",),
+    "api/export.py": ("export",),
     "io/_images.py": ("export",),
     "cli/compare.py": ("compare",),
     "cli/export.py": ("export",),
@@ -22,7 +22,7 @@ COMMANDS = {
     "cli/views.py _size": ("render",),
     "cli/views.py _color": ("render",),
     "cli/views.py interpolate": ("interpolate",),
-    "pipeline/reconstruction.py": ("reconstruct",),
+    "api/reconstruct.py": ("reconstruct",),
     "io/_outputs.py": WRITERS,
     "runtime/_run_folder.py": WRITERS,
     "runtime/_executors.py": ("reconstruct",),

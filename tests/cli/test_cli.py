@@ -192,7 +192,7 @@ def test_the_focal_length_is_given_as_in_the_readme(photographs, tmp_path, monke
         asked.append(build_config(settings=set).intrinsics)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", listen)
+    monkeypatch.setattr("thesisrecon.api.reconstruct.reconstruct", listen)
     arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out"), *words.split()]
     assert run_command(arguments) == 130
     assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
@@ -225,7 +225,7 @@ def test_ctrl_c_states_how_to_resume(photographs, tmp_path, monkeypatch, refused
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", interrupt)
+    monkeypatch.setattr("thesisrecon.api.reconstruct.reconstruct", interrupt)
     said = refused(["reconstruct", photographs, "-o", tmp_path / "out"], 130)
     assert "repeat the command to resume" in said
 
@@ -235,7 +235,7 @@ def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkey
         raise IndexError("index 3 is out of bounds")
 
     monkeypatch.delenv(common.DEBUG_VARIABLE, raising=False)
-    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", fail)
+    monkeypatch.setattr("thesisrecon.api.reconstruct.reconstruct", fail)
     arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out")]
     assert re.search(r"IndexError in test_cli\.py line \d+: index 3 is out", refused(arguments, 1))
     monkeypatch.setenv(common.DEBUG_VARIABLE, "1")

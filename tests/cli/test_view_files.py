@@ -10,12 +10,12 @@ import PIL.Image
 import pytest
 
 from tests.surface.sphere import SHAPE, photograph, ring_of
+from thesisrecon.api.export import write_mesh
 from thesisrecon.camera import Camera
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import render_run
 from thesisrecon.io._exports import cameras_table
 from thesisrecon.io._files import write_json
-from thesisrecon.io._meshes import write_mesh
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.texture_atlas import TextureAtlas

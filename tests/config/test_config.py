@@ -19,11 +19,11 @@ from thesisrecon._settings import (
     tables_from_settings,
     toml_from_config,
 )
+from thesisrecon.api.reconstruct import _exif_warnings
 from thesisrecon.config import KINDS, PRESETS, PipelineConfig, preset
 from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import INTRINSICS, IntrinsicsOptions, camera_numbers, prior_from_options
 from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
-from thesisrecon.pipeline.reconstruction import _exif_warnings
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.stratified import Stratified

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from tests.epipolar.pairs import make_pair, spoil
+from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.epipolar.configuration import (
     Configuration,
     _eigenvalue_errors,
@@ -13,7 +14,6 @@ from thesisrecon.epipolar.configuration import (
     _rotation_test,
     classify_configuration,
 )
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._homography import homography_residuals, homography_sampson_residuals

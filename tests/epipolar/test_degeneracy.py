@@ -9,12 +9,12 @@ import scipy
 from tests.conftest import refuses
 from tests.epipolar.facade import FacadeMaker
 from tests.epipolar.pairs import make_pair, spoil
+from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.epipolar import _degeneracy as assessment
 from thesisrecon.epipolar import _planes
 from thesisrecon.epipolar._degeneracy import NEIGHBOURS, _contradicted_ratios, assess_degeneracy
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import log10_false_alarms, multiplicity_weights
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._conditioning import unit_norm
 from thesisrecon.geometry._homography import (

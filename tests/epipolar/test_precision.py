@@ -5,14 +5,10 @@ import pytest
 from scipy import stats
 
 from tests.epipolar.pairs import make_pair
+from thesisrecon.api.pairs import epipolar_lines
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.two_view import (
-    enforce_rank_two,
-    epipolar_distance_std,
-    epipolar_lines,
-    epipoles,
-)
+from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_distance_std, epipoles
 from thesisrecon.records import FundamentalFit
 from validation.metrics.fundamental_precision import (
     _degrees_of_freedom,

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
+from thesisrecon.api.pairs import estimate_trifocal
 from thesisrecon.epipolar.trifocal_estimation import (
     NO_SEGMENTS,
     _line_moves,
@@ -17,7 +18,6 @@ from thesisrecon.epipolar.trifocal_estimation import (
     _ReprojectionProblem,
     _tensor_equations,
     _TensorEquations,
-    estimate_trifocal,
 )
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import (

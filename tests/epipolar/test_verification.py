@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import refuses
 from tests.epipolar.pairs import SIZE, Pair, make_pair, spoil
-from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.verification import (

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import thesisrecon
 from tests.geometry.properties import holds_for_every, incidence_sine, random_camera, random_points
 from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -111,13 +112,13 @@ def test_3_27_cheirality_is_a_sign_of_depth_that_no_scale_changes(rng):
     P, _, R, centre = random_camera(rng)
     X = random_points(rng, 20)
     true_depth = (dehomogenize(X) - centre) @ R[2]
-    chi = matrix.cheirality(P, X)
+    chi = thesisrecon.cheirality(P, X)
     np.testing.assert_array_equal(chi > 0.0, true_depth > 0.0)
-    np.testing.assert_allclose(matrix.cheirality(-0.5 * P, -2.0 * X), chi, rtol=1e-9)
+    np.testing.assert_allclose(thesisrecon.cheirality(-0.5 * P, -2.0 * X), chi, rtol=1e-9)
     np.testing.assert_allclose(matrix.depth(P, X), true_depth, rtol=1e-8, atol=1e-9)
     # The magnitude is an inverse depth: t = 1/chi for a normalised camera and point.
     unit, normal = X / X[:, 3:], matrix.normalize_camera(P)
-    np.testing.assert_allclose(1.0 / matrix.cheirality(normal, unit), unit @ normal[2], rtol=1e-8)
+    np.testing.assert_allclose(1.0 / thesisrecon.cheirality(normal, unit), unit @ normal[2], rtol=1e-8)
     at_infinity = np.append(rng.normal(size=3), 0.0)[None]
-    assert matrix.cheirality(P, at_infinity)[0] == 0.0
-    np.testing.assert_array_equal(matrix.cheirality(P.tolist(), X.tolist()), chi)
+    assert thesisrecon.cheirality(P, at_infinity)[0] == 0.0
+    np.testing.assert_array_equal(thesisrecon.cheirality(P.tolist(), X.tolist()), chi)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import thesisrecon
 from tests.geometry.properties import gap, holds_for_every, incidence_sine, random_camera, random_points
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry._homography import homography_residuals
@@ -95,12 +96,12 @@ def test_3_33_to_3_35_epipoles_lines_and_rank(rng):
     e1, e2 = two_view.epipoles(F)
     assert gap(e2, P2 @ camera_centre(P1)) < 1e-7
     assert gap(e1, P1 @ camera_centre(P2)) < 1e-7
-    assert np.abs(np.sum(two_view.epipolar_lines(F, xy1) * homogenize(xy2), axis=1)).max() < 1e-5
-    assert incidence_sine(two_view.epipolar_lines(F, xy1), e2).max() < 1e-7
-    lines = two_view.epipolar_lines(F.tolist(), xy1.tolist())
-    np.testing.assert_array_equal(lines, two_view.epipolar_lines(F, xy1))
+    assert np.abs(np.sum(thesisrecon.epipolar_lines(F, xy1) * homogenize(xy2), axis=1)).max() < 1e-5
+    assert incidence_sine(thesisrecon.epipolar_lines(F, xy1), e2).max() < 1e-7
+    lines = thesisrecon.epipolar_lines(F.tolist(), xy1.tolist())
+    np.testing.assert_array_equal(lines, thesisrecon.epipolar_lines(F, xy1))
     np.testing.assert_allclose(np.linalg.norm(lines[:, :2], axis=1), 1.0)
-    assert not two_view.epipolar_lines(F, dehomogenize(e1)[None]).any()
+    assert not thesisrecon.epipolar_lines(F, dehomogenize(e1)[None]).any()
     assert np.abs(F.T @ e2).max() < 1e-12
     assert abs(np.linalg.det(F)) < 1e-15
     # The pair in the other order has the transposed matrix.

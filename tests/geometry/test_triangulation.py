@@ -10,6 +10,7 @@ from tests.conftest import refuses
 from tests.geometry import properties as twins
 from tests.geometry.properties import holds_for_every, random_camera
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.geometry._conditioning import pixel_conditioning
 from thesisrecon.geometry.camera_matrix import (
     camera_centre,
@@ -28,7 +29,7 @@ from thesisrecon.geometry.polynomial_triangulation import (
     triangulate_polynomial,
 )
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
-from thesisrecon.geometry.triangulation import _jacobi_least, triangulate, triangulate_observations
+from thesisrecon.geometry.triangulation import _jacobi_least, triangulate_observations
 from thesisrecon.geometry.two_view import epipolar_distances, fundamental_from_cameras
 from thesisrecon.numerics._partial_bundle import minimize_reprojection
 

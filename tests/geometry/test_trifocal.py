@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from tests.conftest import refuses
 from tests.geometry.properties import gap, holds_for_every, random_camera
-from thesisrecon.epipolar.trifocal_estimation import _check_triplets, _tensor_equations
+from thesisrecon.api.pairs import _check_triplets
+from thesisrecon.epipolar.trifocal_estimation import _tensor_equations
 from thesisrecon.geometry import three_view
 from thesisrecon.geometry._conditioning import unit_tensor
 from thesisrecon.geometry.camera_matrix import camera_centre, project

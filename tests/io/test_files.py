@@ -11,9 +11,9 @@ import pytest
 
 from tests.conftest import refuses
 from tests.io.test_colmap import export, scene
+from thesisrecon.api.models import read_cameras
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
 from thesisrecon.io import _files as files
-from thesisrecon.io._models import read_cameras
 from validation.studies.robustness import disk_ends
 
 

@@ -6,9 +6,10 @@ import numpy as np
 import trimesh
 
 from tests.conftest import refuses
+from thesisrecon.api.export import write_mesh
 from thesisrecon.errors import UsageError
 from thesisrecon.io._exports import write_point_cloud
-from thesisrecon.io._meshes import _split_seams, read_mesh, write_mesh
+from thesisrecon.io._meshes import _split_seams, read_mesh
 from thesisrecon.records import TexturedMesh
 
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.numerics.bundle_scenes import make_block
 from thesisrecon import resect
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.geometry._conditioning import centred_frame, whitening_transform
 from thesisrecon.geometry.camera_matrix import decompose_camera
-from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._partial_bundle import minimize_reprojection, refine_camera, refine_points
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle

@@ -110,7 +110,7 @@ def test_a_run_in_a_folder_is_resumed_and_other_matches_are_another_run(tmp_path
 
 
 def test_a_source_that_was_moved_is_the_same_run(tmp_path, from_rows):
-    from_rows.save(tmp_path / "first")
+    thesisrecon.save(from_rows, tmp_path / "first")
     reconstruct_from_colmap(tmp_path / "first" / "sparse" / "0", tmp_path / "out")
     shutil.move(tmp_path / "first", tmp_path / "second")
     again = reconstruct_from_colmap(tmp_path / "second" / "sparse" / "0", tmp_path / "out")
@@ -247,7 +247,7 @@ def test_images_of_colmap_are_used_as_stored(tmp_path, from_rows, orientation):
     for i in range(5, 10):
         pixels[:8] = i
         PIL.Image.fromarray(pixels).save(tmp_path / "images" / f"{i}.jpg", exif=exif, quality=95)
-    from_rows.save(tmp_path / "own")
+    thesisrecon.save(from_rows, tmp_path / "own")
     result = reconstruct_from_colmap(database, tmp_path / "out", images=tmp_path / "images", until="metric")
     assert (result.images[0].rgb[100].argmax(axis=1) == 0).all()
     reports = {

@@ -8,10 +8,11 @@ from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon import load
+from thesisrecon.api import reconstruct
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import _matching_stages, reconstruction
+from thesisrecon.pipeline import _matching_stages
 
 GROUPS = [range(3), range(3, 7), range(7, 9)]
 
@@ -48,7 +49,7 @@ def _forget_calls():
 def run(out, impossible=0, **given):
     config = fake_config(verification=GroupVerifier(), projective=ProjectiveOfSize(impossible=impossible))
     config = replace(config, images=ImageOptions(groups=given.pop("groups", True)))
-    return reconstruction.reconstruct(photographs(9), out, config=config, until="metric", **given)
+    return reconstruct.reconstruct(photographs(9), out, config=config, until="metric", **given)
 
 
 def files_of(out):
@@ -151,14 +152,14 @@ class ProjectiveOfAFew(ProjectiveOfSize):
 
 def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
     config = fake_config(projective=ProjectiveOfAFew())
-    result = reconstruction.reconstruct(photographs(8), tmp_path, config=config, until="metric")
+    result = reconstruct.reconstruct(photographs(8), tmp_path, config=config, until="metric")
     assert [group["registered"] for group in result.summary["groups"]] == [3]
     sentence = "The images form 2 models without a common scale: 3 images in this model, 3 in group-2"
     assert sentence in result.summary["warnings"]
     assert "is reconstructed in group-2" in result.refused["03.png"]
     assert result.refused["07.png"] == "sees 5 points"
     off = replace(config, images=ImageOptions(groups=False))
-    result = reconstruction.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
+    result = reconstruct.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
     assert "groups" not in result.summary
     assert not (tmp_path / "off" / "group-2").exists()
 
@@ -166,6 +167,6 @@ def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
 def test_a_projective_run_leaves_no_images_over(tmp_path):
     """It may end at the core of a large set, whose other images the metric stage registers."""
     config = fake_config(projective=ProjectiveOfAFew())
-    result = reconstruction.reconstruct(photographs(8), tmp_path, config=config, until="projective")
+    result = reconstruct.reconstruct(photographs(8), tmp_path, config=config, until="projective")
     assert "groups" not in result.summary
     assert not list(tmp_path.glob("group-*"))

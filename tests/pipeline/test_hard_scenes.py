@@ -18,10 +18,10 @@ from tests.pipeline.fake_stages import FakeMetric, fake_config
 from tests.stereo import hard_scenes as scenes
 from tests.stereo.depth_scenes import photograph_scene
 from tests.synthetic import texture
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import preset
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline.reconstruction import reconstruct
 
 # The depth maps of more of them are tested with stereo; here they are empty, or there is no pair to match.
 HOPELESS = {

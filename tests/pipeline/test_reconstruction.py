@@ -9,10 +9,13 @@ import PIL.Image
 import pytest
 import trimesh
 
+import thesisrecon
 from tests.conftest import refuses, same_pairs
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon import load
+from thesisrecon.api.reconstruct import _exif_warnings, reconstruct
+from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
@@ -22,7 +25,6 @@ from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline import _matching_stages, _outputs, _stages, _tiles
 from thesisrecon.pipeline._state import PreparedViews, name_images
-from thesisrecon.pipeline.reconstruction import _exif_warnings, reconstruct
 from thesisrecon.records import Image
 from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import stream
@@ -30,7 +32,6 @@ from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.surface import fusion
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.views.render import render
 
 
 @pytest.fixture(autouse=True)
@@ -217,7 +218,7 @@ def test_a_run_with_fewer_images_in_the_same_folder_leaves_no_old_tiles(tmp_path
     tiles = {path.name for path in (out / "tiles").iterdir()}
     assert len(tiles) > 3
     assert (out / "model.glb").stat().st_size <= 30_000
-    result.save(tmp_path / "copy")
+    thesisrecon.save(result, tmp_path / "copy")
     assert {path.name for path in (tmp_path / "copy" / "tiles").iterdir()} == tiles
     assert "all triangles are in the tiles of" in summary_text(result.summary, out)
     object.__setattr__(config.model, "max_glb_mb", largest)

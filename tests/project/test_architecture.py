@@ -32,7 +32,7 @@ FOUNDATIONS = {
     "numerics",
 }
 COMPOSERS = {
-    "__init__", "config", "api", "dense_model", "pipeline", "view_interpolation", "view_synthesis",
+    "__init__", "config", "api", "pipeline",
 }  # fmt: skip
 """Only these may import several stages: they pass to a stage what it needs of another one."""
 CORE = {"numpy", "scipy", "numba", "PIL", "trimesh", "jinja2", "plotly", "rich", "typer"}

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import make_scene, true_pairs
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.geometry.camera_matrix import project, project_camera
 from thesisrecon.geometry.robust_resection import resect_projective
-from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.projective._model import ProjectiveModel, consistent_observations, retriangulate_points
 from thesisrecon.projective._track_selection import (
     initial_cameras,

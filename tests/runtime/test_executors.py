@@ -18,13 +18,13 @@ import pytest
 from tests.conftest import LOCAL, address
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import fake_config, photographs
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io._files import read_json
 from thesisrecon.pipeline import _matching_stages, _stages
 from thesisrecon.pipeline import _state as preparing
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime import _executors as workers
 from thesisrecon.runtime._executors import Workers
 

@@ -11,9 +11,9 @@ import pytest
 from tests.conftest import refuses
 from tests.pipeline.fake_stages import fake_config, photographs
 from thesisrecon import records
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import read_json, write_atomically
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime._run_folder import (
     ChangedRecord,
     RunDirectory,
@@ -353,7 +353,7 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, refused):
     def compile_kernels(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device", "kernels/index.nbi")
 
-    monkeypatch.setattr("thesisrecon.pipeline.reconstruction.reconstruct", compile_kernels)
+    monkeypatch.setattr("thesisrecon.api.reconstruct.reconstruct", compile_kernels)
     said = refused(["reconstruct", tmp_path / "images", "-o", tmp_path / "other"])
     sentence = "kernels/index.nbi cannot be written: No space left on device; free space there"
     assert said == f"thesisrecon: {sentence}\n"

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.pipeline.fake_stages import fake_config, photographs
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.cli.main import run_command
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime._executors import ProcessPool
 from thesisrecon.runtime._signals import CODES, with_resume_advice
 from validation.studies.robustness import Stop, different, outputs, stop_table, stopped

@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import refuses
 from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
-from thesisrecon.dense_model import confirmed_depth_maps
+from thesisrecon.api.surface import confirmed_depth_maps
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.records import Image

@@ -7,8 +7,8 @@ import pytest
 
 from tests.stereo import hard_scenes as scenes
 from tests.stereo.depth_scenes import photograph_scene
+from thesisrecon.api.surface import confirmed_depth_maps
 from thesisrecon.config import preset
-from thesisrecon.dense_model import confirmed_depth_maps
 
 DEFAULT, THESIS = (preset(name).dense for name in ("default", "thesis"))
 BOTH = pytest.mark.parametrize("stereo", [DEFAULT, THESIS], ids=["default", "thesis"])

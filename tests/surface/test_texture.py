@@ -8,10 +8,11 @@ import pytest
 
 from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, ring_of, sphere_map
+from thesisrecon.api.export import write_mesh
+from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._zbuffer import rasterize
-from thesisrecon.io._meshes import write_mesh
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import _texture_kernels as kernels
@@ -20,7 +21,6 @@ from thesisrecon.surface._mesh import face_neighbours, halve_surface, vertex_nor
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.surface.texture_atlas import TextureAtlas, _pack_rectangles, cut_tile
-from thesisrecon.views.render import render
 
 GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
 

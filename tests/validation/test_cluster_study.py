@@ -6,7 +6,7 @@ import pickle
 import pytest
 
 from tests.pipeline.fake_stages import fake_config, kept_bytes, photographs
-from thesisrecon.pipeline.reconstruction import reconstruct
+from thesisrecon.api.reconstruct import reconstruct
 from validation.studies.cluster import Task, TaskMeter, critical_path, efficiency_table
 
 

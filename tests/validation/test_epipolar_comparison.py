@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.epipolar.pairs import make_pair, spoil
-from thesisrecon.epipolar.estimation import estimate_fundamental
+from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
 from validation.references.fundamental import MINIMAL, SOLVERS, estimate_with

@@ -17,10 +17,10 @@ import pytest
 
 from tests.pipeline.fake_stages import CALLS, fake_config, photographs
 from tests.synthetic import make_scene, true_pairs
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry.two_view import sampson_residuals
-from thesisrecon.pipeline.reconstruction import reconstruct
 from validation import command
 from validation.ablation.command import STUDIES
 from validation.metrics.cameras import TrueCameras, measure_cameras

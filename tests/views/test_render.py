@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, paint, photograph, points_of, sphere_map
+from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import RenderedView, TexturedMesh
@@ -17,7 +18,7 @@ from thesisrecon.surface.linear import surface_from_depth
 from thesisrecon.surface.texture_atlas import TextureAtlas
 from thesisrecon.views import render as module
 from thesisrecon.views._image_similarity import GREY, _ssim_map, covered_pixels, match_exposure, psnr_db, ssim
-from thesisrecon.views.render import Light, Shading, render
+from thesisrecon.views.render import Light, Shading
 
 K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
 

@@ -26,7 +26,7 @@ def compare(
 ) -> None:
     """Compare two models of the same images after a similarity alignment."""
     cap_threads(0)
-    from thesisrecon.comparison import compare_models
+    from thesisrecon.api.compare import compare_models
     from thesisrecon.io._files import json_text, write_new
     from thesisrecon.report._comparison import (
         camera_table,

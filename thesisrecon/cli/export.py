@@ -62,10 +62,10 @@ def export(
     cap_threads(threads)
     if scale is not None and align is not None:
         raise UsageError("--scale and --align exclude each other; positions determine the scale")
-    from thesisrecon.alignment import align_to_positions, scaled
+    from thesisrecon.api.export import export as write_export
+    from thesisrecon.api.export import recorded_images, recorded_masks, require_separate
+    from thesisrecon.api.models import align_to_positions, scaled
     from thesisrecon.io._models import read_model
-    from thesisrecon.model_export import export as write_export
-    from thesisrecon.model_export import recorded_images, recorded_masks, require_separate
 
     if folder.resolve() == model.resolve():
         raise UsageError(f"the folder {folder} holds the model; export to another folder")

@@ -144,13 +144,13 @@ def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0, overwrite: 
 
 
 def _run(images: Path | list[Path], out: Path, seed: int, options: Mapping[str, Any]) -> None:
-    from thesisrecon.pipeline.reconstruction import reconstruct as run_pipeline
+    from thesisrecon.api.reconstruct import reconstruct as run_pipeline
 
     _reported(run_pipeline, images, out, seed, options)
 
 
 def _run_from(source: Path, out: Path, seed: int, options: Mapping[str, Any]) -> None:
-    from thesisrecon.pipeline.from_matches import reconstruct_from_colmap
+    from thesisrecon.api.from_matches import reconstruct_from_colmap
 
     _reported(reconstruct_from_colmap, source, out, seed, options)
 

@@ -13,6 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.api.models import read_cameras
+from thesisrecon.api.views import (
+    match_images,
+    prepare_pair,
+    prepare_trilinear_views,
+    render,
+    require_comparable_images,
+)
 from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
@@ -21,17 +29,14 @@ from thesisrecon.io._exports import animation_suffix, frame_name, write_animatio
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io._images import read_image
 from thesisrecon.io._meshes import read_mesh
-from thesisrecon.io._models import read_cameras
 from thesisrecon.io._outputs import OutputFolder, claim_folder
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import Progress
-from thesisrecon.view_interpolation import prepare_pair, require_comparable_images
-from thesisrecon.view_synthesis import match_images, prepare_trilinear_views
 from thesisrecon.views.interpolation import InterpolatedPair, detect_monotonicity_violations
 from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
-from thesisrecon.views.render import Light, Shading, render
+from thesisrecon.views.render import Light, Shading
 from thesisrecon.views.trilinear import camera_at
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"

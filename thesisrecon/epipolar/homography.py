@@ -11,7 +11,7 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import noise_width
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry._conditioning import require_finite, require_shapes, unit_norm
+from thesisrecon.geometry._conditioning import unit_norm
 from thesisrecon.geometry._homography import (
     homography_linear,
     homography_residuals,
@@ -49,51 +49,8 @@ class HomographyFit:
     covariance: F64
 
 
-def estimate_homography(
-    xy1: F64, xy2: F64, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
-) -> HomographyFit:
-    """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4).
-
-    RANSAC over samples of four, then the least Sampson distance of the inliers, which is to first order the
-    maximum likelihood for Gaussian noise in both images.
-
-    Parameters
-    ----------
-    xy1, xy2 : array_like (N, 2)
-        Matched points, N >= 4, px.
-    threshold_px : float or None
-        Distance of an inlier during the search; None: all matches are inliers.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from.
-
-    Returns
-    -------
-    HomographyFit
-        H, inliers, noise and covariance.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ or coordinates are not finite.
-    StageFailure
-        If there are too few matches or inliers, or they do not determine H (collinear points, for example).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon import estimate_homography
-    >>> xy1 = np.random.default_rng(0).uniform(0, 500, (40, 2))
-    >>> xy2 = 2.0 * xy1 + [30.0, 10.0]
-    >>> xy2[:10] += [[70.0, -50.0]] * np.arange(1, 11)[:, None]
-    >>> fit = estimate_homography(xy1, xy2)
-    >>> int(fit.inliers.sum()), np.abs(fit.H / fit.H[2, 2]).round(6).tolist()
-    (30, [[2.0, 0.0, 30.0], [0.0, 2.0, 10.0], [0.0, 0.0, 1.0]])
-    """
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    require_finite("estimate_homography", xy1, xy2)
-    if threshold_px is not None and not threshold_px > 0.0:
-        raise ValueError(f"threshold_px must be positive, or None for no search; got {threshold_px}")
+def fit_homography(xy1: F64, xy2: F64, threshold_px: float | None, rng: Generator) -> HomographyFit:
+    """Fit a homography; arguments as for :func:`thesisrecon.estimate_homography`."""
     if len(xy1) < _SAMPLE or min(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()) == 0.0:
         raise _undetermined(f"{counted(len(xy1), 'match')}, at least 4 different ones are needed")
     frame = PairFrame.of(xy1, xy2)
@@ -102,7 +59,7 @@ def estimate_homography(
         H, inverse = _refine(homography_linear(points[:, :2], points[:, 2:]), points)
     else:
         gate = threshold_px * frame.scale
-        H = _search(points, gate, np.random.default_rng(seed))
+        H = _search(points, gate, rng)
         for k in range(_ROUNDS):
             before = inliers
             r = homography_sampson_residuals(H, points[:, :2], points[:, 2:])

@@ -12,13 +12,10 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.epipolar._frame import MAX_PX
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._conditioning import (
     normalizing_transform,
-    require_finite,
-    require_shapes,
     unit_tensor,
 )
 from thesisrecon.geometry.homogeneous import homogenize, unit_normals
@@ -79,66 +76,13 @@ class TrifocalFit:
     inliers: B8
 
 
-def estimate_trifocal(
-    xy1: F64 = NO_POINTS,
-    xy2: F64 = NO_POINTS,
-    xy3: F64 = NO_POINTS,
-    *,
-    segments: F64 = NO_SEGMENTS,
-    threshold_px: float | None = 1.0,
-    loss_px: float = 1.0,
-    seed: int | Generator = 0,
+def fit_trifocal(
+    every: F64, segments: F64, *, threshold_px: float | None, loss_px: float, rng: Generator
 ) -> TrifocalFit:
-    """Estimate the trifocal tensor from points and lines of three views.
-
-    Minimises Huber's loss of the distances of points to their reprojections and of segment endpoints to the
-    reprojected lines: the maximum likelihood for Gaussian noise, tolerant of a few wrong matches. Points that
-    contradict the epipolar geometry of a pair of views are left out first.
-
-    Parameters
-    ----------
-    xy1, xy2, xy3 : array_like (N, 2)
-        Matched points of the three views, px.
-    segments : ndarray (3, M, 2, 2), optional
-        Endpoints of matched line segments, px; the endpoints need not correspond. 4 N + 2 M >= 26.
-    threshold_px : float or None
-        Threshold of the fundamental matrices by which wrong points are found, from 12 points on; None: no
-        search.
-    loss_px : float
-        Residual at which Huber's loss becomes linear.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from.
-
-    Returns
-    -------
-    TrifocalFit
-        Tensor, residuals, inliers, noise and covariance.
-
-    Raises
-    ------
-    ValueError
-        If the shapes are wrong or values are not finite.
-    StageFailure
-        If there are too few matches, or they do not determine the tensor, exactly or within their noise:
-        points of one plane or line, pure rotation, random matches.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.geometry.camera_matrix import project
-    >>> X = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + [0, 0, 5]
-    >>> K, views = np.diag([800.0, 800.0, 1.0]), ([0, 0, 0], [-1, 0.2, 0], [0.3, -1, 0.4])
-    >>> points = np.stack([project(K @ np.c_[np.eye(3), t], X) for t in views])
-    >>> bool(estimate_trifocal(*points).point_residuals_px.max() < 1e-6)
-    True
-    """
-    if not loss_px > 0.0:
-        raise ValueError(f"loss_px must be positive; got {loss_px}")
-    require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
-    every, segments = _check_triplets(np.stack([xy1, xy2, xy3]), segments)
+    """Fit a trifocal tensor to points (3, N, 2) and segments; see :func:`thesisrecon.estimate_trifocal`."""
     inliers = np.ones(every.shape[1], dtype=bool)
     if threshold_px is not None and len(inliers) >= _SEARCHED:
-        inliers = _epipolar_inliers(every, threshold_px, np.random.default_rng(seed))
+        inliers = _epipolar_inliers(every, threshold_px, rng)
     points = every[:, inliers]
     n, m = points.shape[1], segments.shape[1]
     if 4 * n + 2 * m < NEEDED_EQUATIONS and n < len(inliers):
@@ -425,15 +369,3 @@ def _line_moves(ends: F64) -> F64:
     return np.stack([np.eye(3)[2] - share, share], axis=1)
 
 
-def _check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
-    """Check matches of three views and return them as float64 arrays."""
-    if np.iscomplexobj(points) or np.iscomplexobj(segments):
-        raise ValueError("points and segments must be real numbers; got complex ones")
-    points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
-    require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
-    require_finite("a trifocal tensor", points, segments)
-    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
-        raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
-    if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
-        raise ValueError("a segment needs two different ends; one has no length")
-    return points, segments

@@ -17,7 +17,7 @@ from thesisrecon.geometry._conditioning import (
 )
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.triangulation import triangulate
+from thesisrecon.geometry.triangulation import triangulate_points
 from thesisrecon.records import Reconstruction, TexturedMesh
 
 CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction
@@ -85,7 +85,9 @@ def checked_points(
     require_shapes(caller, P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
     point, views = np.nonzero(np.isfinite(xy).all(axis=2).T)
     require_inside(views, xy[views, point], sizes)
-    X = triangulate(P, xy) if X is None and xy.shape[1] else np.zeros((0, 4)) if X is None else np.asarray(X)
+    if X is None:
+        X = triangulate_points(P, xy) if xy.shape[1] else np.zeros((0, 4))
+    X = np.asarray(X)
     X = homogenize(X.astype(np.float64)) if X.ndim == 2 and X.shape[1] == 3 else X.astype(np.float64)
     require_shapes(caller, X=(X, ("N", 4)), xy=(xy[0], ("N", 2)))
     require_finite(caller, X)

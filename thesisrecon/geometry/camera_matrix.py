@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry._conditioning import require_shapes
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
 _CONVERGED = 1e-9
@@ -280,32 +279,6 @@ def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 
     """
     normalized = dehomogenize(X @ R.T + t)
     return distort(normalized, distortion) @ K[:2, :2].T + K[:2, 2]
-
-
-def cheirality(P: F64, X: F64) -> F64:
-    """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera, 0 at infinity.
-
-    The scales of X and P do not matter, negative ones included. The magnitude is an inverse depth (the thesis
-    takes it for a depth), without a unit if P is not normalised.
-
-    Parameters
-    ----------
-    P, X : array_like (3, 4) and (N, 4)
-        Camera and homogeneous points.
-
-    Returns
-    -------
-    ndarray (N,)
-
-    Examples
-    --------
-    >>> X = np.array([[0.0, 0.0, 2.0, 1.0], [0.0, 0.0, -2.0, 1.0]])
-    >>> cheirality(np.eye(3, 4), X).round(9).tolist()
-    [0.5, -0.5]
-    """
-    P, X = np.asarray(P, dtype=np.float64), np.asarray(X, dtype=np.float64)
-    require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
-    return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
 
 
 def depth(P: F64, X: F64) -> F64:

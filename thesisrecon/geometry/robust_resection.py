@@ -11,9 +11,6 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry._conditioning import (
     centred_frame,
-    require_calibration,
-    require_finite,
-    require_shapes,
     whitening_transform,
 )
 from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, depth, project
@@ -60,60 +57,10 @@ class Resection:
     covariance: F64
 
 
-def resect(
-    X: F64, xy: F64, K: F64 | None = None, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
+def resect_robust(
+    X: F64, xy: F64, K: F64 | None, threshold_px: float | None, rng: Generator
 ) -> Resection:
-    """Estimate a camera from space points and their pixels, some of them wrong (section 6.4).
-
-    RANSAC over samples of six points (DLT), or with K of three (P3P), then the least reprojection error of
-    the inliers.
-
-    Parameters
-    ----------
-    X, xy : array_like (N, 3) and (N, 2)
-        Points, N >= 6 (N >= 4 with K), and their pixels.
-    K : ndarray (3, 3), optional
-        Calibration matrix; None: estimated, which needs points off one plane.
-    threshold_px : float or None
-        Reprojection error of an inlier during the search; None: all points are inliers.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from.
-
-    Returns
-    -------
-    Resection
-        Camera, inliers, noise and covariance.
-
-    Raises
-    ------
-    ValueError
-        If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
-        lengths and K33 = 1.
-    StageFailure
-        If there are too few points or inliers, all points lie in one plane and K is not given, or points are
-        behind the camera that fits them, as in left-handed coordinates.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon import Camera, resect
-    >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-    >>> camera = Camera(K, np.eye(3), np.array([0.2, -0.1, 4.0]), (640, 480))
-    >>> X = np.random.default_rng(0).uniform(-1, 1, (30, 3))
-    >>> found = resect(X, camera.project(X))
-    >>> float(found.K[0, 0].round(6)), found.t.round(6).tolist()
-    (500.0, [0.2, -0.1, 4.0])
-    """
-    X, xy = np.asarray(X, dtype=np.float64), np.asarray(xy, dtype=np.float64)
-    require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
-    if K is not None:
-        K = np.asarray(K, dtype=np.float64)
-        require_calibration("resect", K)
-    require_finite("resect", X, xy)
-    if threshold_px is not None and not 0.0 < threshold_px < np.inf:
-        raise ValueError(
-            f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
-        )
+    """Resect a camera; arguments as for :func:`thesisrecon.resect`."""
     needed, unknown = (6, 11) if K is None else (4, 6)
     if len(X) < needed:
         raise StageFailure(Notice("few-resection-points"), f"{counted(len(X), 'point')}, {needed} are needed")
@@ -128,7 +75,7 @@ def resect(
     if not np.ptp(xy, axis=0).any():
         raise _no_camera(f"all {len(xy)} pixels are equal")
     limit = threshold_px or _ANY_PX
-    fit = _search(X, xy, K, limit, np.random.default_rng(seed))
+    fit = _search(X, xy, K, limit, rng)
     inliers = np.ones(len(X), dtype=bool) if fit.inliers.any() and threshold_px is None else fit.inliers
     for _ in range(_ROUNDS):
         if inliers.sum() < needed:

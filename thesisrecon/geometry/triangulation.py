@@ -10,12 +10,11 @@ References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry._conditioning import require_finite, require_shapes
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
@@ -189,39 +188,8 @@ _SortedPixels = tuple[I64, I64, F64]
 """Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
 
 
-def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
-    """Triangulate space points by one of the methods of section 6.3 (HZ 12).
-
-    Parameters
-    ----------
-    P, xy : ndarray (V, 3, 4) and (V, N, 2)
-        V >= 2 cameras of any scale, and pixels; NaN for not observed.
-    method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}, optional
-        "polynomial": optimal for exactly two views (6.3.3); "linear" and "iterated": algebraic (6.3.1);
-        "midpoint": metric frames only (6.3.2); "optimal": least reprojection error from any number of views.
-        None: "polynomial" for two views, else "optimal".
-
-    Returns
-    -------
-    ndarray (N, 4)
-        Homogeneous points; zeros if a point is observed in fewer than two views or from one centre only, and
-        of "midpoint" if its rays are parallel.
-
-    Raises
-    ------
-    ValueError
-        Unknown method, wrong shapes, infinite pixels, or unsuitable cameras.
-
-    Examples
-    --------
-    >>> P = np.stack([np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])])
-    >>> X = triangulate(P, np.array([[[0.0, 0.0]], [[-0.5, 0.0]]]))
-    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
-    True
-    """
-    if method is not None and method not in get_args(Method):
-        raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}")
-    P, xy = _checked(P, xy)
+def triangulate_points(P: F64, xy: F64, *, method: Method | None = None) -> F64:
+    """Triangulate points by a method of section 6.3; see :func:`thesisrecon.triangulate`."""
     method = method or ("polynomial" if len(P) == 2 else "optimal")
     if method == "polynomial":
         return triangulate_polynomial(P, xy)
@@ -275,22 +243,6 @@ def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: 
     angles = np.zeros(n_points)
     np.maximum.at(angles, point, np.arccos(cosine))
     return angles
-
-
-def _checked(P: F64, xy: F64) -> tuple[F64, F64]:
-    """Check cameras and pixels and return them as contiguous float64 arrays."""
-    if np.iscomplexobj(P) or np.iscomplexobj(xy):
-        raise ValueError("triangulate needs real numbers; got complex ones")
-    P, xy = np.ascontiguousarray(P, dtype=np.float64), np.ascontiguousarray(xy, dtype=np.float64)
-    require_shapes("triangulate", P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
-    if len(P) < 2:
-        raise ValueError(f"triangulate needs at least two cameras; got {len(P)}")
-    require_finite("triangulate, for its cameras,", P)
-    if not np.abs(P).max(axis=(1, 2)).all():
-        raise ValueError("triangulate needs cameras that are not all zero")
-    if np.isinf(xy).any():
-        raise ValueError("triangulate needs finite pixels, or NaN for not seen; some are infinite")
-    return P, xy
 
 
 def _listed(xy: F64) -> _SortedPixels:

@@ -91,27 +91,8 @@ def epipoles(F: F64) -> tuple[F64, F64]:
     return Vt[2], U[:, 2]
 
 
-def epipolar_lines(F: F64, xy1: F64) -> F64:
-    """Return the epipolar lines l = F x1 with unit normals: l' (x, y, 1) is a distance in px.
-
-    Parameters
-    ----------
-    F, xy1 : array_like (3, 3) and (N, 2)
-        Fundamental matrix, or F' for the lines in image 1, and pixels.
-
-    Returns
-    -------
-    ndarray (N, 3)
-        Zero for an epipole.
-
-    Examples
-    --------
-    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
-    [[0.0, 1.0, 30.0]]
-    """
-    F, xy1 = np.asarray(F, dtype=np.float64), np.asarray(xy1, dtype=np.float64)
-    require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
+def lines_of_points(F: F64, xy1: F64) -> F64:
+    """Return the epipolar lines F x1 (N, 3) with unit normals; see :func:`thesisrecon.epipolar_lines`."""
     x = homogenize(xy1)
     lines = x @ F.T
     # At an epipole only rounding errors are left.
@@ -132,8 +113,8 @@ def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
     ndarray (N, 2)
         In images 1 and 2, px.
     """
-    of_first = np.sum(homogenize(xy1) * epipolar_lines(F.T, xy2), axis=1)
-    of_second = np.sum(homogenize(xy2) * epipolar_lines(F, xy1), axis=1)
+    of_first = np.sum(homogenize(xy1) * lines_of_points(F.T, xy2), axis=1)
+    of_second = np.sum(homogenize(xy2) * lines_of_points(F, xy1), axis=1)
     return np.asarray(np.abs(np.column_stack([of_first, of_second])))
 
 

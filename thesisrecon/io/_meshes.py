@@ -18,7 +18,7 @@ import PIL.Image
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.geometry._from_arrays import require_mesh
-from thesisrecon.io._files import read_bytes, write_atomically
+from thesisrecon.io._files import read_bytes
 from thesisrecon.records import TexturedMesh
 
 _TEXTURE_FORMATS = ("JPEG", "PNG")
@@ -110,37 +110,6 @@ def _require_tree(nodes: list[dict[str, Any]]) -> None:
         held += children
     if len(set(held)) < len(held):
         raise ValueError("its nodes are not a tree")
-
-
-def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
-    """Write a mesh as GLB, with its texture, or its vertex colours if it has none, and float32 coordinates.
-
-    Parameters
-    ----------
-    path, mesh : str or Path, TexturedMesh
-        File, which is replaced, and mesh. It is rotated by 180 degrees about x, since the y axis of glTF
-        points up and that of cameras down.
-
-    Raises
-    ------
-    ValueError, UsageError, OutputError
-        If the mesh is invalid; the name does not end in .glb or ``mesh`` is not a TexturedMesh; the file
-        cannot be written.
-
-    Examples
-    --------
-    >>> import numpy as np, tempfile
-    >>> from thesisrecon import TexturedMesh, write_mesh
-    >>> mesh = TexturedMesh(np.array([[-1.0, -1, 2], [1, -1, 2], [0, 1, 2]]), np.array([[0, 1, 2]]))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_mesh(folder + "/triangle.glb", mesh)
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".glb":
-        raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
-    if not isinstance(mesh, TexturedMesh):
-        raise UsageError(f"write_mesh needs a TexturedMesh; got a {type(mesh).__name__}")
-    write_atomically(path, glb_bytes(mesh))
 
 
 def glb_bytes(mesh: TexturedMesh) -> bytes:

@@ -84,50 +84,6 @@ def _with_views(model: SparseModel, views: list[SparseView]) -> SparseModel:
     return replace(model, views=views, view_index=place[kept], point_index=point, xy=xy)
 
 
-def read_cameras(path: str | Path) -> dict[str, Camera]:
-    """Read the cameras of a run, a ``cameras.json`` or a COLMAP model by image name.
-
-    Parameters
-    ----------
-    path : str or Path
-        Folder of a run or of a COLMAP model, or a ``cameras.json``: {"cameras": [...]} with name, K, R, t or
-        C, width, height and perhaps three radial coefficients "distortion" each, or a table by name.
-
-    Returns
-    -------
-    dict of str to Camera
-        In pixels of the original images, (0, 0) = centre of the top-left pixel; ``as_stored`` of COLMAP
-        models and of runs from COLMAP's matches or tracks.
-
-    Raises
-    ------
-    UsageError
-        If there is no such file, it is damaged or empty, a camera has no K or size, or its lens is neither
-        a pinhole nor radial.
-
-    Examples
-    --------
-    >>> from thesisrecon import read_cameras
-    >>> from thesisrecon.io._images import demo_images
-    >>> cameras = read_cameras(demo_images()[0].parents[1] / "cameras.json")
-    >>> cameras["0000.jpg"].size
-    (1024, 768)
-    """
-    path = Path(path)
-    if not path.exists():
-        raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
-    cameras, model = {}, read_model(path)
-    for view in model.views:
-        if view.K is None or view.size is None:
-            raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
-        if view.distortion is None:
-            advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
-            raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
-        camera = Camera(view.K, view.R, view.t, view.size, view.distortion, as_stored=model.as_stored)
-        cameras[view.name] = camera
-    return cameras
-
-
 def _read_views(path: Path) -> list[SparseView]:
     """Views of a ``cameras.json``: a list with names, or a table by name, as some data sets have it."""
     content, views, last = read_json(path), list[SparseView](), ""

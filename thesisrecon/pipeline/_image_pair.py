@@ -10,12 +10,9 @@ import numpy as np
 import scipy
 
 from thesisrecon._plug_ins import FunctionMatcher, matches_of
-from thesisrecon._settings import Config, as_config
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
-from thesisrecon.errors import Notice, StageFailure
-from thesisrecon.geometry._conditioning import unit_norm
-from thesisrecon.io._images import read_image
+from thesisrecon.errors import StageFailure
 from thesisrecon.matching._prepared import Found, select_found, select_matches
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 from thesisrecon.runtime._run import stream
@@ -25,79 +22,6 @@ ImageInput = str | Path | np.ndarray | Image
 """A file, a uint8 array (H, W), (H, W, 3) or (H, W, 4), or an :class:`Image`."""
 MASK_REACH = 4.0
 """Half width, in pixels of its scale, of the window that determines the position of a corner."""
-
-
-def match_pair(
-    image1: ImageInput, image2: ImageInput, *, config: Config | None = None, seed: int = 0
-) -> TwoView:
-    """Match two images and estimate their fundamental matrix (4.2 and chapter 5).
-
-    Parameters
-    ----------
-    image1, image2 : path, ndarray (H, W), (H, W, 3) or (H, W, 4) uint8, or Image
-        The two images; transparent pixels are masked.
-    config : PipelineConfig, str or path, optional
-        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
-    seed : int
-        Random seed.
-
-    Returns
-    -------
-    TwoView
-        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels of the given images, also if they were
-        matched at a smaller size (``config.images.max_size_px``).
-
-    Raises
-    ------
-    UsageError, StageFailure
-        If a file does not exist, an image cannot be read or the images do not match.
-
-    Examples
-    --------
-    >>> from thesisrecon import PipelineConfig, match_pair
-    >>> from thesisrecon.config import ImageOptions
-    >>> from thesisrecon.io._images import demo_images
-    >>> first, second = demo_images()[:2]
-    >>> pair = match_pair(first, second, config=PipelineConfig(images=ImageOptions(max_size_px=640)))
-    >>> pair.F.shape, len(pair.xy1) > 60
-    ((3, 3), True)
-    """
-    config = as_config(config)
-    size = config.images.max_size_px
-    images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
-    pair = match_images(config, (images[0], images[1]), seed)
-    if not pair.accepted:
-        raise StageFailure(Notice("unmatched-pair"), pair.reason)
-    given = (isinstance(image1, Image), isinstance(image2, Image))
-    T1, T2 = (np.eye(3) if one else im.original_from_working for one, im in zip(given, images, strict=True))
-    return _transformed(pair, T1, T2)
-
-
-def _transformed(pair: TwoView, T1: F64, T2: F64) -> TwoView:
-    """Return the pair in the pixels of resized images, ``T1`` and ``T2`` times the old ones."""
-    if np.array_equal([T1, T2], [np.eye(3)] * 2):
-        return pair
-    back1, back2 = np.linalg.inv(T1), np.linalg.inv(T2)
-
-    def transform(F: F64) -> F64:
-        return unit_norm(back2.T @ F @ back1)
-
-    # Noise is one number for both images: the root mean square of the two.
-    scale = float(np.hypot(T1[0, 0], T2[0, 0]) / np.sqrt(2.0))
-    report = pair.degeneracy
-    if report is not None:
-        model, error = report.competing_model, report.expected_error_px * scale
-        model = None if model is None else transform(model)
-        report = replace(report, competing_model=model, expected_error_px=error)
-    return replace(
-        pair,
-        F=transform(pair.F),
-        sigma_px=pair.sigma_px * scale,
-        xy1=pair.xy1 @ T1[:2, :2] + T1[:2, 2],
-        xy2=pair.xy2 @ T2[:2, :2] + T2[:2, 2],
-        affine=pair.affine * (T2[0, 0] / T1[0, 0]),
-        degeneracy=report,
-    )
 
 
 def match_images(config: PipelineConfig, images: tuple[Image, Image], seed: int) -> TwoView:

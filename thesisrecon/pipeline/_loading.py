@@ -10,62 +10,18 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import I64
-from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import image_without_pixels
 from thesisrecon.pipeline._matching_stages import final_pairs
 from thesisrecon.pipeline._outputs import with_image_names
 from thesisrecon.pipeline._stages import best_result
 from thesisrecon.records import Image
-from thesisrecon.results import SUMMARY, RunResult
+from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import FOLDERS
-from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, ChangedRecord, StageFolder
+from thesisrecon.runtime._run_folder import MANIFEST_FILE, StageFolder
 
 
-def load(out: str | Path) -> RunResult:
-    """Read the result of a finished run from its folder.
-
-    Parameters
-    ----------
-    out : path
-        Output folder of :func:`thesisrecon.reconstruct` or of the command.
-
-    Returns
-    -------
-    RunResult
-        As the run returned it, except for what is not stored: the pixels of ``images`` (grey), ``views`` and
-        ``depth_maps``.
-
-    Raises
-    ------
-    UsageError
-        If no run has finished in the folder, or a file is damaged.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> from thesisrecon import load, reconstruct
-    >>> rng = np.random.default_rng(0)
-    >>> images = [rng.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(2)]
-    >>> with TemporaryDirectory() as out:
-    ...     found = len(reconstruct(images, out, until="features").features[0].xy)
-    ...     len(load(out).features[0].xy) == found
-    True
-    """
-    folder = Path(out)
-    summary, run = read_json(folder / SUMMARY), read_json(folder / RUN_FILE)
-    if not isinstance(summary, dict) or not isinstance(run, dict):
-        raise UsageError(f"{folder} holds no {SUMMARY} and {RUN_FILE}; no run has finished in this folder")
-    try:
-        return _loaded(folder, summary, run)
-    except ChangedRecord as error:
-        raise UsageError(f"a stored result is damaged ({error}); repeat the run in {folder}") from None
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise UsageError(f"{folder} does not hold a run of this version; repeat the run") from None
-
-
-def _loaded(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
+def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
     # The folders of later stages may be those of a run that this one replaced.
     finished = {stage: folder / name for stage, name in FOLDERS.items() if stage in summary["seconds"]}
     reports = [StageFolder(path).finished(_keys(path)) for path in finished.values()]

@@ -19,7 +19,7 @@ from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, count
 from thesisrecon.geometry.camera_matrix import finite_cameras
 from thesisrecon.io._colmap_writing import COLMAP_FILES, write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
-from thesisrecon.io._files import read_json, write_atomically, write_json, write_text
+from thesisrecon.io._files import as_read, read_json, write_atomically, write_json, write_text
 from thesisrecon.io._meshes import glb_bytes
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.pipeline._state import name_images
@@ -27,7 +27,7 @@ from thesisrecon.pipeline._tiles import TILE_FILES, TILES, write_tiles
 from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
-from thesisrecon.results import SUMMARY, RunResult, folder_with
+from thesisrecon.results import SUMMARY, RunResult
 from thesisrecon.runtime._run import Run, Until
 from thesisrecon.runtime._run_folder import RUN_FILE, RunDirectory
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
@@ -155,6 +155,22 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     summary["warnings"] = [*result.warnings, *warnings]
     reports = tuple(run.reports.values())
     return replace(result, reports=reports, summary=summary, warnings=tuple(summary["warnings"]))
+
+
+def folder_with(result: RunResult) -> Path | None:
+    """Return the output folder of a result if the folder still contains this result.
+
+    Parameters
+    ----------
+    result : RunResult
+        Compared by its summary, which contains times and so differs from that of every other run.
+
+    Returns
+    -------
+    Path or None
+    """
+    out = result.out
+    return out if out is not None and read_json(out / SUMMARY) == as_read(result.summary) else None
 
 
 def save_result(result: RunResult, folder: Path, *, overwrite: bool) -> None:

@@ -36,7 +36,7 @@ from thesisrecon.runtime._run import Batch, stream
 from thesisrecon.selfcalibration.stratified import with_images
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
-from thesisrecon.views.render import render
+from thesisrecon.views.render import render_mesh
 
 ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""
@@ -236,7 +236,7 @@ def _compare_held_out(state: PipelineState, mesh: TexturedMesh) -> HeldOut | Non
     except StageFailure:
         return None
     height, width = view.rgb.shape[:2]
-    rendered = render(painted, Camera.from_matrix(view.P, (width, height)), threads=threads)
+    rendered = render_mesh(painted, Camera.from_matrix(view.P, (width, height)), threads=threads)
     compared = covered_pixels(rendered) & view.seen
     if not compared.any():
         return None

@@ -11,7 +11,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry._conditioning import pixel_from_unit
-from thesisrecon.geometry.triangulation import triangulate
+from thesisrecon.geometry.triangulation import triangulate_points
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
@@ -105,7 +105,7 @@ def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
     for plane in quasi_euclidean_planes(F):
         P1, P2 = canonical_cameras(F, plane=plane)
         P = np.stack([T1 @ P1, T2 @ P2])
-        X = triangulate(P, np.stack([pair.xy1, pair.xy2]), method="linear")
+        X = triangulate_points(P, np.stack([pair.xy1, pair.xy2]), method="linear")
         first, second = np.sign(X @ P[0, 2]), np.sign(X @ P[1, 2])
         side = 1.0 if np.sum(first * second) >= 0 else -1.0
         here = abs(float(np.sum(first * np.sign(X[:, 3]))))

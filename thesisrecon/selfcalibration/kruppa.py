@@ -18,7 +18,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted, require_at_least
-from thesisrecon.geometry._conditioning import pixel_from_unit, require_finite, require_shapes, unit_norm
+from thesisrecon.geometry._conditioning import pixel_from_unit, unit_norm
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
@@ -238,51 +238,8 @@ def _plane_for_focals(frame: ReferenceFrame, criterion: RotationCriterion, log_f
     return theta[best, :3], float(cost[best])
 
 
-def kruppa(F: F64, sizes: I64) -> F64:
-    """Calibrate one constant camera from fundamental matrices alone, by the Kruppa equations (section 7.3).
-
-    Square pixels without skew and a principal point within about 1 % of the image centre are assumed. F is
-    normalised first; :class:`KruppaEquations` also allows different cameras.
-
-    Parameters
-    ----------
-    F : ndarray (M, 3, 3) or (3, 3)
-        Fundamental matrices of M pairs of images of the camera, px.
-    sizes : array_like (2,) or (V, 2)
-        Width and height of the images, all equal.
-
-    Returns
-    -------
-    ndarray (3, 3)
-        K in pixels.
-
-    Raises
-    ------
-    ValueError
-        If the shapes are wrong, a matrix is not finite or has rank 1, or the sizes differ.
-    StageFailure
-        If the equations do not determine the focal length, or have several solutions.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import kruppa
-    >>> from thesisrecon.geometry.two_view import fundamental_from_cameras
-    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
-    >>> R = Rotation.from_euler("xyz", [[0, 0, 0], [0.1, -0.4, 0.1], [-0.3, 0.2, 0.5]]).as_matrix()
-    >>> P = K @ np.concatenate([R, [[[0], [0], [5]], [[1], [0], [6]], [[0], [2], [4]]]], axis=2)
-    >>> F = np.stack([fundamental_from_cameras(P[i], P[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
-    >>> round(float(kruppa(F, (640, 480))[0, 0]), 3)
-    800.0
-    """
-    F = np.asarray(F, dtype=np.float64)
-    F = F[None] if F.ndim == 2 else F
-    require_shapes("kruppa", F=(F, ("M", 3, 3)))
-    require_finite("kruppa", F)
-    sizes = np.unique(np.atleast_2d(sizes), axis=0)
-    if sizes.shape != (1, 2):
-        raise ValueError(f"kruppa needs images of the same size, width and height; got {sizes.tolist()}")
+def calibrate_from_fundamentals(F: F64, sizes: I64) -> F64:
+    """Calibrate a camera from F (M, 3, 3), all images of one size; see :func:`thesisrecon.kruppa`."""
     unit = pixel_from_unit(sizes)[0]
     F = unit_norm(unit.T @ F @ unit)
     if not len(F) or not (np.linalg.svd(F, compute_uv=False)[:, 1] > 1e-9).all():

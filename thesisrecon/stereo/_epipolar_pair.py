@@ -20,7 +20,7 @@ from thesisrecon.geometry._conditioning import require_finite, require_shapes
 from thesisrecon.geometry._homography import require_parallax_of_matches
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.triangulation import triangulate
+from thesisrecon.geometry.triangulation import triangulate_points
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
     fundamental_from_cameras,
@@ -290,7 +290,7 @@ def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
     z, F = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)]), pencil.fundamental
 
     def points_in_front(P: F64) -> int:
-        X = triangulate(P, z, method="linear")
+        X = triangulate_points(P, z, method="linear")
         with np.errstate(divide="ignore", invalid="ignore"):
             return int(np.sum((depth(P[0], X) > 0.0) & (depth(P[1], X) > 0.0)))
 
@@ -302,7 +302,7 @@ def _quasi_euclidean(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> F64:
 def _depth_increases_along_half_lines(pencil: EpipolarPencil, P: F64, xy1: F64, xy2: F64) -> bool:
     """Whether points that recede along their rays of view 1 move along the half-lines of view 2."""
     z = np.stack([pencil.normalized(0, xy1), pencil.normalized(1, xy2)])
-    X = triangulate(P, z, method="linear")
+    X = triangulate_points(P, z, method="linear")
     with np.errstate(divide="ignore", invalid="ignore"):
         point, C = dehomogenize(X), dehomogenize(camera_centre(P[0]))
         moved = project(P[1], C + 1.001 * (point - C)) - project(P[1], point)

@@ -9,7 +9,6 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._from_arrays import require_mesh
 from thesisrecon.geometry._zbuffer import (
     Raster,
     image_corners,
@@ -127,7 +126,7 @@ def _vertex_normals(mesh: TexturedMesh) -> F64:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])
 
 
-def render(
+def render_mesh(
     mesh: TexturedMesh,
     camera: Camera,
     *,
@@ -136,41 +135,7 @@ def render(
     samples: int = 2,
     threads: int = 1,
 ) -> RenderedView:
-    """Render a mesh.
-
-    Parameters
-    ----------
-    mesh, camera : TexturedMesh, Camera
-        Mesh with a texture, vertex colours or neither (light grey), and camera without distortion.
-    shading : Shading, optional
-        Lighting. None shows the texture as photographed.
-    background : tuple of int
-        Colour of empty pixels.
-    samples : int
-        Samples per pixel side, averaged. Depth and validity refer to the pixel centre.
-    threads : int
-        Number of threads; the image does not depend on it.
-
-    Returns
-    -------
-    RenderedView
-
-    Raises
-    ------
-    ValueError
-        If the camera has distortion, ``samples`` is below 1, or the mesh is invalid.
-
-    Examples
-    --------
-    >>> triangle = TexturedMesh(np.array([[-1.0, -1, 2], [1, -1, 2], [0, 1, 2]]), np.array([[0, 1, 2]]))
-    >>> K = np.array([[20.0, 0, 9.5], [0, 20, 9.5], [0, 0, 1]])
-    >>> view = render(triangle, Camera(K, np.eye(3), np.zeros(3), (20, 20)))
-    >>> view.color.shape, bool(view.valid[5, 10]), float(view.depth[5, 10])
-    ((20, 20, 3), True, 2.0)
-    """
-    if samples < 1:
-        raise ValueError(f"render needs at least one sample a side; got {samples}")
-    require_mesh("render", mesh)
+    """Render a mesh; arguments as for :func:`thesisrecon.render`."""
     shape = camera.size[::-1]
     rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
     valid = np.empty(shape, dtype=bool)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import StageFailure

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from thesisrecon.api.views import render
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.camera_matrix import project_camera, undistort
 from thesisrecon.records import TexturedMesh
-from thesisrecon.views.render import render
 from validation.scenes.materials import Material
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.raycast import Surface, World, build_world, trace

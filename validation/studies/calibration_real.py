@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Reconstruction
 from thesisrecon.results import RunResult
 from validation.harness.gates import camera_limit

@@ -22,9 +22,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.pipeline import _matching_stages, _parts, _stages
 from thesisrecon.pipeline._state import PreparedViews, batch_pairs
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime._executors import AHEAD
 from thesisrecon.runtime._run import Until
 from validation.studies.growth import write_scene

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.runtime._run import stream
 from validation.metrics.intervals import interval_scores, pose_scores
 from validation.scenes.real import Scene, data_root, read_scene

@@ -6,15 +6,15 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.epipolar.configuration import Configuration
-from thesisrecon.epipolar.estimation import estimate_fundamental
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.two_view import epipolar_lines, epipoles, sampson_residuals, symmetric_residuals
+from thesisrecon.geometry.two_view import epipoles, sampson_residuals, symmetric_residuals
 from thesisrecon.records import FundamentalFit
 from validation.metrics.fundamental_precision import (
     epipolar_distance_interval,

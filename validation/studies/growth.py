@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from PIL import Image as PillowImage
 
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run import Until
 from validation.metrics.cameras import TrueCameras, measure_cameras, relative_centre_error

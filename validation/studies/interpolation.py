@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon import match_pair
+from thesisrecon.api.views import prepare_pair
 from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.geometry._homography import homography_linear, homography_residuals
 from thesisrecon.geometry.camera_matrix import camera_centre, camera_from_centre, decompose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import Image
-from thesisrecon.view_interpolation import prepare_pair
 from thesisrecon.views._warping import sample
 from thesisrecon.views.interpolation import InterpolatedPair, original_from_rectified
 from validation.metrics.pictures import picture_metrics, psnr_db

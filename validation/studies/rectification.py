@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 import thesisrecon
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import project, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.records import Reconstruction, TwoView
 from thesisrecon.stereo._epipolar_pair import EpipolarPair, pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo._planar import (

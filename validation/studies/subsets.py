@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline._stages import ATTEMPTS
-from thesisrecon.pipeline.reconstruction import reconstruct
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from thesisrecon.runtime._run import stream
 from validation.scenes.real import REAL_SCENES, Scene

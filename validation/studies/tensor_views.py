@@ -16,11 +16,11 @@ from typing import Literal
 import numpy as np
 import PIL.Image
 
+from thesisrecon.api.views import match_images
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.config import PipelineConfig
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import TwoView
-from thesisrecon.view_synthesis import match_images
 from thesisrecon.views.trilinear import (
     CalibratedPair,
     VirtualCamera,

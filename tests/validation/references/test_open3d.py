@@ -10,12 +10,13 @@ import pytest
 
 from tests.surface.sphere import SHAPE, K, paint, photograph, ring_of
 from tests.validation.references.conftest import skip_without
+from thesisrecon.api.export import write_mesh
+from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
-from thesisrecon.io._meshes import read_mesh, write_mesh
+from thesisrecon.io._meshes import read_mesh
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.views.render import render
 from validation.references import open3d_geometry
 from validation.references.libraries import open3d
 from validation.references.open3d_geometry import refine_by_icp

@@ -9,12 +9,12 @@ from typing import ClassVar, get_args
 
 import numpy as np
 
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.strata import Group
-from thesisrecon.geometry.triangulation import triangulate
 from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
+from thesisrecon.api.views import prepare_rectified_pair
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.view_interpolation import prepare_rectified_pair
 from thesisrecon.views.trilinear import camera_at
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, Values, row

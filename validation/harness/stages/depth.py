@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
+from thesisrecon.api.surface import confirmed_depth_maps
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import preset
-from thesisrecon.dense_model import confirmed_depth_maps
 from thesisrecon.io._files import write_text
 from thesisrecon.io._images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction

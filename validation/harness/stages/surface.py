@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import PIL.Image
 
+from thesisrecon.api.views import render
 from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import preset
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, Values, each, ratio, read_arrays, row
 from validation.harness.scenes import load_images

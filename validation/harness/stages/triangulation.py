@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import Group
-from thesisrecon.geometry.triangulation import triangulate
 from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from validation.harness.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
+from thesisrecon.api.views import render
 from thesisrecon.arrays import B8, U8
 from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
 from thesisrecon.surface._texture_blending import depth_buffers, prepare_views
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
-from thesisrecon.views.render import render
 from validation.harness.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, each, row
 from validation.harness.scenes import load_images

@@ -10,12 +10,13 @@ from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
-from thesisrecon.geometry._conditioning import pixel_from_unit, require_shapes
+from thesisrecon.geometry._conditioning import pixel_from_unit, require_finite, require_shapes
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
 from thesisrecon.runtime._run import stream
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
+from thesisrecon.selfcalibration.kruppa import calibrate_from_fundamentals
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines, plane_from_vanishing_points
 from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine, with_images
@@ -298,3 +299,51 @@ def _method(
             "give xy (V, N, 2), the pixels of points, or use nonlinear-quadric",
         )
     return with_images(method, images), settings
+
+
+def kruppa(F: F64, sizes: I64) -> F64:
+    """Calibrate one constant camera from fundamental matrices alone, by the Kruppa equations (section 7.3).
+
+    Square pixels without skew and a principal point within about 1 % of the image centre are assumed. F is
+    normalised first; :class:`KruppaEquations` also allows different cameras.
+
+    Parameters
+    ----------
+    F : ndarray (M, 3, 3) or (3, 3)
+        Fundamental matrices of M pairs of images of the camera, px.
+    sizes : array_like (2,) or (V, 2)
+        Width and height of the images, all equal.
+
+    Returns
+    -------
+    ndarray (3, 3)
+        K in pixels.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are wrong, a matrix is not finite or has rank 1, or the sizes differ.
+    StageFailure
+        If the equations do not determine the focal length, or have several solutions.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from thesisrecon import kruppa
+    >>> from thesisrecon.geometry.two_view import fundamental_from_cameras
+    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
+    >>> R = Rotation.from_euler("xyz", [[0, 0, 0], [0.1, -0.4, 0.1], [-0.3, 0.2, 0.5]]).as_matrix()
+    >>> P = K @ np.concatenate([R, [[[0], [0], [5]], [[1], [0], [6]], [[0], [2], [4]]]], axis=2)
+    >>> F = np.stack([fundamental_from_cameras(P[i], P[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
+    >>> round(float(kruppa(F, (640, 480))[0, 0]), 3)
+    800.0
+    """
+    F = np.asarray(F, dtype=np.float64)
+    F = F[None] if F.ndim == 2 else F
+    require_shapes("kruppa", F=(F, ("M", 3, 3)))
+    require_finite("kruppa", F)
+    sizes = np.unique(np.atleast_2d(sizes), axis=0)
+    if sizes.shape != (1, 2):
+        raise ValueError(f"kruppa needs images of the same size, width and height; got {sizes.tolist()}")
+    return calibrate_from_fundamentals(F, sizes)

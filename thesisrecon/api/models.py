@@ -1,4 +1,4 @@
-"""Sparse models in metres: aligned to known positions of cameras, or scaled by one known distance."""
+"""Finished runs and models of other programs: loaded, saved, aligned to positions and scaled."""
 
 from __future__ import annotations
 
@@ -14,11 +14,16 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from thesisrecon.arrays import B8, F64
+from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, unknown_word
 from thesisrecon.geometry.similarity import Similarity, estimate_similarity
+from thesisrecon.io._files import read_json
 from thesisrecon.io._models import read_model
 from thesisrecon.io._positions import read_positions
-from thesisrecon.results import RunResult, folder_with
+from thesisrecon.pipeline._loading import load_run
+from thesisrecon.pipeline._outputs import folder_with, save_result
+from thesisrecon.results import SUMMARY, RunResult
+from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord
 from thesisrecon.sparse_model import SparseModel
 
 _MAX_TRIPLES = 1000
@@ -95,7 +100,7 @@ def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
     if model.metric is None:
         raise UsageError("the result has no cameras; it ended before the metric stage")
     with TemporaryDirectory() as folder:
-        replace(model, mesh=None).save(folder)
+        save_result(replace(model, mesh=None), Path(folder), overwrite=False)
         return read_model(folder)
 
 
@@ -279,3 +284,122 @@ def scaled(
         have = f"got {distance:g}, and the cameras of {name1} and {name2} are {now:g} apart in the model"
         raise UsageError(f"the scale needs a positive distance of two different cameras; {have}")
     return model.transformed(Similarity(distance / now, np.eye(3), np.zeros(3)))
+
+
+def read_cameras(path: str | Path) -> dict[str, Camera]:
+    """Read the cameras of a run, a ``cameras.json`` or a COLMAP model by image name.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a run or of a COLMAP model, or a ``cameras.json``: {"cameras": [...]} with name, K, R, t or
+        C, width, height and perhaps three radial coefficients "distortion" each, or a table by name.
+
+    Returns
+    -------
+    dict of str to Camera
+        In pixels of the original images, (0, 0) = centre of the top-left pixel; ``as_stored`` of COLMAP
+        models and of runs from COLMAP's matches or tracks.
+
+    Raises
+    ------
+    UsageError
+        If there is no such file, it is damaged or empty, a camera has no K or size, or its lens is neither
+        a pinhole nor radial.
+
+    Examples
+    --------
+    >>> from thesisrecon import read_cameras
+    >>> from thesisrecon.io._images import demo_images
+    >>> cameras = read_cameras(demo_images()[0].parents[1] / "cameras.json")
+    >>> cameras["0000.jpg"].size
+    (1024, 768)
+    """
+    path = Path(path)
+    if not path.exists():
+        raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
+    cameras, model = {}, read_model(path)
+    for view in model.views:
+        if view.K is None or view.size is None:
+            raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
+        if view.distortion is None:
+            advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
+            raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
+        camera = Camera(view.K, view.R, view.t, view.size, view.distortion, as_stored=model.as_stored)
+        cameras[view.name] = camera
+    return cameras
+
+
+def load(out: str | Path) -> RunResult:
+    """Read the result of a finished run from its folder.
+
+    Parameters
+    ----------
+    out : path
+        Output folder of :func:`thesisrecon.reconstruct` or of the command.
+
+    Returns
+    -------
+    RunResult
+        As the run returned it, except for what is not stored: the pixels of ``images`` (grey), ``views`` and
+        ``depth_maps``.
+
+    Raises
+    ------
+    UsageError
+        If no run has finished in the folder, or a file is damaged.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from thesisrecon import load, reconstruct
+    >>> rng = np.random.default_rng(0)
+    >>> images = [rng.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(2)]
+    >>> with TemporaryDirectory() as out:
+    ...     found = len(reconstruct(images, out, until="features").features[0].xy)
+    ...     len(load(out).features[0].xy) == found
+    True
+    """
+    folder = Path(out)
+    summary, run = read_json(folder / SUMMARY), read_json(folder / RUN_FILE)
+    if not isinstance(summary, dict) or not isinstance(run, dict):
+        raise UsageError(f"{folder} holds no {SUMMARY} and {RUN_FILE}; no run has finished in this folder")
+    try:
+        return load_run(folder, summary, run)
+    except ChangedRecord as error:
+        raise UsageError(f"a stored result is damaged ({error}); repeat the run in {folder}") from None
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise UsageError(f"{folder} does not hold a run of this version; repeat the run") from None
+
+
+def save(result: RunResult, folder: str | Path, *, overwrite: bool = False) -> None:
+    """Write ``cameras.json``, ``points.ply``, ``sparse/0``, ``model.glb`` and ``summary.json`` of a result.
+
+    Parameters
+    ----------
+    result : RunResult
+        Result of a run; if its output folder still holds it, the files are copied.
+    folder : path
+        Created if missing.
+    overwrite : bool
+        Replace files of these names that thesisrecon did not write, or that were changed since.
+
+    Raises
+    ------
+    UsageError, OutputError
+        If a file would be replaced; if a file cannot be written.
+
+    Examples
+    --------
+    ``result`` as in the example of `thesisrecon.reconstruct_from_matches`:
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from thesisrecon import save
+    >>> with TemporaryDirectory() as folder:
+    ...     save(result, folder)
+    ...     (Path(folder) / "cameras.json").is_file()
+    True
+    """
+    save_result(result, Path(folder), overwrite=overwrite)

@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from thesisrecon.alignment import as_sparse_model
+from thesisrecon.api.models import as_sparse_model
 from thesisrecon.arrays import F64, rows_of_views
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.camera_matrix import undistort
@@ -20,7 +20,7 @@ from thesisrecon.io import _export_formats as formats
 from thesisrecon.io._colmap_writing import COLMAP_FILES, has_skew, write_sparse_model
 from thesisrecon.io._export_formats import calibration, coefficients
 from thesisrecon.io._exports import write_image
-from thesisrecon.io._files import first_repeated, read_json, require_image_name
+from thesisrecon.io._files import first_repeated, read_json, require_image_name, write_atomically
 from thesisrecon.io._images import (
     MAX_DECODED_BYTES,
     find_images,
@@ -29,9 +29,11 @@ from thesisrecon.io._images import (
     rotation_words,
 )
 from thesisrecon.io._masks import USELESS_MASKS, find_masks, read_mask
+from thesisrecon.io._meshes import glb_bytes
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
+from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._executors import available_threads
 from thesisrecon.sparse_model import SparseModel, SparseView
@@ -259,7 +261,17 @@ def recorded_images(model: SparseModel | RunResult | str | Path) -> Path | None:
 
 
 def recorded_masks(model: SparseModel | RunResult | str | Path, to: str) -> tuple[Path | None, list[str]]:
-    """Return the folder of the masks of a run for formats with images, or a note that it is gone."""
+    """Return the folder of the masks of a run for formats with images, or a note that it is gone.
+
+    Parameters
+    ----------
+    model, to : SparseModel, RunResult or path, str
+        The run or its output folder, or any other model; the format.
+
+    Returns
+    -------
+    Path or None, list of str
+    """
     folder = _recorded(model, "masks_folder") if to in _PINHOLE else None
     if folder is None or folder.is_dir():
         return folder, []
@@ -401,3 +413,34 @@ def _write_images(
 
     with ThreadPoolExecutor(threads or available_threads()) as pool:
         return list(pool.map(write, range(len(paths))))
+
+
+def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
+    """Write a mesh as GLB, with its texture, or its vertex colours if it has none, and float32 coordinates.
+
+    Parameters
+    ----------
+    path, mesh : str or Path, TexturedMesh
+        File, which is replaced, and mesh. It is rotated by 180 degrees about x, since the y axis of glTF
+        points up and that of cameras down.
+
+    Raises
+    ------
+    ValueError, UsageError, OutputError
+        If the mesh is invalid; the name does not end in .glb or ``mesh`` is not a TexturedMesh; the file
+        cannot be written.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from thesisrecon import TexturedMesh, write_mesh
+    >>> mesh = TexturedMesh(np.array([[-1.0, -1, 2], [1, -1, 2], [0, 1, 2]]), np.array([[0, 1, 2]]))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_mesh(folder + "/triangle.glb", mesh)
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".glb":
+        raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
+    if not isinstance(mesh, TexturedMesh):
+        raise UsageError(f"write_mesh needs a TexturedMesh; got a {type(mesh).__name__}")
+    write_atomically(path, glb_bytes(mesh))

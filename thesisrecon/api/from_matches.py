@@ -214,9 +214,9 @@ def reconstruct_from_colmap(
 
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> from thesisrecon import reconstruct_from_colmap
+    >>> from thesisrecon import reconstruct_from_colmap, save
     >>> with TemporaryDirectory() as out:
-    ...     result.save(out)
+    ...     save(result, out)
     ...     again = reconstruct_from_colmap(Path(out) / "sparse" / "0")
     >>> abs(round(float(again.cameras[0].K[0, 0] / result.cameras[0].K[0, 0] - 1), 2))
     0.0

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
+from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import unknown_word
-from thesisrecon.geometry._conditioning import require_finite, require_shapes
+from thesisrecon.geometry._conditioning import require_calibration, require_finite, require_shapes
 from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients, require_inside
+from thesisrecon.geometry.robust_resection import Resection, resect_robust
+from thesisrecon.geometry.triangulation import Method, triangulate_points
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.numerics._metric_bundle import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras
@@ -315,3 +319,138 @@ def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound
             f"bundle_adjust needs two views and as many equations as unknowns; {len(view)} observations in "
             f"{len(seen)} views give {2 * len(view)} equations for {unknowns} unknowns"
         )
+
+
+def cheirality(P: F64, X: F64) -> F64:
+    """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera, 0 at infinity.
+
+    The scales of X and P do not matter, negative ones included. The magnitude is an inverse depth (the thesis
+    takes it for a depth), without a unit if P is not normalised.
+
+    Parameters
+    ----------
+    P, X : array_like (3, 4) and (N, 4)
+        Camera and homogeneous points.
+
+    Returns
+    -------
+    ndarray (N,)
+
+    Examples
+    --------
+    >>> X = np.array([[0.0, 0.0, 2.0, 1.0], [0.0, 0.0, -2.0, 1.0]])
+    >>> cheirality(np.eye(3, 4), X).round(9).tolist()
+    [0.5, -0.5]
+    """
+    P, X = np.asarray(P, dtype=np.float64), np.asarray(X, dtype=np.float64)
+    require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
+    return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
+
+
+def resect(
+    X: F64, xy: F64, K: F64 | None = None, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
+) -> Resection:
+    """Estimate a camera from space points and their pixels, some of them wrong (section 6.4).
+
+    RANSAC over samples of six points (DLT), or with K of three (P3P), then the least reprojection error of
+    the inliers.
+
+    Parameters
+    ----------
+    X, xy : array_like (N, 3) and (N, 2)
+        Points, N >= 6 (N >= 4 with K), and their pixels.
+    K : ndarray (3, 3), optional
+        Calibration matrix; None: estimated, which needs points off one plane.
+    threshold_px : float or None
+        Reprojection error of an inlier during the search; None: all points are inliers.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
+
+    Returns
+    -------
+    Resection
+        Camera, inliers, noise and covariance.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
+        lengths and K33 = 1.
+    StageFailure
+        If there are too few points or inliers, all points lie in one plane and K is not given, or points are
+        behind the camera that fits them, as in left-handed coordinates.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Camera, resect
+    >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    >>> camera = Camera(K, np.eye(3), np.array([0.2, -0.1, 4.0]), (640, 480))
+    >>> X = np.random.default_rng(0).uniform(-1, 1, (30, 3))
+    >>> found = resect(X, camera.project(X))
+    >>> float(found.K[0, 0].round(6)), found.t.round(6).tolist()
+    (500.0, [0.2, -0.1, 4.0])
+    """
+    X, xy = np.asarray(X, dtype=np.float64), np.asarray(xy, dtype=np.float64)
+    require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
+    if K is not None:
+        K = np.asarray(K, dtype=np.float64)
+        require_calibration("resect", K)
+    require_finite("resect", X, xy)
+    if threshold_px is not None and not 0.0 < threshold_px < np.inf:
+        raise ValueError(
+            f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
+        )
+    return resect_robust(X, xy, K, threshold_px, np.random.default_rng(seed))
+
+
+def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
+    """Triangulate space points by one of the methods of section 6.3 (HZ 12).
+
+    Parameters
+    ----------
+    P, xy : ndarray (V, 3, 4) and (V, N, 2)
+        V >= 2 cameras of any scale, and pixels; NaN for not observed.
+    method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}, optional
+        "polynomial": optimal for exactly two views (6.3.3); "linear" and "iterated": algebraic (6.3.1);
+        "midpoint": metric frames only (6.3.2); "optimal": least reprojection error from any number of views.
+        None: "polynomial" for two views, else "optimal".
+
+    Returns
+    -------
+    ndarray (N, 4)
+        Homogeneous points; zeros if a point is observed in fewer than two views or from one centre only, and
+        of "midpoint" if its rays are parallel.
+
+    Raises
+    ------
+    ValueError
+        Unknown method, wrong shapes, infinite pixels, or unsuitable cameras.
+
+    Examples
+    --------
+    >>> P = np.stack([np.eye(3, 4), np.hstack([np.eye(3), [[-1.0], [0.0], [0.0]]])])
+    >>> X = triangulate(P, np.array([[[0.0, 0.0]], [[-0.5, 0.0]]]))
+    >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
+    True
+    """
+    if method is not None and method not in get_args(Method):
+        raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}")
+    P, xy = _checked_views(P, xy)
+    return triangulate_points(P, xy, method=method)
+
+
+def _checked_views(P: F64, xy: F64) -> tuple[F64, F64]:
+    """Check cameras and pixels and return them as contiguous float64 arrays."""
+    if np.iscomplexobj(P) or np.iscomplexobj(xy):
+        raise ValueError("triangulate needs real numbers; got complex ones")
+    P, xy = np.ascontiguousarray(P, dtype=np.float64), np.ascontiguousarray(xy, dtype=np.float64)
+    require_shapes("triangulate", P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
+    if len(P) < 2:
+        raise ValueError(f"triangulate needs at least two cameras; got {len(P)}")
+    require_finite("triangulate, for its cameras,", P)
+    if not np.abs(P).max(axis=(1, 2)).all():
+        raise ValueError("triangulate needs cameras that are not all zero")
+    if np.isinf(xy).any():
+        raise ValueError("triangulate needs finite pixels, or NaN for not seen; some are infinite")
+    return P, xy

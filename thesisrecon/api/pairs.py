@@ -1,0 +1,390 @@
+"""Two and three images: matches, fundamental matrix, homography, trifocal tensor and epipolar lines."""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from thesisrecon._settings import Config, as_config
+from thesisrecon.arrays import F64, U8
+from thesisrecon.epipolar._frame import MAX_PX
+from thesisrecon.epipolar.estimation import FundamentalEstimate, Method, fit_all, fit_seven
+from thesisrecon.epipolar.homography import HomographyFit, fit_homography
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.trifocal_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
+from thesisrecon.errors import Notice, StageFailure, unknown_word
+from thesisrecon.geometry._conditioning import require_finite, require_shapes, unit_norm
+from thesisrecon.geometry.two_view import lines_of_points
+from thesisrecon.io._images import read_image, read_pixels
+from thesisrecon.pipeline._image_pair import ImageInput, match_images
+from thesisrecon.records import Image, TwoView
+
+
+def match_pair(
+    image1: ImageInput, image2: ImageInput, *, config: Config | None = None, seed: int = 0
+) -> TwoView:
+    """Match two images and estimate their fundamental matrix (4.2 and chapter 5).
+
+    Parameters
+    ----------
+    image1, image2 : path, ndarray (H, W), (H, W, 3) or (H, W, 4) uint8, or Image
+        The two images; transparent pixels are masked.
+    config : PipelineConfig, str or path, optional
+        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
+    seed : int
+        Random seed.
+
+    Returns
+    -------
+    TwoView
+        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels of the given images, also if they were
+        matched at a smaller size (``config.images.max_size_px``).
+
+    Raises
+    ------
+    UsageError, StageFailure
+        If a file does not exist, an image cannot be read or the images do not match.
+
+    Examples
+    --------
+    >>> from thesisrecon import PipelineConfig, match_pair
+    >>> from thesisrecon.config import ImageOptions
+    >>> from thesisrecon.io._images import demo_images
+    >>> first, second = demo_images()[:2]
+    >>> pair = match_pair(first, second, config=PipelineConfig(images=ImageOptions(max_size_px=640)))
+    >>> pair.F.shape, len(pair.xy1) > 60
+    ((3, 3), True)
+    """
+    config = as_config(config)
+    size = config.images.max_size_px
+    images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
+    pair = match_images(config, (images[0], images[1]), seed)
+    if not pair.accepted:
+        raise StageFailure(Notice("unmatched-pair"), pair.reason)
+    given = (isinstance(image1, Image), isinstance(image2, Image))
+    T1, T2 = (np.eye(3) if one else im.original_from_working for one, im in zip(given, images, strict=True))
+    return _transformed(pair, T1, T2)
+
+
+def _transformed(pair: TwoView, T1: F64, T2: F64) -> TwoView:
+    """Return the pair in the pixels of resized images, ``T1`` and ``T2`` times the old ones."""
+    if np.array_equal([T1, T2], [np.eye(3)] * 2):
+        return pair
+    back1, back2 = np.linalg.inv(T1), np.linalg.inv(T2)
+
+    def transform(F: F64) -> F64:
+        return unit_norm(back2.T @ F @ back1)
+
+    # Noise is one number for both images: the root mean square of the two.
+    scale = float(np.hypot(T1[0, 0], T2[0, 0]) / np.sqrt(2.0))
+    report = pair.degeneracy
+    if report is not None:
+        model, error = report.competing_model, report.expected_error_px * scale
+        model = None if model is None else transform(model)
+        report = replace(report, competing_model=model, expected_error_px=error)
+    return replace(
+        pair,
+        F=transform(pair.F),
+        sigma_px=pair.sigma_px * scale,
+        xy1=pair.xy1 @ T1[:2, :2] + T1[:2, 2],
+        xy2=pair.xy2 @ T2[:2, :2] + T2[:2, 2],
+        affine=pair.affine * (T2[0, 0] / T1[0, 0]),
+        degeneracy=report,
+    )
+
+
+def draw_epipolar_lines(
+    image1: ImageInput, image2: ImageInput, F: F64, xy1: F64, xy2: F64, *, max_lines: int = 30
+) -> tuple[U8, U8]:
+    """Draw the epipolar lines of matches into both images (figure 3.11).
+
+    Parameters
+    ----------
+    image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
+        Files, read at full size, or images.
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches in pixels of these images.
+    max_lines : int
+        Number of matches to draw, spread over all; each has one colour in both images.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8, twice
+        The images, with the line F x1 and the point x2 in the second, F' x2 and x1 in the first.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import draw_epipolar_lines
+    >>> F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    >>> gray = np.full((60, 80), 128, np.uint8)
+    >>> left, right = draw_epipolar_lines(gray, gray, F, np.array([[40.0, 30]]), np.array([[20.0, 30]]))
+    >>> left.shape, np.unique(np.nonzero((right != 128).any(axis=2))[0]).tolist()
+    ((60, 80, 3), [26, 27, 28, 29, 30, 31, 32, 33, 34])
+    """
+    F, xy1, xy2 = (np.asarray(array, dtype=np.float64) for array in (F, xy1, xy2))
+    require_shapes("draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    require_finite("draw_epipolar_lines", F, xy1, xy2)
+    some = np.unique(np.linspace(0, len(xy1) - 1, min(max(max_lines, 0), len(xy1))).astype(np.int64))
+    xy1, xy2 = xy1[some], xy2[some]
+    first, second = read_pixels(image1), read_pixels(image2)
+    return _drawn(first, lines_of_points(F.T, xy2), xy1), _drawn(second, lines_of_points(F, xy1), xy2)
+
+
+def estimate_homography(
+    xy1: F64, xy2: F64, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
+) -> HomographyFit:
+    """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4).
+
+    RANSAC over samples of four, then the least Sampson distance of the inliers, which is to first order the
+    maximum likelihood for Gaussian noise in both images.
+
+    Parameters
+    ----------
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 4, px.
+    threshold_px : float or None
+        Distance of an inlier during the search; None: all matches are inliers.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
+
+    Returns
+    -------
+    HomographyFit
+        H, inliers, noise and covariance.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or coordinates are not finite.
+    StageFailure
+        If there are too few matches or inliers, or they do not determine H (collinear points, for example).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import estimate_homography
+    >>> xy1 = np.random.default_rng(0).uniform(0, 500, (40, 2))
+    >>> xy2 = 2.0 * xy1 + [30.0, 10.0]
+    >>> xy2[:10] += [[70.0, -50.0]] * np.arange(1, 11)[:, None]
+    >>> fit = estimate_homography(xy1, xy2)
+    >>> int(fit.inliers.sum()), np.abs(fit.H / fit.H[2, 2]).round(6).tolist()
+    (30, [[2.0, 0.0, 30.0], [0.0, 2.0, 10.0], [0.0, 0.0, 1.0]])
+    """
+    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    require_finite("estimate_homography", xy1, xy2)
+    if threshold_px is not None and not threshold_px > 0.0:
+        raise ValueError(f"threshold_px must be positive, or None for no search; got {threshold_px}")
+    return fit_homography(xy1, xy2, threshold_px, np.random.default_rng(seed))
+
+
+def estimate_trifocal(
+    xy1: F64 = NO_POINTS,
+    xy2: F64 = NO_POINTS,
+    xy3: F64 = NO_POINTS,
+    *,
+    segments: F64 = NO_SEGMENTS,
+    threshold_px: float | None = 1.0,
+    loss_px: float = 1.0,
+    seed: int | Generator = 0,
+) -> TrifocalFit:
+    """Estimate the trifocal tensor from points and lines of three views.
+
+    Minimises Huber's loss of the distances of points to their reprojections and of segment endpoints to the
+    reprojected lines: the maximum likelihood for Gaussian noise, tolerant of a few wrong matches. Points that
+    contradict the epipolar geometry of a pair of views are left out first.
+
+    Parameters
+    ----------
+    xy1, xy2, xy3 : array_like (N, 2)
+        Matched points of the three views, px.
+    segments : ndarray (3, M, 2, 2), optional
+        Endpoints of matched line segments, px; the endpoints need not correspond. 4 N + 2 M >= 26.
+    threshold_px : float or None
+        Threshold of the fundamental matrices by which wrong points are found, from 12 points on; None: no
+        search.
+    loss_px : float
+        Residual at which Huber's loss becomes linear.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
+
+    Returns
+    -------
+    TrifocalFit
+        Tensor, residuals, inliers, noise and covariance.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are wrong or values are not finite.
+    StageFailure
+        If there are too few matches, or they do not determine the tensor, exactly or within their noise:
+        points of one plane or line, pure rotation, random matches.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon.geometry.camera_matrix import project
+    >>> X = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + [0, 0, 5]
+    >>> K, views = np.diag([800.0, 800.0, 1.0]), ([0, 0, 0], [-1, 0.2, 0], [0.3, -1, 0.4])
+    >>> points = np.stack([project(K @ np.c_[np.eye(3), t], X) for t in views])
+    >>> bool(estimate_trifocal(*points).point_residuals_px.max() < 1e-6)
+    True
+    """
+    if not loss_px > 0.0:
+        raise ValueError(f"loss_px must be positive; got {loss_px}")
+    require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
+    every, segments = _check_triplets(np.stack([xy1, xy2, xy3]), segments)
+    rng = np.random.default_rng(seed)
+    return fit_trifocal(every, segments, threshold_px=threshold_px, loss_px=loss_px, rng=rng)
+
+
+def estimate_fundamental(
+    xy1: NDArray[np.float64],
+    xy2: NDArray[np.float64],
+    *,
+    method: Method = "locally-optimised",
+    threshold_px: float | None = 1.0,
+    seed: int | Generator = 0,
+) -> FundamentalEstimate:
+    """Estimate the fundamental matrix of matches by one of the methods of chapter 5.
+
+    Parameters
+    ----------
+    xy1, xy2 : array_like (N, 2)
+        Matched points, N >= 8 (N = 7 for "seven-point"), px.
+    method : str
+        For matches with outliers: "locally-optimised"
+        (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
+        the thesis) or "least-median". For matches without outliers: "gold-standard" (least reprojection
+        error, HZ 11.4.1), "eight-point" (normalised) or "seven-point" (up to three solutions).
+    threshold_px : float or None
+        Largest Sampson distance of an inlier during the search of the first two methods. None: no outliers;
+        "gold-standard" is used instead of these two.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from; the same seed gives the same result.
+
+    Returns
+    -------
+    FundamentalEstimate
+        F with x2' F x1 = 0, inliers, noise and covariance. ``determined``: no other F explains the matches as
+        well; otherwise ``reasons`` says why. The covariance is that of the minimum of the Sampson distances,
+        a lower bound for the linear methods. For "seven-point" noise and covariance are NaN (there are no
+        residuals), and ``competing_models`` are the other solutions.
+
+    Raises
+    ------
+    ValueError
+        If the method is unknown, the shapes differ or coordinates are not finite.
+    StageFailure
+        If there are too few or collinear matches, or no F has 8 matches within the threshold.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import thesisrecon
+    >>> rng = np.random.default_rng(0)
+    >>> xy1 = rng.uniform(0, 500, (60, 2))
+    >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
+    >>> xy2[:20] = rng.uniform(0, 500, (20, 2))
+    >>> fit = thesisrecon.estimate_fundamental(xy1, xy2)
+    >>> bool(fit.inliers[20:].all()), fit.determined
+    (True, True)
+    >>> plane = xy1 + rng.normal([40.0, 10.0], 0.3, (60, 2))
+    >>> thesisrecon.estimate_fundamental(xy1, plane).determined
+    False
+    >>> linear = thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point")
+    >>> linear.covariance.shape
+    (9, 9)
+    """
+    rng = np.random.default_rng(seed)
+    if threshold_px is None:
+        threshold_px, method = 1.0, "gold-standard" if method in ("locally-optimised", "ransac") else method
+    if method == "locally-optimised":
+        fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
+    elif method == "seven-point":
+        fit = fit_seven(xy1, xy2)
+    elif method not in get_args(Method):
+        raise ValueError(unknown_word("method", method, get_args(Method)))
+    else:
+        # Imported on use: the default method does not need it.
+        from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
+
+        if method == "ransac":
+            fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
+        elif method == "least-median":
+            fit = LeastMedianOfSquares().estimate(xy1, xy2, rng)
+        else:
+            fit = fit_all(xy1, xy2, refined=method == "gold-standard")
+    # Copies: the test is made later.
+    xy1, xy2 = np.array(xy1, dtype=np.float64), np.array(xy2, dtype=np.float64)
+    return FundamentalEstimate(**vars(fit), xy1=xy1, xy2=xy2)
+
+
+def epipolar_lines(F: F64, xy1: F64) -> F64:
+    """Return the epipolar lines l = F x1 with unit normals: l' (x, y, 1) is a distance in px.
+
+    Parameters
+    ----------
+    F, xy1 : array_like (3, 3) and (N, 2)
+        Fundamental matrix, or F' for the lines in image 1, and pixels.
+
+    Returns
+    -------
+    ndarray (N, 3)
+        Zero for an epipole.
+
+    Examples
+    --------
+    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
+    [[0.0, 1.0, 30.0]]
+    """
+    F, xy1 = np.asarray(F, dtype=np.float64), np.asarray(xy1, dtype=np.float64)
+    require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
+    return lines_of_points(F, xy1)
+
+
+def _check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
+    """Check matches of three views and return them as float64 arrays."""
+    if np.iscomplexobj(points) or np.iscomplexobj(segments):
+        raise ValueError("points and segments must be real numbers; got complex ones")
+    points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
+    require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
+    require_finite("a trifocal tensor", points, segments)
+    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
+        raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
+    if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
+        raise ValueError("a segment needs two different ends; one has no length")
+    return points, segments
+
+
+def _drawn(image: U8, lines: F64, xy: F64) -> U8:
+    """An image with unit-normal lines (N, 3) and points (N, 2); number k always has the same colour."""
+    # Imported on use: the estimators of this chapter need no images.
+    import PIL.Image
+    import PIL.ImageDraw
+
+    canvas = PIL.Image.fromarray(image)
+    draw = PIL.ImageDraw.Draw(canvas)
+    reach, thick = float(np.hypot(*canvas.size)), max(1, round(max(canvas.size) / 400))
+    middle = (np.array(canvas.size) - 1.0) / 2.0
+    for k, (line, point) in enumerate(zip(lines, xy, strict=True)):
+        # The golden ratio spreads hues evenly for any number of matches.
+        red, green, blue = (round(255.0 * c) for c in colorsys.hsv_to_rgb(0.618034 * k % 1.0, 1.0, 1.0))
+        foot = middle - (line[:2] @ middle + line[2]) * line[:2]
+        along = reach * np.array([-line[1], line[0]])
+        if np.abs(foot - middle).max() < reach:
+            # Pillow cuts off fractions.
+            draw.line([*np.rint(foot - along), *np.rint(foot + along)], fill=(red, green, blue), width=thick)
+        radius = 4.0 * thick
+        draw.ellipse(
+            [*np.rint(point - radius), *np.rint(point + radius)], outline=(red, green, blue), width=thick
+        )
+    return np.asarray(canvas)
