@@ -13,8 +13,11 @@ import argparse
 import ast
 import itertools
 import json
+import os
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +26,14 @@ import numpy as np
 
 from thesisrecon.errors import counted
 from thesisrecon.io._files import write_text
-from thesisrecon.io._outputs import join_claim
+from thesisrecon.io._outputs import clear_folder, join_claim
 from thesisrecon.runtime._signals import install_signal_handlers
 from validation.harness.process import own_cores, run_process
-from validation.mutations import CopiedTree
 from validation.scenes.real import ROOT
 
 PACKAGES = ("geometry", "epipolar", "selfcalibration", "numerics")
 MIN_SCORE = 0.85
+COPIED = ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml")
 LIMIT_S = 420.0
 """Time limit of a test run (s)."""
 COLD_S = 3600.0
@@ -182,10 +185,39 @@ def draw(root: Path, package: str, count: int, seed: int) -> list[Mutant]:
 
 
 @dataclass(frozen=True)
-class Bench(CopiedTree):
-    """A copy of the library with its tests."""
+class Bench:
+    """A copy of the library with its tests in the folder ``out``; one fault at a time is planted."""
 
-    copied: tuple[str, ...] = ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml")
+    out: Path
+
+    @property
+    def tree(self) -> Path:
+        return self.out / "tree"
+
+    def set_up(self) -> None:
+        clear_folder(self.tree)
+        self.tree.mkdir(parents=True)
+        for name in COPIED:
+            source, target = ROOT / name, self.tree / name
+            if source.is_dir():
+                shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy2(source, target)
+
+    @contextmanager
+    def planted(self, file: str, text: str) -> Iterator[None]:
+        """Replace ``file`` by the faulty ``text`` for a while.
+
+        Kernels are cached by the code they are made from, bytecode by the time of the file.
+        """
+        path = self.tree / file
+        sound, before = path.read_text(encoding="utf-8"), path.stat().st_mtime
+        path.write_text(text, encoding="utf-8")
+        try:
+            yield
+        finally:
+            path.write_text(sound, encoding="utf-8")
+            os.utime(path, (before, before))
 
     def judges(self, file: str) -> list[list[str]]:
         """Return two lists of test files: those of the module's package, then those of its importers."""
@@ -208,7 +240,9 @@ class Bench(CopiedTree):
         log = self.out / "logs" / f"{name}.log"
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no"]
         command += ["-m", "not slow and not browser and not real", *files]
-        environment = self.environment | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        # The kernels outlive the copy.
+        environment = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(self.out / "kernels")}
+        environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         where: Any = {"cores": own_cores(), "environment": environment, "cwd": self.tree}
         process = run_process(command, log=log, limit_s=limit_s, **where)
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()

@@ -1,1 +1,0 @@
-"""Checks of the package as it is built and installed."""
