@@ -9,6 +9,8 @@ from thesisrecon.geometry.two_view import symmetric_residuals
 
 NONE_PX = 99.0
 """Error of a missing F, and the maximum reported error."""
+RIGHT_PX = 1.0
+"""An F with a smaller error is right."""
 
 
 def rms_epipolar_distance(F: F64 | None, truth: F64) -> float:

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.records import Reconstruction
@@ -27,7 +26,7 @@ DEFAULT_FOCAL_REL = 1.2
 
 
 def match_with_pycolmap(
-    images: Path, out: Path, *, shared_camera: bool = True, threads: int = 2, pairs: Path | None = None
+    images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None
 ) -> dict[str, float]:
     """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both.
 
@@ -37,12 +36,12 @@ def match_with_pycolmap(
     _begin(out)
     database, seconds, start = out / "database.db", {}, time.perf_counter()
 
-    mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
+    mode = pycolmap.CameraMode.SINGLE
     extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
     pycolmap.extract_features(
         database, images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu
     )
-    _guess_focals(database, DEFAULT_FOCAL_REL)
+    _guess_focals(database)
     seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
@@ -66,11 +65,11 @@ def _begin(out: Path) -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
 
 
-def _guess_focals(database: Path, focal_rel: float) -> None:
+def _guess_focals(database: Path) -> None:
     """Replace every focal length, including EXIF ones, by a guess."""
     store = pycolmap.Database.open(database)
     for camera in store.read_all_cameras():
-        guess = focal_rel * max(camera.width, camera.height)
+        guess = DEFAULT_FOCAL_REL * max(camera.width, camera.height)
         camera.params = [guess, *camera.params[1:]]
         camera.has_prior_focal_length = False
         store.update_camera(camera)
@@ -87,41 +86,26 @@ class ReferenceRun:
     seconds: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class Start:
-    """Start of COLMAP: a focal length of ``focal_rel`` long sides, and optionally the principal
-    point; or ``K`` (3, 3) by the name of the image, pixels as ours, assumed
-    exact (the cameras of the images must be their own then)."""
-
-    refine_principal_point: bool = False
-    focal_rel: float = DEFAULT_FOCAL_REL
-    K: Mapping[str, F64] | None = None
-
-
 def map_with_pycolmap(
     images: Path,
     matched: Path,
     out: Path,
     *,
-    start: Start | None = None,
+    refine_principal_point: bool = False,
     threads: int = 2,
     mapper: Literal["incremental", "global"] = "incremental",
 ) -> None:
-    """Map the matches of ``match_with_pycolmap`` in ``matched`` from ``start``.
+    """Map the matches of ``match_with_pycolmap`` in ``matched``.
 
     ``out`` is another folder, emptied first, for :func:`read_run`; the global mapper (GLOMAP) refines what it
     refines by default. Raises :class:`StageFailure` if COLMAP makes no model.
     """
-    start = start or Start()
     if not (matched / "seconds.json").is_file():
         raise StageFailure("COLMAP left no matches to start from")
     _begin(out)
     for name in ("database.db", "seconds.json"):
         shutil.copy(matched / name, out / name)
-    _guess_focals(out / "database.db", start.focal_rel)
-    if start.K is not None:
-        give_calibration(out / "database.db", start.K)
-    _map(images, out, start, threads=threads, mapper=mapper)
+    _map(images, out, refine_principal_point, threads=threads, mapper=mapper)
 
 
 def read_run(images: Path, out: Path) -> ReferenceRun:
@@ -140,7 +124,12 @@ def _model_folders(out: Path) -> list[Path]:
 
 
 def _map(
-    images: Path, out: Path, start: Start, *, threads: int, mapper: Literal["incremental", "global"]
+    images: Path,
+    out: Path,
+    refine_principal_point: bool,
+    *,
+    threads: int,
+    mapper: Literal["incremental", "global"],
 ) -> None:
     """Map the database in ``out``, whose folder "sparse" the models go to, with COLMAP's defaults.
 
@@ -155,26 +144,11 @@ def _map(
     else:
         options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
         options.mapper.num_threads = threads
-        options.ba_refine_principal_point = start.refine_principal_point
-        # A calibration that is given is exact.
-        options.ba_refine_focal_length = options.ba_refine_extra_params = start.K is None
+        options.ba_refine_principal_point = refine_principal_point
         pycolmap.incremental_mapping(*paths, options)
     seconds["map"] = time.perf_counter() - begun
     write_text(out / "seconds.json", json.dumps(seconds))
     _model_folders(out)
-
-
-def give_calibration(database: Path, K: Mapping[str, F64]) -> None:
-    """Set the true calibration of every camera."""
-    store = pycolmap.Database.open(database)
-    for image in store.read_all_images():
-        camera, known = store.read_camera(image.camera_id), K[image.name]
-        camera.model = pycolmap.CameraModelId.PINHOLE
-        # COLMAP's pixels have their origin at the corner of the first one.
-        camera.params = [known[0, 0], known[1, 1], known[0, 2] + 0.5, known[1, 2] + 0.5]
-        camera.has_prior_focal_length = True
-        store.update_camera(camera)
-    store.close()
 
 
 def reconstruct_with_pycolmap(
@@ -192,7 +166,7 @@ def reconstruct_with_pycolmap(
     models and the times, for :func:`read_run`. Raises ``StageFailure`` if COLMAP makes no model.
     """
     match_with_pycolmap(images, out, threads=threads, pairs=pairs)
-    _map(images, out, Start(refine_principal_point), threads=threads, mapper="incremental")
+    _map(images, out, refine_principal_point, threads=threads, mapper="incremental")
 
 
 def main() -> None:

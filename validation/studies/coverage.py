@@ -7,7 +7,6 @@ the truth in 95 of 100 cases.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Literal
@@ -28,18 +27,6 @@ from validation.studies.runner import Part, Rows
 Cameras = Literal["shared", "per-image"]
 MODES: tuple[Cameras, ...] = ("shared", "per-image")
 SUCCESS_PCT = 3.0
-MIN_HOLDING = 0.92
-WIDE_REL = 0.02
-"""Relative standard deviation from which on a focal length counts as marked uncertain."""
-
-
-def add_intervals(rows: Rows, scores: IntervalScores, least: float | None) -> None:
-    for label, columns in COLUMNS.items():
-        row = f"95 % intervals of the {label} that hold the truth"
-        rows.add(row, scores.holding(columns), at_least=least)
-        rows.add(f"largest error, {label}", scores.worst(columns), "stated standard deviations")
-    width = float(100.0 * np.nanmedian(scores.std_rel))
-    rows.add("stated standard deviation of the focal, median", width, "%")
 
 
 def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
@@ -47,21 +34,6 @@ def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
         return scores
     first = int(np.flatnonzero(np.isfinite(scores.std_rel))[0])
     return IntervalScores(scores.z[first : first + 1], scores.std_rel[first : first + 1])
-
-
-def named(result: MetricResult, view: int) -> bool:
-    """Return whether the result marks the focal length of a view as uncertain.
-
-    The view is not registered, a sentence names it, its value is shrunk, or its standard deviation is
-    large.
-    """
-    if not result.reconstruction.registered[view]:
-        return True
-    sentence = re.compile(rf"#{view}\b")
-    if any(sentence.search(said) for said in (*result.warnings, *result.failed_checks)):
-        return True
-    interval = result.intrinsics[view]["focal_px"]
-    return interval.source.startswith("shrunk") or interval.std / interval.value >= WIDE_REL
 
 
 COVERAGE = 0.92, 0.98

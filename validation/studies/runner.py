@@ -40,7 +40,6 @@ MODULES = {
     "benchmark-table": "timing",
     "calibration-coverage": "coverage",
     "coverage-real": "coverage_real",
-    "calibration-real": "calibration_real",
     "cluster-efficiency": "cluster",
     "critical-motions": "critical_motions",
     "dinosaur": "dinosaur",
@@ -48,12 +47,10 @@ MODULES = {
     "epipolar-methods": "epipolar_methods",
     "facades": "facades",
     "factorization": "factorization",
-    "front-end": "front_end",
     "full-disk": "robustness",
     "growth-of-cameras": "growth_of_cameras",
     "growth-of-cost": "growth",
     "harsh": "harsh",
-    "interpolation": "interpolation",
     "kill-anywhere": "robustness",
     "large-images": "large_images",
     "main-job": "main_job",
@@ -62,10 +59,8 @@ MODULES = {
     "rectification": "rectification",
     "self-check": "self_check",
     "stop-anywhere": "robustness",
-    "stratified": "selfcalibration",
     "subsets": "subsets",
     "surfaces": "surfaces",
-    "tensor-views": "tensor_views",
     "wide-steps": "wide_steps",
 }
 """Name of a study -> the module of this folder that holds its function."""
@@ -99,7 +94,6 @@ CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
 """Folder that keeps SIFT matches of image pairs between studies."""
 HELP = {
     "benchmark": "JSON file of pytest-benchmark (default: run the benchmarks)",
-    "cache": "folder that keeps SIFT matches",
     "cameras": "shared: one camera for all images; per-image: one for each",
     "cold": "begin each run without compiled kernels",
     "colmap": "COLMAP on the same images and pairs too",
@@ -107,7 +101,6 @@ HELP = {
     "core_views": "views reconstructed projectively; 0: all",
     "every": "take every n-th one only",
     "executor": "executor of the runs",
-    "gaps": "gaps of the pairs (i, i + gap)",
     "formats": "names of file formats (default: all)",
     "images": "folder of images",
     "kills": "runs killed (SIGKILL) at moments spread over their time",

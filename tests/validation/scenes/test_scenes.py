@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from PIL import Image as PillowImage
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project
 from validation.harness.records import ReportOptions
@@ -30,14 +29,12 @@ from validation.scenes.raycast import Surface, build_world, trace
 from validation.scenes.real import (
     REAL_SCENES,
     ROOT,
-    Scene,
     load_fixture_depth,
     load_fixture_scene,
     load_real_scene,
     read_scene,
 )
 from validation.scenes.sensor import Sensor, expose, integrate_pixels
-from validation.scenes.zoomed import Rezoom, rezoom_scene, windowed_scene
 
 FOLDER = ROOT / "fixtures" / "courtyard"
 
@@ -231,79 +228,6 @@ def test_an_image_without_its_truth_is_named(tmp_path):
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [camera]}))
     with pytest.raises(ValueError, match=r"b\.JPG"):
         read_scene(tmp_path, "x")
-
-
-ZOOM_SIZE = (180, 120)
-
-
-ZOOM_K = np.array([[150.0, 0.0, 92.0], [0.0, 151.0, 57.0], [0.0, 0.0, 1.0]])
-
-
-X = np.array([[0.05, -0.03, 1.0], [-0.1, 0.08, 1.0]])
-
-
-@pytest.fixture
-def spots_scene(tmp_path):
-    """Two images of two white spots that stand where K sees the points X."""
-    y, x = np.mgrid[: ZOOM_SIZE[1], : ZOOM_SIZE[0]]
-    gray = np.zeros(ZOOM_SIZE[::-1])
-    for place in spots(ZOOM_K):
-        gray += 250.0 * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * 2.0**2))
-    paths = tuple(tmp_path / f"{n}.png" for n in range(2))
-    for path in paths:
-        PillowImage.fromarray(np.repeat(gray[..., None], 3, axis=2).clip(0, 255).astype(np.uint8)).save(path)
-    return Scene("spots", paths, np.array([ZOOM_K, ZOOM_K]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
-
-
-def spots(calibration):
-    seen = X @ calibration.T
-    return seen[:, :2] / seen[:, 2:]
-
-
-def found_spot(path, near):
-    """Centre of gravity around a place."""
-    with PillowImage.open(path) as picture:
-        gray = np.asarray(picture, dtype=np.float64)[..., 0]
-    y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
-    weight = gray * (np.hypot(x - near[0], y - near[1]) < 9.0)
-    return np.array([np.sum(weight * x), np.sum(weight * y)]) / weight.sum()
-
-
-def test_spots_of_zoomed_images_are_where_their_calibration_sees_them(spots_scene, tmp_path):
-    new = rezoom_scene(spots_scene, tmp_path / "zoom", seed=3, how=Rezoom(0.3, 0.05))
-    assert new.K is not None
-    for path, calibration in zip(new.image_paths, new.K, strict=True):
-        for place in spots(calibration):
-            assert found_spot(path, place) == pytest.approx(place, abs=0.05)
-
-
-def test_zoomed_frames_stay_inside_their_image_and_move_the_principal_point():
-    rng = np.random.default_rng(0)
-    shares = []
-    for _ in range(50):
-        frame = Rezoom().frame(ZOOM_K, ZOOM_SIZE, rng)
-        assert frame.left >= -1e-9
-        assert frame.top >= -1e-9
-        assert np.all(
-            np.array([frame.left, frame.top]) + frame.size <= frame.zoom * np.array(ZOOM_SIZE) + 1e-9
-        )
-        assert np.all(np.array(frame.size) <= ZOOM_SIZE)
-        middle = (np.array(frame.size) - 1) / 2
-        shares.append((frame.calibration(ZOOM_K)[:2, 2] - middle) / frame.size)
-    # Frames are whole pixels wide, the shift is drawn for the unrounded one.
-    assert np.abs(shares).max() <= 0.1 + 1e-9
-    assert np.abs(shares).max() > 0.08
-
-
-def test_a_windowed_image_keeps_its_window_and_its_camera(spots_scene, tmp_path):
-    new = windowed_scene(spots_scene, tmp_path / "windows", {1: np.array([0.0, 0.0, 0.4, 1.0])})
-    with PillowImage.open(new.image_paths[1]) as picture, PillowImage.open(spots_scene.image_paths[1]) as old:
-        after, before = np.asarray(picture), np.asarray(old)
-    right = after[:, int(0.4 * ZOOM_SIZE[0]) + 1 :]
-    assert np.ptp(right) == 0
-    inside = slice(30, 40)
-    assert np.array_equal(after[50:60, inside], before[50:60, inside])
-    assert new.K is spots_scene.K
 
 
 RAY_K = np.array([[90.0, 0.0, 33.0], [0.0, 90.0, 22.0], [0.0, 0.0, 1.0]])

@@ -23,7 +23,7 @@ from validation.harness.scenes import has_images, load_images, truth_of
 from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
 from validation.metrics.record import Metric
-from validation.references.colmap import Start, map_with_pycolmap, match_with_pycolmap
+from validation.references.colmap import map_with_pycolmap, match_with_pycolmap
 from validation.references.colmap_reading import read_colmap_model
 from validation.scenes.real import Scene
 
@@ -124,9 +124,9 @@ def _run_colmap(task: Task, scene: Scene, options: ReportOptions, place: Path) -
         match_with_pycolmap(images, place, threads=1)
         return
     matched = options.place(task.stage, task.scene, MATCHES)
-    start = Start(refine_principal_point=task.method == COLMAP_PP)
     mapper: Literal["incremental", "global"] = "global" if task.method == COLMAP_GLOBAL else "incremental"
-    map_with_pycolmap(images, matched, place, start=start, threads=1, mapper=mapper)
+    refined = task.method == COLMAP_PP
+    map_with_pycolmap(images, matched, place, refine_principal_point=refined, threads=1, mapper=mapper)
 
 
 def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:

@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from thesisrecon.arrays import F64
-from thesisrecon.config import preset
+from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io._images import read_images
-from thesisrecon.records import Image
+from thesisrecon.pipeline._image_pair import match_views
+from thesisrecon.records import Image, TwoView
 from validation.harness.records import Judgement, Outcome, ReportOptions, Stage, Task
 from validation.harness.rows import OURS, Values, each, read_arrays, row
 from validation.harness.scenes import has_images, load_images
 from validation.harness.stages.fundamental import MATCHES
-from validation.metrics.epipolar import rms_epipolar_distance
+from validation.metrics.epipolar import RIGHT_PX, rms_epipolar_distance
 from validation.metrics.record import Metric
 from validation.references.libraries import NoReference
 from validation.references.opencv import harris_corners, sift_corners
+from validation.references.sift import sift_front_end
 from validation.scenes.real import Scene, load_fixture_depth
 from validation.scenes.real_pairs import RealPair, camera_pairs
-from validation.studies.front_end_pairs import RIGHT_PX, PreparedViews, front_ends
 
 THESIS, SIFT, HARRIS = "ours (thesis)", "SIFT", "cv2.cornerHarris"
-FRONT_ENDS = {OURS: "ours", THESIS: "thesis", SIFT: "SIFT"}
+FRONT_ENDS = (OURS, THESIS, SIFT)
 CORNERS = 1000
 REPEATED_PX = 1.5
 VERIFIED = "mean over the pairs; none if F is wrong"
@@ -55,7 +57,7 @@ class FeaturesStage(Stage):
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         if options.gates_only:
             return (OURS, THESIS) if scene in WITH_DEPTH else (OURS,)
-        return (*FRONT_ENDS, HARRIS) if scene in WITH_DEPTH else tuple(FRONT_ENDS)
+        return (*FRONT_ENDS, HARRIS) if scene in WITH_DEPTH else FRONT_ENDS
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         # The judgement evaluates F on these matches, moved onto the true epipolar lines.
@@ -101,12 +103,24 @@ def _corners(method: str, image: Image) -> F64:
     return sift_corners(image, CORNERS) if method == SIFT else harris_corners(image, CORNERS)
 
 
+def _front_end(method: str) -> PipelineConfig:
+    """Return a front end with the estimator of F and the verification of the default."""
+    ours, thesis = preset("default"), preset("thesis")
+    if method == SIFT:
+        return sift_front_end(ours)
+    return replace(ours, features=thesis.features, matching=thesis.matching) if method == THESIS else ours
+
+
 def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> dict[str, Any]:
     """Return F in original pixels, number of inliers and sigma of every pair."""
-    prepared = PreparedViews(front_ends()[FRONT_ENDS[method]], images)
+    config = _front_end(method)
+    prepared = [config.matching.prepare(image, config.features.detect(image)) for image in images]
     arrays: dict[str, Any] = {}
     for gap in _gaps(options):
-        views = [prepared.relate(i, i + gap, options.seed) for i in range(len(images) - gap)]
+        views: list[TwoView] = [
+            match_views(config, prepared[i], prepared[i + gap], (i, i + gap), options.seed)
+            for i in range(len(images) - gap)
+        ]
         arrays[f"F{gap}"] = np.array([in_original_pixels(v.F, images[v.i], images[v.j]) for v in views])
         arrays[f"inliers{gap}"] = np.array([view.inliers for view in views])
         arrays[f"sigma{gap}"] = np.array([view.sigma_px for view in views])
