@@ -12,12 +12,12 @@ from thesisrecon.api.cameras import triangulate
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
-from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres import CeresOptions, bundle_adjuster, colmap_model
 from validation.references.fundamental import SOLVERS
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.two_views import make_two_views
 from validation.scenes.walks import SIZE, make_walk
+from validation.stages.bundle import FOCAL_K1
 
 MATCHES, SIGMA_PX, FRAME = 1000, 0.5, (1280.0, 960.0)
 POINTS = 2000

@@ -12,7 +12,7 @@ def main() -> int:
     install_signal_handlers("validation")
     if sys.argv[1:2] == ["study"]:
         # A study needs neither the stages nor the ablation.
-        from validation.studies.runner import run_studies
+        from validation.runs.study import run_studies
 
         with with_resume_advice("run the same command again"):
             return run_studies(sys.argv[2:])

@@ -14,14 +14,14 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io._outputs import join_claim
 from thesisrecon.runtime._signals import with_resume_advice
 from validation.ablation import command as ablation
-from validation.harness.gates import read_gates
-from validation.harness.page import write_pages
-from validation.harness.process import own_cores
-from validation.harness.records import ReportOptions
-from validation.harness.results import Results, collect, read_results, write_results
-from validation.harness.scenes import load_images
-from validation.harness.schedule import run_tasks
-from validation.harness.stages import STAGES, available_scenes
+from validation.runs.gates import read_gates
+from validation.runs.page import write_pages
+from validation.runs.processes import own_cores
+from validation.runs.records import ReportOptions
+from validation.runs.report import run_tasks
+from validation.runs.results import Results, collect, read_results, write_results
+from validation.runs.scenes import load_images
+from validation.stages import STAGES, available_scenes
 
 MIN_SIDE_PX = 64
 """Smallest long side of depth maps, for the matching window."""
@@ -75,9 +75,6 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--resume", type=Path, help="folder of an earlier run whose references are reused"
         )
-        command.add_argument(
-            "--methods", nargs="+", metavar="METHOD", help="own methods that run again with --resume"
-        )
         command.add_argument("--time-limit", type=float, default=300.0, help="limit of one task in seconds")
         command.add_argument(
             "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps (default: small)"
@@ -101,8 +98,6 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
         raise ValueError(
             f"no scene is called {unknown[0]}; choose from {', '.join(available_scenes(quick=False))}"
         )
-    if parsed.methods and parsed.resume is None:
-        raise ValueError("--methods needs --resume: name the folder of the earlier run")
     if parsed.resume is not None and parsed.resume.resolve() == parsed.out.resolve():
         raise ValueError("--resume names another folder than --out, whose earlier results are removed")
     if parsed.threads < 1 or parsed.time_limit <= 0:
@@ -119,7 +114,6 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
         seed=parsed.seed,
         threads=min(parsed.threads, len(own_cores())),
         limit_s=parsed.time_limit,
-        methods=tuple(parsed.methods or ()),
         resume="" if parsed.resume is None else str(parsed.resume.resolve()),
         side_px=parsed.max_side,
     )

@@ -28,7 +28,7 @@ from thesisrecon.errors import counted
 from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import clear_folder, join_claim
 from thesisrecon.runtime._signals import install_signal_handlers
-from validation.harness.process import own_cores, run_process
+from validation.runs.processes import own_cores, run_process
 from validation.scenes.real import ROOT
 
 PACKAGES = ("geometry", "epipolar", "selfcalibration", "numerics")

@@ -148,10 +148,10 @@ def commands_of(text):
 
 def test_commands_of_the_pages_exist(site):
     """Names of commands, studies and ablations, and all options."""
-    pytest.importorskip("validation.studies.runner")
+    pytest.importorskip("validation.runs.study")
     from validation.ablation.command import STUDIES
     from validation.command import _parser
-    from validation.studies.runner import MODULES, load_study, study_parser
+    from validation.runs.study import MODULES, load_study, study_parser
 
     sections = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", site("interface").command_page(), re.M | re.S))
     shipped, tried = {file.stem for file in STUDIES.glob("*.toml")}, 0
@@ -182,8 +182,8 @@ def test_commands_of_the_pages_exist(site):
 
 def test_all_studies_run_with_the_options_of_the_pages():
     """`study all` makes the tables of the chapters and of the evidence."""
-    pytest.importorskip("validation.studies.runner")
-    from validation.studies.runner import MODULES, OF_PAGES, load_study, study_parser
+    pytest.importorskip("validation.runs.study")
+    from validation.runs.study import MODULES, OF_PAGES, load_study, study_parser
 
     def options(name, words):
         return vars(study_parser(name, load_study(name)).parse_args([*words, "-o", "OUT"]))

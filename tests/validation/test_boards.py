@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from thesisrecon.errors import StageFailure
-from validation.harness.stages.boards import OURS, _metrics
 from validation.references.libraries import NoReference, load
 from validation.references.opencv import board_corners, calibrate_from_corners
 from validation.scenes.boards import CORNERS, K1, LENS, RENDERED, SIZE, K, board_images, make_board
+from validation.stages.boards import OURS, _metrics
 
 try:
     load("cv2")

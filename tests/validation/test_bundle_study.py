@@ -6,9 +6,9 @@ import pytest
 pytest.importorskip("pycolmap")
 
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
-from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres import CeresOptions, refine_with_ceres
 from validation.scenes.walks import SIZE, make_walk
+from validation.stages.bundle import FOCAL_K1
 
 
 @pytest.mark.parametrize("kind", ["street", "loop"])

@@ -7,7 +7,7 @@ import pytest
 
 from tests.pipeline.fake_stages import fake_config, kept_bytes, photographs
 from thesisrecon.api.reconstruct import reconstruct
-from validation.studies.cluster import Task, TaskMeter, critical_path, efficiency_table
+from validation.studies.cluster_efficiency import Task, TaskMeter, critical_path, efficiency_table
 
 
 def tasks_of(*seconds, sent=0, received=0):

@@ -5,8 +5,8 @@ import pytest
 
 from validation.metrics.intervals import IntervalScores, holding_std
 from validation.scenes.dinosaur import load_dinosaur
-from validation.studies import coverage
-from validation.studies.coverage import one_camera
+from validation.studies import calibration_coverage
+from validation.studies.calibration_coverage import one_camera
 from validation.studies.dinosaur import compare, to_metrics
 
 
@@ -17,8 +17,8 @@ def test_a_value_that_all_views_share_counts_once():
 
 
 def test_without_a_trusted_result_no_coverage_is_reached(monkeypatch):
-    monkeypatch.setattr(coverage, "run_trial", lambda *_: None)
-    assert "missed" in [row.verdict for row in coverage.check_coverage("shared", range(3))]
+    monkeypatch.setattr(calibration_coverage, "run_trial", lambda *_: None)
+    assert "missed" in [row.verdict for row in calibration_coverage.check_coverage("shared", range(3))]
 
 
 def test_cameras_that_err_together_make_a_share_as_unsure_as_scenes_do():

@@ -11,6 +11,7 @@ pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
 from validation.ablation.tasks.fundamental import measure_pair
+from validation.runs.study import run_study
 from validation.scenes.cube import cube_pairs, make_cube
 from validation.studies import epipolar_methods
 from validation.studies.epipolar_methods import (
@@ -28,7 +29,6 @@ from validation.studies.epipolar_methods import (
     measure,
     run_methods,
 )
-from validation.studies.runner import run_study
 
 BY_NAME = {m.name: m for m in METHODS}
 CRITERIA = ("Sampson (5.4)", "epipolar distance (5.6)", "gold standard")

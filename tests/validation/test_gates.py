@@ -1,6 +1,6 @@
 """Every limit of ``validation/gates.toml`` is checked on fixtures and real images.
 
-All numbers come from the harness, which runs each stage as a process and recomputes its results.
+All numbers come from the report, which runs each stage as a process and recomputes its results.
 Gates of scenes whose photographs are not on this machine are skipped.
 """
 
@@ -8,13 +8,13 @@ from functools import cache
 
 import pytest
 
-from validation.harness.gates import read_gates
-from validation.harness.process import own_cores
-from validation.harness.records import ReportOptions
-from validation.harness.results import collect
-from validation.harness.scenes import IMAGE_SCENES, available_scenes
-from validation.harness.schedule import run_tasks
-from validation.harness.stages import STAGES
+from validation.runs.gates import read_gates
+from validation.runs.processes import own_cores
+from validation.runs.records import ReportOptions
+from validation.runs.report import run_tasks
+from validation.runs.results import collect
+from validation.runs.scenes import IMAGE_SCENES, available_scenes
+from validation.stages import STAGES
 
 pytestmark = pytest.mark.slow
 GATES = read_gates()

@@ -9,13 +9,13 @@ pytest.importorskip("pycolmap")
 
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._colmap_writing import write_colmap_model
-from validation.harness.process import own_cores, run_process
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.references.colmap import read_run, reconstruct_with_pycolmap
+from validation.runs.processes import own_cores, run_process
+from validation.runs.study import run_study
 from validation.scenes.real import Scene, load_fixture_scene
-from validation.studies import main_job
-from validation.studies.main_job import COLMAP, OURS
-from validation.studies.runner import run_study
+from validation.studies import against_colmap
+from validation.studies.against_colmap import COLMAP, OURS
 
 from .test_metrics import N, V, _reconstruction, _truth
 
@@ -63,14 +63,14 @@ def test_the_table_is_made_from_saved_results(tmp_path, monkeypatch, capsys):
         source = saved if method in (OURS, COLMAP) else tmp_path / "nothing"
         return [sys.executable, "-c", copy, str(source), str(out)]
 
-    monkeypatch.setattr(main_job, "_command", pretend)
-    monkeypatch.setattr(main_job, "scenes_here", lambda _names: [scene])
-    assert run_study("main-job", ["-o", str(tmp_path / "out"), "--scenes", "fountain-P11"]) == 1
+    monkeypatch.setattr(against_colmap, "_command", pretend)
+    monkeypatch.setattr(against_colmap, "scenes_here", lambda _names: [scene])
+    assert run_study("against-colmap", ["-o", str(tmp_path / "out"), "--scenes", "fountain-P11"]) == 1
 
-    rows = {row["name"]: row for row in json.loads((tmp_path / "out" / "main-job.json").read_text())}
+    rows = {row["name"]: row for row in json.loads((tmp_path / "out" / "against-colmap.json").read_text())}
     assert rows["focal error"]["verdict"] == "reached"
     assert rows["wall time"]["values"][COLMAP] == 6.0
-    text = (tmp_path / "out" / "main-job.md").read_text()
+    text = (tmp_path / "out" / "against-colmap.md").read_text()
     assert f"- {OURS}: features 1.50 s" in text
     assert text.count(" failed: ") == 2
     assert "## fountain-P11" in text

@@ -3,11 +3,11 @@
 import pytest
 
 from tests.validation.test_metrics import V, _reconstruction, _truth
-from validation.harness.gates import read_gates
-from validation.metrics.record import Metric, markdown_table
+from validation.runs.gates import read_gates
+from validation.runs.tables import Metric, markdown_table
 from validation.scenes.real import Scene
-from validation.studies import main_job
-from validation.studies.main_job import COLMAP, OURS, Outcome, check_reconstruction
+from validation.studies import against_colmap
+from validation.studies.against_colmap import COLMAP, OURS, Outcome, check_reconstruction
 
 
 def _rows(scene, outcomes, *, n_views=V):
@@ -60,10 +60,10 @@ def test_a_run_that_failed_is_not_hidden_by_one_that_did_not(tmp_path, monkeypat
             Outcome(None if fails else model, 9.0 - fails, 1.0, 1.0, failure="no" * fails)
             for fails in failing
         ]
-        left = {method: list(runs) for method in main_job.METHODS}
-        monkeypatch.setattr(main_job, "run_method", lambda method, *_, left=left, **__: left[method].pop())
+        left = {method: list(runs) for method in against_colmap.METHODS}
+        monkeypatch.setattr(against_colmap, "run_method", lambda m, *_, left=left, **__: left[m].pop())
         scene = Scene("a set", tuple(tmp_path / f"{n}.png" for n in range(V)))
-        _, outcomes = main_job.measure_scene(scene, tmp_path, threads=1, repeats=2, environment={})
+        _, outcomes = against_colmap.measure_scene(scene, tmp_path, threads=1, repeats=2, environment={})
         assert all(outcome.failure == "no" for outcome in outcomes.values())
 
 

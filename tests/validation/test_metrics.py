@@ -19,8 +19,8 @@ from validation.metrics.cameras import (
 )
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
 from validation.metrics.pictures import psnr_db, ssim
-from validation.metrics.record import number
-from validation.studies.coverage import run_trial
+from validation.runs.tables import number
+from validation.studies.calibration_coverage import run_trial
 
 
 def test_psnr_is_that_of_the_mean_square():

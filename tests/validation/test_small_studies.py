@@ -24,28 +24,21 @@ from thesisrecon.geometry.two_view import sampson_residuals
 from validation import command
 from validation.ablation.command import STUDIES
 from validation.metrics.cameras import TrueCameras, measure_cameras
-from validation.metrics.record import Metric
+from validation.runs.processes import call_apart
+from validation.runs.study import MODULES, OF_PAGES, load_study, run_studies, run_study, study_parser
+from validation.runs.tables import Metric, text_table
 from validation.scenes.many_tracks import GATE_PX, make_tracks
 from validation.scenes.many_views import walk
-from validation.studies import coverage_real, growth, timing
+from validation.studies import benchmark_table, coverage_real
+from validation.studies import growth_of_cost as growth
+from validation.studies.benchmark_table import ratio_table, ratios_to_ours
 from validation.studies.coverage_real import draw_neighbours
 from validation.studies.facades import KINDS, lens_error
-from validation.studies.growth import Cost, Meter
+from validation.studies.growth_of_cost import Cost, Meter, exponent
 from validation.studies.large_images import FORMATS, read_one, write_image
-from validation.studies.measuring import call_apart, exponent
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
-from validation.studies.runner import (
-    MODULES,
-    OF_PAGES,
-    load_study,
-    run_studies,
-    run_study,
-    study_parser,
-    text_table,
-)
 from validation.studies.subsets import OUTCOMES, Matched, Trial, run_trial, solve, table_row, take_views
-from validation.studies.timing import ratio_table, ratios_to_ours
-from validation.studies.wide_steps import WideResult, check_step
+from validation.studies.wide_baseline import WideResult, check_step
 
 
 def test_the_exponent_is_that_of_a_power():
@@ -253,8 +246,8 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
         yield f"{sum(numbers)} {kind}"
         yield rows if kind == "b" else rows[:0]
 
-    monkeypatch.setitem(MODULES, "toy", "timing")
-    monkeypatch.setattr(timing, "toy_study", toy_study, raising=False)
+    monkeypatch.setitem(MODULES, "toy", "benchmark_table")
+    monkeypatch.setattr(benchmark_table, "toy_study", toy_study, raising=False)
     toy_study.__annotations__ = {"out": Path, "numbers": Sequence[int], "kind": Literal["a", "b"]}
     assert run_studies(["toy", "--numbers", "3", "4"]) == 0
     assert capsys.readouterr().out == "7 a\n\n"
@@ -286,7 +279,7 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
         yield "begun"
         raise failures.pop()
 
-    monkeypatch.setattr(timing, "toy_study", failing_study)
+    monkeypatch.setattr(benchmark_table, "toy_study", failing_study)
     monkeypatch.setitem(OF_PAGES, "toy", [[]])
     for code in (2, 1):
         others.clear()

@@ -6,10 +6,10 @@ import pytest
 from tests.synthetic import texture
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
-from validation.harness.records import ReportOptions, Task
-from validation.harness.stages import disparity
 from validation.metrics.depth import bad_pixels
+from validation.runs.records import ReportOptions, Task
 from validation.scenes.stereo import StereoPair, load_stereo_pair, seen_by_both
+from validation.stages import disparity
 
 LIMITS_PCT = {"Tsukuba": (3.13, 4.1), "Teddy": (8.4, 14.0), "Cones": (4.1, 10.5), "Motorcycle": (5.6, 16.0)}
 """Of pixels off by more than one: OpenCV's better mode for the default, the literature's scanline program for

@@ -7,11 +7,11 @@ import pytest
 
 from tests.surface.sphere import photograph, ring_of
 from thesisrecon.records import DepthMap, Reconstruction, TexturedMesh, Tracks
-from validation.harness.stages import surface as surface_stage
-from validation.harness.stages import views as views_stage
 from validation.metrics import depth, surfaces
 from validation.references.libraries import NoReference, load
 from validation.scenes.real import load_fixture_scene
+from validation.stages import surface as surface_stage
+from validation.stages import views as views_stage
 
 try:
     load("open3d")

@@ -15,10 +15,10 @@ from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
 from validation.ablation.tables import comparison_text, failures_of, mean_text, write_tables
-from validation.harness.page import plot_at, write_page
-from validation.harness.records import Plot, slug
-from validation.harness.rows import plot, scatter
-from validation.metrics.record import number
+from validation.runs.page import plot_at, write_page
+from validation.runs.records import Plot, slug
+from validation.runs.rows import plot, scatter
+from validation.runs.tables import number
 from validation.stamp import commit
 
 PAGE = "index.html"

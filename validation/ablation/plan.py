@@ -27,7 +27,7 @@ from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode
 from validation.ablation.tasks import Reconstruction
 
 ROOT = Path(__file__).resolve().parents[1]
-RUN_BY_ROWS = ("scenes", "metrics", "references", "harness", "studies", "ablation/tasks")
+RUN_BY_ROWS = ("scenes", "metrics", "references", "runs", "stages", "studies", "ablation/tasks")
 """Folders of the code that the rows run, without that of the library."""
 _VERSIONS = ("numpy", "scipy", "numba")
 Levels = Mapping[str, str]

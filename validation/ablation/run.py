@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +17,8 @@ from thesisrecon.io._outputs import join_claim
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.store import STEPS, WORK, Outcome, Store, finite
 from validation.ablation.study import FunctionTask, Study
-from validation.ablation.workers import Crew, Job, carry_out, crew_of, pack
+from validation.ablation.workers import Job, Workers, pack, workers_of
+from validation.runs.jobs import run_jobs
 
 LOST = "the worker process of this row was killed or ran out of memory"
 
@@ -102,8 +103,8 @@ def ablate(
         total = len({row.key for row in plan.rows})
         lost: dict[str, Outcome] = {}
         if todo:
-            with crew_of(executor, threads) as crew:
-                session = _Session(plan, store, crew, State(total, total - len(todo)), on_progress)
+            with workers_of(executor, threads) as workers:
+                session = _Session(plan, store, workers, State(total, total - len(todo)), on_progress)
                 lost = session.run(list(todo.values()))
         shutil.rmtree(store.path / WORK, ignore_errors=True)
     return _rows(plan, store, lost)
@@ -183,59 +184,49 @@ class _Session:
 
     plan: Plan
     store: Store
-    crew: Crew
+    workers: Workers
     state: State
     on_progress: ProgressCallback
-    tries: Counter[str] = field(default_factory=Counter)
+    suspects: set[str] = field(default_factory=set)
     lost: dict[str, Outcome] = field(default_factory=dict)
 
     def run(self, rows: Sequence[PlannedRow]) -> dict[str, Outcome]:
-        """Carry out all rows; the outcomes of those that were lost, which are not stored."""
+        """Carry out all rows; return the outcomes of those that were lost, which are not stored."""
         parts = parts_of(rows)
         ended = {p.key for p in parts if p.step and self.store.load(p.key, STEPS) is not None}
         waiting = [p for p in parts if p.name not in ended]
         self.state.steps = sum(bool(p.step) for p in waiting)
         packed = {p.row.key: pack(p.row.setting) for p in waiting}
-        running: dict[Future[Outcome], _Part] = {}
+
+        def is_ready(part: _Part, running: Collection[_Part]) -> bool:
+            # A part whose process died runs alone, so that it is known which one kills processes.
+            alone = not self.suspects or (part.name in self.suspects and not running)
+            return alone and set(part.after) <= ended
+
+        def submit(part: _Part) -> Future[Outcome]:
+            row = part.row
+            job = Job(part.name, *packed[row.key], row.scene, row.seed, self.store.path, part.step)
+            return self.workers.submit(job)
+
         self.on_progress(self.state)
-        while waiting or running:
-            for part in self._ready(waiting, ended, len(running)):
-                waiting.remove(part)
-                running[self._submit(part, packed[part.row.key])] = part
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            outcomes = [(running.pop(future), _outcome(future)) for future in done]
-            if any(outcome.lost for _, outcome in outcomes):
-                # No row of a broken pool ends.
-                outcomes += [(part, Outcome(failure=LOST, lost=True)) for part in running.values()]
-                running.clear()
-                self.crew.executor = self.crew.renew()
-            for part, outcome in outcomes:
-                self.tries[part.name] += outcome.lost
-                if outcome.lost and self.tries[part.name] < 2:
+        for done in run_jobs(waiting, submit, is_ready, self.workers.most):
+            for part, future in done:
+                outcome = self._outcome(future)
+                if outcome.lost and part.name not in self.suspects:
+                    self.suspects.add(part.name)
                     waiting.insert(0, part)
                 else:
+                    self.suspects.discard(part.name)
                     ended.add(part.name)
                     self._keep(part, outcome)
         return self.lost
 
-    def _ready(self, waiting: Sequence[_Part], ended: set[str], running: int) -> list[_Part]:
-        """The parts that can begin, in order. One that was in a process that died runs alone, so that it is
-        known which of them kills processes."""
-        ready = [p for p in waiting if set(p.after) <= ended]
-        suspects = [p for p in ready if self.tries[p.name]]
-        if suspects:
-            return suspects[:1] if not running else []
-        return ready[: max(0, self.crew.most - running)]
-
-    def _submit(self, part: _Part, packed: tuple[bytes, Any]) -> Future[Outcome]:
-        row = part.row
-        job = Job(part.name, *packed, row.scene, row.seed, self.store.path, part.step)
+    def _outcome(self, future: Future[Outcome]) -> Outcome:
         try:
-            return self.crew.executor.submit(carry_out, job)
-        except BrokenProcessPool as error:
-            future: Future[Outcome] = Future()
-            future.set_exception(error)
-            return future
+            return future.result()
+        except BrokenProcessPool:
+            self.workers.renew(future)
+            return Outcome(failure=LOST, lost=True)
 
     def _keep(self, part: _Part, outcome: Outcome) -> None:
         row, state = part.row, self.state
@@ -252,13 +243,6 @@ class _Session:
             state.done += 1
             state.failed += bool(outcome.failure or finite(outcome.metrics, self.plan.wanted(row))[1])
         self.on_progress(state)
-
-
-def _outcome(future: Future[Outcome]) -> Outcome:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        return Outcome(failure=LOST, lost=True)
 
 
 def _row_record(plan: Plan, row: PlannedRow) -> dict[str, Any]:

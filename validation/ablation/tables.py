@@ -1,9 +1,7 @@
-"""The analysis as text, Markdown, CSV and, where pyarrow is installed, Parquet."""
+"""The analysis as Markdown and CSV."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -15,9 +13,8 @@ from thesisrecon.io._files import write_text
 from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
 from validation.ablation.run import Row
 from validation.ablation.study import Measure
-from validation.metrics.record import number
+from validation.runs.tables import number, text_table, write_csv
 from validation.stamp import stamp
-from validation.studies.runner import text_table
 
 Record = Mapping[str, Any]
 
@@ -79,16 +76,8 @@ def write_tables(analysis: Analysis, out: Path) -> list[Path]:
         "means": [_cell_record(c) for c in analysis.cells],
     }
     for name, records in tables.items():
-        sink = io.StringIO(newline="")
-        writer = csv.DictWriter(sink, list(records[0]) if records else [])
-        writer.writeheader()
-        writer.writerows({k: "" if _is_nan(v) else v for k, v in r.items()} for r in records)
-        write_text(out / f"{name}.csv", sink.getvalue())
+        write_csv(out / f"{name}.csv", records)
     return [out / "tables.md", *(out / f"{name}.csv" for name in tables)]
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
 
 
 # ---------------------------------------------------------------- Markdown

@@ -6,10 +6,11 @@ import os
 import pickle
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, Future
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -117,47 +118,55 @@ def _where(error: BaseException) -> str:
 
 
 @dataclass
-class Crew:
-    """An executor, the most rows to hand to it (one extra for each process, so that none waits), and how to
-    replace it when a process died."""
+class Workers:
+    """Processes (``count``), or this process if 0; they get ``most`` jobs, a spare one each."""
 
-    executor: Executor
-    most: int
-    renew: Callable[[], Executor]
+    count: int
+    pool: ProcessPool | None = None
+    _pool_of: dict[Future[Outcome], ProcessPool] = field(default_factory=dict)
 
+    @property
+    def most(self) -> int:
+        return max(1, 2 * self.count)
 
-class _Here(Executor):
-    """Run each row at once in this process."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
+    def submit(self, job: Job) -> Future[Outcome]:
+        """Carry out a job; that of a pool that broke has :class:`BrokenProcessPool` as its result."""
+        future: Future[Outcome] = Future()
         try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
+            if self.count:
+                self.pool = self.pool or ProcessPool(self.count)
+                future = self.pool.submit(carry_out, job)
+                self._pool_of[future] = self.pool
+            else:
+                future.set_result(carry_out(job))
+        except (BrokenProcessPool, OutputError) as error:
             future.set_exception(error)
         return future
 
+    def renew(self, broken: Future[Outcome]) -> None:
+        """Start new processes for those that a job was lost with, unless that was done for another job."""
+        if self._pool_of.get(broken, self.pool) is self.pool:
+            self.pool = None
+
 
 @contextmanager
-def crew_of(executor: str, threads: int | None) -> Iterator[Crew]:
-    """Yield the crew of "local" or "processes"; :class:`UsageError` for another name or no thread."""
+def workers_of(executor: str, threads: int | None) -> Iterator[Workers]:
+    """Yield the workers of "local" or "processes"; :class:`UsageError` for another name or no thread."""
     if threads is not None and threads < 1:
         raise UsageError(f"threads must be at least 1; got {threads}")
     if executor not in EXECUTORS:
         raise UsageError(unknown_word("executor", executor, EXECUTORS))
-    if executor == "local":
-        yield Crew(_Here(), 1, _Here)
-        return
-    for name in ONE_THREAD:
-        # One process per core: NumPy's own threads would compete for them.
-        os.environ.setdefault(name, "1")
-    count = threads or available_threads()
-    crew = Crew(ProcessPool(count), 2 * count, lambda: ProcessPool(count))
+    workers = Workers(0 if executor == "local" else threads or available_threads())
+    if workers.count:
+        for name in ONE_THREAD:
+            # One process per core: NumPy's own threads would compete for them.
+            os.environ.setdefault(name, "1")
     try:
-        yield crew
+        yield workers
     except BaseException:
-        if isinstance(crew.executor, ProcessPool):
-            crew.executor.abandon()
+        if workers.pool is not None:
+            workers.pool.abandon()
         raise
     finally:
-        crew.executor.shutdown(wait=True, cancel_futures=True)
+        if workers.pool is not None:
+            workers.pool.shutdown(wait=True, cancel_futures=True)

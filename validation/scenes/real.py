@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -19,6 +21,8 @@ REAL_SCENES = {
     "Herz-Jesus-P8": "strecha/Herz-Jesus-P8",
     "kermit": "kermit",
 }
+SHIFTED = "Cones9"
+"""Nine views of the Middlebury Cones, by a camera that moves without rotation."""
 SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
@@ -111,6 +115,29 @@ def load_real_scene(name: str) -> Scene | None:
 def load_fixture_scene(name: str = "courtyard") -> Scene:
     """A scene of fixtures/, always there. Raises ``ValueError`` for a name that does not exist."""
     return read_scene(ROOT / "fixtures" / name, name)
+
+
+def load_scene(name: str) -> Scene | None:
+    """Load a fixture, a real scene or the shifted views; None if its images are not on this machine."""
+    if name in REAL_SCENES:
+        return load_real_scene(name)
+    if name != SHIFTED:
+        return load_fixture_scene(name)
+    root = data_root()
+    paths = () if root is None else tuple(sorted((root / "stereo" / SHIFTED).glob("im*.png")))
+    return Scene(SHIFTED, paths) if paths else None
+
+
+def scenes_here(names: Iterable[str]) -> list[Scene]:
+    """Load the scenes that are on this machine; the others are named on the error stream."""
+    found = []
+    for name in names:
+        scene = load_scene(name)
+        if scene is None:
+            print(f"{name}: its images are not on this machine, left out", file=sys.stderr)
+        else:
+            found.append(scene)
+    return found
 
 
 @cache

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,6 +26,8 @@ from validation.references.sift import SETTINGS, SiftKeypoints, detect_sift, mat
 from validation.scenes.real import Scene, data_root
 
 HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8
+CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
+"""Folder that keeps SIFT matches of image pairs."""
 CONSISTENT_PX = 1.5
 """Sampson distance to the true F within which a match of a scene with cameras counts as right."""
 FARTHEST = 3.0

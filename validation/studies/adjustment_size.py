@@ -16,12 +16,13 @@ from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics._observations import Observations
-from validation.harness.stages.bundle import FOCAL_K1
 from validation.references.ceres import CeresOptions, refine_with_ceres
+from validation.runs.processes import call_apart, timed
+from validation.runs.study import Part
+from validation.runs.tables import text_table
 from validation.scenes.many_tracks import SIZE, Kind, make_tracks
 from validation.scenes.pose import off_the_truth
-from validation.studies.measuring import call_apart, timed
-from validation.studies.runner import Part, text_table
+from validation.stages.bundle import FOCAL_K1
 
 LOSS_PX, MIN_VIEWS = 0.5, 3
 FOCAL_OFF, MOVED = 1.02, 0.003

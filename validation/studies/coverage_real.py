@@ -19,8 +19,9 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.runtime._run import stream
 from validation.metrics.intervals import interval_scores, pose_scores
+from validation.runs.study import Part, report_progress
+from validation.runs.tables import Rows, text_table
 from validation.scenes.real import Scene, data_root, read_scene
-from validation.studies.runner import Part, Rows, report_progress, text_table
 from validation.studies.subsets import Matched, solve, take_views
 
 SCENES = {

@@ -27,12 +27,12 @@ from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.projective._track_selection import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from validation.metrics.record import Metric
+from validation.runs.study import Part, pick, report_progress
+from validation.runs.tables import Metric, Rows, text_table
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 from validation.scenes.critical import Sequence as SyntheticSequence
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur
-from validation.studies.coverage import MODES, Cameras
-from validation.studies.runner import Part, Rows, pick, report_progress, text_table
+from validation.studies.calibration_coverage import MODES, Cameras
 
 OURS = "ours"
 CALIBRATOR = HypothesesAndRefinement(search=None, camera_subsets=0, focal_steps=17)

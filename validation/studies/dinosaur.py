@@ -21,9 +21,9 @@ from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks
 from thesisrecon.runtime._run import stream
-from validation.metrics.record import Metric
+from validation.runs.study import Part
+from validation.runs.tables import Metric, Rows
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks
-from validation.studies.runner import Part, Rows
 
 OURS, PUBLISHED = "thesisrecon", "published cameras"
 LOSS_PX, WRONG_PX = 1.0, 3.0

@@ -27,8 +27,9 @@ from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.metrics.fundamental_precision import fundamental_bound
 from validation.references.fundamental import OURS, SOLVERS, opencv_eight_point
 from validation.references.libraries import one_thread
+from validation.runs.study import Part, pick, report_progress
+from validation.runs.tables import Rows, text_table
 from validation.scenes.two_views import make_two_views
-from validation.studies.runner import Part, Rows, pick, report_progress, text_table
 
 Estimate = Callable[[F64, F64, float, int], F64 | None]
 """F (3, 3) or None from matches (N, 2), (N, 2), a threshold in px and a seed."""

@@ -20,9 +20,10 @@ from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.records import MetricResult
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.metrics.intervals import LEVEL, interval_scores
+from validation.runs.study import Part, report_progress
+from validation.runs.tables import Rows
 from validation.scenes.many_views import load_facade
 from validation.scenes.real import Scene
-from validation.studies.runner import Part, Rows, report_progress
 from validation.studies.subsets import Matched, match_scene, solve
 
 KINDS = ("none", "decentring", "aspect", "smooth")

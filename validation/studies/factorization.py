@@ -23,13 +23,13 @@ from thesisrecon.numerics._projective_bundle import refine_projective_bundle
 from thesisrecon.projective.factorization import Factorization, depths_from_fundamentals, factorize
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
-from validation.metrics.record import Metric
+from validation.runs.study import Part
+from validation.runs.tables import Metric, Rows
 from validation.scenes.dinosaur import pairs_from_tracks
-from validation.scenes.real import Scene
+from validation.scenes.real import Scene, scenes_here
 from validation.scenes.rigs import noisy_tracks
 from validation.scenes.transforms import random_transform
 from validation.scenes.triangulation import beside
-from validation.studies.runner import Part, Rows, scenes_here
 
 PLAIN, ITERATED, AFFINE, GROWN = (
     "Sturm-Triggs",

@@ -18,9 +18,10 @@ from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_par
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.runtime._run import stream
 from validation.metrics.cameras import TrueCameras, measure_cameras, relative_centre_error
+from validation.runs.processes import call_apart, peak_mb, reset_peak
+from validation.runs.study import Part
+from validation.runs.tables import text_table
 from validation.scenes.many_tracks import Kind, make_tracks
-from validation.studies.measuring import call_apart, peak_mb, reset_peak
-from validation.studies.runner import Part, text_table
 
 COLUMNS = ("projective", "selfcalibration", "metric")
 

@@ -20,9 +20,10 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from validation.metrics.intervals import LEVEL
+from validation.runs.study import Part, report_progress
+from validation.runs.tables import Rows, text_table
 from validation.scenes.dinosaur import pairs_from_tracks
 from validation.scenes.harsh import KINDS
-from validation.studies.runner import Part, Rows, report_progress, text_table
 from validation.studies.subsets import Matched, solve
 
 OURS = "ours"

@@ -10,8 +10,9 @@ import numpy as np
 import PIL.Image
 
 from thesisrecon.io._images import read_images
-from validation.studies.measuring import call_apart
-from validation.studies.runner import Part, pick, report_progress, text_table
+from validation.runs.processes import call_apart
+from validation.runs.study import Part, pick, report_progress
+from validation.runs.tables import text_table
 
 LARGEST_SIDE = 13_376
 """A square of this side has 178.9 megapixels, the most that are accepted."""

@@ -16,8 +16,9 @@ import numpy as np
 from thesisrecon import RunResult, reconstruct, reconstruct_from_tracks
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
+from validation.runs.study import Part
+from validation.runs.tables import text_table
 from validation.scenes.moving import Lens, Moving, drive, hand_held, render_drive
-from validation.studies.runner import Part, text_table
 
 CASES: dict[str, tuple[Callable[[int, Lens], Moving], Lens]] = {
     "car, camera as assumed": (drive, Lens()),

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.errors import UsageError
-from validation.scenes.real import REAL_SCENES, Scene
-from validation.studies.runner import Part, Rows, load_scene, pick
+from validation.runs.study import Part, pick
+from validation.runs.tables import Rows
+from validation.scenes.real import REAL_SCENES, Scene, load_scene
 
 LAST_STAGE = {"courtyard": "model", **dict.fromkeys(REAL_SCENES, "metric")}
 """Image sets and the last stage of their runs."""

@@ -27,10 +27,11 @@ from thesisrecon.stereo._polar import polar
 from thesisrecon.stereo._rectification_quality import RectificationQuality, jacobians, measure_quality
 from thesisrecon.stereo._resampling import Rectification
 from thesisrecon.stereo.rectification import rectify
-from validation.metrics.record import Metric
 from validation.references.opencv import opencv_calibrated, opencv_uncalibrated
-from validation.studies.measuring import timed
-from validation.studies.runner import Part, Rows, scenes_here
+from validation.runs.processes import timed
+from validation.runs.study import Part
+from validation.runs.tables import Metric, Rows
+from validation.scenes.real import scenes_here
 
 SCENES = ("fountain-P11", "Herz-Jesus-P8")
 BEST_F, BEST = "best from F", "best from cameras"

@@ -31,8 +31,9 @@ from typing import Any, Literal
 from thesisrecon.cli.main import run_command
 from thesisrecon.errors import NOT_MADE, REMEDIES
 from thesisrecon.runtime._signals import CODES
+from validation.runs.study import Part, report_progress
+from validation.runs.tables import Rows, text_table
 from validation.scenes.real import ROOT
-from validation.studies.runner import Part, Rows, report_progress, text_table
 
 COURTYARD = ROOT / "fixtures" / "courtyard"
 CLEAN = ("seconds", "elapsed_seconds", "resumed", "peak_memory_mb", "threads", "executor")

@@ -1,6 +1,6 @@
 """The self-check on wrong and on right models.
 
-Right models of real images are spoiled (:mod:`validation.scenes.spoiled`) and adjusted again. The result is
+Right models of real images are spoiled (:mod:`validation.scenes.corrupted`) and adjusted again. The result is
 wrong or has recovered; both are counted with the verdict of the self-check. Focal lengths held 10 % off stand
 for a wrong user prior; right models lose some of their views and points.
 """
@@ -26,8 +26,10 @@ from thesisrecon.metric._shared_camera import contradicted_focal_priors
 from thesisrecon.metric.refinement import finish_metric, settle_camera_model
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 from thesisrecon.results import RunResult
-from validation.scenes.spoiled import SPOILINGS, model_from_reconstruction
-from validation.studies.runner import Part, Rows, report_progress, scenes_here, text_table
+from validation.runs.study import Part, report_progress
+from validation.runs.tables import Rows, text_table
+from validation.scenes.corrupted import SPOILINGS, model_from_reconstruction
+from validation.scenes.real import scenes_here
 
 OURS = "ours"
 SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")

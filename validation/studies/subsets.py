@@ -24,9 +24,10 @@ from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline._stages import ATTEMPTS
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from thesisrecon.runtime._run import stream
-from validation.scenes.real import REAL_SCENES, Scene
-from validation.studies.coverage import MODES, SUCCESS_PCT, Cameras
-from validation.studies.runner import SHIFTED, Part, Rows, report_progress, scenes_here, text_table
+from validation.runs.study import Part, report_progress
+from validation.runs.tables import Rows, text_table
+from validation.scenes.real import REAL_SCENES, SHIFTED, Scene, scenes_here
+from validation.studies.calibration_coverage import MODES, SUCCESS_PCT, Cameras
 
 MIN_SUCCESS = 0.98
 MIN_VIEWS, MAX_VIEWS = 5, 8

@@ -11,8 +11,8 @@ from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.linear import LinearSurface
-from validation.metrics.record import Metric
-from validation.studies.runner import Part
+from validation.runs.study import Part
+from validation.runs.tables import Metric
 
 SURFACES: Mapping[str, LinearSurface | BSplineSurface] = {
     "linear": LinearSurface(),

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from thesisrecon.geometry.camera_matrix import compose_camera, project
-from validation.harness.records import ReportOptions
-from validation.harness.scenes import load_images
+from validation.runs.records import ReportOptions
+from validation.runs.scenes import load_images
 from validation.scenes.courtyard import build_courtyard
 from validation.scenes.cube import SIZE as CUBE_SIZE
 from validation.scenes.cube import make_cube

@@ -19,8 +19,7 @@ from validation.ablation.study import Measure, Place, Task
 from validation.metrics.epipolar import RIGHT_PX, rms_epipolar_distance
 from validation.scenes.many_views import load_yard, yard_number
 from validation.scenes.real import Scene, load_fixture_scene, load_real_scene
-from validation.scenes.real_pairs import SCENES_WITH_CAMERAS, camera_pairs
-from validation.studies.runner import CACHE
+from validation.scenes.real_pairs import CACHE, SCENES_WITH_CAMERAS, camera_pairs
 
 _COURTYARD = "courtyard"
 MAX_SIZE_PX = 1536

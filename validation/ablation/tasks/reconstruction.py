@@ -20,9 +20,9 @@ from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task
 from validation.ablation.tasks.windows import window_names, window_parts, window_slice
-from validation.harness.records import ReportOptions
-from validation.harness.scenes import IMAGE_SCENES, load_images, truth_of
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
+from validation.runs.records import ReportOptions
+from validation.runs.scenes import IMAGE_SCENES, load_images, truth_of
 from validation.scenes.many_views import load_yard, yard_number
 from validation.scenes.real import Scene
 

@@ -1,0 +1,1 @@
+"""Run reports, gates, ablations and studies: processes, resume, tables and pages."""

@@ -1,0 +1,139 @@
+"""Records of a report: options, tasks, outcomes and judgements."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from validation.runs.tables import Metric
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Options of a report.
+
+    ``out``: output folder. ``scenes``, ``stages``: names in order. ``folders``: folder of each user scene.
+    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references and pictures that no gate
+    needs. ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s).
+    ``side_px``: long side of depth maps, 0 for the default. ``resume``: folder of an earlier run whose
+    references are reused, or empty.
+    ``stages_from``: module of ``STAGES``.
+    """
+
+    out: Path
+    scenes: tuple[str, ...]
+    stages: tuple[str, ...]
+    folders: Mapping[str, str] = field(default_factory=dict)
+    quick: bool = False
+    gates_only: bool = False
+    seed: int = 0
+    threads: int = 2
+    limit_s: float = 300.0
+    resume: str = ""
+    side_px: int = 0
+    stages_from: str = "validation.stages"
+
+    def place(self, stage: str, scene: str, method: str = "") -> Path:
+        """Return the folder of a task, or of all tasks of a stage on a scene."""
+        place = self.out / "data" / stage / scene
+        return place / slug(method) if method else place
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"out": str(self.out)}
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> ReportOptions:
+        tuples = {name: tuple(record.get(name, ())) for name in ("scenes", "stages")}
+        return cls(**{**record, **tuples, "out": Path(record["out"])})
+
+
+@dataclass(frozen=True)
+class Task:
+    """One method of one stage on one scene."""
+
+    stage: str
+    scene: str
+    method: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a task: its result folder and resources; ``failure`` is empty or the error message."""
+
+    place: Path
+    failure: str = ""
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_mb: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        return not self.failure
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure on the page of a scene: a PNG or JPEG ``file`` in the folder of the judgement."""
+
+    file: str
+    title: str
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class Plot:
+    """An interactive plot on the page of a scene: ``figure`` for plotly.js (data, layout)."""
+
+    title: str
+    figure: Mapping[str, Any]
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Evaluation of a stage on a scene: numbers first, then plots and figures."""
+
+    metrics: Sequence[Metric]
+    plots: Sequence[Plot] = ()
+    pictures: Sequence[Picture] = ()
+    notes: Sequence[str] = ()
+
+
+class Stage(Protocol):
+    """A stage of the library beside its references.
+
+    ``definition`` states the comparison in one sentence. ``takes`` returns whether the stage can work on a
+    scene; ``methods`` the methods there; ``needs`` the (stage, method) results that a method, or the
+    judgement (empty ``method``), reads. ``run`` computes a task and saves its result; ``judge`` reads all
+    results and recomputes every number.
+    """
+
+    name: str
+    title: str
+    definition: str
+    scenes: tuple[str, ...] = ()
+
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return scene in self.scenes
+
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]: ...
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return ()
+
+    def run(self, task: Task, options: ReportOptions) -> None: ...
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement: ...
+
+
+def slug(text: str) -> str:
+    """Return a name for files and keys: letters, digits, dots and single dashes."""
+    return re.sub(r"[^A-Za-z0-9.]+", "-", text).strip("-")
+
+
+def key_of(stage: str, metric: Metric) -> str:
+    """Return the gate key of a number."""
+    return f"{stage}/{metric.scene}/{slug(metric.name)}"

@@ -1,0 +1,295 @@
+"""Run all tasks of a report in parallel, each in a process of its own.
+
+The first own task of a stage compiles its kernels. No other task of that stage, nor a first task of another
+stage, starts before it ends; references use the other cores.
+
+A run may resume another one: references are reused, and our results where settings and code are unchanged.
+Own methods have names that begin with "ours". Only numbered folders of a library run are copied; the library
+itself checks whether settings and code of a stage have changed.
+
+As a program (of the process pool) it runs one task: OPTIONS STAGE SCENE [METHOD]; without a method, the
+judgement on the outcomes in ``outcomes.json``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from thesisrecon.errors import StageFailure
+from thesisrecon.io._files import write_text
+from thesisrecon.io._outputs import clear_folder
+from thesisrecon.runtime._run import FOLDERS
+from thesisrecon.runtime._run_folder import RUN_FILE
+from validation.runs.jobs import run_jobs
+from validation.runs.process_pool import ProcessPool
+from validation.runs.processes import failure_of, last_line, own_cores
+from validation.runs.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
+from validation.runs.rows import OURS
+from validation.runs.tables import Metric
+
+Judged = Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]]
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
+JUDGE = ""
+"""Method name of the judgement task."""
+JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
+REFERENCES_USE_OURS = ("boards", "surface", "view-interpolation", "views")
+"""Stages whose references use our code and run again."""
+SAME_OPTIONS = ("quick", "gates_only", "seed", "side_px")
+"""Options that affect the results of a task."""
+
+
+def tasks_of(options: ReportOptions, stages: Mapping[str, Stage]) -> list[Task]:
+    """Return every method of every stage on every scene, then its judgement."""
+    found = []
+    for scene in options.scenes:
+        for name in options.stages:
+            stage = stages[name]
+            if stage.takes(scene, options):
+                found += [Task(name, scene, method) for method in stage.methods(scene, options)]
+                found.append(Task(name, scene, JUDGE))
+    return found
+
+
+def run_tasks(options: ReportOptions, stages: Mapping[str, Stage], report: Callable[[str], None]) -> Judged:
+    """Return the judgement and outcomes of each (stage, scene); failures do not stop other tasks."""
+    earlier = earlier_run(options)
+    clear_folder(options.out / "data")
+    write_text(options.out / "options.json", json.dumps(options.to_json()))
+    tasks = tasks_of(options, stages)
+    ended = {} if earlier is None else reuse_results(earlier, options, tasks, stages)
+    behind = tasks_behind(tasks, stages)
+    # Start long chains first to finish early.
+    waiting = sorted((task for task in tasks if task not in ended), key=lambda task: -behind[task])
+    cores = own_cores()[: options.threads]
+    modules = ("validation.runs.report", options.stages_from)
+    # On an interrupt the processes end first: their threads wait for nothing else.
+    with ThreadPoolExecutor(len(cores)) as threads, ProcessPool(modules, cores, ENVIRONMENT) as pool:
+        jobs = run_jobs(
+            waiting,
+            lambda task: threads.submit(_run_task, task, options, dict(ended), pool),
+            lambda task, running: _is_ready(task, waiting, running, ended, stages),
+            len(cores),
+        )
+        for done in jobs:
+            for task, future in done:
+                ended[task] = future.result()
+                # In task order, so that tables do not depend on the order of completion.
+                ended = {t: ended[t] for t in tasks if t in ended}
+                report(f"[{len(ended)}/{len(tasks)}] {_progress_line(task, ended[task])}")
+    judged = [task for task in ended if task.method == JUDGE]
+    return {(t.stage, t.scene): (_judgement(ended[t]), _outcomes(t, ended)) for t in judged}
+
+
+def tasks_behind(tasks: list[Task], stages: Mapping[str, Stage]) -> dict[Task, int]:
+    """Return how many tasks depend, directly or indirectly, on each."""
+    followers: dict[Task, set[Task]] = {task: set() for task in tasks}
+    for task in tasks:
+        before = [Task(s, task.scene, method) for s, method in stages[task.stage].needs(task.method)]
+        if task.method == JUDGE:
+            before += [t for t in tasks if (t.stage, t.scene) == (task.stage, task.scene) and t != task]
+        for other in before:
+            if other in followers:
+                followers[other].add(task)
+
+    def reached(task: Task, seen: set[Task]) -> set[Task]:
+        for follower in followers[task] - seen:
+            seen.add(follower)
+            reached(follower, seen)
+        return seen
+
+    return {task: len(reached(task, set())) for task in tasks}
+
+
+def _is_ready(
+    task: Task,
+    waiting: Collection[Task],
+    running: Collection[Task],
+    ended: Collection[Task],
+    stages: Mapping[str, Stage],
+) -> bool:
+    """Return whether the inputs of the task exist and its kernels are not being compiled."""
+    open_tasks = {*waiting, *running}
+    own = {t for t in open_tasks - {task} if (t.stage, t.scene) == (task.stage, task.scene)}
+    if task.method == JUDGE and own:
+        return False
+    if _is_ours(task):
+        compiled = {t.stage for t in ended if _is_ours(t)}
+        first = {t.stage for t in running if _is_ours(t)} - compiled
+        if task.stage in first or (first and task.stage not in compiled):
+            return False
+    return not any(
+        Task(stage, task.scene, method) in open_tasks
+        for stage, method in stages[task.stage].needs(task.method)
+    )
+
+
+def _is_ours(task: Task) -> bool:
+    return task.method.startswith(OURS)
+
+
+def _run_task(
+    task: Task, options: ReportOptions, ended: Mapping[Task, Outcome], pool: ProcessPool
+) -> Outcome:
+    place = options.place(task.stage, task.scene, task.method)
+    place.mkdir(parents=True, exist_ok=True)
+    arguments = [str(options.out / "options.json"), task.stage, task.scene]
+    if task.method == JUDGE:
+        record = {name: asdict(o) | {"place": str(o.place)} for name, o in _outcomes(task, ended).items()}
+        write_text(place / OUTCOMES, json.dumps(record))
+    else:
+        arguments.append(task.method)
+    # Outside the task folder, which the task may empty.
+    log = place.with_name(f"{place.name}.log")
+    process = pool.run(arguments, log=log, limit_s=options.limit_s)
+    failure = failure_of(process, last_line(log), options.limit_s)
+    return Outcome(place, failure, process.wall_s, process.cpu_s, process.peak_mb)
+
+
+def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
+    """Return the outcomes of the methods of this judgement, in task order."""
+    return {
+        t.method: outcome
+        for t, outcome in ended.items()
+        if (t.stage, t.scene) == (task.stage, task.scene) and t.method != JUDGE
+    }
+
+
+def _judgement(outcome: Outcome) -> Judgement:
+    if not outcome.ok:
+        return Judgement((), notes=(f"This comparison could not be evaluated: {outcome.failure}.",))
+    record: dict[str, Any] = json.loads((outcome.place / JUDGEMENT).read_text(encoding="utf-8"))
+    return Judgement(
+        [Metric(**metric) for metric in record["metrics"]],
+        [Plot(**plot) for plot in record["plots"]],
+        [Picture(**picture) for picture in record["pictures"]],
+        record["notes"],
+    )
+
+
+def _progress_line(task: Task, outcome: Outcome) -> str:
+    name = f"{task.scene}: {task.stage}, {task.method or 'judged'}"
+    return f"{name}: {outcome.failure or f'{outcome.wall_s:.1f} s'}"
+
+
+# ---------------------------------------------------------------- one task, in a process of the pool
+
+
+def main(arguments: list[str]) -> int:
+    """Run one task."""
+    options_file, stage, scene, *method = arguments
+    options = ReportOptions.from_json(json.loads(Path(options_file).read_text(encoding="utf-8")))
+    stages: dict[str, Stage] = importlib.import_module(options.stages_from).STAGES
+    try:
+        if method:
+            options.place(stage, scene, method[0]).mkdir(parents=True, exist_ok=True)
+            stages[stage].run(Task(stage, scene, method[0]), options)
+        else:
+            _judge(options, stages[stage], scene)
+    except (StageFailure, ImportError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 3
+    return 0
+
+
+def _judge(options: ReportOptions, stage: Stage, scene: str) -> None:
+    """Store the judgement with the messages of the methods that failed."""
+    place = options.place(stage.name, scene)
+    outcomes = read_outcomes(place)
+    judgement = stage.judge(scene, outcomes, options)
+    failures = [f"{name}: {outcome.failure}." for name, outcome in outcomes.items() if not outcome.ok]
+    judgement = replace(judgement, notes=[*judgement.notes, *failures])
+    write_text(place / JUDGEMENT, json.dumps(asdict(judgement), default=_plain_number))
+
+
+def read_outcomes(place: Path) -> dict[str, Outcome]:
+    """Return the outcomes of a stage on a scene by method, those of its folder."""
+    record = json.loads((place / OUTCOMES).read_text(encoding="utf-8"))
+    return {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in record.items()}
+
+
+def _plain_number(value: Any) -> Any:
+    """Convert NumPy numbers and arrays for JSON."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value)} cannot be stored in a judgement")
+
+
+# ---------------------------------------------------------------- resume another run
+
+
+def earlier_run(options: ReportOptions) -> ReportOptions | None:
+    """Return the options of the run to start from, None if there is none to start from.
+
+    Raises ``ValueError`` if the folder holds no run, or one with different options.
+    """
+    if not options.resume:
+        return None
+    other = _options_of(Path(options.resume))
+    different = [name for name in SAME_OPTIONS if getattr(other, name) != getattr(options, name)]
+    moved = [s for s, folder in options.folders.items() if other.folders.get(s, folder) != folder]
+    different += [f"folder of the scene {scene}" for scene in moved]
+    if different:
+        raise ValueError(
+            f"{options.resume} is a run with another {', '.join(different)}: use a run with the same options"
+        )
+    return other
+
+
+def reuse_results(
+    other: ReportOptions, options: ReportOptions, tasks: Sequence[Task], stages: Mapping[str, Stage]
+) -> dict[Task, Outcome]:
+    """Return the outcomes of tasks that need not run again; their files are copied from the ``other`` run."""
+    known = {}
+    for task in tasks:
+        if _runs_again(task):
+            _copy_stage_folders(other.place(task.stage, task.scene, task.method) / "run", options, task)
+        elif task.method:
+            place = other.place(task.stage, task.scene)
+            outcome = read_outcomes(place).get(task.method) if (place / OUTCOMES).is_file() else None
+            if outcome is not None and outcome.ok:
+                kept = options.place(task.stage, task.scene, task.method)
+                shutil.copytree(other.place(task.stage, task.scene, task.method), kept, dirs_exist_ok=True)
+                known[task] = replace(outcome, place=kept)
+        _copy_inputs(other, options, task, stages)
+    return known
+
+
+def _runs_again(task: Task) -> bool:
+    return bool(task.method) and (_is_ours(task) or task.stage in REFERENCES_USE_OURS)
+
+
+def _options_of(folder: Path) -> ReportOptions:
+    try:
+        record = json.loads((folder / "options.json").read_text(encoding="utf-8"))
+        return replace(ReportOptions.from_json(record), out=folder)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{folder} holds no run to start from (options.json): {error}") from None
+
+
+def _copy_stage_folders(run: Path, options: ReportOptions, task: Task) -> None:
+    place = options.place(task.stage, task.scene, task.method) / "run"
+    if (run / RUN_FILE).is_file():
+        # The library accepts only folders with this file.
+        place.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(run / RUN_FILE, place / RUN_FILE)
+    for name in sorted(set(FOLDERS.values())):
+        if (run / name).is_dir():
+            shutil.copytree(run / name, place / name, dirs_exist_ok=True)
+
+
+def _copy_inputs(
+    other: ReportOptions, options: ReportOptions, task: Task, stages: Mapping[str, Stage]
+) -> None:
+    """Copy the inputs of a task from stages that are not part of this run."""
+    for stage, method in stages[task.stage].needs(task.method):
+        place = other.place(stage, task.scene, method)
+        if stage not in options.stages and place.is_dir():
+            shutil.copytree(place, options.place(stage, task.scene, method), dirs_exist_ok=True)

@@ -1,0 +1,159 @@
+"""``results.json`` and the tables as CSV: numbers with limits and references."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.io._files import read_bytes, write_text
+from validation.references.libraries import PACKAGES
+from validation.runs.gates import Gate
+from validation.runs.records import Judgement, Outcome, ReportOptions, key_of
+from validation.runs.tables import Metric, write_csv
+from validation.stamp import commit
+
+OWN_PACKAGES = ("thesisrecon", "numpy", "scipy", "numba")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A reported number: ours (``value``) and the references; ``direction`` is the good side of the
+    ``limit``."""
+
+    key: str
+    value: float | None
+    unit: str
+    direction: str
+    limit: float | None
+    reference: Mapping[str, float | None]
+    source: str
+    verdict: str
+    reason: str = ""
+    ranked: bool = True
+
+
+@dataclass(frozen=True)
+class Results:
+    """A whole report."""
+
+    rows: Sequence[Row]
+    missing: Sequence[str]
+    failures: Mapping[str, str]
+    environment: Mapping[str, Any]
+    options: Mapping[str, Any]
+
+    @property
+    def broken(self) -> list[Row]:
+        return [row for row in self.rows if row.verdict == "missed"]
+
+
+def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
+    """Return the row of a metric with the limit of its gate."""
+    others = {name: _finite(v) for name, v in metric.values.items() if name != metric.judged}
+    at_most = metric.at_most if gate is None else gate.at_most
+    value = _finite(metric.values.get(metric.judged))
+    verdict = "reported" if gate is None else "reached" if gate.holds(value) else "missed"
+    return Row(
+        key_of(stage, metric),
+        value,
+        metric.unit,
+        "at most" if at_most else "at least",
+        None if gate is None else gate.limit,
+        others,
+        metric.definition,
+        verdict,
+        "" if gate is None else gate.reason,
+        metric.ranked,
+    )
+
+
+def collect(
+    options: ReportOptions,
+    judged: Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]],
+    gates: Mapping[str, Gate],
+) -> Results:
+    """Collect all rows of a run; gates without a reported number are ``missing``."""
+    rows = []
+    for (stage, _), (judgement, _outcomes) in judged.items():
+        rows += [row_of(stage, m, gates.get(key_of(stage, m))) for m in judgement.metrics]
+    reported = {row.key for row in rows}
+    missing = sorted(k for k in gates if tuple(k.split("/")[:2]) in set(judged) and k not in reported)
+    failures = {
+        f"{stage}/{scene}/{method}": outcome.failure
+        for (stage, scene), (_, outcomes) in judged.items()
+        for method, outcome in outcomes.items()
+        if not outcome.ok
+    }
+    return Results(rows, missing, failures, environment(options), options.to_json())
+
+
+def environment(options: ReportOptions) -> dict[str, Any]:
+    """Return the environment of the run."""
+    versions = {name: _version(name) for name in (*OWN_PACKAGES, *PACKAGES.values())}
+    return {
+        "commit": commit(),
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        **versions,
+        "threads": f"{options.threads} parallel tasks, one thread each",
+        "seed": options.seed,
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def write_results(out: Path, results: Results) -> None:
+    """Write ``results.json`` and ``tables/STAGE.csv``."""
+    write_text(out / "results.json", json.dumps(asdict(results), indent=1, allow_nan=False))
+    for stage in dict.fromkeys(row.key.split("/")[0] for row in results.rows):
+        rows = [row for row in results.rows if row.key.startswith(f"{stage}/")]
+        references = dict.fromkeys(name for row in rows for name in row.reference)
+        records = [
+            {"key": row.key, "unit": row.unit, "ours": row.value}
+            | {name: row.reference.get(name) for name in references}
+            | {"direction": row.direction, "limit": row.limit, "verdict": row.verdict}
+            | {"definition": row.source, "reason": row.reason}
+            for row in rows
+        ]
+        write_csv(out / "tables" / f"{stage}.csv", records)
+
+
+def read_results(out: Path) -> Results:
+    """Read the run in this folder.
+
+    Raises ``ValueError`` if there is none.
+    """
+    try:
+        record = json.loads(read_bytes(out / "results.json").decode("utf-8"))
+        return Results(**{**record, "rows": [Row(**row) for row in record["rows"]]})
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{out} holds no results.json of a report: {error}") from None
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor()

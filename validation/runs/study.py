@@ -1,0 +1,281 @@
+"""Run the studies: ``python -m validation study NAME [--option ...]``, ``python -m validation study --list``.
+``python -m validation study all -o OUT`` runs them all, the ablations and the report, which takes hours.
+
+A study is a generator function ``NAME_study`` in a module of that name in ``validation/studies``. Its keyword
+parameters with their defaults and annotations are the options of the command, which :data:`HELP` explains. It
+yields parts: a list of :class:`Metric` rows (one table under the scene of the first row) or a string (printed
+as it is). The exit code is 1 if a bound is missed, 2 if an option or the data are missing.
+
+A parameter ``out : Path`` is a folder that keeps what the study makes; without ``--out`` it is temporary.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import os
+import sys
+import tempfile
+import traceback
+import types
+import typing
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.io._files import write_text
+from thesisrecon.io._outputs import join_claim
+from validation.runs.tables import Metric, markdown_table, write_metrics
+from validation.stamp import stamp
+
+FOLDER = Path(__file__).parents[1] / "studies"
+IN_ROBUSTNESS = ("full-disk", "kill-anywhere", "stop-anywhere")
+MODULES = {path.stem.replace("_", "-"): path.stem for path in sorted(FOLDER.glob("[a-z]*.py"))}
+del MODULES["robustness"]
+MODULES |= dict.fromkeys(IN_ROBUSTNESS, "robustness")
+"""Name of a study -> the module of ``validation/studies`` that holds its function."""
+FORMER = {"main-job": "against-colmap", "wide-steps": "wide-baseline"}
+"""Former names of studies."""
+OF_PAGES = {
+    "cluster-efficiency": [
+        ["--sizes", "48", "100"],
+        ["--sizes", "12", "--until", "dense"],
+        ["--scene", "street", "--sizes", "72", "--set", "images.part_views=30"],
+    ],
+    "coverage-real": [["--trials", "60"]],
+    "critical-motions": [["--trials", "200"]],
+    "epipolar": [["--trials", "2000"]],
+    "epipolar-methods": [["--trials", "500"]],
+    "growth-of-cost": [
+        ["--colmap", "--sizes", "100", "300"],
+        ["--sizes", "1000"],
+        ["--sizes", "100", "--set", "matching.many_share=1"],
+        ["--scene", "street", "--sizes", "100", "--set", "matching.many_share=1"],
+        ["--scene", "street", "--sizes", "100", "1000"],
+        ["--until", "model", "--sizes", "12", "48"],
+    ],
+    "harsh": [["--trials", "8"]],
+    "against-colmap": [["--repeats", "3"]],
+    "moving-cameras": [[], ["--trials", "8"], ["--rendered", "--trials", "3"]],
+    "record": [],
+    "subsets": [["--trials", "25"]],
+}
+"""Options of the studies that the documentation shows with other ones than their defaults, for each run; a
+record is of one machine and has no table."""
+HELP = {
+    "benchmark": "JSON file of pytest-benchmark (default: run the benchmarks)",
+    "cameras": "shared: one camera for all images; per-image: one for each",
+    "cold": "begin each run without compiled kernels",
+    "colmap": "COLMAP on the same images and pairs too",
+    "compare_with": "two records: before and after",
+    "core_views": "views reconstructed projectively; 0: all",
+    "every": "take every n-th one only",
+    "executor": "executor of the runs",
+    "formats": "names of file formats (default: all)",
+    "images": "folder of images",
+    "kills": "runs killed (SIGKILL) at moments spread over their time",
+    "kinds": "words; kinds of sets that contain one of them are taken",
+    "long_side": "long side of the images in px",
+    "max_size": "long side of the images in px",
+    "methods": "names of methods (default: all)",
+    "modes": "one camera or focal length for all images, or one for each",
+    "moments": "moments spread over the time of a run",
+    "motions": "names of motions (default: all)",
+    "noise": "standard deviations of image coordinates in px",
+    "one_run": "kill one run again and again as it goes on",
+    "parts": "parts of the study (default: all)",
+    "points": "numbers of points or matches",
+    "presets": "presets of the runs",
+    "ratios": "JSON file for the ratios",
+    "rendered": "images of rendered drives in place of tracks",
+    "repeats": "repetitions; the least or the median counts",
+    "scene": "place or street",
+    "scenes": "names of image sets (default: all on this machine)",
+    "seed": "random seed",
+    "seeds": "random seeds, or their number",
+    "set_": "settings STAGE.FIELD=VALUE of the runs",
+    "sets": "names of the recorded sets",
+    "signal_": "signal that the process group gets",
+    "sizes": "numbers of images",
+    "threads": "threads of a run",
+    "trials": "random trials of each setting",
+    "until": "last stage of the runs",
+    "views": "numbers of views, or fewest and most",
+    "workers": "processes that share the trials",
+    "write_to": "file of the record; earlier runs in it are kept",
+    "writes": "runs killed in the middle of a write",
+    "wrong": "shares of wrong matches",
+    "zoom": "whether focal lengths differ",
+}
+"""Help of the options of all studies."""
+Part = Sequence[Metric] | str
+StudyFunction = Callable[..., Iterable[Part]]
+
+
+def run_studies(arguments: Sequence[str]) -> int:
+    """Run the study that the command line names and return its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m validation study", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    known = [*MODULES, "all"]
+    parser.add_argument("name", nargs="?", choices=known, metavar="NAME", help="name of the study, or all")
+    parser.add_argument("--list", action="store_true", help="list the studies and exit")
+    names = [name.replace("_", "-") for name in arguments[:1]]
+    options = parser.parse_args([FORMER.get(name, name) for name in names])
+    if options.list:
+        for name in MODULES:
+            print(f"{name:22} {_summary(load_study(name))}")
+        return 0
+    if options.name is None:
+        parser.error("name a study; --list shows them")
+    if options.name == "all":
+        parser = argparse.ArgumentParser(prog="python -m validation study all", description=run_all.__doc__)
+        parser.add_argument("-o", "--out", type=Path, required=True, help="folder for the tables")
+        return run_all(parser.parse_args(list(arguments[1:])).out)
+    return run_study(options.name, arguments[1:])
+
+
+def run_study(name: str, arguments: Sequence[str] = ()) -> int:
+    """Run one study with its options: print its parts, write them if asked, return the exit code."""
+    function = load_study(name)
+    options = vars(study_parser(name, function).parse_args(list(arguments)))
+    out, json_file, texts = options.pop("out"), options.pop("json"), list[str]()
+    metrics: list[Metric] = []
+    if json_file is not None and os.path.lexists(json_file):
+        print(f"study {name}: {json_file} exists already; move it, or choose another name", file=sys.stderr)
+        return 2
+    try:
+        with output_folder(out, [f"{name}.md", f"{name}.json"]) as folder:
+            if "out" in inspect.signature(function).parameters:
+                options["out"] = folder
+            for part in function(**options):
+                if not part:
+                    continue
+                metrics += [] if isinstance(part, str) else part
+                texts.append(part_text(part))
+                print(texts[-1], end="\n\n", flush=True)
+                # Written after each part, so that an interrupted study keeps what it has.
+                if out is not None:
+                    write_text(folder / f"{name}.md", "\n\n".join((stamp(), *texts)) + "\n")
+                    write_metrics(folder / f"{name}.json", metrics)
+                if json_file is not None:
+                    write_metrics(json_file, metrics)
+    except (UsageError, StageFailure) as error:
+        print(f"study {name}: {error}", file=sys.stderr)
+        return 2
+    if not texts:
+        print(f"study {name}: the images are not on this machine (THESISRECON_DATA)", file=sys.stderr)
+        return 2
+    return int(any(row.verdict == "missed" for row in metrics))
+
+
+def run_all(out: Path) -> int:
+    """Make every table of the documentation, each in a folder of its own: all studies with the options of
+    the pages, all ablations, and the report. One that ends with an error does not end the others; the exit
+    code is the largest."""
+    from validation.ablation.command import STUDIES
+    from validation.command import main
+
+    runs: dict[str, Callable[[], int]] = {}
+    for name in MODULES:
+        for number, options in enumerate(OF_PAGES.get(name, [[]])):
+            folder = out / (f"{name}-{number + 1}" if number else name)
+            words = f"study {name} {' '.join(options)}".rstrip()
+            runs[words] = partial(run_study, name, ["-o", str(folder), *options])
+    for path in sorted(STUDIES.glob("*.toml")):
+        runs[f"ablation {path.stem}"] = partial(main, ["ablate", path.stem, "-o", str(out / path.stem)])
+    runs["report"] = partial(main, ["report", "-o", str(out / "report")])
+    largest = 0
+    for words, run in runs.items():
+        report_progress(words)
+        try:
+            code = run()
+        except Exception:
+            traceback.print_exc()
+            code = 1
+        largest = max(largest, code)
+    return largest
+
+
+def load_study(name: str) -> StudyFunction:
+    """Import the function of a study."""
+    module = import_module(f"validation.studies.{MODULES[name]}")
+    function: StudyFunction = getattr(module, f"{name.replace('-', '_')}_study")
+    return function
+
+
+def study_parser(name: str, function: StudyFunction) -> argparse.ArgumentParser:
+    """Make the command-line parser from the signature and the docstring of a study."""
+    module = sys.modules[function.__module__]
+    text = f"{_summary(function)}\n\n{inspect.getdoc(module) or ''}"
+    parser = argparse.ArgumentParser(
+        prog=f"python -m validation study {name}",
+        description=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("-o", "--out", type=Path, help="folder for the tables and for what the study makes")
+    parser.add_argument("--json", type=Path, help="file for the metric rows")
+    hints = typing.get_type_hints(function)
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.name != "out":
+            flag = f"--{parameter.name.replace('_', '-').strip('-')}"
+            given = _argument(hints[parameter.name], parameter.default)
+            parser.add_argument(flag, dest=parameter.name, help=HELP.get(parameter.name), **given)
+    return parser
+
+
+def _argument(hint: Any, default: Any) -> dict[str, Any]:
+    """Return the keywords of ``add_argument`` for an annotation and its default."""
+    given: dict[str, Any] = {"default": default}
+    if default is inspect.Parameter.empty:
+        given = {"required": True}
+    if isinstance(hint, types.UnionType):
+        hint = next(one for one in typing.get_args(hint) if one is not type(None))
+    if hint is bool:
+        return {"action": "store_true"}
+    if typing.get_origin(hint) in (Sequence, tuple):
+        given["nargs"] = "*"
+        hint = typing.get_args(hint)[0]
+    if typing.get_origin(hint) is typing.Literal:
+        return given | {"choices": typing.get_args(hint)}
+    return given | {"type": hint, "metavar": hint.__name__.upper()}
+
+
+def _summary(function: StudyFunction) -> str:
+    return (inspect.getdoc(function) or "").partition("\n")[0]
+
+
+@contextmanager
+def output_folder(folder: Path | None, names: Sequence[str]) -> Iterator[Path]:
+    """The folder of a study that writes these tables, else a temporary one."""
+    if folder is not None:
+        with join_claim(folder.resolve()) as outputs:
+            outputs.require(names)
+            yield folder.resolve()
+        return
+    with tempfile.TemporaryDirectory() as place:
+        yield Path(place)
+
+
+def part_text(part: Part) -> str:
+    return part if isinstance(part, str) else f"## {part[0].scene}\n\n{markdown_table(list(part))}"
+
+
+# ---------------------------------------------------------------- helpers of the studies
+
+
+def report_progress(text: object) -> None:
+    """Print a line on the error stream at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def pick(names: Sequence[str] | None, known: Iterable[str]) -> list[str]:
+    """Return the names asked for, all known ones by default; ``UsageError`` for an unknown name."""
+    known = list(known)
+    for name in names or ():
+        if name not in known:
+            raise UsageError(f"{name!r} does not exist; choose from {', '.join(known)}")
+    return known if names is None else list(names)

@@ -1,0 +1,125 @@
+"""Measured numbers with references, targets and verdicts, and their tables as Markdown, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from thesisrecon.io._files import write_text
+
+Verdict = Literal["reached", "missed", "reported"]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One row of a table: a number on a scene, by ours and the references, with its target.
+
+    ``values`` maps methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper
+    one with ``at_most``; without it the row is only reported. ``definition`` states the number in one line.
+    Neither side of a number that is not ``ranked`` is better, such as a count of faces.
+    """
+
+    scene: str
+    name: str
+    unit: str
+    values: Mapping[str, float | None]
+    judged: str
+    target: float | None = None
+    at_most: bool = True
+    definition: str = ""
+    ranked: bool = True
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return whether the judged method reached the target; a number that is missing has not."""
+        if self.target is None:
+            return "reported"
+        value = self.values.get(self.judged)
+        if value is None:
+            return "missed"
+        return "reached" if (value <= self.target if self.at_most else value >= self.target) else "missed"
+
+
+def markdown_table(metrics: Sequence[Metric]) -> str:
+    """Return the rows of one scene as a Markdown table, one column per method."""
+    methods = list(dict.fromkeys(method for metric in metrics for method in metric.values))
+    lines = []
+    for metric in metrics:
+        sign = "<=" if metric.at_most else ">="
+        target = "" if metric.target is None else f"{sign} {number(metric.target)}"
+        name = f"{metric.name}, {metric.unit}" if metric.unit else metric.name
+        numbers = [number(metric.values.get(method)) for method in methods]
+        lines.append([name, *numbers, target, metric.verdict])
+    return text_table(["", *methods, "target", "verdict"], lines)
+
+
+def number(value: float | None) -> str:
+    """Return three significant digits, whole numbers in full, "-" for none."""
+    if value is None or math.isnan(value):
+        return "-"
+    if abs(value) < 1e9 and float(value).is_integer():
+        return str(int(value))
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+class Rows(list[Metric]):
+    """Rows of one scene; the numbers of one ``judged`` method are held against the bounds."""
+
+    def __init__(self, scene: str, judged: str) -> None:
+        super().__init__()
+        self.scene, self.judged = scene, judged
+
+    def add(
+        self,
+        name: str,
+        values: Mapping[str, float | None] | float,
+        unit: str = "",
+        at_most: float | None = None,
+        at_least: float | None = None,
+    ) -> None:
+        """Append one row; a plain number belongs to the judged method."""
+        given = values if isinstance(values, Mapping) else {self.judged: float(values)}
+        bound = at_most if at_least is None else at_least
+        self.append(Metric(self.scene, name, unit, given, self.judged, bound, at_least is None))
+
+    def each(
+        self,
+        name: str,
+        items: Mapping[str, T | None],
+        read: Callable[[T], float | None],
+        unit: str = "",
+        at_most: float | None = None,
+        at_least: float | None = None,
+    ) -> None:
+        """Append a row with a number of each method's item; methods without an item have none."""
+        values = {method: None if item is None else read(item) for method, item in items.items()}
+        self.add(name, values, unit, at_most, at_least)
+
+
+def text_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
+    """Return a Markdown table of cells that are printed as they are."""
+    lines = [[*map(str, head)], ["---"] * len(head), *([*map(str, row)] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def write_csv(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """Write records with the same keys; None and NaN become empty cells."""
+    sink = io.StringIO(newline="")
+    writer = csv.DictWriter(sink, list(records[0]) if records else [])
+    writer.writeheader()
+    writer.writerows({k: "" if v is None or v != v else v for k, v in r.items()} for r in records)
+    write_text(path, sink.getvalue())
+
+
+def write_metrics(path: Path, metrics: Sequence[Metric]) -> None:
+    """Write metrics with their verdicts as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [{**asdict(metric), "verdict": metric.verdict} for metric in metrics]
+    write_text(path, json.dumps(rows, indent=1) + "\n")

@@ -1,0 +1,278 @@
+"""Chapters 4 to 7: intrinsics and cameras of images beside COLMAP's mappers and the truth."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import thesisrecon
+from thesisrecon._settings import config_from_tables
+from thesisrecon.config import PipelineConfig, preset
+from thesisrecon.errors import StageFailure
+from thesisrecon.io._files import read_json
+from thesisrecon.records import Reconstruction
+from thesisrecon.runtime._run import FOLDERS
+from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
+from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
+from validation.metrics.intervals import focal_errors_pct
+from validation.references.colmap import map_with_pycolmap, match_with_pycolmap
+from validation.references.colmap_reading import read_colmap_model
+from validation.runs.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
+from validation.runs.rows import OURS, Values, each, plot, row, scatter
+from validation.runs.scenes import has_images, load_images, truth_of
+from validation.runs.tables import Metric
+from validation.scenes.real import Scene
+
+THESIS, PER_IMAGE = "ours (thesis)", "ours (a camera each)"
+COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, global"
+MATCHES = "COLMAP, matches"
+FIXTURE = "courtyard"
+"""Scene of the gates of the thesis preset, always available."""
+SETTINGS: dict[str, PipelineConfig] = {
+    OURS: preset("default"),
+    THESIS: preset("thesis"),
+    PER_IMAGE: config_from_tables({"intrinsics": {"cameras": "per-image"}}),
+}
+MAPPERS = {COLMAP: "default", COLMAP_PP: "principal-point", COLMAP_GLOBAL: "global"}
+FOCAL = "median |f / f_true - 1|, f = sqrt(fx fy), over the registered cameras"
+CENTRE = "mean distance of the camera centres after the least-squares similarity"
+PRINCIPAL_POINT = "median distance from the true one"
+REPROJECTION = "median distance of inlier observations from their projected points"
+ROTATION = "median angle after the rotation common to all cameras is taken off"
+SHARE_HELD = "share of focal lengths and principal points whose stated 95 % interval contains the truth"
+
+
+class CamerasStage(Stage):
+    """Reconstruction by ours and by COLMAP without priors on the same images."""
+
+    name = "cameras"
+    title = "Cameras and intrinsics"
+    definition = (
+        "From images without any camera prior: the default and the thesis' preset beside "
+        "COLMAP (default, with the principal point refined, and its global mapper), one thread each. "
+        "Every number is recomputed from the saved cameras and points."
+    )
+
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return has_images(scene, options)
+
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
+        if options.gates_only:
+            if scene == FIXTURE:
+                return (OURS, THESIS)
+            return (OURS, PER_IMAGE) if load_images(scene, options).has_truth else (OURS,)
+        if options.quick:
+            return (OURS, MATCHES, COLMAP, THESIS)
+        return (OURS, MATCHES, PER_IMAGE, THESIS, *MAPPERS)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        if method == PER_IMAGE:
+            return ((self.name, OURS),)
+        return ((self.name, MATCHES),) if method in MAPPERS else ()
+
+    def run(self, task: Task, options: ReportOptions) -> None:
+        scene = load_images(task.scene, options)
+        place = options.place(task.stage, task.scene, task.method)
+        if task.method not in SETTINGS:
+            _run_colmap(task, scene, options, place)
+            return
+        run, config = place / "run", SETTINGS[task.method]
+        if task.method == PER_IMAGE:
+            # The matches are the same.
+            shutil.copytree(options.place(self.name, task.scene, OURS) / "run", run, dirs_exist_ok=True)
+        paths, seed = list(scene.image_paths), options.seed
+        thesisrecon.reconstruct(
+            paths, run, config=config, seed=seed, threads=1, until="metric", overwrite=True
+        )
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        images = load_images(scene, options)
+        models = {m: read_model(images, m, o) for m, o in outcomes.items() if m != MATCHES}
+        metrics = [*_errors(images, models), *_fit(images, models), *_costs(scene, outcomes)]
+        metrics += _before_adjustment(images, outcomes.get(OURS))
+        metrics += [*_per_image(images, models.get(PER_IMAGE)), *_stated(images, outcomes)]
+        return Judgement(metrics, plots=[_plot(images, models)])
+
+
+def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
+    """Return the saved model of a method in image order, or None."""
+    names = [path.name for path in scene.image_paths]
+    folder = outcome.place / "run" if method in SETTINGS else outcome.place
+    try:
+        folders = [path for path in sorted((folder / "sparse").glob("*")) if path.is_dir()]
+        models = [read_colmap_model(path, names) for path in folders]
+        return max(models, key=lambda model: model.registered.sum(), default=None)
+    except (StageFailure, OSError):
+        return None
+
+
+def our_model(scene: Scene, options: ReportOptions) -> Reconstruction:
+    """Return our saved reconstruction of a scene; ``ValueError`` if missing."""
+    model = read_model(scene, OURS, Outcome(options.place("cameras", scene.name, OURS)))
+    if model is None:
+        raise ValueError(f"our model of {scene.name} is missing: run the stage cameras too")
+    return model
+
+
+def _run_colmap(task: Task, scene: Scene, options: ReportOptions, place: Path) -> None:
+    images = scene.image_paths[0].parent
+    if task.method == MATCHES:
+        match_with_pycolmap(images, place, threads=1)
+        return
+    matched = options.place(task.stage, task.scene, MATCHES)
+    mapper: Literal["incremental", "global"] = "global" if task.method == COLMAP_GLOBAL else "incremental"
+    refined = task.method == COLMAP_PP
+    map_with_pycolmap(images, matched, place, refine_principal_point=refined, threads=1, mapper=mapper)
+
+
+def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    """Compare the cameras with the true ones, if known."""
+    registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
+    rows = [row(scene.name, "registered", "%", registered, "share of the images", more=True)]
+    truth = truth_of(scene)
+    if truth is None:
+        return rows
+    errors = {n: None if m is None else measure_cameras(m, truth) for n, m in models.items()}
+    numbers: tuple[tuple[str, str, Callable[[CameraErrors], float | None], str], ...] = (
+        ("focal error", "%", lambda e: e.focal_error_pct, FOCAL),
+        ("principal point error", "px", lambda e: e.principal_point_error_px, PRINCIPAL_POINT),
+        ("centre error", "mm", lambda e: e.centre_error_mm, CENTRE),
+        ("rotation error", "deg", lambda e: e.rotation_error_deg, ROTATION),
+    )
+    for name, unit, read, words in numbers:
+        values: Values = {n: None if e is None else read(e) for n, e in errors.items()}
+        rows.append(row(scene.name, name, unit, values, words))
+        if THESIS in values:
+            rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], words))
+    return rows
+
+
+def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    """Return reprojection errors and numbers of points."""
+    residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
+    points = each(models, lambda m: m.valid.sum())
+    seen: Values = {n: r.observations / p if r and (p := points[n]) else None for n, r in residuals.items()}
+    return [
+        row(scene.name, "reprojection", "px", each(residuals, lambda r: r.median_px), REPROJECTION),
+        row(scene.name, "observations a point", "", seen, "inlier observations over points", more=True),
+        row(scene.name, "points", "", points, "valid points of the model", more=True),
+    ]
+
+
+def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
+    """Evaluate chapters 6 and 7 separately, before the metric stage corrects their errors."""
+    if outcome is None or not outcome.ok:
+        return []
+    projective = _last_record(outcome, "projective")
+    t, P, X = projective.tracks, projective.P, projective.X
+    seen = projective.used
+    x = np.einsum("kab,kb->ka", P[t.view_index[seen]], X[t.point_index[seen]])
+    residual = float(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[seen], axis=1)))
+    words = f"{REPROJECTION}, by the projective model"
+    rows = [row(scene.name, "projective reprojection", "px", residual, words)]
+    if scene.K is None:
+        return rows
+    K = _last_record(outcome, "selfcalibration").K
+    known = np.isfinite(K).all(axis=(1, 2)) & (K[:, 0, 0] > 0.0)
+    error = float(np.median(focal_errors_pct(K[known], scene.K[known])))
+    words = f"{FOCAL}, as self-calibration leaves it"
+    return [*rows, row(scene.name, "self-calibrated focal error", "%", error, words)]
+
+
+def _last_record(outcome: Outcome, stage: str) -> Any:
+    """Return the last record of a stage of the run."""
+    folder = RunDirectory(outcome.place / "run").stage(FOLDERS[stage])
+    *_, (item, key) = read_json(folder.path / MANIFEST_FILE)["keys"].items()
+    return folder.load(item, key)
+
+
+def _costs(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
+    """Return processor seconds and memory; COLMAP's mappers include the shared matching.
+
+    Ours with a camera each continues a finished run, so it has no time of its own.
+    """
+    done = {n: o if o.ok else None for n, o in outcomes.items() if n not in (MATCHES, PER_IMAGE)}
+    shared = outcomes[MATCHES].cpu_s if MATCHES in outcomes else 0.0
+    times: Values = {n: None if o is None else o.cpu_s + shared * (n in MAPPERS) for n, o in done.items()}
+    return [
+        row(scene, "time", "s", times, "processor seconds from images to cameras"),
+        row(scene, "peak memory", "MB", each(done, lambda o: o.peak_mb), "of the process"),
+    ]
+
+
+def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
+    """Return errors of focal lengths with independent cameras."""
+    if scene.K is None or model is None or model.K is None or not model.registered.any():
+        return []
+    errors = focal_errors_pct(model.K[model.registered], scene.K[model.registered])
+    words, name = "|f / f_true - 1| over the images, with independent cameras", "focal error, a camera each"
+    return [
+        row(scene.name, name, "%", float(np.median(errors)), f"median {words}"),
+        row(scene.name, f"worst {name}", "%", float(errors.max()), f"largest {words}"),
+    ]
+
+
+def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
+    """Return self-check results and the coverage of the stated intervals."""
+    records: dict[str, Any] = {
+        name: read_json(outcomes[name].place / "run" / "summary.json")
+        for name in SETTINGS
+        if name in outcomes and outcomes[name].ok
+    }
+    trusted = each(records, lambda r: bool(r["trusted"]))
+    silent = each(records, lambda r: sum(not refused["reason"] for refused in r["refused"]))
+    rows = [
+        row(scene.name, "trusted", "", trusted, "1: passed its self-check", more=True),
+        row(scene.name, "refused without a reason", "", silent, "images"),
+    ]
+    if scene.K is None or not records:
+        return rows
+    for name, where in ((OURS, ""), (PER_IMAGE, ", a camera each")):
+        cameras = records.get(name, {}).get("cameras", [])
+        held = _share_held(cameras, scene.K) if cameras else None
+        words = "largest stated standard deviation of a focal length"
+        rows += [
+            row(scene.name, f"intervals that hold{where}", "%", held, SHARE_HELD, more=True),
+            row(scene.name, f"widest focal interval{where}", "%", _widest(cameras), words),
+        ]
+    return rows
+
+
+def _widest(cameras: list[dict[str, Any]]) -> float | None:
+    focals = [c["focal_px"] for c in cameras if c.get("focal_px")]
+    return max((100.0 * f["std"] / f["value"] for f in focals), default=None)
+
+
+def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float | None:
+    places = {"focal_px": None, "principal_x_px": (0, 2), "principal_y_px": (1, 2)}
+    held = []
+    for camera, true_K in zip(cameras, K, strict=True):
+        for name, place in places.items():
+            interval = camera.get(name)
+            if interval is None or not interval["std"]:
+                continue
+            truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if place is None else true_K[place]
+            held.append(abs(interval["value"] - truth) <= 1.96 * interval["std"])
+    return 100.0 * float(np.mean(held)) if held else None
+
+
+def _plot(scene: Scene, models: Mapping[str, Reconstruction | None]) -> Plot:
+    """Plot the focal length of every image by each method, and the true one."""
+    focals = {name: _focals(model) for name, model in models.items() if model is not None}
+    images = range(1, len(scene.image_paths) + 1)
+    traces = [scatter(name, images, focal) for name, focal in focals.items()]
+    if scene.K is not None:
+        true = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
+        marker = {"symbol": "line-ew-open", "size": 18, "color": "#1b2733"}
+        traces.append(scatter("truth", images, true, marker=marker))
+    return plot("Focal lengths", traces, "image", "focal length (px)")
+
+
+def _focals(model: Reconstruction) -> list[float | None]:
+    assert model.K is not None
+    found = np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1])
+    return [float(f) if seen else None for f, seen in zip(found, model.registered, strict=True)]

@@ -1,0 +1,175 @@
+"""Chapter 5: F of the same matches by ours, OpenCV, COLMAP and PoseLib, against the truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.geometry.two_view import epipoles
+from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.references.fundamental import estimate_with
+from validation.references.libraries import NoReference
+from validation.runs.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
+from validation.runs.rows import OURS, each, plot, read_arrays, row, scatter
+from validation.runs.scenes import has_images, load_images
+from validation.runs.tables import Metric
+from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
+
+MATCHES = "SIFT matches"
+VARIANTS, MINIMAL = ("ours (thesis)", "ours (eight points)"), "ours (seven points)"
+REFERENCES = ("FM_RANSAC", "FM_LMEDS", "USAC_ACCURATE", "USAC_MAGSAC", "COLMAP", "PoseLib")
+QUICK = ("USAC_MAGSAC", "PoseLib")
+THRESHOLD_PX = 1.0
+FAILED_PX = 5.0
+ERROR = "RMS distance of right correspondences to their epipolar lines, over both images (5.6)"
+
+
+Answers = dict[str, F64]
+"""Answers of a method for all pairs and seeds: ``F`` (pairs, seeds, 3, 3), NaN if missing, ``inliers``
+(pairs, seeds) their number, ``seconds`` (pairs, seeds) of one processor."""
+
+
+class FundamentalStage(Stage):
+    """F of SIFT matches with one threshold for all methods."""
+
+    name = "fundamental"
+    title = "Fundamental matrices"
+    definition = (
+        "F of the same SIFT matches, threshold 1 px, several seeds, which also order the matches. "
+        "Errors are on the matches that agree with the true cameras, moved to where they agree exactly, or on"
+        " correspondences made by hand."
+    )
+
+    def takes(self, scene: str, options: ReportOptions) -> bool:
+        return scene == "kusvod2" or (has_images(scene, options) and load_images(scene, options).has_truth)
+
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
+        references = () if options.gates_only else QUICK if options.quick else REFERENCES
+        return (MATCHES, OURS, *VARIANTS, MINIMAL, *references)
+
+    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
+        return () if method in ("", MATCHES) else ((self.name, MATCHES),)
+
+    def run(self, task: Task, options: ReportOptions) -> None:
+        pairs = _pairs(task.scene, options)
+        if task.method == MATCHES:
+            return
+
+        def answer(pair: RealPair, seed: int) -> tuple[F64 | None, B8, float]:
+            start = time.process_time()
+            found = estimate_with(task.method, pair.xy1, pair.xy2, threshold_px=THRESHOLD_PX, seed=seed)
+            return found.F, found.inliers, time.process_time() - start
+
+        answer(pairs[0], 0)  # compiles
+        answers = [[answer(pair, options.seed + seed) for seed in range(_seeds(options))] for pair in pairs]
+        none = np.full((3, 3), np.nan)
+        np.savez(
+            options.place(task.stage, task.scene, task.method) / "answers.npz",
+            F=[[none if F is None else F for F, _, _ in found] for found in answers],
+            inliers=[[float(inliers.sum()) for _, inliers, _ in found] for found in answers],
+            seconds=[[seconds for _, _, seconds in found] for found in answers],
+        )
+
+    def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
+        pairs = _pairs(scene, options)
+        answers = {m: read_arrays(o, "answers.npz") for m, o in outcomes.items() if m != MATCHES}
+        errors = {m: None if a is None else _errors(a, pairs) for m, a in answers.items()}
+        notes = [f"{len(pairs)} pairs, {_seeds(options)} seeds each."]
+        return Judgement(_metrics(scene, pairs, answers, errors), plots=[_plot(errors)], notes=notes)
+
+
+def _seeds(options: ReportOptions) -> int:
+    return 2 if options.quick else 5
+
+
+def _pairs(scene: str, options: ReportOptions) -> list[RealPair]:
+    """Return the pairs of a scene, with the matches of the matching task.
+
+    Raises :class:`NoReference` if SIFT is unavailable.
+    """
+    cache = options.place("fundamental", scene, MATCHES)
+    try:
+        if scene == "kusvod2":
+            return list(kusvod2_pairs(cache))
+        gaps = (1,) if options.quick else (1, 2)
+        return list(camera_pairs(load_images(scene, options), cache, gaps))
+    except NoReference as error:
+        raise NoReference(f"there are no SIFT matches: {error}") from error
+
+
+def _errors(answers: Answers, pairs: list[RealPair]) -> F64:
+    """(pairs, seeds) px."""
+    rows = []
+    for pair, found in zip(pairs, answers["F"], strict=True):
+        assert pair.truth is not None
+        rows.append([rms_epipolar_distance(F, pair.truth) for F in found])
+    return np.array(rows)
+
+
+def _metrics(
+    scene: str, pairs: list[RealPair], answers: Mapping[str, Answers | None], errors: Mapping[str, F64 | None]
+) -> list[Metric]:
+    median, worst = each(errors, np.median), each(errors, lambda e: np.quantile(e, 0.9))
+    failed = each(errors, lambda e: 100.0 * np.mean(e > FAILED_PX))
+    counts = np.array([len(pair.xy1) for pair in pairs])[:, None]
+    inliers = each(answers, lambda a: 100.0 * np.mean(a["inliers"] / counts))
+    spent = each(answers, lambda a: 1e3 * np.median(a["seconds"]))
+    minimal = answers.get(MINIMAL)
+    rank = None if minimal is None else _third_singular_value(minimal)
+    rank_words = "largest third singular value of F over the second: F has rank 2"
+    rows = [
+        row(scene, "median error", "px", median, ERROR),
+        row(scene, "tenth worst error", "px", worst, "the 90 % quantile of it"),
+        row(scene, "failed", "%", failed, f"runs with an error above {FAILED_PX:g} px"),
+        row(scene, "inliers", "%", inliers, "mean share of the matches accepted as inliers", ranked=False),
+        row(scene, "time", "ms", spent, "median processor time of a pair"),
+        *(row(scene, f"{name}: median error", "px", median.get(name), ERROR) for name in VARIANTS),
+        row(scene, f"{MINIMAL}: rank", "", rank, rank_words),
+    ]
+    if all(pair.F is not None for pair in pairs):
+        angle = each(answers, lambda a: np.median(_epipole_angles(a, pairs)))
+        words = "median angle between found and true epipole"
+        rows.insert(1, row(scene, "epipole angle", "deg", angle, words))
+    return rows
+
+
+def _third_singular_value(answers: Answers) -> float:
+    """Return the largest over all runs with an F, NaN without any."""
+    F = answers["F"]
+    s = np.linalg.svd(F[np.isfinite(F).all(axis=(2, 3))], compute_uv=False)
+    return float((s[:, 2] / s[:, 1]).max()) if len(s) else float("nan")
+
+
+def _epipole_angles(answers: Answers, pairs: list[RealPair]) -> F64:
+    """Return the angles (deg) between estimated and true epipoles of image 1, as directions from the centre
+    of the matches at the distance of their spread; 90 without F."""
+    angles = []
+    for pair, found in zip(pairs, answers["F"], strict=True):
+        assert pair.F is not None
+        middle, spread = pair.xy1.mean(axis=0), float(np.linalg.norm(pair.xy1.std(axis=0)))
+        true = _direction(pair.F, middle, spread)
+        for F in found:
+            cosine = abs(float(true @ _direction(F, middle, spread))) if np.isfinite(F).all() else 0.0
+            angles.append(float(np.degrees(np.arccos(min(cosine, 1.0)))))
+    return np.array(angles)
+
+
+def _direction(F: F64, middle: F64, spread: float) -> F64:
+    e = epipoles(F)[0]
+    moved = np.array([e[0] - middle[0] * e[2], e[1] - middle[1] * e[2], spread * e[2]])
+    return np.asarray(moved / np.linalg.norm(moved))
+
+
+def _plot(errors: Mapping[str, F64 | None]) -> Plot:
+    """Plot the sorted errors of every method."""
+    traces = []
+    for name, found in errors.items():
+        if found is not None:
+            x = np.sort(np.minimum(found.ravel(), NONE_PX))
+            share = 100.0 * np.arange(1, len(x) + 1) / len(x)
+            traces.append(scatter(name, x.tolist(), share.tolist(), "lines"))
+    log, whole, words = {"type": "log"}, {"range": [0, 100]}, "To the left is better."
+    return plot("Errors of all runs", traces, "error (px)", "runs below (%)", words, xaxis=log, yaxis=whole)

@@ -1,0 +1,65 @@
+"""Ratios of the least times of pytest-benchmark, read from a file of ``scripts/benchmark`` or measured."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from thesisrecon.errors import UsageError
+from thesisrecon.io._files import write_text
+from validation.runs.study import Part
+from validation.runs.tables import text_table
+
+
+def ratios_to_ours(groups: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    """Return group -> reference -> our time over its time; groups without ours are left out."""
+    return {
+        group: {name: times["ours"] / seconds for name, seconds in times.items() if name != "ours"}
+        for group, times in groups.items()
+        if "ours" in times
+    }
+
+
+def ratio_table(groups: Mapping[str, Mapping[str, float]]) -> str:
+    ratios, rows = ratios_to_ours(groups), []
+    for group, times in groups.items():
+        for name, seconds in times.items():
+            ratio = ratios.get(group, {}).get(name)
+            rows.append([group, name, f"{1e3 * seconds:.3g}", "" if ratio is None else f"**{ratio:.2f}**"])
+    return text_table(["", "method", "ms a call", "ours / this"], rows)
+
+
+def run_benchmarks(file: Path) -> None:
+    """Run all benchmarks on one thread, with processor times, into a file."""
+    options = ["--benchmark-only", "--benchmark-min-rounds=5", "--benchmark-max-time=1"]
+    options += ["--benchmark-timer=time.process_time", f"--benchmark-json={file}"]
+    command = [sys.executable, "-m", "pytest", "benchmarks", "-q", *options]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise UsageError(f"the benchmarks failed: {(done.stdout + done.stderr).strip()[-500:]}")
+
+
+def benchmark_table_study(
+    out: Path, benchmark: Path | None = None, ratios: Path | None = None
+) -> Iterator[Part]:
+    """Compare the least times of the benchmarks with those of the references."""
+    if benchmark is None:
+        benchmark = out / "benchmark.json"
+        run_benchmarks(benchmark)
+    groups: dict[str, dict[str, float]] = {}
+    try:
+        for entry in json.loads(benchmark.read_text(encoding="utf-8"))["benchmarks"]:
+            times = groups.setdefault(entry["group"], {})
+            times[entry["extra_info"]["method"]] = float(entry["stats"]["min"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{benchmark} is not a JSON file of our benchmarks: {error}") from error
+    yield ratio_table(groups)
+    if ratios is not None:
+        content = {"seconds": groups, "ours_over": ratios_to_ours(groups)}
+        write_text(ratios, json.dumps(content, indent=1))
