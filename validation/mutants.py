@@ -291,9 +291,9 @@ def table(verdicts: Sequence[Verdict]) -> str:
             lines.append(f"| {package} | {len(own)} | {caught} | {100.0 * caught / len(own):.0f} % |")
     lines += ["", "| file | line | was | became | caught by |", "| --- | --- | --- | --- | --- |"]
     for v in verdicts:
-        words = [" ".join(text.split()).replace("|", "\\|")[:60] for text in (v.mutant.old, v.mutant.new)]
+        texts = [" ".join(text.split()).replace("|", "\\|")[:60] for text in (v.mutant.old, v.mutant.new)]
         by = v.by.replace("|", "\\|") or "**not caught**"
-        lines.append(f"| {v.mutant.file} | {v.mutant.line} | `{words[0]}` | `{words[1]}` | {by} |")
+        lines.append(f"| {v.mutant.file} | {v.mutant.line} | `{texts[0]}` | `{texts[1]}` | {by} |")
     return "\n".join(lines)
 
 

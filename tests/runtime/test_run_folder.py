@@ -348,7 +348,7 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, refused):
     wanted = runs.whole(tmp_path / "whole")
     refusal = refused_at(runs, 3, errno.ENOSPC, wanted)
     assert refusal.wrong == ""
-    assert "No space left on device; free space there" in refusal.said
+    assert "No space left on device; free space there" in refusal.message
 
     def compile_kernels(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device", "kernels/index.nbi")

@@ -90,7 +90,7 @@ def test_a_program_stops_at_any_time(what, asked, tmp_path):
     ready = tmp_path / "ready"
     stop = stopped(program(tmp_path, AT_WORK[what]), ready.exists, asked, environment=environment)
     word = "interrupted" if asked == signal.SIGINT else "terminated"
-    assert (stop.code, stop.said, stop.left) == (CODES[asked], f"toy: {word}; it goes on later\n", 0)
+    assert (stop.code, stop.message, stop.left) == (CODES[asked], f"toy: {word}; it goes on later\n", 0)
 
 
 @pytest.mark.parametrize(("name", "slow"), [("thesisrecon", "cli"), ("validation", "command")])
@@ -101,7 +101,7 @@ def test_a_command_is_ended_while_it_is_loaded(name, slow, asked, tmp_path):
     stop = stopped(program, ready.exists, asked, environment={**os.environ, "PYTHONPATH": str(ROOT)})
     word = "interrupted" if asked == signal.SIGINT else "terminated"
     assert stop.code == CODES[asked]
-    assert stop.said == f"{name}: {word}; repeat the command to resume\n"
+    assert stop.message == f"{name}: {word}; repeat the command to resume\n"
 
 
 def test_signals_ignored_at_start_stay_ignored(tmp_path):
@@ -132,7 +132,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path):
     )
     assert (stop.code, stop.left) == (130, 0)
     advice = f"repeat the command to resume from {out}"
-    assert stop.said == f"thesisrecon: interrupted; {advice}\n"
+    assert stop.message == f"thesisrecon: interrupted; {advice}\n"
     assert run_command([*arguments, "-o", str(out)]) == 0
     assert run_command([*arguments, "-o", str(tmp_path / "whole")]) == 0
     assert different(outputs(out), outputs(tmp_path / "whole")) == ()

@@ -17,8 +17,8 @@ from validation.metrics.cameras import (
     relative_centre_error,
     rotation_errors_deg,
 )
+from validation.metrics.image_similarity import psnr_db, ssim
 from validation.metrics.intervals import focal_errors_pct, interval_scores, join_scores
-from validation.metrics.pictures import psnr_db, ssim
 from validation.runs.tables import number
 from validation.studies.calibration_coverage import run_trial
 

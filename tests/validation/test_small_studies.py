@@ -95,7 +95,7 @@ def test_outcomes_of_a_trial_are_distinguished():
         "open": replace(wrong, interval_pct=11.0),
         "refused": replace(shifted, failed_checks=("close to a pure translation",)),
         "refused, another reason": replace(shifted, failed_checks=("too few points",)),
-        "right, doubted": replace(wrong, median_pct=1.0, failed_checks=("no",)),
+        "right, not trusted": replace(wrong, median_pct=1.0, failed_checks=("no",)),
         "wrong": wrong,
         "crash": replace(wrong, median_pct=np.nan, crash="ValueError: no"),
     }
@@ -354,8 +354,8 @@ def test_the_error_of_centres_is_after_a_similarity():
         return measure_cameras(found.reconstruction, TrueCameras(scene.K, scene.R, centres)).centre_error_mm
 
     assert error_mm(5.0 * scene.centres) < 0.05
-    spoiled = 5.0 * scene.centres + [[1e-3, 0.0, 0.0]] * np.array([1, 0, 0, 0, 0, -1])[:, None]
-    assert 0.2 < error_mm(spoiled) < 0.5
+    corrupted = 5.0 * scene.centres + [[1e-3, 0.0, 0.0]] * np.array([1, 0, 0, 0, 0, -1])[:, None]
+    assert 0.2 < error_mm(corrupted) < 0.5
 
 
 @pytest.mark.parametrize("name", FORMATS)

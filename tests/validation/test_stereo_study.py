@@ -75,9 +75,9 @@ def test_opencv_is_timed_on_the_images_as_they_are(tmp_path, monkeypatch):
     monkeypatch.setattr(disparity, "one_thread", lambda: None)
     monkeypatch.setattr(disparity, "load_stereo_pair", lambda _: small_pair())
     options = ReportOptions(tmp_path, ("small",), ("disparity",), quick=True)
-    place = options.place("disparity", "small", disparity.HH)
-    place.mkdir(parents=True)
+    folder = options.folder("disparity", "small", disparity.HH)
+    folder.mkdir(parents=True)
     disparity.DisparityStage().run(Task("disparity", "small", disparity.HH), options)
     assert calls == [True, False]
-    with np.load(place / "disparity.npz") as found:
+    with np.load(folder / "disparity.npz") as found:
         assert found["disparity"].all()

@@ -129,16 +129,16 @@ def level_name(path: str, value: Any) -> str:
     """Return the name of an axis value in tables: the kind of a variant, a number with its field."""
     field = path.rpartition(".")[2]
     if isinstance(value, Mapping):
-        fields = [f"{k} = {_words(v)}" for k, v in value.items() if k not in ("kind", "preset")]
+        fields = [f"{k} = {_text(v)}" for k, v in value.items() if k not in ("kind", "preset")]
         head = value.get("kind", value.get("preset", ""))
         head = str(head).rpartition(":")[2]
         return ", ".join([head, *fields] if head else fields) or field
     if _is_object(value):
-        fields = [f"{k} = {_words(v)}" for k, v in _non_default_fields(value).items()]
+        fields = [f"{k} = {_text(v)}" for k, v in _non_default_fields(value).items()]
         return ", ".join([type(value).__name__, *fields])
     if isinstance(value, str):
         return value.rpartition(":")[2] if is_own(value) else value
-    return f"{field} = {_words(value)}"
+    return f"{field} = {_text(value)}"
 
 
 def _non_default_fields(value: Any) -> dict[str, Any]:
@@ -151,7 +151,7 @@ def _non_default_fields(value: Any) -> dict[str, Any]:
     return {n: getattr(value, n) for n in names if getattr(value, n) != getattr(usual, n)}
 
 
-def _words(value: Any) -> str:
+def _text(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):

@@ -31,8 +31,8 @@ STUDIES = Path(__file__).parent / "studies"
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command ``ablate`` among the others."""
-    words = "Compare variants and parameters over scenes and seeds, with intervals."
-    command = commands.add_parser("ablate", help=words, description=words)
+    text = "Compare variants and parameters over scenes and seeds, with intervals."
+    command = commands.add_parser("ablate", help=text, description=text)
     shipped = ", ".join(sorted(p.stem for p in STUDIES.glob("*.toml")))
     command.add_argument(
         "study", metavar="STUDY", help=f"TOML file, or the name of a shipped study: {shipped}"
@@ -53,7 +53,7 @@ def run_command(parsed: argparse.Namespace) -> int:
     try:
         study = read_study(_path(parsed.study))
         if parsed.plan:
-            print(plan_words(plan_study(study)))
+            print(plan_summary(plan_study(study)))
             return 0
         if parsed.read:
             rows = read_rows(study, parsed.out)
@@ -73,7 +73,7 @@ def run_command(parsed: argparse.Namespace) -> int:
     except KeyboardInterrupt as stop:
         print("; ".join(("ablate: interrupted", *map(str, stop.args))), file=sys.stderr)
         return CODES[SIGINT]
-    print(_last_words(rows, page))
+    print(_summary(rows, page))
     return 3 if rows and all(r.failure for r in rows) else 0
 
 
@@ -82,7 +82,7 @@ def _path(name: str) -> Path:
     return shipped if not Path(name).exists() and shipped.is_file() else Path(name)
 
 
-def plan_words(plan: Plan) -> str:
+def plan_summary(plan: Plan) -> str:
     """Return the size of a study: rows and shared steps."""
     unique = list({row.key: row for row in plan.rows}.values())
     shared = Counter(part.step for part in parts_of(unique) if part.step)
@@ -98,7 +98,7 @@ def plan_words(plan: Plan) -> str:
     return "\n".join(part for part in parts if part)
 
 
-def _last_words(rows: Rows, page: Path) -> str:
+def _summary(rows: Rows, page: Path) -> str:
     """Failures, a line for each variant and scene, and the path of the page."""
     failed = sum(bool(r.failure) for r in rows)
     found = [f"{f.variant} failed on {f.scene}: {f.why}" for f in failures_of(rows)]
@@ -119,7 +119,7 @@ def progress_view() -> Iterator[ProgressCallback]:
 
         def report(state: State) -> None:
             steps = f"{state.steps_done} of {state.steps} shared steps" if state.steps else ""
-            words = f"{steps}, {state.failed} failed" if state.failed else steps
-            progress.update(task, total=state.total, completed=state.done, description=words)
+            text = f"{steps}, {state.failed} failed" if state.failed else steps
+            progress.update(task, total=state.total, completed=state.done, description=text)
 
         yield report

@@ -82,8 +82,8 @@ def _findings(analysis: Analysis) -> list[str]:
             if count == 1 and len(names) > 2 and len(names) == len(analysis.plan.variants) - 1:
                 names = ["all others"]
             sentences += [f"{verdict}: {'; '.join(names)}"] if names else []
-        said = ". ".join(sentences) or "no difference from the baseline is shown"
-        found.append(f"{measure.name} {said}.")
+        summary = ". ".join(sentences) or "no difference from the baseline is shown"
+        found.append(f"{measure.name} {summary}.")
     return found
 
 
@@ -231,9 +231,9 @@ def _cost(measure: Measure, cells: Sequence[Cell]) -> Plot | None:
         "legend": {"orientation": "h", "y": -0.2},
         "height": 420 + 10 * len(known),
     }
-    words = "Filled: Pareto-optimal (no variant is both better and cheaper)."
+    caption = "Filled: Pareto-optimal (no variant is both better and cheaper)."
     title, x = f"{measure.name} against cost", "processor time of a row (s)"
-    return plot(title, traces, x, _with_unit(measure.name, measure), words, **layout)
+    return plot(title, traces, x, _with_unit(measure.name, measure), caption, **layout)
 
 
 def _with_unit(text: str, measure: Measure) -> str:

@@ -53,7 +53,7 @@ def overview(results: Results, earlier: Results | None) -> dict[str, Any]:
         traces = [_trace(dots, 6, "circle", 0.45), _trace(mean_dots, 10, "diamond", 1.0)]
         figure = {"data": traces, "layout": _layout(len(order))}
         plots.append(
-            {"id": "plot-overview", "title": "Worst first", "figure": figure, "words": "", "solid": False}
+            {"id": "plot-overview", "title": "Worst first", "figure": figure, "caption": "", "solid": False}
         )
     better = sum(mean < 1.0 for mean in means.values())
     where = f"{better} of {len(means)} combinations of stage and scene"
@@ -80,10 +80,10 @@ def changes(results: Results, earlier: Results | None) -> list[str]:
     before = {row.key: row for row in earlier.rows}
     both = [(row, before[row.key]) for row in results.rows if row.limit is not None and row.key in before]
     sentences = []
-    for words, now in (("Broken since the last run", "missed"), ("Reached again", "reached")):
+    for change, now in (("Broken since the last run", "missed"), ("Reached again", "reached")):
         changed = [(row, old) for row, old in both if row.verdict == now != old.verdict != "reported"]
         sentences += [
-            f"{words}: {row.key}, {number(old.value)} before, {number(row.value)} now."
+            f"{change}: {row.key}, {number(old.value)} before, {number(row.value)} now."
             for row, old in changed
         ]
     return sentences or [f"No limit of {len(both)} changed its verdict since the last run."]

@@ -54,7 +54,7 @@ def write_pages(
     def write_scene(scene: str) -> None:
         rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         sections = [
-            _section(stages[name], rows, names) | _figures(options.place(name, scene), name, judgement)
+            _section(stages[name], rows, names) | _figures(options.folder(name, scene), name, judgement)
             for (name, where), (judgement, _) in judged.items()
             if where == scene
         ]
@@ -106,8 +106,8 @@ def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> _Verdict:
     judged = [row for row in rows if row.limit is not None]
     broken = [row for row in judged if row.verdict != "reached"]
     if not judged and not missing:
-        words = f"{counted(len(rows), 'number')} reported, none with a limit."
-        return _Verdict("open", "Nothing promised here", words)
+        sentence = f"{counted(len(rows), 'number')} reported, none with a limit."
+        return _Verdict("open", "Nothing promised here", sentence)
     summary = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
     reasons = tuple(f"{r.key}: {number(r.value)} {r.unit}, {r.direction} {number(r.limit)}" for r in broken)
     reasons += tuple(f"{key}: no method reported this number" for key in missing)
@@ -131,11 +131,11 @@ def _section(stage: Stage, rows: Sequence[Row], names: Mapping[str, str]) -> dic
     }
 
 
-def _figures(place: Path, stage: str, judgement: Judgement) -> dict[str, Any]:
-    """Return what the judgement in the folder ``place`` adds to the section of its stage."""
+def _figures(folder: Path, stage: str, judgement: Judgement) -> dict[str, Any]:
+    """Return what the judgement in the folder ``folder`` adds to the section of its stage."""
     return {
         "plots": [plot_at(f"{slug(stage)}-{n}", plot) for n, plot in enumerate(judgement.plots)],
-        "pictures": [_picture(place, picture) for picture in judgement.pictures],
+        "pictures": [_picture(folder, picture) for picture in judgement.pictures],
         "notes": judgement.notes,
     }
 
@@ -150,14 +150,14 @@ def _row(row: Row, names: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def plot_at(place: str, plot: Plot) -> dict[str, Any]:
-    """Return a plot as an entry of a section; ``place`` becomes part of its identifier."""
-    return {"id": f"plot-{place}", **vars(plot), "solid": "scene" in plot.figure.get("layout", {})}
+def plot_at(folder: str, plot: Plot) -> dict[str, Any]:
+    """Return a plot as an entry of a section; ``folder`` becomes part of its identifier."""
+    return {"id": f"plot-{folder}", **vars(plot), "solid": "scene" in plot.figure.get("layout", {})}
 
 
-def _picture(place: Path, picture: Picture) -> dict[str, Any]:
+def _picture(folder: Path, picture: Picture) -> dict[str, Any]:
     """Return the image as a data URL at page width."""
-    with PIL.Image.open(place / picture.file) as opened:
+    with PIL.Image.open(folder / picture.file) as opened:
         rgb = opened.convert("RGB")
     rgb.thumbnail((WIDEST_PX, WIDEST_PX))
     sink = io.BytesIO()
@@ -166,7 +166,7 @@ def _picture(place: Path, picture: Picture) -> dict[str, Any]:
     return {
         "address": address,
         "title": picture.title,
-        "words": picture.words,
+        "caption": picture.caption,
         "width": rgb.width,
         "height": rgb.height,
     }

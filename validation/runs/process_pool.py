@@ -134,7 +134,7 @@ def _wait(child: int, limit_s: float, orders: IO[str]) -> tuple[int, float, floa
     either.register(ended, select.POLLIN)
     # A closed pipe is always reported.
     either.register(orders, 0)
-    ready = {place for place, _ in either.poll(limit_s * 1000.0)}
+    ready = {source for source, _ in either.poll(limit_s * 1000.0)}
     if ended not in ready:
         with contextlib.suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
@@ -156,8 +156,8 @@ def _become(main: Callable[[list[str]], int], arguments: list[str], log: str) ->
             os.open(os.devnull, os.O_RDONLY),
             os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644),
         )
-        for place, file in ((0, nothing), (1, sink), (2, sink)):
-            os.dup2(file, place)
+        for descriptor, file in ((0, nothing), (1, sink), (2, sink)):
+            os.dup2(file, descriptor)
         code = main(arguments)
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1

@@ -141,8 +141,8 @@ def call_apart(
     Arguments and answer are written as JSON. Return the answer and what the process used; ``RuntimeError``
     with the end of its output if it fails.
     """
-    with tempfile.TemporaryDirectory() as place:
-        answer, log = Path(place) / "answer.json", Path(place) / "log"
+    with tempfile.TemporaryDirectory() as folder:
+        answer, log = Path(folder) / "answer.json", Path(folder) / "log"
         name = f"{function.__module__}:{function.__name__}"
         command = [sys.executable, "-m", "validation.runs.processes", name]
         command += [json.dumps(arguments, default=str), str(answer)]

@@ -36,10 +36,10 @@ class ReportOptions:
     side_px: int = 0
     stages_from: str = "validation.stages"
 
-    def place(self, stage: str, scene: str, method: str = "") -> Path:
+    def folder(self, stage: str, scene: str, method: str = "") -> Path:
         """Return the folder of a task, or of all tasks of a stage on a scene."""
-        place = self.out / "data" / stage / scene
-        return place / slug(method) if method else place
+        folder = self.out / "data" / stage / scene
+        return folder / slug(method) if method else folder
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self) | {"out": str(self.out)}
@@ -63,7 +63,7 @@ class Task:
 class Outcome:
     """Outcome of a task: its result folder and resources; ``failure`` is empty or the error message."""
 
-    place: Path
+    folder: Path
     failure: str = ""
     wall_s: float = 0.0
     cpu_s: float = 0.0
@@ -80,7 +80,7 @@ class Picture:
 
     file: str
     title: str
-    words: str = ""
+    caption: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Plot:
 
     title: str
     figure: Mapping[str, Any]
-    words: str = ""
+    caption: str = ""
 
 
 @dataclass(frozen=True)

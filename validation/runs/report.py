@@ -138,19 +138,19 @@ def _is_ours(task: Task) -> bool:
 def _run_task(
     task: Task, options: ReportOptions, ended: Mapping[Task, Outcome], pool: ProcessPool
 ) -> Outcome:
-    place = options.place(task.stage, task.scene, task.method)
-    place.mkdir(parents=True, exist_ok=True)
+    folder = options.folder(task.stage, task.scene, task.method)
+    folder.mkdir(parents=True, exist_ok=True)
     arguments = [str(options.out / "options.json"), task.stage, task.scene]
     if task.method == JUDGE:
-        record = {name: asdict(o) | {"place": str(o.place)} for name, o in _outcomes(task, ended).items()}
-        write_text(place / OUTCOMES, json.dumps(record))
+        record = {name: asdict(o) | {"folder": str(o.folder)} for name, o in _outcomes(task, ended).items()}
+        write_text(folder / OUTCOMES, json.dumps(record))
     else:
         arguments.append(task.method)
     # Outside the task folder, which the task may empty.
-    log = place.with_name(f"{place.name}.log")
+    log = folder.with_name(f"{folder.name}.log")
     process = pool.run(arguments, log=log, limit_s=options.limit_s)
     failure = failure_of(process, last_line(log), options.limit_s)
-    return Outcome(place, failure, process.wall_s, process.cpu_s, process.peak_mb)
+    return Outcome(folder, failure, process.wall_s, process.cpu_s, process.peak_mb)
 
 
 def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
@@ -165,7 +165,7 @@ def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
 def _judgement(outcome: Outcome) -> Judgement:
     if not outcome.ok:
         return Judgement((), notes=(f"This comparison could not be evaluated: {outcome.failure}.",))
-    record: dict[str, Any] = json.loads((outcome.place / JUDGEMENT).read_text(encoding="utf-8"))
+    record: dict[str, Any] = json.loads((outcome.folder / JUDGEMENT).read_text(encoding="utf-8"))
     return Judgement(
         [Metric(**metric) for metric in record["metrics"]],
         [Plot(**plot) for plot in record["plots"]],
@@ -189,7 +189,7 @@ def main(arguments: list[str]) -> int:
     stages: dict[str, Stage] = importlib.import_module(options.stages_from).STAGES
     try:
         if method:
-            options.place(stage, scene, method[0]).mkdir(parents=True, exist_ok=True)
+            options.folder(stage, scene, method[0]).mkdir(parents=True, exist_ok=True)
             stages[stage].run(Task(stage, scene, method[0]), options)
         else:
             _judge(options, stages[stage], scene)
@@ -201,18 +201,18 @@ def main(arguments: list[str]) -> int:
 
 def _judge(options: ReportOptions, stage: Stage, scene: str) -> None:
     """Store the judgement with the messages of the methods that failed."""
-    place = options.place(stage.name, scene)
-    outcomes = read_outcomes(place)
+    folder = options.folder(stage.name, scene)
+    outcomes = read_outcomes(folder)
     judgement = stage.judge(scene, outcomes, options)
     failures = [f"{name}: {outcome.failure}." for name, outcome in outcomes.items() if not outcome.ok]
     judgement = replace(judgement, notes=[*judgement.notes, *failures])
-    write_text(place / JUDGEMENT, json.dumps(asdict(judgement), default=_plain_number))
+    write_text(folder / JUDGEMENT, json.dumps(asdict(judgement), default=_plain_number))
 
 
-def read_outcomes(place: Path) -> dict[str, Outcome]:
+def read_outcomes(folder: Path) -> dict[str, Outcome]:
     """Return the outcomes of a stage on a scene by method, those of its folder."""
-    record = json.loads((place / OUTCOMES).read_text(encoding="utf-8"))
-    return {name: Outcome(**{**o, "place": Path(o["place"])}) for name, o in record.items()}
+    record = json.loads((folder / OUTCOMES).read_text(encoding="utf-8"))
+    return {name: Outcome(**{**o, "folder": Path(o["folder"])}) for name, o in record.items()}
 
 
 def _plain_number(value: Any) -> Any:
@@ -250,14 +250,14 @@ def reuse_results(
     known = {}
     for task in tasks:
         if _runs_again(task):
-            _copy_stage_folders(other.place(task.stage, task.scene, task.method) / "run", options, task)
+            _copy_stage_folders(other.folder(task.stage, task.scene, task.method) / "run", options, task)
         elif task.method:
-            place = other.place(task.stage, task.scene)
-            outcome = read_outcomes(place).get(task.method) if (place / OUTCOMES).is_file() else None
+            folder = other.folder(task.stage, task.scene)
+            outcome = read_outcomes(folder).get(task.method) if (folder / OUTCOMES).is_file() else None
             if outcome is not None and outcome.ok:
-                kept = options.place(task.stage, task.scene, task.method)
-                shutil.copytree(other.place(task.stage, task.scene, task.method), kept, dirs_exist_ok=True)
-                known[task] = replace(outcome, place=kept)
+                kept = options.folder(task.stage, task.scene, task.method)
+                shutil.copytree(other.folder(task.stage, task.scene, task.method), kept, dirs_exist_ok=True)
+                known[task] = replace(outcome, folder=kept)
         _copy_inputs(other, options, task, stages)
     return known
 
@@ -275,14 +275,14 @@ def _options_of(folder: Path) -> ReportOptions:
 
 
 def _copy_stage_folders(run: Path, options: ReportOptions, task: Task) -> None:
-    place = options.place(task.stage, task.scene, task.method) / "run"
+    folder = options.folder(task.stage, task.scene, task.method) / "run"
     if (run / RUN_FILE).is_file():
         # The library accepts only folders with this file.
-        place.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(run / RUN_FILE, place / RUN_FILE)
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(run / RUN_FILE, folder / RUN_FILE)
     for name in sorted(set(FOLDERS.values())):
         if (run / name).is_dir():
-            shutil.copytree(run / name, place / name, dirs_exist_ok=True)
+            shutil.copytree(run / name, folder / name, dirs_exist_ok=True)
 
 
 def _copy_inputs(
@@ -290,6 +290,6 @@ def _copy_inputs(
 ) -> None:
     """Copy the inputs of a task from stages that are not part of this run."""
     for stage, method in stages[task.stage].needs(task.method):
-        place = other.place(stage, task.scene, method)
-        if stage not in options.stages and place.is_dir():
-            shutil.copytree(place, options.place(stage, task.scene, method), dirs_exist_ok=True)
+        folder = other.folder(stage, task.scene, method)
+        if stage not in options.stages and folder.is_dir():
+            shutil.copytree(folder, options.folder(stage, task.scene, method), dirs_exist_ok=True)

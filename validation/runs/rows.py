@@ -21,7 +21,7 @@ def row(
     name: str,
     unit: str,
     values: Mapping[str, float | None] | float | None,
-    words: str = "",
+    definition: str = "",
     *,
     more: bool = False,
     ranked: bool = True,
@@ -32,7 +32,7 @@ def row(
     A smaller one is better, with ``more`` a larger one, and neither if it is not ``ranked``.
     """
     table = values if isinstance(values, Mapping) else {judged: values}
-    return Metric(scene, name, unit, table, judged, at_most=not more, definition=words, ranked=ranked)
+    return Metric(scene, name, unit, table, judged, at_most=not more, definition=definition, ranked=ranked)
 
 
 def each(results: Mapping[str, Result | None], read: Callable[[Result], Any]) -> Values:
@@ -49,7 +49,7 @@ def read_arrays(outcome: Outcome | None, file: str) -> dict[str, Any] | None:
     """Return the arrays that a task saved, None if it failed."""
     if outcome is None or not outcome.ok:
         return None
-    with np.load(Path(outcome.place) / file) as stored:
+    with np.load(Path(outcome.folder) / file) as stored:
         return dict(stored)
 
 
@@ -60,9 +60,9 @@ def scatter(
     return {"type": "scatter", "mode": mode, "name": name, "x": list(x), "y": list(y), **more}
 
 
-def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, words: str = "", **layout: Any) -> Plot:
+def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, caption: str = "", **layout: Any) -> Plot:
     """Return a plot with axis titles ``x`` and ``y``; ``layout`` adds to that of plotly.js."""
     for axis, text in (("xaxis", x), ("yaxis", y)):
         layout[axis] = {"title": {"text": text}} | layout.get(axis, {})
     layout["margin"] = {"l": 70, "r": 10, "t": 10, "b": 50}
-    return Plot(title, {"data": traces, "layout": layout}, words)
+    return Plot(title, {"data": traces, "layout": layout}, caption)

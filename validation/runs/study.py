@@ -256,8 +256,8 @@ def output_folder(folder: Path | None, names: Sequence[str]) -> Iterator[Path]:
             outputs.require(names)
             yield folder.resolve()
         return
-    with tempfile.TemporaryDirectory() as place:
-        yield Path(place)
+    with tempfile.TemporaryDirectory() as temporary:
+        yield Path(temporary)
 
 
 def part_text(part: Part) -> str:

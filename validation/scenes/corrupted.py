@@ -123,7 +123,7 @@ def wrong_focal(model: MetricEstimate, rng: np.random.Generator) -> MetricEstima
     return _transformed(model, H, factor)
 
 
-SPOILINGS: dict[str, Callable[[MetricEstimate, np.random.Generator], MetricEstimate]] = {
+CORRUPTIONS: dict[str, Callable[[MetricEstimate, np.random.Generator], MetricEstimate]] = {
     "one camera moved": one_moved,
     "two cameras swapped": two_swapped,
     "all cameras moved": all_moved,

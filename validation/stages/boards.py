@@ -45,15 +45,15 @@ class BoardsStage(Stage):
         one_thread()
         board = _board(task.method, options)
         pictures = board_images(task.method, board)
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         for n, picture in enumerate(pictures):
-            PIL.Image.fromarray(picture).save(place / f"{n:02d}.png")
+            PIL.Image.fromarray(picture).save(folder / f"{n:02d}.png")
         corners = [board_corners(picture, CORNERS) for picture in pictures]
         found = calibrate_from_corners(board.X, corners, SIZE)
-        np.savez(place / "found.npz", corners=np.array(corners), K=found.K, k1=found.k1, std=found.std)
+        np.savez(folder / "found.npz", corners=np.array(corners), K=found.K, k1=found.k1, std=found.std)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        place = options.place(self.name, scene)
+        folder = options.folder(self.name, scene)
         metrics, traces, pictures = list[Metric](), list[dict[str, Any]](), list[Picture]()
         for way, outcome in outcomes.items():
             board, found = _board(way, options), read_arrays(outcome, "found.npz")
@@ -62,11 +62,11 @@ class BoardsStage(Stage):
                 off = np.round((found["corners"] - board.projections()).reshape(-1, 2), 4)
                 traces.append(scatter(way, *off.T.tolist(), marker={"size": 4, "opacity": 0.6}))
                 file = f"{way.replace(' ', '-')}.png"
-                PIL.Image.fromarray(_side_by_side(outcome.place)).save(place / file)
+                PIL.Image.fromarray(_side_by_side(outcome.folder)).save(folder / file)
                 pictures.append(Picture(file, f"By the {way}", "Four of the images."))
-        words = "Each point is a corner: OpenCV's position minus its true projection."
+        text = "Each point is a corner: OpenCV's position minus its true projection."
         equal = {"scaleanchor": "x"}
-        plots = [plot("Corner errors", traces, "x (px)", "y (px)", words, yaxis=equal)] if traces else []
+        plots = [plot("Corner errors", traces, "x (px)", "y (px)", text, yaxis=equal)] if traces else []
         return Judgement(metrics, plots, pictures)
 
 
@@ -77,10 +77,10 @@ def _board(way: str, options: ReportOptions) -> Board:
 def _metrics(scene: str, way: str, board: Board, found: Mapping[str, F64] | None) -> list[Metric]:
     """Return the rows of one renderer: corners, focal length, principal point, distortion."""
 
-    def number(name: str, unit: str, ours: Any, own: Any, words: str) -> Metric:
+    def number(name: str, unit: str, ours: Any, own: Any, text: str) -> Metric:
         values = {OURS: None if found is None else float(ours), OWN: None if found is None else float(own)}
         # An error and a standard deviation, both of OpenCV: neither is ours or better.
-        return row(scene, f"{way}: {name}", unit, values, words, ranked=False)
+        return row(scene, f"{way}: {name}", unit, values, text, ranked=False)
 
     if found is None:
         names = (("corners", "px"), ("focal length", "%"), ("principal point", "px"), ("distortion", ""))
@@ -89,17 +89,17 @@ def _metrics(scene: str, way: str, board: Board, found: Mapping[str, F64] | None
     focal = np.sqrt(found["K"][0, 0] * found["K"][1, 1])
     std, centre = found["std"], np.linalg.norm(found["K"][:2, 2] - K[:2, 2])
     spread = np.sqrt(np.mean(np.sum((off - off.mean(axis=0)) ** 2, axis=1)) / len(off))
-    words = "length of the mean of (OpenCV corner - true projection); beside it the std of that mean"
+    text = "length of the mean of (OpenCV corner - true projection); beside it the std of that mean"
     off_focal, std_focal = 100.0 * abs(focal / K[0, 0] - 1.0), 100.0 * np.mean(std[:2]) / K[0, 0]
     k1 = f"|k1 - true k1|; the true one is {board.distortion:g}"
     return [
-        number("corners", "px", np.linalg.norm(off.mean(axis=0)), spread, words),
+        number("corners", "px", np.linalg.norm(off.mean(axis=0)), spread, text),
         number("focal length", "%", off_focal, std_focal, "|f / f_true - 1|, f = sqrt(fx fy)"),
         number("principal point", "px", centre, np.hypot(*std[2:4]), "distance from the true one"),
         number("distortion", "", abs(float(found["k1"]) - board.distortion), std[4], k1),
     ]
 
 
-def _side_by_side(place: Path) -> U8:
-    files = sorted(Path(place).glob("[0-9][0-9].png"))[:SHOWN]
+def _side_by_side(folder: Path) -> U8:
+    files = sorted(Path(folder).glob("[0-9][0-9].png"))[:SHOWN]
     return np.concatenate([np.asarray(PIL.Image.open(file))[::2, ::2] for file in files], axis=1)

@@ -52,15 +52,15 @@ class BundleStage(Stage):
         return (("cameras", OURS),)
 
     def run(self, task: Task, options: ReportOptions) -> None:
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         exact, points, given, size = _optimum(task.scene, options)
         poses, camera = _covariances(task.method, exact, points, given, size)
-        np.savez(place / "covariances.npz", poses=poses, camera=camera)
+        np.savez(folder / "covariances.npz", poses=poses, camera=camera)
         if task.scene == STREET:
             return
         adjusted, X, seconds = _adjust(task.method, *_problem(task.scene, options))
         R, t, intrinsics = adjusted.R, adjusted.t, adjusted.intrinsics
-        np.savez(place / "adjusted.npz", R=R, t=t, intrinsics=intrinsics, X=X, seconds=seconds)
+        np.savez(folder / "adjusted.npz", R=R, t=t, intrinsics=intrinsics, X=X, seconds=seconds)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         covariances = _covariance_metrics(scene, outcomes)
@@ -157,10 +157,10 @@ def _covariance_metrics(scene: str, outcomes: Mapping[str, Outcome]) -> list[Met
     if ours is None or ceres is None:
         return [row(scene, "largest difference of covariances", "std^2", None)]
     poses, camera = _off(ours["poses"], ceres["poses"]), _off(ours["camera"], ceres["camera"])
-    words = "largest entry of the covariances in units of COLMAP's standard deviations, ours minus COLMAP's"
+    text = "largest entry of the covariances in units of COLMAP's standard deviations, ours minus COLMAP's"
     return [
-        row(scene, "covariance of poses", "std^2", poses, words),
-        row(scene, "covariance of intrinsics", "std^2", camera, words),
+        row(scene, "covariance of poses", "std^2", poses, text),
+        row(scene, "covariance of intrinsics", "std^2", camera, text),
     ]
 
 

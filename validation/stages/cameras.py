@@ -76,14 +76,14 @@ class CamerasStage(Stage):
 
     def run(self, task: Task, options: ReportOptions) -> None:
         scene = load_images(task.scene, options)
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         if task.method not in SETTINGS:
-            _run_colmap(task, scene, options, place)
+            _run_colmap(task, scene, options, folder)
             return
-        run, config = place / "run", SETTINGS[task.method]
+        run, config = folder / "run", SETTINGS[task.method]
         if task.method == PER_IMAGE:
             # The matches are the same.
-            shutil.copytree(options.place(self.name, task.scene, OURS) / "run", run, dirs_exist_ok=True)
+            shutil.copytree(options.folder(self.name, task.scene, OURS) / "run", run, dirs_exist_ok=True)
         paths, seed = list(scene.image_paths), options.seed
         thesisrecon.reconstruct(
             paths, run, config=config, seed=seed, threads=1, until="metric", overwrite=True
@@ -101,7 +101,7 @@ class CamerasStage(Stage):
 def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
     """Return the saved model of a method in image order, or None."""
     names = [path.name for path in scene.image_paths]
-    folder = outcome.place / "run" if method in SETTINGS else outcome.place
+    folder = outcome.folder / "run" if method in SETTINGS else outcome.folder
     try:
         folders = [path for path in sorted((folder / "sparse").glob("*")) if path.is_dir()]
         models = [read_colmap_model(path, names) for path in folders]
@@ -112,21 +112,21 @@ def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | 
 
 def our_model(scene: Scene, options: ReportOptions) -> Reconstruction:
     """Return our saved reconstruction of a scene; ``ValueError`` if missing."""
-    model = read_model(scene, OURS, Outcome(options.place("cameras", scene.name, OURS)))
+    model = read_model(scene, OURS, Outcome(options.folder("cameras", scene.name, OURS)))
     if model is None:
         raise ValueError(f"our model of {scene.name} is missing: run the stage cameras too")
     return model
 
 
-def _run_colmap(task: Task, scene: Scene, options: ReportOptions, place: Path) -> None:
+def _run_colmap(task: Task, scene: Scene, options: ReportOptions, folder: Path) -> None:
     images = scene.image_paths[0].parent
     if task.method == MATCHES:
-        match_with_pycolmap(images, place, threads=1)
+        match_with_pycolmap(images, folder, threads=1)
         return
-    matched = options.place(task.stage, task.scene, MATCHES)
+    matched = options.folder(task.stage, task.scene, MATCHES)
     mapper: Literal["incremental", "global"] = "global" if task.method == COLMAP_GLOBAL else "incremental"
     refined = task.method == COLMAP_PP
-    map_with_pycolmap(images, matched, place, refine_principal_point=refined, threads=1, mapper=mapper)
+    map_with_pycolmap(images, matched, folder, refine_principal_point=refined, threads=1, mapper=mapper)
 
 
 def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
@@ -143,11 +143,11 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
         ("centre error", "mm", lambda e: e.centre_error_mm, CENTRE),
         ("rotation error", "deg", lambda e: e.rotation_error_deg, ROTATION),
     )
-    for name, unit, read, words in numbers:
+    for name, unit, read, text in numbers:
         values: Values = {n: None if e is None else read(e) for n, e in errors.items()}
-        rows.append(row(scene.name, name, unit, values, words))
+        rows.append(row(scene.name, name, unit, values, text))
         if THESIS in values:
-            rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], words))
+            rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], text))
     return rows
 
 
@@ -172,20 +172,20 @@ def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
     seen = projective.used
     x = np.einsum("kab,kb->ka", P[t.view_index[seen]], X[t.point_index[seen]])
     residual = float(np.median(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[seen], axis=1)))
-    words = f"{REPROJECTION}, by the projective model"
-    rows = [row(scene.name, "projective reprojection", "px", residual, words)]
+    text = f"{REPROJECTION}, by the projective model"
+    rows = [row(scene.name, "projective reprojection", "px", residual, text)]
     if scene.K is None:
         return rows
     K = _last_record(outcome, "selfcalibration").K
     known = np.isfinite(K).all(axis=(1, 2)) & (K[:, 0, 0] > 0.0)
     error = float(np.median(focal_errors_pct(K[known], scene.K[known])))
-    words = f"{FOCAL}, as self-calibration leaves it"
-    return [*rows, row(scene.name, "self-calibrated focal error", "%", error, words)]
+    text = f"{FOCAL}, as self-calibration leaves it"
+    return [*rows, row(scene.name, "self-calibrated focal error", "%", error, text)]
 
 
 def _last_record(outcome: Outcome, stage: str) -> Any:
     """Return the last record of a stage of the run."""
-    folder = RunDirectory(outcome.place / "run").stage(FOLDERS[stage])
+    folder = RunDirectory(outcome.folder / "run").stage(FOLDERS[stage])
     *_, (item, key) = read_json(folder.path / MANIFEST_FILE)["keys"].items()
     return folder.load(item, key)
 
@@ -209,17 +209,17 @@ def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
     if scene.K is None or model is None or model.K is None or not model.registered.any():
         return []
     errors = focal_errors_pct(model.K[model.registered], scene.K[model.registered])
-    words, name = "|f / f_true - 1| over the images, with independent cameras", "focal error, a camera each"
+    text, name = "|f / f_true - 1| over the images, with independent cameras", "focal error, a camera each"
     return [
-        row(scene.name, name, "%", float(np.median(errors)), f"median {words}"),
-        row(scene.name, f"worst {name}", "%", float(errors.max()), f"largest {words}"),
+        row(scene.name, name, "%", float(np.median(errors)), f"median {text}"),
+        row(scene.name, f"worst {name}", "%", float(errors.max()), f"largest {text}"),
     ]
 
 
 def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     """Return self-check results and the coverage of the stated intervals."""
     records: dict[str, Any] = {
-        name: read_json(outcomes[name].place / "run" / "summary.json")
+        name: read_json(outcomes[name].folder / "run" / "summary.json")
         for name in SETTINGS
         if name in outcomes and outcomes[name].ok
     }
@@ -234,10 +234,10 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     for name, where in ((OURS, ""), (PER_IMAGE, ", a camera each")):
         cameras = records.get(name, {}).get("cameras", [])
         held = _share_held(cameras, scene.K) if cameras else None
-        words = "largest stated standard deviation of a focal length"
+        text = "largest stated standard deviation of a focal length"
         rows += [
             row(scene.name, f"intervals that hold{where}", "%", held, SHARE_HELD, more=True),
-            row(scene.name, f"widest focal interval{where}", "%", _widest(cameras), words),
+            row(scene.name, f"widest focal interval{where}", "%", _widest(cameras), text),
         ]
     return rows
 
@@ -248,14 +248,14 @@ def _widest(cameras: list[dict[str, Any]]) -> float | None:
 
 
 def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float | None:
-    places = {"focal_px": None, "principal_x_px": (0, 2), "principal_y_px": (1, 2)}
+    entries = {"focal_px": None, "principal_x_px": (0, 2), "principal_y_px": (1, 2)}
     held = []
     for camera, true_K in zip(cameras, K, strict=True):
-        for name, place in places.items():
+        for name, entry in entries.items():
             interval = camera.get(name)
             if interval is None or not interval["std"]:
                 continue
-            truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if place is None else true_K[place]
+            truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if entry is None else true_K[entry]
             held.append(abs(interval["value"] - truth) <= 1.96 * interval["std"])
     return 100.0 * float(np.mean(held)) if held else None
 

@@ -51,11 +51,11 @@ class CloudsStage(Stage):
         return (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
 
     def run(self, task: Task, options: ReportOptions) -> None:
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         images = load_images(task.scene, options)
         for name, (mine, other, unit) in _pairs_of_clouds(images, _models(images, options)).items():
             transform = refine_by_icp(mine, other, NEAR_PCT / 100.0 * unit)
-            np.savez(place / f"{slug(name)}.npz", transform=transform)
+            np.savez(folder / f"{slug(name)}.npz", transform=transform)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         images = load_images(scene, options)
@@ -82,8 +82,8 @@ def _models(scene: Scene, options: ReportOptions) -> dict[str, Reconstruction | 
     """Return the models of the stage cameras, None if missing."""
     models = {}
     for name in (OURS, COLMAP, COLMAP_PP):
-        place = options.place("cameras", scene.name, name)
-        models[name] = read_model(scene, name, Outcome(place)) if place.is_dir() else None
+        folder = options.folder("cameras", scene.name, name)
+        models[name] = read_model(scene, name, Outcome(folder)) if folder.is_dir() else None
     return models
 
 
@@ -143,10 +143,10 @@ def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
 
 def _is_supported(model: Reconstruction, view: int) -> tuple[F64, I64]:
     """Return inlier observations of a view: pixels and indices among the valid points."""
-    place = np.cumsum(model.valid) - 1
+    number = np.cumsum(model.valid) - 1
     tracks = model.tracks
     here = (tracks.view_index == view) & model.inlier & model.valid[tracks.point_index]
-    return tracks.xy[here], np.asarray(place[tracks.point_index[here]], dtype=np.int64)
+    return tracks.xy[here], np.asarray(number[tracks.point_index[here]], dtype=np.int64)
 
 
 def _same_points(
@@ -157,11 +157,11 @@ def _same_points(
     if not len(pairs):
         return []
     apart = 100.0 * np.linalg.norm(mine[pairs[:, 0]] - other[pairs[:, 1]], axis=1) / unit
-    words = "distance of ours to theirs, for points observed by both within a pixel"
-    most = f"90 % quantile of the {words}"
+    text = "distance of ours to theirs, for points observed by both within a pixel"
+    most = f"90 % quantile of the {text}"
     return [
-        row(scene, f"points shared with {name}", "", float(len(pairs)), words, more=True),
-        _distance(scene, f"shared with {name}: median apart", np.median(apart), f"median {words}"),
+        row(scene, f"points shared with {name}", "", float(len(pairs)), text, more=True),
+        _distance(scene, f"shared with {name}: median apart", np.median(apart), f"median {text}"),
         _distance(scene, f"shared with {name}: 90 % within", np.quantile(apart, 0.9), most),
     ]
 
@@ -179,12 +179,12 @@ def _moved(model: Reconstruction, move: Similarity) -> F64:
 def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float) -> list[Metric]:
     forth, back = (100.0 * cKDTree(b).query(a)[0] / unit for a, b in ((mine, other), (other, mine)))
     share = 100.0 * float(np.mean(forth <= NEAR_PCT))
-    words = "median distance of a point of ours to the nearest"
-    back_words = "median distance of one of their points to the nearest"
+    text = "median distance of a point of ours to the nearest"
+    back_text = "median distance of one of their points to the nearest"
     near = f"share of our points with one of theirs within {NEAR_PCT} %"
     return [
-        _distance(scene, f"ours to {name}", np.median(forth), words),
-        _distance(scene, f"{name} to ours", np.median(back), back_words),
+        _distance(scene, f"ours to {name}", np.median(forth), text),
+        _distance(scene, f"{name} to ours", np.median(back), back_text),
         row(scene, f"near {name}", "%", share, near, more=True),
     ]
 
@@ -210,8 +210,8 @@ def _icp_metrics(
     ]
 
 
-def _distance(scene: str, name: str, value: float, words: str) -> Metric:
-    return row(scene, name, "% of distance", float(value), words)
+def _distance(scene: str, name: str, value: float, text: str) -> Metric:
+    return row(scene, name, "% of distance", float(value), text)
 
 
 def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
@@ -231,8 +231,8 @@ def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
         for k, axis in enumerate("xyz")
     }
     layout = {"scene": {"aspectmode": "data", **axes}, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}}
-    words = "Ours is coloured by the distance of each point to the nearest of theirs; drag to turn."
-    return Plot(f"Ours and {name}", {"data": traces, "layout": layout}, words)
+    text = "Ours is coloured by the distance of each point to the nearest of theirs; drag to turn."
+    return Plot(f"Ours and {name}", {"data": traces, "layout": layout}, text)
 
 
 def _trace(name: str, X: F64, marker: dict[str, Any]) -> dict[str, Any]:

@@ -87,25 +87,25 @@ class DepthStage(Stage):
         dense = replace(dense, max_side=side_of(options))
         maps = confirmed_depth_maps(dense, dense.prepare(images, model))
         seconds = time.process_time() - start
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         for view, m in maps.items():
-            np.savez(place / f"{view:04d}.npz", P=m.P, depth=m.depth, std=m.std, views=m.views)
-        write_text(place / "seconds.txt", f"{seconds / max(len(maps), 1)}\n")
+            np.savez(folder / f"{view:04d}.npz", P=m.P, depth=m.depth, std=m.std, views=m.views)
+        write_text(folder / "seconds.txt", f"{seconds / max(len(maps), 1)}\n")
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         images = load_images(scene, options)
         model = our_model(images, options)
-        found = {name: read_maps(o.place) if o.ok else {} for name, o in outcomes.items()}
+        found = {name: read_maps(o.folder) if o.ok else {} for name, o in outcomes.items()}
         views = sorted({view for maps in found.values() for view in maps})
         truths = {view: true_depth(images, view) for view in views} if scene == COURTYARD else {}
         judged = {
             name: together(_judged(maps, images, model, truths)) if maps else None
             for name, maps in found.items()
         }
-        known = {name: outcomes[name].place if maps else None for name, maps in found.items()}
-        seconds = each(known, lambda place: (place / "seconds.txt").read_text())
-        words = "processor time, compiling included"
-        metrics = [*_metrics(scene, judged), row(scene, "time a view", "s", seconds, words)]
+        known = {name: outcomes[name].folder if maps else None for name, maps in found.items()}
+        seconds = each(known, lambda folder: (folder / "seconds.txt").read_text())
+        text = "processor time, compiling included"
+        metrics = [*_metrics(scene, judged), row(scene, "time a view", "s", seconds, text)]
         return Judgement(
             metrics, pictures=[] if options.gates_only else _pictures(images, found, model, options)
         )
@@ -133,10 +133,10 @@ def views_of(scene: Scene, options: ReportOptions) -> dict[int, PinholeView]:
     }
 
 
-def read_maps(place: Path) -> dict[int, DepthMap]:
+def read_maps(folder: Path) -> dict[int, DepthMap]:
     """Saved depth maps by view."""
     maps = {}
-    for file in sorted(Path(place).glob("[0-9]*.npz")):
+    for file in sorted(Path(folder).glob("[0-9]*.npz")):
         with np.load(file) as m:
             view = int(file.stem)
             maps[view] = DepthMap(view, m["P"], m["depth"], m["std"], m["views"])
@@ -145,7 +145,7 @@ def read_maps(place: Path) -> dict[int, DepthMap]:
 
 def our_maps(scene: str, options: ReportOptions, method: str = OURS) -> dict[int, DepthMap]:
     """Return the saved depth maps of this stage; ``ValueError`` without any."""
-    maps = read_maps(options.place("depth", scene, method))
+    maps = read_maps(options.folder("depth", scene, method))
     if not maps:
         raise ValueError(f"there are no depth maps of {scene}: run the stage depth too")
     return maps
@@ -180,7 +180,7 @@ def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric
         ("error in deviations", "", lambda j: j.deviations, ideal, False),
     )
     return [
-        row(scene, name, unit, each(judged, read), words, more=more) for name, unit, read, words, more in rows
+        row(scene, name, unit, each(judged, read), text, more=more) for name, unit, read, text, more in rows
     ]
 
 
@@ -190,23 +190,23 @@ def _pictures(
     """Draw two views: image, maps, and, if known, truth and errors."""
     views = sorted(set.intersection(*(set(maps) for maps in found.values()))) if found else []
     chosen = sorted({views[len(views) // 4], views[len(views) // 2]}) if views else []
-    images, place = images_of(scene), options.place(DepthStage.name, scene.name)
+    images, folder = images_of(scene), options.folder(DepthStage.name, scene.name)
     pictures = []
     for view in chosen:
         rgb = pinhole_view(images[view], model, view, max_side=side_of(options)).rgb
         maps = {name: of_method[view] for name, of_method in found.items()}
         limits = depth_range([m.depth for m in maps.values()])
         rows = [[rgb, *(depth_colours(m.depth, limits) for m in maps.values())]]
-        words = f"Image, {', then '.join(maps)}: near red, far blue, unknown black."
+        text = f"Image, {', then '.join(maps)}: near red, far blue, unknown black."
         if scene.name == COURTYARD:
             scales = {name: true_from_maps(of_method, scene).scale for name, of_method in found.items()}
             true = _true_map(view, next(iter(maps.values())).depth.shape)
             own = depth_colours((true / next(iter(scales.values()))).astype(np.float32), limits)
             rows.append([own, *(_errors(m, true, scales[name]) for name, m in maps.items())])
-            words += f" Below the truth, and errors from blue (none) to red ({100.0 * WORST:g} % or more)."
+            text += f" Below the truth, and errors from blue (none) to red ({100.0 * WORST:g} % or more)."
         file = f"view-{view:02d}.png"
-        PIL.Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(place / file)
-        pictures.append(Picture(file, f"Depth of image {view + 1}", words))
+        PIL.Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(folder / file)
+        pictures.append(Picture(file, f"Depth of image {view + 1}", text))
     return pictures
 
 

@@ -60,8 +60,8 @@ class DisparityStage(Stage):
             # The columns that we add at the left border are not counted as OpenCV's.
             _match(task.method, pair, widened=False)
             seconds.append(time.process_time() - start)
-        place = options.place(task.stage, task.scene, task.method)
-        np.savez(place / "disparity.npz", disparity=disparity, seconds=min(seconds))
+        folder = options.folder(task.stage, task.scene, task.method)
+        np.savez(folder / "disparity.npz", disparity=disparity, seconds=min(seconds))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         pair = _pair(scene)
@@ -91,9 +91,9 @@ class DisparityStage(Stage):
         ]
         drawn = {name: d for name, d in maps.items() if d is not None}
         shown = [name for name in (THESIS, OURS, THREE_WAY) if name in drawn]
-        PIL.Image.fromarray(_picture(pair, drawn, shown)).save(options.place(self.name, scene) / "maps.png")
-        words = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
-        return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", words)])
+        PIL.Image.fromarray(_picture(pair, drawn, shown)).save(options.folder(self.name, scene) / "maps.png")
+        text = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
+        return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", text)])
 
 
 def _surface_error(disparity: F32, pair: StereoPair) -> float:

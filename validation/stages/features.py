@@ -66,16 +66,16 @@ class FeaturesStage(Stage):
     def run(self, task: Task, options: ReportOptions) -> None:
         scene = load_images(task.scene, options)
         images = read_images(scene.image_paths, max_size_px=MAX_SIZE_PX).images
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         if task.scene in WITH_DEPTH:
             corners: dict[str, Any] = {f"{i}": _corners(task.method, m) for i, m in enumerate(images)}
-            np.savez(place / "corners.npz", **corners)
+            np.savez(folder / "corners.npz", **corners)
         if task.method != HARRIS:
-            np.savez(place / "matches.npz", **_matches(task.method, images, options))
+            np.savez(folder / "matches.npz", **_matches(task.method, images, options))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         images = load_images(scene, options)
-        cache = options.place("fundamental", scene, MATCHES)
+        cache = options.folder("fundamental", scene, MATCHES)
         found = {n: read_arrays(outcomes[n], "matches.npz") if n in outcomes else None for n in FRONT_ENDS}
         metrics, notes = list[Metric](), list[str]()
         try:
@@ -161,10 +161,10 @@ def _repeatability(scene: Scene, outcomes: Mapping[str, Outcome]) -> Metric:
     found = {name: read_arrays(outcome, "corners.npz") for name, outcome in outcomes.items()}
     views = range(len(scene.image_paths))
     shares = each(found, lambda f: 100.0 * _share_repeated(scene, [f[f"{i}"] for i in views]))
-    words = (
+    text = (
         "share of the 1000 strongest corners visible in the next image that are detected there within 1.5 px"
     )
-    return row(scene.name, "repeatability", "%", shares, words, more=True)
+    return row(scene.name, "repeatability", "%", shares, text, more=True)
 
 
 def _share_repeated(scene: Scene, corners: list[F64]) -> float:

@@ -67,7 +67,7 @@ class FundamentalStage(Stage):
         answers = [[answer(pair, options.seed + seed) for seed in range(_seeds(options))] for pair in pairs]
         none = np.full((3, 3), np.nan)
         np.savez(
-            options.place(task.stage, task.scene, task.method) / "answers.npz",
+            options.folder(task.stage, task.scene, task.method) / "answers.npz",
             F=[[none if F is None else F for F, _, _ in found] for found in answers],
             inliers=[[float(inliers.sum()) for _, inliers, _ in found] for found in answers],
             seconds=[[seconds for _, _, seconds in found] for found in answers],
@@ -90,7 +90,7 @@ def _pairs(scene: str, options: ReportOptions) -> list[RealPair]:
 
     Raises :class:`NoReference` if SIFT is unavailable.
     """
-    cache = options.place("fundamental", scene, MATCHES)
+    cache = options.folder("fundamental", scene, MATCHES)
     try:
         if scene == "kusvod2":
             return list(kusvod2_pairs(cache))
@@ -119,7 +119,7 @@ def _metrics(
     spent = each(answers, lambda a: 1e3 * np.median(a["seconds"]))
     minimal = answers.get(MINIMAL)
     rank = None if minimal is None else _third_singular_value(minimal)
-    rank_words = "largest third singular value of F over the second: F has rank 2"
+    rank_text = "largest third singular value of F over the second: F has rank 2"
     rows = [
         row(scene, "median error", "px", median, ERROR),
         row(scene, "tenth worst error", "px", worst, "the 90 % quantile of it"),
@@ -127,12 +127,12 @@ def _metrics(
         row(scene, "inliers", "%", inliers, "mean share of the matches accepted as inliers", ranked=False),
         row(scene, "time", "ms", spent, "median processor time of a pair"),
         *(row(scene, f"{name}: median error", "px", median.get(name), ERROR) for name in VARIANTS),
-        row(scene, f"{MINIMAL}: rank", "", rank, rank_words),
+        row(scene, f"{MINIMAL}: rank", "", rank, rank_text),
     ]
     if all(pair.F is not None for pair in pairs):
         angle = each(answers, lambda a: np.median(_epipole_angles(a, pairs)))
-        words = "median angle between found and true epipole"
-        rows.insert(1, row(scene, "epipole angle", "deg", angle, words))
+        text = "median angle between found and true epipole"
+        rows.insert(1, row(scene, "epipole angle", "deg", angle, text))
     return rows
 
 
@@ -171,5 +171,5 @@ def _plot(errors: Mapping[str, F64 | None]) -> Plot:
             x = np.sort(np.minimum(found.ravel(), NONE_PX))
             share = 100.0 * np.arange(1, len(x) + 1) / len(x)
             traces.append(scatter(name, x.tolist(), share.tolist(), "lines"))
-    log, whole, words = {"type": "log"}, {"range": [0, 100]}, "To the left is better."
-    return plot("Errors of all runs", traces, "error (px)", "runs below (%)", words, xaxis=log, yaxis=whole)
+    log, whole, text = {"type": "log"}, {"range": [0, 100]}, "To the left is better."
+    return plot("Errors of all runs", traces, "error (px)", "runs below (%)", text, xaxis=log, yaxis=whole)

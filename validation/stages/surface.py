@@ -55,8 +55,8 @@ class SurfaceStage(Stage):
 
     def run(self, task: Task, options: ReportOptions) -> None:
         mesh = _surface(task.method, task.scene, options)
-        place = options.place(task.stage, task.scene, task.method)
-        np.savez(place / "mesh.npz", vertices=mesh.vertices, faces=mesh.faces.astype(np.int32))
+        folder = options.folder(task.stage, task.scene, task.method)
+        np.savez(folder / "mesh.npz", vertices=mesh.vertices, faces=mesh.faces.astype(np.int32))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         truth = load_truth()
@@ -64,10 +64,10 @@ class SurfaceStage(Stage):
         meshes = {name: _true_mesh(name, outcome, scene, options) for name, outcome in outcomes.items()}
         judged = {n: None if m is None else judge_surface(m, truth, samples) for n, m in meshes.items()}
         faces = each(meshes, lambda m: len(m.faces))
-        words = "triangles of the surface"
-        metrics = [*_metrics(scene, judged), row(scene, "faces", "", faces, words, ranked=False)]
+        text = "triangles of the surface"
+        metrics = [*_metrics(scene, judged), row(scene, "faces", "", faces, text, ranked=False)]
         notes = [f"The scene is {truth.depth_m:.2f} m deep, the median over all true depth maps."]
-        place, pictures = options.place(self.name, scene), list[Picture]()
+        folder, pictures = options.folder(self.name, scene), list[Picture]()
         camera = _camera(scene, options)
         for name in () if options.gates_only else SHOWN:
             mesh = meshes.get(name)
@@ -75,9 +75,9 @@ class SurfaceStage(Stage):
                 continue
             file = f"{name.replace(' ', '-')}.png"
             off_pct = 100.0 * truth.surface.distances(mesh.vertices) / truth.depth_m
-            PIL.Image.fromarray(_drawn(mesh, off_pct, camera)).save(place / file)
-            words = f"View of a middle image; blue: no error, red: {RED_PCT:g} % of the depth or more."
-            pictures.append(Picture(file, f"Surface: {name}", words))
+            PIL.Image.fromarray(_drawn(mesh, off_pct, camera)).save(folder / file)
+            text = f"View of a middle image; blue: no error, red: {RED_PCT:g} % of the depth or more."
+            pictures.append(Picture(file, f"Surface: {name}", text))
         return Judgement(metrics, pictures=pictures, notes=notes)
 
 
@@ -106,11 +106,11 @@ def _true_mesh(method: str, outcome: Outcome, scene: str, options: ReportOptions
 
 def _metrics(scene: str, judged: Mapping[str, tuple[F64, F64] | None]) -> list[Metric]:
     rows, means = [], dict[str, Values]()
-    words = {"accuracy": "from the surface to the truth", "completeness": "from the truth to the surface"}
-    for side, what in enumerate(words):
+    text = {"accuracy": "from the surface to the truth", "completeness": "from the truth to the surface"}
+    for side, what in enumerate(text):
         distances = {n: None if d is None else d[side] for n, d in judged.items()}
         means[what] = each(distances, lambda d: np.minimum(d, CAPPED).mean())
-        median, where = each(distances, np.median), words[what]
+        median, where = each(distances, np.median), text[what]
         rows.append(row(scene, f"{what}, median", "% of depth", median, f"median distance {where}"))
         rows.append(row(scene, f"{what}, mean", "% of depth", means[what], f"mean distance {where}"))
         for bound in WITHIN:

@@ -76,8 +76,8 @@ class TriangulationStage(Stage):
             answers[f"{n}"] = method(problem.P, problem.xy)
             if len(problem.P) == 2:
                 seconds.append((time.process_time() - start) / problem.xy.shape[1])
-        place = options.place(task.stage, task.scene, task.method)
-        np.savez(place / "points.npz", seconds=np.array(seconds), **answers)
+        folder = options.folder(task.stage, task.scene, task.method)
+        np.savez(folder / "points.npz", seconds=np.array(seconds), **answers)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         problems = list(_problems(options))
@@ -91,8 +91,8 @@ class TriangulationStage(Stage):
                 where = f"{views} views, {'projective' if projective else 'metric'} frame"
                 metrics += _metrics(scene, where, chosen, found)
         spent = each(found, lambda f: 1e6 * float(np.median(f["seconds"])))
-        words = "two views, one processor, median"
-        metrics.append(row(scene, "time a point", "us", spent, words, judged=OURS))
+        text = "two views, one processor, median"
+        metrics.append(row(scene, "time a point", "us", spent, text, judged=OURS))
         return Judgement(metrics, plots=[_plot(problems, found)])
 
 
@@ -116,10 +116,8 @@ def _adjustment(scene: str, problems: list[Problem], found: Mapping[str, F64] | 
         if found is not None and f"P{n}" in found:
             cost = squared_distances(found[f"P{n}"], found[f"{n}"], p.xy).sum()
             over.append(float(np.sqrt(cost / squared_distances(p.P, _least_near_truth(p), p.xy).sum()) - 1.0))
-    words = "RMS residual of cameras and points over that of the best points with the true cameras, minus 1"
-    return row(
-        scene, "projective adjustment above the truth", "", max(over, default=None), words, judged=OURS
-    )
+    text = "RMS residual of cameras and points over that of the best points with the true cameras, minus 1"
+    return row(scene, "projective adjustment above the truth", "", max(over, default=None), text, judged=OURS)
 
 
 def _solver(method: str, views: int) -> Method | None:
@@ -162,12 +160,12 @@ def _metrics(
     optimum = _median_space_error(problems, {n: _least_near_truth(p) for n, p in problems.items()})
     over = each(apart, lambda value: value / optimum)
     optimal = f"the optimum, {where}"
-    words = "of the median error in space over that of points found from the truth by descent"
+    text = "of the median error in space over that of points found from the truth by descent"
     residual = "RMS distance to the measured points over that of the optimum, minus 1"
     distance = "median distance from the true point over its distance from the first camera"
     return [
         *(
-            row(scene, f"{title}error in space over {optimal}", "", over.get(name), words, judged=name)
+            row(scene, f"{title}error in space over {optimal}", "", over.get(name), text, judged=name)
             for name, title in {OURS: "", LINEAR: f"{LINEAR}: ", MIDPOINT: f"{MIDPOINT}: "}.items()
         ),
         row(scene, f"residual above the optimum, {where}", "", above, residual, judged=OURS),

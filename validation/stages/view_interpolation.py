@@ -12,7 +12,7 @@ from thesisrecon.api.views import prepare_rectified_pair
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.views.trilinear import camera_at
-from validation.metrics.pictures import psnr_db, ssim
+from validation.metrics.image_similarity import psnr_db, ssim
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
 from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
@@ -60,9 +60,9 @@ class ViewInterpolationStage(Stage):
         return (*sources, DISSOLVE, *(source + BY_TENSOR for source in tensors))
 
     def run(self, task: Task, options: ReportOptions) -> None:
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         for view, picture in _pictures(task.method, _cones()).items():
-            PIL.Image.fromarray(picture).save(_file(place, view))
+            PIL.Image.fromarray(picture).save(_file(folder, view))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         cones = _cones()
@@ -77,11 +77,11 @@ class ViewInterpolationStage(Stage):
                 for name, images in made.items()
             }
 
-        peak, words = mean(psnr_db), "mean over images 3, 4 and 5"
+        peak, text = mean(psnr_db), "mean over images 3, 4 and 5"
         sgbm = max((v for n in (THREE_WAY, HH) if (v := peak[n]) is not None), default=None)
         metrics = [
-            row(scene, "PSNR", "dB", peak, words, more=True),
-            row(scene, "SSIM", "", mean(ssim), words, more=True),
+            row(scene, "PSNR", "dB", peak, text, more=True),
+            row(scene, "SSIM", "", mean(ssim), text, more=True),
         ]
         for what, method in (("", OURS), ("tensor: ", TENSOR)):
             for name, other in (("the better SGBM", sgbm), ("cross-dissolve", peak[DISSOLVE])):
@@ -90,7 +90,7 @@ class ViewInterpolationStage(Stage):
                 difference = "difference of the means"
                 metrics.append(row(scene, f"{what}PSNR over {name}", "dB", over, difference, more=True))
         metrics += [_of_view(scene, k, cones, made) for k in (*BETWEEN, *BEYOND)]
-        return Judgement(metrics, pictures=_beside(options.place(self.name, scene), cones, made))
+        return Judgement(metrics, pictures=_beside(options.folder(self.name, scene), cones, made))
 
 
 def _of_view(scene: str, k: int, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> Metric:
@@ -103,17 +103,17 @@ def _of_view(scene: str, k: int, cones: NineViews, made: Mapping[str, Mapping[in
         for name, images in made.items()
         if not beyond or BY_TENSOR in name
     }
-    words = f"without {BORDER_PX} columns at the borders" if beyond else "of this view alone"
-    return row(scene, f"PSNR, view {k}", "dB", values, words, more=True, judged=TENSOR if beyond else OURS)
+    text = f"without {BORDER_PX} columns at the borders" if beyond else "of this view alone"
+    return row(scene, f"PSNR, view {k}", "dB", values, text, more=True, judged=TENSOR if beyond else OURS)
 
 
-def _beside(place: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> list[Picture]:
+def _beside(folder: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> list[Picture]:
     shown = []
     for k, picture in made[OURS].items():
         row = np.concatenate([cones.images[k], picture, _difference(picture, cones.images[k])], axis=1)
-        PIL.Image.fromarray(row).save(_file(place, k))
-        words = "The image, ours, and four times the difference from middle grey."
-        shown.append(Picture(_file(place, k).name, f"View {k}", words))
+        PIL.Image.fromarray(row).save(_file(folder, k))
+        text = "The image, ours, and four times the difference from middle grey."
+        shown.append(Picture(_file(folder, k).name, f"View {k}", text))
     return shown
 
 
@@ -158,12 +158,12 @@ def _disparities(
     return both_ways(lambda a, b: reference.match(a, b, DISPARITIES), left, right)
 
 
-def _file(place: Path, view: int) -> Path:
-    return place / f"{view}.png"
+def _file(folder: Path, view: int) -> Path:
+    return folder / f"{view}.png"
 
 
 def _read(outcome: Outcome) -> dict[int, U8]:
-    place = Path(outcome.place)
+    folder = Path(outcome.folder)
     return {
-        k: read_rgb(_file(place, k)) for k in (*BETWEEN, *BEYOND) if outcome.ok and _file(place, k).exists()
+        k: read_rgb(_file(folder, k)) for k in (*BETWEEN, *BEYOND) if outcome.ok and _file(folder, k).exists()
     }

@@ -75,26 +75,26 @@ class ViewsStage(Stage):
     def run(self, task: Task, options: ReportOptions) -> None:
         maps = our_maps(task.scene, options)
         views = views_of(load_images(task.scene, options), options)
-        place = options.place(task.stage, task.scene, task.method)
-        shared = options.place(task.stage, task.scene, OURS)
+        folder = options.folder(task.stage, task.scene, task.method)
+        shared = options.folder(task.stage, task.scene, OURS)
         for k in _left_out(sorted(maps), options):
             others = [i for i in sorted(maps) if i != k]
             seen = [views[i] for i in others]
             mesh = _model(task.method, [maps[i] for i in others], seen, shared / f"surface-{k:04d}.npz")
             camera = Camera.from_matrix(views[k].P, (views[k].rgb.shape[1], views[k].rgb.shape[0]))
             drawn = render(mesh, camera)
-            _save(place / f"{k:04d}.png", drawn.color)
-            _save(place / f"{k:04d}-covered.png", np.where(drawn.valid, 255, 0).astype(np.uint8))
+            _save(folder / f"{k:04d}.png", drawn.color)
+            _save(folder / f"{k:04d}-covered.png", np.where(drawn.valid, 255, 0).astype(np.uint8))
             if task.method == FINE and not options.quick:
                 try:
-                    _save(place / f"{k:04d}-own.png", render_open3d(mesh, camera))
+                    _save(folder / f"{k:04d}-own.png", render_open3d(mesh, camera))
                 except RuntimeError as error:
                     print(f"Open3D cannot draw here: {error}")
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         views = views_of(load_images(scene, options), options)
-        left_out = _left_out(sorted(read_maps(options.place("depth", scene, OURS))), options)
-        place, pictures = options.place(self.name, scene), list[Picture]()
+        left_out = _left_out(sorted(read_maps(options.folder("depth", scene, OURS))), options)
+        folder, pictures = options.folder(self.name, scene), list[Picture]()
         found: dict[str, list[Likeness]] = {}
         for k in left_out:
             drawn = _drawn(outcomes, k)
@@ -103,12 +103,12 @@ class ViewsStage(Stage):
                 found.setdefault(name, []).append(one)
             shown = {n: drawn[n].color for n in (OURS, FINE) if n in drawn}
             file = f"left-out-{k:02d}.png"
-            _save(place / file, _beside(views[k].rgb, shown, compared))
-            words = (
+            _save(folder / file, _beside(views[k].rgb, shown, compared))
+            text = (
                 f"The image, then {', '.join(shown)}; below the differences, blue (none) to red "
                 f"({RED_LEVELS:g} grey levels or more), black where not compared."
             )
-            pictures.append(Picture(file, f"Image {k + 1}, left out", words))
+            pictures.append(Picture(file, f"Image {k + 1}, left out", text))
         names = [*outcomes, *([OWN_PICTURE] if OWN_PICTURE in found else [])]
         numbers = ", ".join(str(k + 1) for k in left_out)
         notes = [f"Left out: image{'s' * (len(left_out) > 1)} {numbers}."]
@@ -118,8 +118,8 @@ class ViewsStage(Stage):
 def _left_out(views: Sequence[int], options: ReportOptions) -> list[int]:
     """Return evenly spaced views, without the first and the last if possible."""
     count = QUICK_LEFT_OUT if options.quick else LEFT_OUT
-    places = np.linspace(0, len(views) - 1, count + 2)[1:-1]
-    return sorted({views[round(float(place))] for place in places})
+    shares = np.linspace(0, len(views) - 1, count + 2)[1:-1]
+    return sorted({views[round(float(share))] for share in shares})
 
 
 def _model(
@@ -165,14 +165,14 @@ def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView
     """Return the saved renderings of a camera, without depths."""
     drawn = {}
     for name, outcome in outcomes.items():
-        place = Path(outcome.place)
+        folder = Path(outcome.folder)
         if not outcome.ok:
             continue
-        covered = _read(place / f"{view:04d}-covered.png") > 0
+        covered = _read(folder / f"{view:04d}-covered.png") > 0
         depth = np.full(covered.shape, np.nan, dtype=np.float32)
-        drawn[name] = RenderedView(_read(place / f"{view:04d}.png"), depth, covered)
-        if (place / f"{view:04d}-own.png").is_file():
-            drawn[OWN_PICTURE] = RenderedView(_read(place / f"{view:04d}-own.png"), depth, covered)
+        drawn[name] = RenderedView(_read(folder / f"{view:04d}.png"), depth, covered)
+        if (folder / f"{view:04d}-own.png").is_file():
+            drawn[OWN_PICTURE] = RenderedView(_read(folder / f"{view:04d}-own.png"), depth, covered)
     return drawn
 
 
@@ -192,7 +192,7 @@ def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
     equal = "exposures equalised first; mean over the left-out images"
     original = "original exposures; mean over the left-out images"
     rows = []
-    for name, unit, field, words in (
+    for name, unit, field, text in (
         ("PSNR", "dB", "psnr_db", equal),
         ("SSIM", "", "ssim", equal),
         ("PSNR as it is", "dB", "psnr_as_is_db", original),
@@ -200,13 +200,13 @@ def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
         ("covered", "%", "covered", "share of the frame that the model covers whole"),
     ):
         values = each(found, lambda one, field=field: getattr(one, field))  # type: ignore[misc]
-        rows.append(row(scene, name, unit, values, words, more=True))
+        rows.append(row(scene, name, unit, values, text, more=True))
     for metric in rows[:2]:
         theirs = [v for n, v in metric.values.items() if n.startswith("Open3D") and v is not None]
         ours = metric.values.get(OURS)
         over = ours - max(theirs) if ours is not None and theirs else None
-        words = f"{metric.name} of ours minus the best of Open3D's"
-        rows.append(row(scene, f"{metric.name} over Open3D", metric.unit, over, words, more=True))
+        text = f"{metric.name} of ours minus the best of Open3D's"
+        rows.append(row(scene, f"{metric.name} over Open3D", metric.unit, over, text, more=True))
     return rows
 
 

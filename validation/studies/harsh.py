@@ -34,23 +34,23 @@ OFF = 0.03
 class Trial:
     """One set and its outcome.
 
-    ``said``: "refused", "doubted" or "trusted"; ``worst``, ``median``: relative focal errors of the
-    registered cameras; ``quiet``: cameras that err by more than 3 % and by more than their 95 % intervals;
+    ``outcome``: "refused", "not trusted" or "trusted"; ``worst``, ``median``: relative focal errors of the
+    registered cameras; ``silent``: cameras that err by more than 3 % and by more than their 95 % intervals;
     ``failed_checks``: failed checks, or the refusal.
     """
 
     number: int
-    said: str
+    outcome: str
     registered: int
     worst: float
     median: float
-    quiet: int
+    silent: int
     failed_checks: tuple[str, ...]
 
     @property
     def is_silent_error(self) -> bool:
         """Whether the answer is trusted, wrong, and has an interval that does not show it."""
-        return self.said == "trusted" and self.quiet > 0
+        return self.outcome == "trusted" and self.silent > 0
 
 
 def run_trial(kind: str, number: int) -> Trial:
@@ -70,10 +70,10 @@ def judge(number: int, result: MetricResult | None, failures: Sequence[str], mat
     if result is None:
         return Trial(number, "refused", 0, np.nan, np.nan, 0, tuple(failures[-1:]))
     error, stated = focal_errors(result, matched)
-    quiet = int(((error > OFF) & (error > stated)).sum())
-    said = "trusted" if result.trusted else "doubted"
+    silent = int(((error > OFF) & (error > stated)).sum())
+    outcome = "trusted" if result.trusted else "not trusted"
     worst, median = float(error.max()), float(np.median(error))
-    return Trial(number, said, len(error), worst, median, quiet, tuple(result.failed_checks))
+    return Trial(number, outcome, len(error), worst, median, silent, tuple(result.failed_checks))
 
 
 def verified_tracks(t: Tracks, pairs: Sequence[TwoView]) -> Tracks:
@@ -96,30 +96,31 @@ def focal_errors(result: MetricResult, matched: Matched) -> tuple[F64, F64]:
 
 
 def table_row(kind: str, trials: Sequence[Trial]) -> list[object]:
-    count = Counter(t.said for t in trials)
-    trusted, doubted = ([t for t in trials if t.said == said] for said in ("trusted", "doubted"))
+    count = Counter(t.outcome for t in trials)
+    trusted = [t for t in trials if t.outcome == "trusted"]
+    rejected = [t for t in trials if t.outcome == "not trusted"]
     median = f"{100.0 * float(np.median([t.worst for t in trusted])):.2f}" if trusted else "-"
-    good, off = sum(t.worst <= OFF for t in doubted), sum(t.worst > OFF for t in trusted)
-    quiet = sum(t.quiet > 0 for t in trusted)
-    return [kind, count["refused"], count["doubted"], good, count["trusted"], median, off, quiet]
+    good, off = sum(t.worst <= OFF for t in rejected), sum(t.worst > OFF for t in trusted)
+    silent = sum(t.silent > 0 for t in trusted)
+    return [kind, count["refused"], count["not trusted"], good, count["trusted"], median, off, silent]
 
 
 def _report(found: Iterable[tuple[str, Sequence[Trial]]]) -> Iterator[Part]:
-    lines, silent, total = [], [], 0
+    lines, errors, total = [], [], 0
     for kind, trials in found:
         lines.append(table_row(kind, trials))
-        total += sum(t.said == "trusted" for t in trials)
-        silent += [f"{kind}: {t}" for t in trials if t.is_silent_error]
+        total += sum(t.outcome == "trusted" for t in trials)
+        errors += [f"{kind}: {t}" for t in trials if t.is_silent_error]
         report_progress(f"{kind} done")
     yield text_table(HEAD, lines)
-    yield "\n".join(silent)
+    yield "\n".join(errors)
     rows = Rows(f"{total} trusted", OURS)
-    rows.add("trusted, wrong, outside its interval", len(silent), at_most=0.0)
+    rows.add("trusted, wrong, outside its interval", len(errors), at_most=0.0)
     yield rows
 
 
-HEAD = ["set", "refused", "doubted", "doubted though within 3 %", "trusted", "their worst focal, median, %"]
-HEAD += ["off by more than 3 %", "and by more than the interval"]
+HEAD = ["set", "refused", "not trusted", "not trusted though within 3 %", "trusted"]
+HEAD += ["their worst focal, median, %", "off by more than 3 %", "and by more than the interval"]
 
 
 def harsh_study(trials: int = 20, workers: int = 1, kinds: Sequence[str] | None = None) -> Iterator[Part]:

@@ -186,7 +186,7 @@ GRACE_S = 0.5
 class Stop:
     """An interrupted run.
 
-    ``seconds``: from the signal to the end; ``code``, ``said``: exit code and error stream; ``left``:
+    ``seconds``: from the signal to the end; ``code``, ``message``: exit code and error stream; ``left``:
     processes left behind; ``kept``: finished stage files; ``different``: outputs that differ after the
     resume.
     """
@@ -194,7 +194,7 @@ class Stop:
     when: str
     seconds: float
     code: int
-    said: str
+    message: str
     left: int
     kept: int
     different: tuple[str, ...] = ()
@@ -208,12 +208,12 @@ class Stop:
             f"{self.left} processes left": self.left > 0,
             f"differs: {', '.join(self.different)}": bool(self.different),
         }
-        return "; ".join(words for words, here in found.items() if here)
+        return "; ".join(fault for fault, present in found.items() if present)
 
 
 def _faults_of_end(ended: Stop | Refusal, code: int) -> dict[str, bool]:
     """Return the faults that the exit code and the error stream may have, and whether they are there."""
-    sentence = ended.said.count("\n") == 1 and "Traceback" not in ended.said
+    sentence = ended.message.count("\n") == 1 and "Traceback" not in ended.message
     return {f"exit code {ended.code}": ended.code != code, "not one sentence": not sentence}
 
 
@@ -249,8 +249,8 @@ def stopped(
     left = _of_session(process.pid)
     for number in left:
         os.kill(number, signal.SIGKILL)
-    with process.stderr as said:
-        return Stop(f"{start - begun:.1f} s", seconds, process.wait(), said.read(), len(left), 0)
+    with process.stderr as stream:
+        return Stop(f"{start - begun:.1f} s", seconds, process.wait(), stream.read(), len(left), 0)
 
 
 _LISTEN = """
@@ -313,28 +313,28 @@ SMALL_MODEL = ["--set", "dense.max_side=160", "--set", "dense.match_side=160"]
 class Refusal:
     """A run that could not write.
 
-    ``when``: where the disk was full or read-only; ``code``, ``said``: exit code and error stream;
+    ``when``: where the disk was full or read-only; ``code``, ``message``: exit code and error stream;
     ``strange``: files that a whole run does not have; ``different``: outputs that differ after the resume.
     """
 
     when: str
     code: int
-    said: str
+    message: str
     strange: tuple[str, ...]
     different: tuple[str, ...]
 
     @property
     def wrong(self) -> str:
         # Once cameras and summary are there, the run ends well, with warnings.
-        complete = self.code == 0 and NOT_MADE in self.said
+        complete = self.code == 0 and NOT_MADE in self.message
         found = {
             **({} if complete else _faults_of_end(self, REFUSED)),
-            "names no place": " cannot be written: " not in self.said,
-            "does not say what to do": not any(words in self.said for words in REMEDIES.values()),
+            "names no place": " cannot be written: " not in self.message,
+            "does not say what to do": not any(words in self.message for words in REMEDIES.values()),
             f"strange files: {', '.join(self.strange)}": bool(self.strange),
             f"differs: {', '.join(self.different)}": bool(self.different),
         }
-        return "; ".join(words for words, here in found.items() if here)
+        return "; ".join(fault for fault, present in found.items() if present)
 
 
 @contextlib.contextmanager
@@ -370,16 +370,16 @@ class SmallRuns:
         self.options = ["--max-size", str(size_px), "--until", until, "--threads", "1", *SMALL_MODEL]
 
     def run(self, out: Path) -> tuple[int, str]:
-        said, shown = io.StringIO(), io.StringIO()
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(shown):
+        errors, printed = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(printed):
             code = run_command(["reconstruct", str(self.images), "-o", str(out), *self.options])
-        warnings = [line for line in shown.getvalue().splitlines() if NOT_MADE in line]
-        return code, said.getvalue() + "\n".join(warnings)
+        warnings = [line for line in printed.getvalue().splitlines() if NOT_MADE in line]
+        return code, errors.getvalue() + "\n".join(warnings)
 
     def whole(self, out: Path) -> dict[str, bytes]:
-        code, said = self.run(out)
+        code, message = self.run(out)
         if code:
-            raise RuntimeError(f"a run with room ended with {code}: {said}")
+            raise RuntimeError(f"a run with room ended with {code}: {message}")
         return outputs(out)
 
 
@@ -403,7 +403,7 @@ def refuse_runs(runs: SmallRuns, every: int) -> Iterator[Refusal]:
 
 
 def refusal_table(rows: Sequence[Refusal]) -> str:
-    cells = ([r.when, r.code, r.said.strip(), r.wrong or "nothing"] for r in rows)
+    cells = ([r.when, r.code, r.message.strip(), r.wrong or "nothing"] for r in rows)
     return text_table(["the run could not write", "exit code", "message", "wrong"], cells)
 
 

@@ -1,8 +1,8 @@
 """The self-check on wrong and on right models.
 
-Right models of real images are spoiled (:mod:`validation.scenes.corrupted`) and adjusted again. The result is
-wrong or has recovered; both are counted with the verdict of the self-check. Focal lengths held 10 % off stand
-for a wrong user prior; right models lose some of their views and points.
+Right models of real images are corrupted (:mod:`validation.scenes.corrupted`) and adjusted again. The result
+is wrong or has recovered; both are counted with the verdict of the self-check. Focal lengths fixed 10 % off
+stand for a wrong user prior; right models lose some of their views and points.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from thesisrecon.records import IntrinsicInterval, SelfCalibration
 from thesisrecon.results import RunResult
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import Rows, text_table
-from validation.scenes.corrupted import SPOILINGS, model_from_reconstruction
+from validation.scenes.corrupted import CORRUPTIONS, model_from_reconstruction
 from validation.scenes.real import scenes_here
 
 OURS = "ours"
@@ -40,10 +40,10 @@ HELD_OFF = 1.1
 
 @dataclass(frozen=True)
 class Outcome:
-    """A spoiled or thinned model: ``wrong`` in truth, ``doubted`` by the self-check."""
+    """A corrupted or reduced model: ``wrong`` in truth, ``rejected`` by the self-check."""
 
     wrong: bool
-    doubted: bool
+    rejected: bool
 
 
 def settle(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate | None:
@@ -74,13 +74,15 @@ def is_wrong(model: MetricEstimate, right: MetricEstimate) -> bool:
     )
 
 
-def is_doubted(model: MetricEstimate, calibration: SelfCalibration, adjustment: MetricAdjustment) -> bool:
-    """Return whether the self-check doubts a model with narrow intervals, sharing aside."""
-    said = [
+def fails_self_check(
+    model: MetricEstimate, calibration: SelfCalibration, adjustment: MetricAdjustment
+) -> bool:
+    """Return whether a model with narrow intervals fails the self-check, shared cameras apart."""
+    stated = [
         {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 0.0, "")}
         for g in model.cameras.group
     ]
-    failed_checks = self_check(model, calibration, said, sigmas=LATE)[1]
+    failed_checks = self_check(model, calibration, stated, sigmas=LATE)[1]
     return bool(failed_checks or contradicted_focal_priors(model, adjustment))
 
 
@@ -94,11 +96,11 @@ def judge(
         (model, adjustment, *_), sharing, *_ = settle_camera_model(finish_metric(settled, adjustment))
     except StageFailure:
         return None
-    doubted = bool(sharing.failed_checks) or is_doubted(model, calibration, adjustment)
-    return Outcome(is_wrong(model, right), doubted)
+    rejected = bool(sharing.failed_checks) or fails_self_check(model, calibration, adjustment)
+    return Outcome(is_wrong(model, right), rejected)
 
 
-def spoiled_outcomes(
+def corrupted_outcomes(
     result: RunResult, prior: IntrinsicsPrior, seeds: int
 ) -> dict[str, list[Outcome | None]]:
     assert result.metric is not None
@@ -107,13 +109,13 @@ def spoiled_outcomes(
     right = settle(model_from_reconstruction(result.metric.reconstruction, prior), adjustment)
     assert right is not None
     found: dict[str, list[Outcome | None]] = defaultdict(list)
-    for number, (name, spoil) in enumerate(SPOILINGS.items()):
+    for number, (name, corrupt) in enumerate(CORRUPTIONS.items()):
         for seed in range(seeds):
-            bad = spoil(right, np.random.default_rng([seed, number]))
+            bad = corrupt(right, np.random.default_rng([seed, number]))
             found[name].append(judge(bad, right, result.calibration, adjustment))
-    held, prior_held = _focal_held(right, prior)
-    found["focal held 10 % off"].append(
-        judge(held, right, result.calibration, MetricAdjustment(prior_held, 0.02, 0.02))
+    fixed, fixed_prior = _fixed_focal(right, prior)
+    found["focal length fixed 10 % off"].append(
+        judge(fixed, right, result.calibration, MetricAdjustment(fixed_prior, 0.02, 0.02))
     )
     found["right, as it is"].append(judge(right, right, result.calibration, adjustment))
     # Few views with a focal each leave the focals open, which only their intervals show.
@@ -121,12 +123,12 @@ def spoiled_outcomes(
     for seed in range(seeds if one_camera else 0):
         rng = np.random.default_rng([seed, 99])
         found["right, some views and points"].append(
-            judge(_thinned(right, rng), right, result.calibration, adjustment)
+            judge(_reduced(right, rng), right, result.calibration, adjustment)
         )
     return found
 
 
-def _focal_held(model: MetricEstimate, prior: IntrinsicsPrior) -> tuple[MetricEstimate, IntrinsicsPrior]:
+def _fixed_focal(model: MetricEstimate, prior: IntrinsicsPrior) -> tuple[MetricEstimate, IntrinsicsPrior]:
     intrinsics = model.cameras.intrinsics.copy()
     intrinsics[:, 0] *= HELD_OFF
     mean, std = prior.mean.copy(), prior.std.copy()
@@ -137,7 +139,7 @@ def _focal_held(model: MetricEstimate, prior: IntrinsicsPrior) -> tuple[MetricEs
     )
 
 
-def _thinned(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
+def _reduced(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
     """Keep four or more neighbouring views and half of the points."""
     views = np.flatnonzero(model.registered)
     count = int(rng.integers(4, len(views) + 1))
@@ -151,30 +153,30 @@ def _thinned(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
 
 
 def self_check_study(out: Path, scenes: Sequence[str] = SCENES, seeds: int = 5) -> Iterator[Part]:
-    """Count wrong models that the self-check doubts and right models that it accepts."""
+    """Count wrong models that fail the self-check and right models that pass."""
     table: dict[str, list[Outcome | None]] = defaultdict(list)
     for scene in scenes_here(scenes):
         result = thesisrecon.reconstruct(scene.image_paths[0].parent, out / scene.name, until="metric")
         assert result.metric is not None
         for options in (IntrinsicsOptions(cameras="shared"), IntrinsicsOptions(cameras="per-image")):
             prior = prior_for(result.metric.reconstruction, options)
-            for kind, outcomes in spoiled_outcomes(result, prior, seeds).items():
+            for kind, outcomes in corrupted_outcomes(result, prior, seeds).items():
                 table[kind] += outcomes
         report_progress(f"{scene.name} done")
     lines = []
     for kind, outcomes in table.items():
         some = [o for o in outcomes if o is not None]
         wrong, right = [o for o in some if o.wrong], [o for o in some if not o.wrong]
-        counts = [len(outcomes), len(outcomes) - len(some), len(wrong), sum(o.doubted for o in wrong)]
-        lines.append([kind, *counts, len(right), sum(o.doubted for o in right)])
-    yield text_table(["made", "models", "nothing left", "wrong", "doubted", "right", "doubted"], lines)
+        counts = [len(outcomes), len(outcomes) - len(some), len(wrong), sum(o.rejected for o in wrong)]
+        lines.append([kind, *counts, len(right), sum(o.rejected for o in right)])
+    yield text_table(["made", "models", "nothing left", "wrong", "rejected", "right", "rejected"], lines)
     every = [o for outcomes in table.values() for o in outcomes if o is not None]
-    doubted = {
-        name: [100.0 * o.doubted for o in every if o.wrong is (name == "wrong")]
+    rejected = {
+        name: [100.0 * o.rejected for o in every if o.wrong is (name == "wrong")]
         for name in ("wrong", "right")
     }
-    for name, values in doubted.items():
+    for name, values in rejected.items():
         rows, share = Rows(f"{len(values)} {name}", OURS), float(np.mean(values))
         bound = 100.0 if name == "wrong" else None
-        rows.add("doubted", share, "%", at_most=2.0 if bound is None else None, at_least=bound)
+        rows.add("rejected", share, "%", at_most=2.0 if bound is None else None, at_least=bound)
         yield rows

@@ -52,7 +52,7 @@ class Matched:
     reasons: tuple[str, ...] = ()
 
 
-OUTCOMES = ("right", "open", "refused", "refused, another reason", "right, doubted", "wrong", "crash")
+OUTCOMES = ("right", "open", "refused", "refused, another reason", "right, not trusted", "wrong", "crash")
 """Outcomes: within 3 % and trusted; farther off but inside its 95 % interval; not trusted (wrong or without
 an answer) for an accepted reason or another one; within 3 % and not trusted; wrong and trusted."""
 
@@ -88,7 +88,7 @@ class Trial:
         if self.crash:
             return "crash"
         if self.right:
-            return "right, doubted" if self.failed_checks else "right"
+            return "right, not trusted" if self.failed_checks else "right"
         if self.failed_checks:
             text = "; ".join(self.failed_checks)
             named = not self.reasons or any(reason in text for reason in self.reasons)

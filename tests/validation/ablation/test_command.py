@@ -61,7 +61,7 @@ def test_an_interrupted_study_states_how_to_resume(tmp_path):
         environment={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     kept = f"run the same command to continue from the finished rows in {tmp_path / 'out'}"
-    assert (stop.code, stop.said, stop.left) == (130, f"validation: interrupted; {kept}\n", 0)
+    assert (stop.code, stop.message, stop.left) == (130, f"validation: interrupted; {kept}\n", 0)
 
 
 def test_an_interrupt_in_a_program_is_reported(tmp_path, monkeypatch, capsys):

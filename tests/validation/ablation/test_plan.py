@@ -12,7 +12,7 @@ from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from validation.ablation import Measure, Study
-from validation.ablation.command import STUDIES, plan_words
+from validation.ablation.command import STUDIES, plan_summary
 from validation.ablation.plan import ROOT, RUN_BY_ROWS, plan_study, versions
 from validation.ablation.run import parts_of
 from validation.ablation.toml import read_study, study_from_table
@@ -143,7 +143,7 @@ def test_only_steps_after_which_rows_part_are_parts_of_their_own():
     assert [p.step for p in steps].count("second") == 2
     for part in parts:
         assert all(any(s.key == key for s in steps) for key in part.after)
-    assert "computed once for several rows: first (2), second (2)" in plan_words(plan)
+    assert "computed once for several rows: first (2), second (2)" in plan_summary(plan)
 
 
 TABLE = {"scenes": ["a"], "axes": {"epipolar.threshold_px": [2.0]}, "task": "reconstruction"}

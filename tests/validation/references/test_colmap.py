@@ -102,7 +102,7 @@ def test_sift_keypoints_are_shifted_by_half_a_pixel(tmp_path):
     grey = 255.0 * np.exp(-((x - 70.0) ** 2 + (y - 40.0) ** 2) / 32.0)
     for name in ("a.png", "b.png"):
         PIL.Image.fromarray(grey.astype(np.uint8)).save(images / name)
-    match_with_pycolmap(images, tmp_path / "out", shared_camera=False, threads=1)
+    match_with_pycolmap(images, tmp_path / "out", threads=1)
     store = pycolmap.Database.open(tmp_path / "out" / "database.db")
     image = store.read_all_images()[0]
     np.testing.assert_allclose(store.read_keypoints(image.image_id)[0, :2], [70.5, 40.5], atol=0.02)

@@ -15,8 +15,8 @@ def test_points_seen_at_one_position_are_merged_in_any_order():
     ours = _reconstruction(_truth())
     order = np.random.default_rng(0).permutation(N)
     tracks = ours.tracks
-    place = np.argsort(order)
-    theirs = replace(ours, X=ours.X[order], tracks=replace(tracks, point_index=place[tracks.point_index]))
+    folder = np.argsort(order)
+    theirs = replace(ours, X=ours.X[order], tracks=replace(tracks, point_index=folder[tracks.point_index]))
     pairs = same_points(ours, theirs)
     assert len(pairs) == N
     np.testing.assert_array_equal(order[pairs[:, 1]], pairs[:, 0])

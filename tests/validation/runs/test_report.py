@@ -201,13 +201,13 @@ def test_a_run_starts_from_the_references_of_a_like_one(tmp_path):
     first = toy_options(tmp_path / "first", quick=True)
     run_tasks(first, STAGES, lambda _: None)
     # Of ours nothing is taken but the folders of a run; a reference stands as it is.
-    (first.place("toy", "yard", "good") / "value.json").write_text("7.0", encoding="utf-8")
+    (first.folder("toy", "yard", "good") / "value.json").write_text("7.0", encoding="utf-8")
     reported = []
     second = dataclasses.replace(toy_options(tmp_path / "second", quick=True), resume=str(first.out))
     judgement, outcomes = run_tasks(second, STAGES, reported.append)["toy", "yard"]
     assert judgement.metrics[0].values == {"ours": 0.5, "good": 7.0}
     assert [line for line in reported if "good" in line] == []
-    assert outcomes["good"].place == second.place("toy", "yard", "good")
+    assert outcomes["good"].folder == second.folder("toy", "yard", "good")
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"quick": True}, {"folders": {"yard": "/other/yard"}}, None])

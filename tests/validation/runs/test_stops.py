@@ -61,7 +61,7 @@ def test_a_report_that_is_ended_takes_its_tasks_along(asked, tmp_path):
     stop = stopped(program, lambda: process_of(tmp_path) > 0, asked, environment=environment)
     assert is_gone(process_of(tmp_path))
     if asked == signal.SIGINT:
-        assert (stop.code, stop.said, stop.left) == (130, "toy: interrupted; begin again\n", 0)
+        assert (stop.code, stop.message, stop.left) == (130, "toy: interrupted; begin again\n", 0)
 
 
 def test_an_interrupt_in_a_program_ends_the_tasks(tmp_path):

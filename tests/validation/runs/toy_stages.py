@@ -31,29 +31,29 @@ class ToyStage:
         return (("toy", "good"),) if method == "after" else ()
 
     def run(self, task, options):
-        place = options.place(task.stage, task.scene, task.method)
+        folder = options.folder(task.stage, task.scene, task.method)
         if task.method == "missing":
             import no_such_library  # noqa: F401
         if task.method == "failing":
-            shutil.rmtree(place)  # as one that starts with an empty folder does
+            shutil.rmtree(folder)  # as one that starts with an empty folder does
             raise StageFailure("the toy is broken", "it has 1 wheel", "buy another")
         if task.method == "crashing":
             os.kill(os.getpid(), signal.SIGSEGV)
         if task.method == "hanging":
-            (place / "process").write_text(str(os.getpid()))
+            (folder / "process").write_text(str(os.getpid()))
             time.sleep(600)
         value = VALUES[task.method]
         if task.method == "after":
-            value *= json.loads((options.place("toy", task.scene, "good") / "value.json").read_text())
-        (place / "value.json").write_text(json.dumps(value))
+            value *= json.loads((options.folder("toy", task.scene, "good") / "value.json").read_text())
+        (folder / "value.json").write_text(json.dumps(value))
 
     def judge(self, scene, outcomes, options):
         values = {
-            name: json.loads((o.place / "value.json").read_text()) if o.ok else None
+            name: json.loads((o.folder / "value.json").read_text()) if o.ok else None
             for name, o in outcomes.items()
         }
-        place = options.place(self.name, scene)
-        PIL.Image.new("RGB", (40, 30), (200, 10, 10)).save(place / "red.png")
+        folder = options.folder(self.name, scene)
+        PIL.Image.new("RGB", (40, 30), (200, 10, 10)).save(folder / "red.png")
         metrics = [
             Metric(scene, "wheels, lost", "px", values, "ours", definition='"less" is <better>'),
             Metric(scene, "time", "s", {"ours": time.time()}, "ours"),
