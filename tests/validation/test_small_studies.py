@@ -33,7 +33,6 @@ from validation.studies import benchmark_table, coverage_real
 from validation.studies import growth_of_cost as growth
 from validation.studies.benchmark_table import ratio_table, ratios_to_ours
 from validation.studies.coverage_real import draw_neighbours
-from validation.studies.facades import KINDS, lens_error
 from validation.studies.growth_of_cost import Cost, Meter, exponent
 from validation.studies.large_images import FORMATS, read_one, write_image
 from validation.studies.robustness import TORN, Kill, different, kill_table, outputs
@@ -330,19 +329,6 @@ def test_wide_steps_are_counted_without_our_front_end_too():
         assert pairs.name == "pairs found, of 2"
         assert wrong.values == dict.fromkeys(methods, 1.0)
         assert wrong.verdict == verdict
-
-
-def test_lens_errors_of_facades_are_a_tenth_of_a_pixel_and_vanish_at_the_principal_point():
-    K = np.array([[900.0, 0.0, 404.0], [0.0, 900.0, 296.0], [0.0, 0.0, 1.0]])
-    xy = np.random.default_rng(0).uniform(0.0, (800.0, 600.0), (2000, 2))
-    for kind in KINDS:
-        moved = lens_error(kind, xy, K, np.random.default_rng(1))
-        rms = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
-        assert 0.05 < rms < 0.5 if kind != "none" else rms == 0.0
-        if kind in ("decentring", "aspect"):
-            assert not lens_error(kind, K[None, :2, 2], K, np.random.default_rng(1)).any()
-    with pytest.raises(UsageError, match="lens error"):
-        lens_error("fisheye", xy, K, np.random.default_rng(1))
 
 
 def test_the_error_of_centres_is_after_a_similarity():

@@ -297,20 +297,6 @@ def build_yard(seed: int) -> World:
     return build_world(objects + [[wall] for wall in walls], build_materials(), SUN)
 
 
-def build_facade(seed: int) -> World:
-    """One of the three walls alone, with one to three stones before it: most points lie on one plane."""
-    rng = np.random.default_rng([73, seed])
-    x, _, z = np.eye(3)
-    material, width = ((BACK, 12.4), (LEFT, 9.9), (RIGHT, 9.9))[seed % 3]
-    wall = Surface(np.array([-0.5 * width, 0.0, 0.0]), x, z, (width, WALL_HEIGHT), material)
-    stones = []
-    for _ in range(int(rng.integers(1, 4))):
-        place = (float(rng.uniform(-3.0, 3.0)), float(rng.uniform(-0.6, -0.35)), 0.0)
-        size = (float(rng.uniform(0.4, 0.8)), 0.4, float(rng.uniform(0.4, 0.9)))
-        stones.append(_box(place, size, STONE, float(rng.uniform(-0.2, 0.2))))
-    return build_world([*stones, [wall]], build_materials(), SUN)
-
-
 def _thing(x: float, y: float, rng: np.random.Generator) -> list[list[Surface]]:
     """A crate with perhaps another one on it, a dressed stone, a barrel or a column."""
     kind, turn = int(rng.integers(4)), float(rng.uniform(-0.4, 0.4))

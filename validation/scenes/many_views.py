@@ -19,7 +19,7 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64
 from thesisrecon.io._files import write_atomically, write_json
-from validation.scenes.courtyard import build_courtyard, build_facade, build_yard
+from validation.scenes.courtyard import build_courtyard, build_yard
 from validation.scenes.image_files import write_png
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.raycast import World, trace
@@ -81,7 +81,7 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
 
 _YARD = re.compile(r"yard-(\d{1,4})")
 YARDS = Path(tempfile.gettempdir()) / "thesisrecon-yards"
-YARD_IMAGES, YARD_SIZE, FACADE_SIZE = 10, (960, 720), (800, 600)
+YARD_IMAGES, YARD_SIZE = 10, (960, 720)
 
 
 def yard_number(name: str) -> int | None:
@@ -125,28 +125,6 @@ def _write_scene(
         given = {"name": name, "width": size[0], "height": size[1], "K": pose.K, "R": pose.R, "t": t}
         entries.append({**given, "distortion": [0.0, 0.0, 0.0]})
     write_json(folder / "cameras.json", {"cameras": entries})
-
-
-def load_facade(number: int) -> Scene:
-    """Ten images of a facade (:func:`build_facade`) by one camera, rendered on first use (a minute).
-
-    The principal point is off the middle by 0.5 % of the long side.
-    """
-    folder = YARDS / f"facade-{number}-{YARD_IMAGES}"
-    if not (folder / "cameras.json").is_file():
-        rng, (width, height) = np.random.default_rng([74, number]), FACADE_SIZE
-        focal = float(rng.uniform(0.9, 1.3)) * width
-        K = np.array([[focal, 0.0, 0.505 * width], [0.0, focal, 0.4933 * height], [0.0, 0.0, 1.0]])
-        poses = []
-        for k in range(YARD_IMAGES):
-            angle = (2.0 * _van_der_corput(k + 1) - 1.0) * 40.0 * pi / 180.0
-            distance, eye = rng.uniform(5.6, 7.2), rng.uniform(1.0, 3.4)
-            C = np.array([distance * sin(angle), -distance * cos(angle), eye])
-            target = rng.uniform([-0.8, 0.0, 2.0], [0.8, 0.0, 2.8])
-            roll = tan(0.5 * rng.uniform(-8.0, 8.0) * pi / 180.0)
-            poses.append(Pose(K, look_at(C, target, roll), C, float(rng.uniform(0.9, 1.1))))
-        _write_scene(folder, build_facade(number), poses, FACADE_SIZE, (2005, number))
-    return read_scene(folder, f"facade-{number}")
 
 
 STEREO_SIZE, STEREO_BASELINE_M = (480, 360), 0.3
