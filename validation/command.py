@@ -1,7 +1,7 @@
 """Command line of the validation: ``python -m validation report|check|ablate|study``.
 
-``report`` and ``check`` run every stage beside the references on the same inputs, ``ablate`` runs variants
-and parameters beside each other, ``study`` runs one of the measurements of :mod:`validation.studies`.
+``report`` and ``check`` run every stage and the references on the same inputs, ``ablate`` compares variants
+and parameters, ``study`` runs one of the measurements of :mod:`validation.studies`.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def _inside(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _changes(node: Any) -> Iterator[ast.AST]:
-    """Yield what may stand in the place of a node."""
+    """Yield the replacements of a node."""
 
     def changed(**fields: Any) -> ast.AST:
         found: ast.AST = type(node)(**{**dict(ast.iter_fields(node)), **fields})

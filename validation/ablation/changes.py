@@ -30,7 +30,7 @@ def apply_changes(setting: Setting, changes: Mapping[str, Any], folder: Path) ->
     """``setting`` with every change made, in order.
 
     Raises :class:`UsageError` for a path that does not exist (naming the nearest), a value of another type, a
-    variant without the method of its stage, and whatever a variant refuses.
+    variant without the method of its stage, and values that a variant refuses.
     """
     for path, value in changes.items():
         setting = _changed(setting, path, value, folder)

@@ -256,7 +256,7 @@ def _row_record(plan: Plan, row: PlannedRow) -> dict[str, Any]:
 
 
 def _study_record(plan: Plan) -> dict[str, Any]:
-    """The study in plain words, beside its rows."""
+    """Describe the study for ``study.json``."""
     return {
         "title": plan.study.title,
         "mode": plan.study.mode,

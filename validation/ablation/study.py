@@ -73,7 +73,7 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """Folders of a row: ``own`` is an empty folder of its own, ``shared`` that of all rows."""
+    """Folders of a row: ``own`` is empty at the beginning, ``shared`` is common to all rows."""
 
     own: Path
     shared: Path
@@ -108,9 +108,9 @@ class Study:
         preset has there), or the object itself.
     scenes : the names of the scenes; a task may also take folders.
     seeds : of the random steps, or how many (then 0, 1, ...); a sample only where the task draws its data.
-    subsets : how many subsets of the images of each scene are run beside the whole scene.
+    subsets : how many subsets of the images of each scene are run in addition to the whole scene.
     conditions : axes that are not compared, such as the noise of all variants.
-    mode : "one-at-a-time" changes one thing of the start at a time, "ladder" keeps each change and adds the
+    mode : "one-at-a-time" changes one setting of the start at a time, "ladder" keeps each change and adds the
         next, "grid" takes every combination.
     baseline : the name of the variant that the others are compared with; the first where empty.
     start : the name of the unchanged configuration in the modes that begin with it.

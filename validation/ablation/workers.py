@@ -1,4 +1,4 @@
-"""Compute rows in this process or in processes of their own."""
+"""Compute rows in this process or in other processes."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ def reconstruct_with_pycolmap(
 
 
 def main() -> None:
-    """One run as a process of its own."""
+    """Run COLMAP once, as a program."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("images", type=Path)
     parser.add_argument("out", type=Path)

@@ -1,4 +1,4 @@
-"""F of matches by OpenCV, COLMAP and PoseLib beside ours, behind one signature.
+"""F of matches by OpenCV, COLMAP and PoseLib and by ours, with one signature.
 
 Every method is given the matches in an order that the seed draws: OpenCV's generators start from a fixed
 state, so only the order makes its runs differ. Libraries with a seed get it too.

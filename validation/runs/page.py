@@ -82,7 +82,7 @@ def write_pages(
             overview(results, earlier),
             *(section for section in whole if section["rows"]),
         ],
-        title="Ours beside the references",
+        title="Ours and the references",
         links=links,
         verdict=_verdict(results.rows, results.missing),
         several=True,

@@ -1,6 +1,6 @@
 """Run tasks as forks of a process that has imported everything once.
 
-Importing the library takes two seconds, as long as many tasks. Each task is still a process of its own that
+Importing the library takes two seconds, as long as many tasks. Each task is still its own process, which
 may crash, hang or be killed, with its own time and memory.
 """
 

@@ -103,7 +103,7 @@ class Judgement:
 
 
 class Stage(Protocol):
-    """A stage of the library beside its references.
+    """A stage of the library and its references.
 
     ``definition`` states the comparison in one sentence. ``takes`` returns whether the stage can work on a
     scene; ``methods`` the methods there; ``needs`` the (stage, method) results that a method, or the

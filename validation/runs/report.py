@@ -1,4 +1,4 @@
-"""Run all tasks of a report in parallel, each in a process of its own.
+"""Run all tasks of a report in parallel, each in its own process.
 
 The first own task of a stage compiles its kernels. No other task of that stage, nor a first task of another
 stage, starts before it ends; references use the other cores.

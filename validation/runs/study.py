@@ -173,7 +173,7 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
 
 
 def run_all(out: Path) -> int:
-    """Make every table of the documentation, each in a folder of its own: all studies with the options of
+    """Make every table of the documentation, each in its own folder: all studies with the options of
     the pages, all ablations, and the report. One that ends with an error does not end the others; the exit
     code is the largest."""
     from validation.ablation.command import STUDIES

@@ -144,7 +144,7 @@ def _barrel() -> Material:
 
 def _column(seed: int) -> Material:
     """A drum of field stones whose ends are round, so that they stand well on their feet; no mason lays the
-    same stones twice, so each column has a ``seed`` of its own."""
+    same stones twice, so each column has its own ``seed``."""
     stones = rubble(grid((2 * PI * 0.22, 2.6), TEXEL), TEXEL, seed, cell_m=0.2, relief_m=0.02, wrap=True)
     row = np.arange(stones.shape[0])
     calm = smooth((np.minimum(row, row[-1] - row) * TEXEL).astype(np.float32), 0.0, 0.03)[:, None]

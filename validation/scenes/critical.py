@@ -69,7 +69,7 @@ class _Path:
 
 
 def _general(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Cameras on a cap of 40 to 80 degrees across, held at any roll up to 30 degrees, not quite aimed."""
+    """Cameras on a cap of 40 to 80 degrees across, with a roll of up to 30 degrees and an inexact aim."""
     half = np.radians(rng.uniform(20.0, 40.0))
     azimuth, height = rng.uniform(-half, half, (2, w.views))
     direction = np.stack(
@@ -101,7 +101,7 @@ def _turntable(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
 
 
 def _planar(w: _Path, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64, F64]:
-    """A tripod rolled over the floor: headings of its own at every place, the tilt as it was."""
+    """A tripod moved over the floor: another heading at each position, a constant tilt."""
     azimuth = rng.uniform(-0.6, 0.6, w.views)
     C = w.distance * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
     C *= rng.uniform(0.75, 1.25, (w.views, 1))
@@ -115,12 +115,12 @@ def _planar(w: _Path, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64
 
 
 def _parallel_axes(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
-    """The same with a lift."""
+    """Planar motion with changes of height."""
     return _planar(w, rng, axial=rng.uniform(0.2, 0.6))
 
 
 def _optical_axis(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Forward and sideways, rolled by any angle, the optical axis never turned."""
+    """Translation with roll about the optical axis, whose direction is constant."""
     R, C = _translation(w, rng)
     roll = rng.uniform(-np.pi, np.pi, w.views)
     return Rotation.from_rotvec(roll[:, None] * UP).as_matrix() @ R, C
@@ -143,8 +143,8 @@ def make_sequence(
 ) -> Sequence:
     """5 to 15 cameras and 150 to 400 points in a box, 0.5 to 1 px noise, a focal of 0.7 to 2 long sides.
 
-    ``by_hand`` adds what a photographer cannot avoid; ``zoom``: focals vary by factors e^+-zoom. The
-    principal point is off by 0.5 % of the long side (rms), and a tenth of what is in the image is not
+    ``by_hand`` adds the unavoidable errors of a hand-held camera; ``zoom``: focals vary by factors e^+-zoom.
+    The principal point is off by 0.5 % of the long side (rms), and a tenth of what is in the image is not
     matched.
     """
     path = _Path(int(rng.integers(5, 16)), rng.uniform(3.0, 6.0), rng.uniform(0.4, 0.8))

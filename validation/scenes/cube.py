@@ -79,7 +79,7 @@ def project_exactly(K: F64, R: F64, C: F64, X: F64) -> F64:
 def make_cube() -> CubeSequence:
     """The sequence; always the same numbers.
 
-    The cameras stand on a shaken 3 x 3 x 3 grid of azimuth, elevation and distance. Most see two or three
+    The cameras stand on a perturbed 3 x 3 x 3 grid of azimuth, elevation and distance. Most see two or three
     faces, and six (low, at either side) a single one.
     """
     rng = np.random.Generator(np.random.PCG64(1900))

@@ -74,7 +74,7 @@ def _points(rng: np.random.Generator, n: int = 400) -> F64:
 
 
 def _cap(rng: np.random.Generator, views: int, half_deg: float = 30.0) -> tuple[F64, F64]:
-    """Cameras on a cap of the sphere, at several distances and rolls, not quite aimed."""
+    """Cameras on a cap of the sphere, at several distances and rolls, with an inexact aim."""
     azimuth, height = np.radians(rng.uniform(-half_deg, half_deg, (2, views)))
     C = np.stack([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)], axis=1)
     C *= 4.0 * rng.uniform(0.8, 1.25, (views, 1))
@@ -185,29 +185,29 @@ def _zoomed_path(rng: np.random.Generator) -> HarshSet:
 
 KINDS: Mapping[str, Callable[[np.random.Generator], HarshSet]] = {
     "three images": lambda rng: _general(rng, 3),
-    "four images, each its zoom": lambda rng: _own_zooms(_general(rng, 4), rng),
+    "four images, one zoom per image": lambda rng: _own_zooms(_general(rng, 4), rng),
     "a small arc of 5 to 10 degrees": lambda rng: _set(
         _cap(rng, _several(rng), rng.uniform(2.5, 5.0)), _points(rng), rng
     ),
     "nearly pure rotation": _nearly_turning,
     "sideways, turned by 0.1 to 2 degrees": _sideways,
     "forward, turned by 0.1 to 2 degrees": _forward,
-    "sideways or forward, each its zoom": _zoomed_path,
+    "sideways or forward, one zoom per image": _zoomed_path,
     "turntable": lambda rng: _set(_orbit(rng, _several(rng)), _points(rng), rng),
-    "turntable, cropped alike": lambda rng: _cropped(
+    "turntable, all cropped equally": lambda rng: _cropped(
         _set(_orbit(rng, _several(rng)), _points(rng), rng), rng.uniform(-0.1, 0.1, 2)
     ),
-    "turntable, each its zoom": lambda rng: _own_zooms(
+    "turntable, one zoom per image": lambda rng: _own_zooms(
         _set(_orbit(rng, _several(rng)), _points(rng), rng), rng
     ),
-    "two zooms by turns, shared camera assumed": lambda rng: _two_zooms(rng, 1.1, 2.0),
-    "two near zooms by turns, shared camera assumed": lambda rng: _two_zooms(rng, 1.02, 1.1),
-    "one image of another focal, shared camera assumed": _one_other,
-    "cropped alike": lambda rng: _cropped(_general(rng), rng.uniform(-0.12, 0.12, 2)),
-    "each cropped for itself": lambda rng: _own_zooms(
+    "two alternating zooms, shared camera assumed": lambda rng: _two_zooms(rng, 1.1, 2.0),
+    "two similar alternating zooms, shared camera assumed": lambda rng: _two_zooms(rng, 1.02, 1.1),
+    "one image with another focal length, shared camera assumed": _one_other,
+    "all cropped equally": lambda rng: _cropped(_general(rng), rng.uniform(-0.12, 0.12, 2)),
+    "each cropped differently": lambda rng: _own_zooms(
         _cropped(scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))), rng
     ),
-    "each cropped for itself, shared camera assumed": lambda rng: _cropped(
+    "each cropped differently, shared camera assumed": lambda rng: _cropped(
         scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))
     ),
     "pixels not square": _aspect,
@@ -219,5 +219,5 @@ KINDS: Mapping[str, Callable[[np.random.Generator], HarshSet]] = {
     "noise of 2 to 3 px": lambda rng: replace(_general(rng), sigma_px=float(rng.uniform(2.0, 3.0))),
     "a fifth of the matches wrong": lambda rng: replace(_general(rng), wrong=0.2),
     "an object moves with 30 % of the points": lambda rng: replace(_general(rng), moving=0.3),
-    "five images of few points, each its zoom": _few_points,
+    "five images of few points, one zoom per image": _few_points,
 }

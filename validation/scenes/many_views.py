@@ -99,7 +99,7 @@ def load_yard(number: int) -> Scene:
 
 
 def write_yard(folder: Path, seed: int) -> None:
-    """Images and ``cameras.json`` of a yard of its own (:func:`build_yard`), seen by cameras of its own."""
+    """Images and ``cameras.json`` of another yard (:func:`build_yard`) and other cameras for each seed."""
     poses = walk(YARD_IMAGES, YARD_SIZE, seed=1000 + seed)
     zoom = float(np.random.default_rng([72, seed]).uniform(0.85, 1.25))
     zoomed = [replace(pose, K=_zoomed(pose.K, zoom)) for pose in poses]

@@ -61,7 +61,7 @@ def grid(size_m: tuple[float, float], texel_m: float) -> tuple[int, int]:
 
 
 def bricks(shape: tuple[int, int], texel_m: float, seed: int) -> Material:
-    """Red bricks with recessed mortar, each of its own colour, weathered."""
+    """Red bricks with recessed mortar, of different colours, weathered."""
     edge, label = courses(shape, texel_m, seed, block_m=(0.25, 0.085))
     grain = fractal(shape, texel_m, seed + 1, wavelengths_m=(0.08, 2.5 * texel_m), ratio=0.8)
     inside = smooth(edge, 0.004, 0.013)

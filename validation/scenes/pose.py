@@ -1,4 +1,4 @@
-"""True poses of synthetic cameras, and cameras moved off the truth.
+"""True poses of synthetic cameras, and perturbed cameras.
 
 ``look_at`` uses + - * / sqrt only, which IEEE 754 rounds exactly.
 """
@@ -60,7 +60,7 @@ def turntable(
     return R @ turn.swapaxes(1, 2), turn @ start
 
 
-def off_the_truth(
+def perturb(
     cameras: MetricCameras,
     X: F64,
     rng: np.random.Generator,

@@ -54,7 +54,7 @@ class Scene:
 
 
 def data_root() -> Path | None:
-    """The folder of real images: THESISRECON_DATA, else ../shared/data beside the repository, None when
+    """The folder of real images: THESISRECON_DATA, else ../shared/data next to the repository, None when
     absent."""
     named = os.environ.get("THESISRECON_DATA")
     folder = Path(named) if named else ROOT.parent / "shared" / "data"

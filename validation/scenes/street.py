@@ -1,4 +1,4 @@
-"""A street of any length: a row of houses, each with a wall and things of its own, and a walk along it.
+"""A street of any length: a row of different houses and objects, and a camera path along it.
 
 Only the houses near a camera are built to render its image, so that memory does not grow with the length.
 """
@@ -74,9 +74,9 @@ def _house(house: int) -> tuple[list[Material], float]:
 
 
 def build_near(house: int) -> World:
-    """The houses around one, as a world of their own; x runs along the street, y into the walls."""
+    """Build a house and its neighbours as one world; x runs along the street, y into the walls."""
     x, y, z = np.eye(3)
-    materials, walls, things = list[Material](), list[list[Surface]](), list[list[Surface]]()
+    materials, walls, objects = list[Material](), list[list[Surface]](), list[list[Surface]]()
     for h in range(house - NEAR, house + NEAR + 1):
         rng, first = np.random.default_rng([83, h]), len(materials)
         own, back = _house(h)
@@ -88,8 +88,8 @@ def build_near(house: int) -> World:
             u, away = float(rng.uniform(0.5, WIDTH - 0.5)), float(rng.uniform(0.6, 1.8))
             size = rng.uniform([0.4, 0.4, 0.4], [0.8, 0.8, 1.5])
             angle, material = float(rng.uniform(-0.4, 0.4)), first + 2 + int(rng.integers(2))
-            things.append(_crate(at + u * x - away * y, size, angle, material))
-    return build_world(things + walls, materials, SUN)
+            objects.append(_crate(at + u * x - away * y, size, angle, material))
+    return build_world(objects + walls, materials, SUN)
 
 
 @lru_cache(maxsize=1)

@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics._metric_kernels import MetricCameras
 from thesisrecon.numerics._observations import Observations
-from validation.scenes.pose import off_the_truth
+from validation.scenes.pose import perturb
 
 Kind = Literal["street", "loop"]
 SIZE = (1000, 750)
@@ -31,8 +31,8 @@ class Walk:
     seen: Observations
 
     def start(self, rng: np.random.Generator, *, size: float = 0.02) -> tuple[MetricCameras, F64]:
-        """Cameras turned by a few milliradians, moved and zoomed off the truth, points moved."""
-        return off_the_truth(self.cameras, self.X, rng, turned=size / 6.0, moved=size, zoomed=1.01)
+        """Return cameras and points with small random errors, from which adjustment starts."""
+        return perturb(self.cameras, self.X, rng, turned=size / 6.0, moved=size, zoomed=1.01)
 
 
 def make_walk(

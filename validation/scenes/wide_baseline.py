@@ -1,4 +1,4 @@
-"""Image pairs with wide steps and known truth: photographs seen obliquely or turned, and a rendered yard."""
+"""Image pairs with wide baselines and known truth: warped images and a rendered yard."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class WidePair:
 
 
 def warped_pairs(step: WideStep) -> Iterator[WidePair]:
-    """Each photograph, and its print seen by a camera that differs by ``step``; none if they are not here."""
+    """Yield each real image and its view by a camera that differs by ``step``; none without the data."""
     root = data_root()
     for path in (root / name for name in PHOTOGRAPHS) if root is not None else ():
         if path.is_file():
@@ -85,7 +85,7 @@ def warped_pairs(step: WideStep) -> Iterator[WidePair]:
 
 
 def warp_photograph(path: Path, step: WideStep) -> WidePair:
-    """A photograph reduced by the scale of ``step``, and the second view of it in the same size."""
+    """Return an image reduced by the scale of ``step``, and its second view of the same size."""
     rgb = read_rgb(path)
     whole = np.array(rgb.shape[1::-1], dtype=np.float64)
     long_side = min(LONG_SIDE, whole.max() / step.scale)
@@ -103,7 +103,7 @@ def warp_photograph(path: Path, step: WideStep) -> WidePair:
 
 
 def _to_canvas(whole: F64, size: np.ndarray, step: WideStep) -> F64:
-    """Homography (3, 3) from a photograph's pixels to those of a camera 1.2 long sides in front of it."""
+    """Return the homography (3, 3) from image pixels to those of a camera 1.2 long sides in front of it."""
     distance = 1.2
     to_plane = np.diag([1.0 / whole.max(), 1.0 / whole.max(), 1.0])
     to_plane[:2, 2] = -0.5 * (whole - 1.0) / whole.max()

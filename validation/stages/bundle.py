@@ -17,7 +17,7 @@ from validation.runs.records import Judgement, Outcome, ReportOptions, Stage, Ta
 from validation.runs.rows import OURS, each, ratio, read_arrays, row
 from validation.runs.scenes import has_images, load_images
 from validation.runs.tables import Metric
-from validation.scenes.pose import off_the_truth
+from validation.scenes.pose import perturb
 from validation.scenes.walks import SIZE, make_walk
 from validation.stages.cameras import our_model
 
@@ -37,7 +37,7 @@ class BundleStage(Stage):
     definition = (
         "The final model of our run, every camera and point moved (focal length by 2 %), adjusted to "
         "convergence by ours and by COLMAP's Ceres from the same start, Huber's loss. Cost is computed here, "
-        "by one function, from the cameras and points that each leaves. Covariances, ours beside COLMAP's "
+        "by one function, from the cameras and points that each leaves. Covariances, ours against COLMAP's "
         "estimate_ba_covariance: of the saved model (and of a synthetic street) at its optimum, squared "
         "loss, focal length, principal point and k1 free, poses in the inner gauge."
     )
@@ -187,7 +187,7 @@ def perturbed_model(
     """Set the focal length 2 % off and move poses and points by 0.3 % of the scene."""
     exact, X, seen = model_as_bundle(model)
     scale = float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
-    cameras, X = off_the_truth(exact, X, rng, turned=0.003, moved=0.003 * scale, zoomed=1.02)
+    cameras, X = perturb(exact, X, rng, turned=0.003, moved=0.003 * scale, zoomed=1.02)
     return cameras, X, seen
 
 

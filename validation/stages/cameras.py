@@ -1,4 +1,4 @@
-"""Chapters 4 to 7: intrinsics and cameras of images beside COLMAP's mappers and the truth."""
+"""Chapters 4 to 7: intrinsics and cameras compared with COLMAP's mappers and the truth."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class CamerasStage(Stage):
     name = "cameras"
     title = "Cameras and intrinsics"
     definition = (
-        "From images without any camera prior: the default and the thesis' preset beside "
+        "From images without any camera prior: the default and the thesis' preset and "
         "COLMAP (default, with the principal point refined, and its global mapper), one thread each. "
         "Every number is recomputed from the saved cameras and points."
     )
@@ -193,7 +193,7 @@ def _last_record(outcome: Outcome, stage: str) -> Any:
 def _costs(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     """Return processor seconds and memory; COLMAP's mappers include the shared matching.
 
-    Ours with a camera each continues a finished run, so it has no time of its own.
+    Our run with one camera per image continues a finished run, so its time is not reported.
     """
     done = {n: o if o.ok else None for n, o in outcomes.items() if n not in (MATCHES, PER_IMAGE)}
     shared = outcomes[MATCHES].cpu_s if MATCHES in outcomes else 0.0

@@ -1,4 +1,4 @@
-"""Chapter 4: corners and matches of ours beside SIFT and OpenCV's Harris corners."""
+"""Chapter 4: our corners and matches compared with SIFT and OpenCV's Harris corners."""
 
 from __future__ import annotations
 

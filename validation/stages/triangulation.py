@@ -46,7 +46,7 @@ class Problem(DrawnRig):
 
 
 class TriangulationStage(Stage):
-    """The thesis' comparison of methods, beside the references."""
+    """The thesis' comparison of methods, with the references."""
 
     name = "triangulation"
     title = "Triangulation"

@@ -1,4 +1,4 @@
-"""Sections 1.2 and 1.3: interpolated views beside the real images."""
+"""Sections 1.2 and 1.3: interpolated views compared with the real images."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ViewInterpolationStage(Stage):
     name = "view-interpolation"
     title = "View interpolation"
     definition = (
-        "Images 3, 4 and 5 of nine, computed from 2 and 6, beside the real ones: interpolation with our "
+        "Images 3, 4 and 5 of nine are computed from 2 and 6 and compared: interpolation with our "
         "disparities, with OpenCV's and with the true ones, the tensor with the same, and a cross-dissolve. "
         "The tensor also computes 1 and 7, a quarter of the baseline beyond the ends."
     )

@@ -1,4 +1,4 @@
-"""Section 2.6: renderings of the model at a left-out image, beside that image."""
+"""Section 2.6: renderings of the model compared with left-out images."""
 
 from __future__ import annotations
 

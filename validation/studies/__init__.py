@@ -1,1 +1,1 @@
-"""Studies: measurements beside theory and references, each run by ``python -m validation study NAME``."""
+"""Studies: measurements against theory and references, run by ``python -m validation study NAME``."""

@@ -21,7 +21,7 @@ from validation.runs.processes import call_apart, timed
 from validation.runs.study import Part
 from validation.runs.tables import text_table
 from validation.scenes.many_tracks import SIZE, Kind, make_tracks
-from validation.scenes.pose import off_the_truth
+from validation.scenes.pose import perturb
 from validation.stages.bundle import FOCAL_K1
 
 LOSS_PX, MIN_VIEWS = 0.5, 3
@@ -30,7 +30,7 @@ METHODS = ("ours", "Ceres")
 
 
 def adjustment_problem(kind: Kind, views: int) -> tuple[MetricCameras, F64, Observations]:
-    """Cameras and points off the truth (focal length by 2 %) and the simulated observations."""
+    """Return perturbed cameras and points (focal length by 2 %) and the simulated observations."""
     made, rng = make_tracks(kind, views), np.random.default_rng(5)
     t = made.tracks
     K, R, C = (np.array([getattr(pose, name) for pose in made.poses]) for name in "KRC")
@@ -48,7 +48,7 @@ def adjustment_problem(kind: Kind, views: int) -> tuple[MetricCameras, F64, Obse
     k = np.flatnonzero(good[t.point_index])
     row = np.array([[K[0, 0, 0], 1.0, 0.0, K[0, 0, 2], K[0, 1, 2], 0.0]])
     exact = MetricCameras(R, poses[:, :, 3], row, np.zeros(views, dtype=np.int64))
-    cameras, X = off_the_truth(
+    cameras, X = perturb(
         exact, X[used], rng, turned=MOVED, moved=MOVED, zoomed=FOCAL_OFF, points_moved=2.0 * MOVED
     )
     return cameras, X, Observations(t.view_index[k], number[t.point_index[k]], t.xy[k])

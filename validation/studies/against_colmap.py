@@ -1,7 +1,7 @@
-"""The main job beside COLMAP on the same images: cameras registered, errors, reprojection, wall time.
+"""Reconstruction compared with COLMAP on the same images: cameras, errors, reprojection, wall time.
 
-Each method runs as a process of its own on the same number of processor cores. Ours is the command line up to
-the metric stage, and its whole life counts; of COLMAP only extraction, matching and mapping count. Every
+Each method runs in its own process on the same number of processor cores. Ours is the command line up to
+the metric stage, and its whole time counts; of COLMAP only extraction, matching and mapping count. Every
 number is computed here from saved cameras and points.
 """
 

@@ -4,7 +4,7 @@ The tasks of each stage are scheduled in the order in which they are submitted: 
 worker, and at most twice as many tasks as workers are under way. Pairs are batched as for that number of
 workers; each batch prepares its views again. With a gigabit line each way, the arguments of one task after
 another leave the machine of the command, and the results come back one after another. Everything else counts
-as serial, also pickling and saving, which in fact run beside the tasks, and steps that use several threads.
+as serial, also pickling and saving, which in fact run during the tasks, and steps that use several threads.
 
 Seconds are those of the processor. The efficiency is the work of one worker by workers x critical path.
 """

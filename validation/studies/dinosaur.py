@@ -1,8 +1,8 @@
 """Chapter 6: a real turntable.
 
-Our cameras and the published ones are measured alike. Every track is triangulated from all its observations
-with one robust loss, for the cameras as given and after a projective bundle adjustment with that loss. An
-observation is right if either set of cameras explains it, so rejecting observations gains nothing.
+Our cameras and the published ones are measured in the same way. Every track is triangulated from all its
+observations with one robust loss, for the cameras as given and after a projective bundle adjustment with that
+loss. An observation is right if either set of cameras explains it, so rejecting observations gains nothing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Growth of time and memory with the number of images, beside COLMAP on the same images and pairs.
+"""Growth of time and memory with the number of images, compared with COLMAP on the same images and pairs.
 
 The first n images of a long walk become metric cameras: around the courtyard, where each image overlaps with
 ever more others, or along a street, where it overlaps with a few. Exponents are slopes of lines fitted to the
@@ -110,7 +110,7 @@ def measure_cost(
 ) -> dict[str, Any]:
     """Reconstruct in this process, its kernels loaded before; return the fields of :class:`Cost`.
 
-    The matched pairs are listed in ``pairs-COUNT.txt`` beside the images.
+    The matched pairs are listed in ``pairs-COUNT.txt`` in the folder of the images.
     """
     paths = sorted(Path(images).glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:

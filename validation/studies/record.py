@@ -206,7 +206,7 @@ def summary_differences(a: dict[str, float], b: dict[str, float]) -> list[str]:
     if only:
         values = sorted(a[k] for k in only if k in a) == sorted(b[k] for k in only if k in b)
         if not values:
-            lines.append(f"{len(only)} numbers stand in one record only, as {only[:3]}")
+            lines.append(f"{len(only)} numbers are in one record only, such as {only[:3]}")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Rectification of every accepted pair of real images (reconstructed once in OUT) beside OpenCV."""
+"""Rectification of every accepted pair of real images (reconstructed once in OUT), compared with OpenCV."""
 
 from __future__ import annotations
 

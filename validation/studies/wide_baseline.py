@@ -1,7 +1,7 @@
-"""Wide steps between two images: which front ends find the right matches, and up to which step.
+"""Wide baselines: which front ends find the right matches, and up to which difference of the views.
 
-``warped``: photographs and views of their prints (roll, scale, obliqueness, exposure), ``rendered``: a yard
-seen from two known poses. A pair is found if it is accepted and its F is right: the median distance of the
+``warped``: images and warped views of them (roll, scale, obliqueness, exposure), ``rendered``: a yard from
+two known poses. A pair is found if it is accepted and its F is right: the median distance of the
 true correspondences to its epipolar lines is below ``RIGHT_REL`` of the long side; accepted with another F
 it is wrong.
 """
