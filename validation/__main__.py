@@ -10,7 +10,7 @@ from thesisrecon.runtime._signals import install_signal_handlers, with_resume_ad
 def main() -> int:
     """Run the command; its modules are imported after the signal handlers are set."""
     install_signal_handlers("validation")
-    if sys.argv[1:2] == ["study"]:
+    if sys.argv[1:2] == ["study"] and sys.argv[2:3] != ["all"]:
         # A study needs neither the stages nor the ablation.
         from validation.runs.study import run_studies
 

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+import traceback
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from thesisrecon.errors import StageFailure, counted
@@ -21,6 +24,7 @@ from validation.runs.records import ReportOptions
 from validation.runs.report import run_tasks
 from validation.runs.results import Results, collect, read_results, write_results
 from validation.runs.scenes import load_images
+from validation.runs.study import MODULES, OF_PAGES, report_progress, run_studies, run_study
 from validation.stages import STAGES, available_scenes
 
 MIN_SIDE_PX = 64
@@ -29,9 +33,14 @@ MIN_SIDE_PX = 64
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; exit code 0: success, 1: a missed gate or bound, 2: a wrong option."""
-    parsed = _parser().parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["study"] and given[1:2] != ["all"]:
+        return run_studies(given[1:])
+    parsed = _parser().parse_args(given)
     if parsed.command == "ablate":
         return ablation.run_command(parsed)
+    if parsed.command == "study":
+        return run_all(parsed.out)
     try:
         options = _report_options(parsed)
         gates = read_gates()
@@ -80,7 +89,11 @@ def _parser() -> argparse.ArgumentParser:
             "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps (default: small)"
         )
     ablation.add_parser(commands)
-    commands.add_parser("study", help="Run one study; --list shows them.", add_help=False)
+    # One study has its own parser.
+    help_text = "Run one study, or all; --list shows them."
+    study = commands.add_parser("study", help=help_text, description=run_all.__doc__)
+    study.add_argument("name", choices=["all"], help="all: every study, ablation and the report")
+    study.add_argument("-o", "--out", type=Path, required=True, help="folder for the tables")
     return parser
 
 
@@ -144,3 +157,28 @@ def _print_gates(results: Results) -> None:
     for key in results.missing:
         why = [words for task, words in results.failures.items() if task.split("/")[:2] == key.split("/")[:2]]
         print(f"missed   {key}: no method reported this number{''.join(f' ({words})' for words in why[:1])}")
+
+
+def run_all(out: Path) -> int:
+    """Make every table of the documentation, each in its own folder: all studies with the options of
+    the pages, all ablations, and the report. One that ends with an error does not end the others; the exit
+    code is the largest."""
+    runs: dict[str, Callable[[], int]] = {}
+    for name in MODULES:
+        for number, options in enumerate(OF_PAGES.get(name, [[]])):
+            folder = out / (f"{name}-{number + 1}" if number else name)
+            words = f"study {name} {' '.join(options)}".rstrip()
+            runs[words] = partial(run_study, name, ["-o", str(folder), *options])
+    for path in sorted(ablation.STUDIES.glob("*.toml")):
+        runs[f"ablation {path.stem}"] = partial(main, ["ablate", path.stem, "-o", str(out / path.stem)])
+    runs["report"] = partial(main, ["report", "-o", str(out / "report")])
+    largest = 0
+    for words, run in runs.items():
+        report_progress(words)
+        try:
+            code = run()
+        except Exception:
+            traceback.print_exc()
+            code = 1
+        largest = max(largest, code)
+    return largest

@@ -262,7 +262,7 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
     monkeypatch.setitem(OF_PAGES, "toy", [[], ["--numbers", "7"]])
     others = []
     monkeypatch.setattr(command, "main", lambda arguments: others.append(arguments) or 0)
-    assert run_studies(["all", "-o", str(tmp_path / "all")]) == 0
+    assert command.run_all(tmp_path / "all") == 0
     assert sorted(path.name for path in (tmp_path / "all").iterdir()) == ["toy", "toy-2"]
     text = (tmp_path / "all" / "toy" / "toy.md").read_text()
     assert re.match(r"Commit \S+; .* cores, .*; Python [\d.]+\.\n\n3 a\n", text)
@@ -282,7 +282,7 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
     monkeypatch.setitem(OF_PAGES, "toy", [[]])
     for code in (2, 1):
         others.clear()
-        assert run_studies(["all", "-o", str(tmp_path / f"failing-{code}")]) == code
+        assert command.run_all(tmp_path / f"failing-{code}") == code
         assert others[-1][0] == "report"
 
 

@@ -16,11 +16,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._files import printable
 from thesisrecon.runtime._signals import CODES, with_resume_advice
-from validation.ablation.analysis import analyse
+from validation.ablation.analysis import analyse, failures_of
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import Plan, plan_study
 from validation.ablation.run import ProgressCallback, Rows, State, ablate, parts_of, read_rows
-from validation.ablation.tables import failures_of
 from validation.ablation.toml import read_study
 
 KEPT = "run the same command to continue from the finished rows in {}"

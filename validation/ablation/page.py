@@ -11,10 +11,18 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.io._outputs import join_claim
-from validation.ablation.analysis import Analysis, Cell, Comparison, as_reported
+from validation.ablation.analysis import (
+    Analysis,
+    Cell,
+    Comparison,
+    as_reported,
+    comparison_text,
+    failures_of,
+    mean_text,
+)
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
-from validation.ablation.tables import comparison_text, failures_of, mean_text, write_tables
+from validation.ablation.tables import write_tables
 from validation.runs.page import plot_at, write_page
 from validation.runs.records import Plot, slug
 from validation.runs.rows import plot, scatter

@@ -16,12 +16,10 @@ import inspect
 import os
 import sys
 import tempfile
-import traceback
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -120,8 +118,7 @@ def run_studies(arguments: Sequence[str]) -> int:
     """Run the study that the command line names and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m validation study", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    known = [*MODULES, "all"]
-    parser.add_argument("name", nargs="?", choices=known, metavar="NAME", help="name of the study, or all")
+    parser.add_argument("name", nargs="?", choices=list(MODULES), metavar="NAME", help="name of the study")
     parser.add_argument("--list", action="store_true", help="list the studies and exit")
     names = [name.replace("_", "-") for name in arguments[:1]]
     options = parser.parse_args([FORMER.get(name, name) for name in names])
@@ -131,10 +128,6 @@ def run_studies(arguments: Sequence[str]) -> int:
         return 0
     if options.name is None:
         parser.error("name a study; --list shows them")
-    if options.name == "all":
-        parser = argparse.ArgumentParser(prog="python -m validation study all", description=run_all.__doc__)
-        parser.add_argument("-o", "--out", type=Path, required=True, help="folder for the tables")
-        return run_all(parser.parse_args(list(arguments[1:])).out)
     return run_study(options.name, arguments[1:])
 
 
@@ -170,34 +163,6 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
         print(f"study {name}: the images are not on this machine (THESISRECON_DATA)", file=sys.stderr)
         return 2
     return int(any(row.verdict == "missed" for row in metrics))
-
-
-def run_all(out: Path) -> int:
-    """Make every table of the documentation, each in its own folder: all studies with the options of
-    the pages, all ablations, and the report. One that ends with an error does not end the others; the exit
-    code is the largest."""
-    from validation.ablation.command import STUDIES
-    from validation.command import main
-
-    runs: dict[str, Callable[[], int]] = {}
-    for name in MODULES:
-        for number, options in enumerate(OF_PAGES.get(name, [[]])):
-            folder = out / (f"{name}-{number + 1}" if number else name)
-            words = f"study {name} {' '.join(options)}".rstrip()
-            runs[words] = partial(run_study, name, ["-o", str(folder), *options])
-    for path in sorted(STUDIES.glob("*.toml")):
-        runs[f"ablation {path.stem}"] = partial(main, ["ablate", path.stem, "-o", str(out / path.stem)])
-    runs["report"] = partial(main, ["report", "-o", str(out / "report")])
-    largest = 0
-    for words, run in runs.items():
-        report_progress(words)
-        try:
-            code = run()
-        except Exception:
-            traceback.print_exc()
-            code = 1
-        largest = max(largest, code)
-    return largest
 
 
 def load_study(name: str) -> StudyFunction:
