@@ -21,6 +21,9 @@ REAL_SCENES = {
     "Herz-Jesus-P8": "strecha/Herz-Jesus-P8",
     "kermit": "kermit",
 }
+TURNTABLE_SCENES = {"temple": "truth/temple", "lego": "truth/lego"}
+"""Larger sets with truth, which only some studies use."""
+FOLDERS = REAL_SCENES | TURNTABLE_SCENES
 SHIFTED = "Cones9"
 """Nine views of the Middlebury Cones, by a camera that moves without rotation."""
 SUFFIXES = {".jpg", ".jpeg", ".png"}
@@ -95,19 +98,19 @@ def with_truth(scene: Scene, model: Path, *, complete: bool = True) -> Scene:
 
 
 def real_folder(name: str) -> Path | None:
-    """Return the folder of one of ``REAL_SCENES``, or None if missing.
+    """Return the folder of one of ``FOLDERS``, or None if missing.
 
     Raises ``ValueError`` for a name that is none of them.
     """
-    if name not in REAL_SCENES:
-        raise ValueError(f"a real scene is one of {sorted(REAL_SCENES)}; got {name!r}")
+    if name not in FOLDERS:
+        raise ValueError(f"a real scene is one of {sorted(FOLDERS)}; got {name!r}")
     root = data_root()
-    folder = None if root is None else root / REAL_SCENES[name]
+    folder = None if root is None else root / FOLDERS[name]
     return folder if folder is not None and folder.is_dir() else None
 
 
 def load_real_scene(name: str) -> Scene | None:
-    """One of ``REAL_SCENES``, or None; as :func:`real_folder`."""
+    """Load one of ``FOLDERS``, or return None; as :func:`real_folder`."""
     folder = real_folder(name)
     return None if folder is None else read_scene(folder, name)
 
@@ -119,7 +122,7 @@ def load_fixture_scene(name: str = "courtyard") -> Scene:
 
 def load_scene(name: str) -> Scene | None:
     """Load a fixture, a real scene or the shifted views; None if its images are not on this machine."""
-    if name in REAL_SCENES:
+    if name in FOLDERS:
         return load_real_scene(name)
     if name != SHIFTED:
         return load_fixture_scene(name)

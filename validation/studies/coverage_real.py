@@ -19,17 +19,12 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.runtime._run import stream
 from validation.metrics.intervals import interval_scores, pose_scores
-from validation.runs.study import Part, report_progress
+from validation.runs.study import Part
 from validation.runs.tables import Rows, text_table
-from validation.scenes.real import Scene, data_root, read_scene
+from validation.scenes.real import Scene, scenes_here
 from validation.studies.subsets import Matched, solve, take_views
 
-SCENES = {
-    "temple": "truth/temple",
-    "lego": "truth/lego",
-    "fountain-P11": "strecha/fountain-P11",
-    "Herz-Jesus-P8": "strecha/Herz-Jesus-P8",
-}
+SCENES = ("temple", "lego", "fountain-P11", "Herz-Jesus-P8")
 MIN_VIEWS, MAX_VIEWS, FEW = 3, 20, 8
 MIN_MATCHES = 30
 LEVELS = (1.0, 1.96, 2.576)
@@ -120,16 +115,11 @@ HEAD = ["subsets", "results", "trusted", *(f"{kind}, 68 95 99 %" for kind in KIN
 
 
 def coverage_real_study(
-    out: Path, scenes: Sequence[str] = tuple(SCENES), trials: int = 40, threads: int = 2
+    out: Path, scenes: Sequence[str] = SCENES, trials: int = 40, threads: int = 2
 ) -> Iterator[Part]:
     """Measure the coverage of the intervals on random subsets of photographs with truth."""
-    root, done = data_root(), list[Trial]()
-    for name in scenes:
-        folder = root / SCENES[name] if root is not None else None
-        if folder is None or not folder.is_dir():
-            report_progress(f"{name}: its images are not on this machine, left out")
-            continue
-        scene = read_scene(folder, name)
+    done = list[Trial]()
+    for scene in scenes_here(scenes):
         matched, K = match_truth_scene(scene, out, threads=threads)
         found = [run_trial(matched, (K, *scene.cameras[1:]), number) for number in range(trials)]
         done += [trial for trial in found if trial is not None]

@@ -20,9 +20,9 @@ import numpy as np
 from thesisrecon.errors import UsageError
 from validation.runs.study import Part, pick
 from validation.runs.tables import Rows
-from validation.scenes.real import REAL_SCENES, Scene, load_scene
+from validation.scenes.real import FOLDERS, REAL_SCENES, Scene, load_scene
 
-LAST_STAGE = {"courtyard": "model", **dict.fromkeys(REAL_SCENES, "metric")}
+LAST_STAGE = {"courtyard": "model", **dict.fromkeys(FOLDERS, "metric")}
 """Image sets and the last stage of their runs."""
 TRACKS = ("cube", "dinosaur")
 PRESETS = ("default", "thesis")
@@ -213,7 +213,7 @@ def summary_differences(a: dict[str, float], b: dict[str, float]) -> list[str]:
 def record_study(
     out: Path,
     write_to: Path | None = None,
-    sets: Sequence[str] = (*TRACKS, *LAST_STAGE),
+    sets: Sequence[str] = (*TRACKS, "courtyard", *REAL_SCENES),
     presets: Sequence[str] = PRESETS,
     compare_with: Sequence[Path] = (),
 ) -> Iterator[Part]:
