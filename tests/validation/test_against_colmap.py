@@ -82,14 +82,14 @@ def test_the_table_is_made_from_saved_results(tmp_path, monkeypatch, capsys):
     assert tables in capsys.readouterr().out
 
 
-def test_pycolmap_on_small_photographs_comes_back_in_our_types(tmp_path):
+def test_models_of_pycolmap_are_returned_in_our_types(tmp_path):
     scene = load_fixture_scene()
     images = tmp_path / "images"
     images.mkdir()
     views = slice(4, 9)
     for path in scene.image_paths[views]:
-        with Image.open(path) as photograph:
-            small = photograph.resize((photograph.width // 2, photograph.height // 2))
+        with Image.open(path) as whole:
+            small = whole.resize((whole.width // 2, whole.height // 2))
         exif = Image.Exif()
         exif[0x8769] = {0x920A: 5.0, 0xA405: 300}
         small.save(images / path.name, quality=95, exif=exif)

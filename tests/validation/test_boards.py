@@ -27,7 +27,7 @@ def test_boards_are_seen_whole_and_from_all_sides():
 
 
 @pytest.mark.parametrize("way", [RENDERED, LENS])
-def test_a_calibration_finds_the_camera_that_photographed(way):
+def test_a_calibration_finds_the_true_camera(way):
     board = make_board(way, VIEWS)
     corners = np.array([board_corners(picture, CORNERS) for picture in board_images(way, board)])
     found = calibrate_from_corners(board.X, list(corners), SIZE)

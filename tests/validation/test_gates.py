@@ -65,5 +65,5 @@ def test_every_gate_holds(gate, results):
     assert gate.holds(found[0].value), f"{found[0].value} {found[0].unit}, {gate.reason}"
 
 
-def test_every_set_of_photographs_has_its_gates():
+def test_every_image_set_has_gates():
     assert {scene_of(gate) for gate in GATES.values()} >= {*IMAGE_SCENES, *ALWAYS}

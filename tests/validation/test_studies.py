@@ -383,7 +383,7 @@ def test_a_file_of_numbers_is_not_replaced(tmp_path, capsys):
     assert (tmp_path / "x.json").read_bytes() == b"of the user"
 
 
-def test_subsets_of_photographs_are_connected_by_verified_matches():
+def test_subsets_of_images_are_connected_by_verified_matches():
     pairs = [SimpleNamespace(i=i, j=i + 1, accepted=i != 3, inliers=100) for i in range(7)]
     matched = Matched("row", None, pairs, np.full((8, 2), 100), np.ones(8))
     for seed in range(20):

@@ -39,11 +39,11 @@ def test_a_depth_that_is_too_far_is_measured():
     assert align.scale == pytest.approx(2.0)
     truth = depth.true_depth(scene, 5)
     one = depth.judge_against_truth(maps[5], truth, align.scale)
-    told = depth.together([one])
-    assert told.median == pytest.approx(0.002, rel=0.05)
-    assert told.right == pytest.approx(told.known)
-    assert told.known > 0.99
-    assert told.deviations == pytest.approx(0.002 * np.nanmedian(truth[0]) / 0.02 / 0.6745, rel=0.2)
+    measured = depth.together([one])
+    assert measured.median == pytest.approx(0.002, rel=0.05)
+    assert measured.right == pytest.approx(measured.known)
+    assert measured.known > 0.99
+    assert measured.deviations == pytest.approx(0.002 * np.nanmedian(truth[0]) / 0.02 / 0.6745, rel=0.2)
     far = depth.judge_against_truth(replace(maps[5], depth=maps[5].depth * 1.02), truth, align.scale)
     assert far.right == pytest.approx(0.0, abs=0.01)
     with pytest.raises(ValueError, match="no depth map"):
@@ -103,7 +103,7 @@ def test_ours_is_held_against_the_grid_of_open3d():
     assert rows["accuracy, mean"].values["missing"] is None
 
 
-def test_a_photograph_is_left_out(tmp_path):
+def test_an_image_is_left_out(tmp_path):
     maps = {m.view: m for m in ring_of(12)}
     views = {i: photograph(m, 0.9 if i % 2 else 1.1) for i, m in maps.items()}
     others = [i for i in maps if i != 3]

@@ -82,8 +82,8 @@ def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
 
 
 def test_an_unreported_metric_is_named(tmp_path):
-    knowledge = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
-    rows = ablate(knowledge, tmp_path, executor="local")
+    planned = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
+    rows = ablate(planned, tmp_path, executor="local")
     assert {r.failure for r in rows} == {"the task returned no wieght"}
     assert rows[1].metrics["size"] == 800.0
     assert "no row has the metric wieght" in analyse(rows).warnings
@@ -106,41 +106,41 @@ def test_common_first_stages_of_rows_are_computed_once(tmp_path):
 
 
 def test_the_same_rows_from_any_executor(tmp_path):
-    knowledge = study(tmp_path / "log", scenes=["a"], seeds=1)
+    planned = study(tmp_path / "log", scenes=["a"], seeds=1)
     here, there = (
-        [(r.key, r.metrics) for r in ablate(knowledge, tmp_path / kind, executor=kind, threads=1)]
+        [(r.key, r.metrics) for r in ablate(planned, tmp_path / kind, executor=kind, threads=1)]
         for kind in ("local", "processes")
     )
     assert here == there
 
 
 def test_a_wrong_executor_or_folder_is_reported(tmp_path):
-    knowledge = study(tmp_path / "log", seeds=1)
+    planned = study(tmp_path / "log", seeds=1)
     with pytest.raises(UsageError, match="unknown executor 'prozesses'; did you mean processes"):
-        ablate(knowledge, tmp_path / "out", executor="prozesses")
+        ablate(planned, tmp_path / "out", executor="prozesses")
     with pytest.raises(UsageError, match="threads must be at least 1"):
-        ablate(knowledge, tmp_path / "out", threads=0)
+        ablate(planned, tmp_path / "out", threads=0)
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(UsageError, match="cannot be written"):
-        ablate(knowledge, tmp_path / "file" / "out", executor="local")
+        ablate(planned, tmp_path / "file" / "out", executor="local")
 
 
 @dataclass(frozen=True)
 class Deadly(Darts):
     """Kills its process where the aim is 2."""
 
-    def run(self, *knowledge):
+    def run(self, *given):
         if self.aim == 2.0:
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().run(*knowledge)
+        return super().run(*given)
 
 
 def test_a_row_that_kills_its_process_is_lost_alone_and_tried_again_next_time(tmp_path):
-    knowledge = study(tmp_path / "log", scenes=["a"], seeds=1, task=Deadly(log=str(tmp_path / "log")))
-    rows = ablate(knowledge, tmp_path / "out", executor="processes", threads=2)
+    planned = study(tmp_path / "log", scenes=["a"], seeds=1, task=Deadly(log=str(tmp_path / "log")))
+    rows = ablate(planned, tmp_path / "out", executor="processes", threads=2)
     assert [bool(r.failure) for r in rows] == [False, False, True]
     assert "was killed or ran out of memory" in rows[2].failure
-    assert len(read_rows(knowledge, tmp_path / "out")) == 2
+    assert len(read_rows(planned, tmp_path / "out")) == 2
 
 
 KILLED = """

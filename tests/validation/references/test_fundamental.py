@@ -11,7 +11,7 @@ skip_without("cv2", "pycolmap", "poselib")
 
 
 @pytest.mark.parametrize("method", SOLVERS)
-def test_lines_in_the_second_photograph_are_f_times_points_of_the_first(method, looked):
+def test_lines_in_the_second_image_are_f_times_points_of_the_first(method, looked):
     xy1, xy2 = looked.xy
     F = estimate_with(method, xy1, xy2, threshold_px=1.0, seed=0).F
     assert F is not None

@@ -164,7 +164,7 @@ def drawn_apart(mesh, camera, folder):
     pytest.skip(f"Open3D cannot draw here: {reason}")
 
 
-def test_its_own_pictures_agree_with_ours(tmp_path):
+def test_images_rendered_by_open3d_agree_with_ours(tmp_path):
     maps = ring_of()
     mesh = open3d_geometry.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
     camera = Camera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).scaled(2)

@@ -77,7 +77,7 @@ def test_images_move_the_way_their_maps_say():
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("widened", [False, True])
-def test_a_disparity_is_how_far_left_the_right_photograph_has_it_in_pixels(mode, widened):
+def test_a_disparity_is_the_shift_to_the_left_in_the_right_image(mode, widened):
     left = np.random.default_rng(0).integers(0, 256, (48, 160, 3)).astype(np.uint8)
     right = np.roll(left, -7, axis=1)
     found = OpenCVSemiGlobal(mode, widened=widened).match(left, right, 32)
