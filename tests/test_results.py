@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import thesisrecon
-from tests.conftest import same_pairs
+from tests.conftest import refuses, same_pairs
 from tests.pipeline.given_scene import SIZE, given_scene
 from thesisrecon.api.models import read_cameras
 from thesisrecon.errors import UsageError
@@ -51,8 +51,7 @@ def test_unknown_images_are_named(run):
         result.cameras["other"]
     with pytest.raises(KeyError, match="there is no image 9; 5 were read"):
         result.cameras[9]
-    with pytest.raises(KeyError, match="there is no image 7"):
-        result.observations(7)
+    refuses(KeyError, "there is no image 7", result.observations, 7)
 
 
 def test_a_finished_folder_is_read_back(run):
@@ -113,8 +112,7 @@ def test_results_of_one_folder_stay_apart_and_outlive_it(run, tmp_path):
 
 
 def test_a_folder_without_a_finished_run_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="no run has finished in this folder"):
-        thesisrecon.load(tmp_path)
+    refuses(UsageError, "no run has finished in this folder", thesisrecon.load, tmp_path)
 
 
 def test_cameras_of_an_earlier_stage_are_refused_with_the_reason(run, tmp_path):

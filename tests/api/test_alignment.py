@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refuses
 from thesisrecon import Camera, UsageError, align_to_positions, scaled
 from thesisrecon.sparse_model import SparseModel, SparseView
 
@@ -106,5 +107,4 @@ def test_a_known_distance_gives_the_scale():
         (("1.jpg", "2.jpg"), 0.0, "got 0"),
         (("1.jpg", "2.jpg"), np.nan, "got nan"),
     ]:
-        with pytest.raises(UsageError, match=words):
-            scaled(model, *names, distance)
+        refuses(UsageError, words, scaled, model, *names, distance)

@@ -11,6 +11,7 @@ import PIL.Image
 import pytest
 
 import thesisrecon
+from tests.conftest import refuses
 from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon import (
     Camera,
@@ -143,8 +144,7 @@ def test_observations_are_in_the_pixels_of_the_reduced_images(monkeypatch, walle
     xy[~((xy >= 0.0) & (xy <= np.array(SIZE) - 1.0)).all(axis=2)] = np.nan
     arrays = (np.stack([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t"))
     given = Reconstruction.from_cameras(*arrays, sizes=SIZE, X=X, xy=xy)
-    with pytest.raises(StageFailure, match="seen"):
-        depth_maps([image.rgb for image in walled.images], given, max_size=120)
+    refuses(StageFailure, "seen", depth_maps, [image.rgb for image in walled.images], given, max_size=120)
     (reduced,) = seen
     tracks = reduced.tracks
     assert len(tracks.xy) > 100
@@ -193,8 +193,7 @@ def test_images_with_cameras_of_a_colmap_model_are_used_as_stored(tmp_path, monk
         texture(mesh, tmp_path / "images", cameras)
         np.testing.assert_array_equal(given.pop().rgb, expected)
     turned = {"a.png": of_colmap["a.png"].scaled(0.5)}
-    with pytest.raises(ValueError, match="without EXIF rotation, as in COLMAP"):
-        texture(mesh, tmp_path / "images", turned)
+    refuses(ValueError, "without EXIF rotation, as in COLMAP", texture, mesh, tmp_path / "images", turned)
 
 
 def test_the_example_makes_a_glb_of_the_courtyard(tmp_path, monkeypatch):
@@ -242,17 +241,13 @@ def test_wrong_input_gets_one_sentence(walled, tmp_path):
         (lambda: fuse_depth_maps([np.ones((180, 240))]), "needs the cameras"),
         (lambda: fuse_depth_maps([np.ones((100, 240))], cameras[:1]), "needs a camera of its shape"),
     ):
-        with pytest.raises(ValueError, match=words):
-            call()
+        refuses(ValueError, words, call)
     away = [
         Camera(c.K, np.diag([-1.0, 1, -1]) @ c.R if i % 2 else c.R, c.t, SIZE)
         for i, c in enumerate(cameras[:2])
     ]
-    with pytest.raises(StageFailure, match="no depth was found"):
-        depth_maps(images[:2], away)
-    with pytest.raises(StageFailure, match="no depths"):
-        fuse_depth_maps([np.full((180, 240), np.nan)], cameras[:1])
-    with pytest.raises(UsageError, match="needs a TexturedMesh; got a NoneType"):
-        write_mesh(tmp_path / "model.glb", None)
+    refuses(StageFailure, "no depth was found", depth_maps, images[:2], away)
+    refuses(StageFailure, "no depths", fuse_depth_maps, [np.full((180, 240), np.nan)], cameras[:1])
+    refuses(UsageError, "needs a TexturedMesh; got a NoneType", write_mesh, tmp_path / "model.glb", None)
     with pytest.raises(UsageError, match=r"ending \.glb"):
         write_mesh(tmp_path / "model.ply", fuse_depth_maps([np.ones((180, 240))], cameras[:1]))

@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import thesisrecon.api.export as export_module
+from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from thesisrecon import Camera, UsageError, export, reconstruct
 from thesisrecon.cli.main import run_command
@@ -423,8 +424,7 @@ def test_a_result_is_exported_with_or_without_its_folder(tmp_path, kept):
         assert size == result.cameras[name].size
         expected = result.cameras[name].project(result.points)
         np.testing.assert_allclose(project(result.points), expected, atol=1e-6, rtol=0)
-    with pytest.raises(UsageError, match="give it with --images"):
-        export(result, tmp_path / "out", to="nerfstudio")
+    refuses(UsageError, "give it with --images", export, result, tmp_path / "out", to="nerfstudio")
 
 
 @pytest.mark.references
@@ -462,10 +462,8 @@ def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
         (replace(model, views=[]), "opencv", None, "no camera"),
     ]
     for bad, to, source, words in cases:
-        with pytest.raises(UsageError, match=words):
-            export(bad, tmp_path / "out", to=to, images=source)
-    with pytest.raises(UsageError, match="holds a run"):
-        export(model, tmp_path / "run", to="opencv")
+        refuses(UsageError, words, export, bad, tmp_path / "out", to=to, images=source)
+    refuses(UsageError, "holds a run", export, model, tmp_path / "run", to="opencv")
 
 
 def test_an_export_does_not_replace_its_input(tmp_path, images):
@@ -476,8 +474,7 @@ def test_an_export_does_not_replace_its_input(tmp_path, images):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
     def refused(source, to, **given):
-        with pytest.raises(UsageError, match="would replace the originals"):
-            export(source, tmp_path, to=to, **given)
+        refuses(UsageError, "would replace the originals", export, source, tmp_path, to=to, **given)
 
     refused(model, "nerfstudio", images=images, masks=tmp_path / "masks")
     for source in ("", "sparse", "sparse/0"):

@@ -16,7 +16,6 @@ from tests.synthetic import texture
 from thesisrecon.api import views as between
 from thesisrecon.cli import view_files as sequences
 from thesisrecon.cli.main import run_command
-from thesisrecon.cli.view_files import interpolate_images
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
@@ -273,9 +272,3 @@ def test_bad_input_of_the_command_gets_one_sentence(arguments, words, code, tmp_
     out = tmp_path / "out"
     assert words in refused(["interpolate", *placed, "-o", out], code)
     assert not out.exists()
-
-
-def test_a_folder_of_other_files_is_refused(tmp_path):
-    photographs = (COURTYARD / "0004.jpg", COURTYARD / "0005.jpg")
-    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    refuses(UsageError, "which this command did not create", interpolate_images, tmp_path, photographs)

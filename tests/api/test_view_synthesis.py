@@ -119,7 +119,3 @@ def test_films_are_of_two_different_photographs(found):
     with pytest.raises(UsageError, match="2 images; got 3"):
         trilinear_sequence((first, second, first), 5, config=SMALL, seed=0)
     refuses(UsageError, "the same image", trilinear_sequence, (first, first), 5, config=SMALL, seed=0)
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    refuses(UsageError, "there is no image file", match_images, tmp_path / "none.png", tmp_path / "none.png")

@@ -64,54 +64,6 @@ def test_too_few_images(copies, words, found, folder, reconstruct):
     assert found.items() <= summary.items()
 
 
-def test_damaged_files_among_good_ones(folder, reconstruct):
-    """A text named .jpg and a truncated JPEG are refused with their reasons; the others go on to cameras."""
-    for path in courtyard(4):
-        shutil.copy(path, folder / f"good {path.name}")
-    (folder / "letter.jpg").write_text("dear reader")
-    whole = courtyard(6)[5].read_bytes()
-    (folder / "cut off.jpg").write_bytes(whole[: len(whole) // 2])
-    _, summary = reconstruct()
-    assert summary["registered"] == 4
-    reasons = {entry["name"]: entry["reason"] for entry in summary["refused"]}
-    assert "not an image" in reasons["letter.jpg"]
-    assert "truncated" in reasons["cut off.jpg"]
-    page = (folder.parent / "out" / "report.html").read_text(encoding="utf-8")
-    assert "letter.jpg" in page
-
-
-def test_every_kind_of_pixel_in_one_scene(folder, reconstruct):
-    """16-bit, grey, RGBA and CMYK images, an EXIF rotation, spaces and letters beyond ASCII: all become
-    cameras.
-    """
-    grey = np.asarray(picture(0).convert("L")).astype(np.uint16) * 257
-    PIL.Image.fromarray(grey).save(folder / "a sixteen bits.png")
-    picture(1).convert("L").save(folder / "b größe.png")
-    picture(2).convert("RGBA").save(folder / "c 写真.png")
-    picture(3).convert("CMYK").save(folder / "d.tif")
-    exif = PIL.Image.Exif()
-    exif[0x0112] = 6
-    picture(4).transpose(PIL.Image.Transpose.ROTATE_90).save(folder / "e.jpg", exif=exif, quality=95)
-    _, summary = reconstruct()
-    cameras = {camera["name"]: camera for camera in summary["cameras"]}
-    assert list(cameras) == ["a sixteen bits.png", "b größe.png", "c 写真.png", "d.tif", "e.jpg"]
-    assert all(camera["registered"] for camera in cameras.values())
-    assert cameras["e.jpg"]["width_px"] == picture(4).size[0]
-    assert {camera["camera"] for camera in cameras.values()} == {0}
-
-
-def test_mixed_sizes_are_different_cameras(folder, reconstruct):
-    for k in range(4):
-        scale = 0.75 if k % 2 else 1.0
-        image = picture(k)
-        image.resize((int(image.size[0] * scale), int(image.size[1] * scale))).save(folder / f"{k}.png")
-    _, summary = reconstruct()
-    assert summary["registered"] == 4
-    focals = [c["focal_px"]["value"] / c["width_px"] for c in summary["cameras"]]
-    assert [c["camera"] for c in summary["cameras"]] == [0, 1, 0, 1]
-    assert np.ptp(focals) < 0.1 * np.mean(focals)
-
-
 def test_images_without_common_corners(folder, reconstruct):
     """Noise, and a soft gradient that passes for a photograph but has no corner to match."""
     rng, ramp = np.random.default_rng(0), np.linspace(0, 255, 400)[None, :] * np.ones((300, 1))

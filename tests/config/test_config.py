@@ -27,8 +27,6 @@ from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEs
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.stratified import Stratified
-from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.fusion import DepthSheets
 
 
 def apply_settings(*settings):
@@ -233,14 +231,6 @@ def test_toml_keeps_awkward_text():
         }
     }
     assert tomllib.loads("\n".join(_toml_lines(tables, ()))) == tables
-
-
-def test_surface_and_fusion_are_chosen_by_their_words():
-    assert apply_settings("model.surface=b-spline-surface").model.surface == BSplineSurface()
-    config = apply_settings("model.surface.kind=b-spline-surface", "model.surface.knot_px=6")
-    assert config.model.surface == BSplineSurface(knot_px=6)
-    assert apply_settings("model.fusion=depth-sheets").model.fusion == DepthSheets()
-    refuses(UsageError, "linear-surface", apply_settings, "model.surface=linear")
 
 
 SIZES = [(4000, 3000), (4000, 3000), (3000, 4000)]

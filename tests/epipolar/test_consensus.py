@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare, norm
 
+from tests.conftest import refuses
 from thesisrecon.epipolar._noise import (
     TAIL,
     NoiseMixture,
@@ -67,8 +68,7 @@ def test_noise_scale_finds_sigma_and_bears_outliers(sigma, seed):
 def test_noise_scale_has_the_small_sample_factor_and_refuses_too_few_residuals():
     assert noise_scale(np.ones(12), parameters=7) == pytest.approx(2 * 1.4826022)
     for residuals in (np.ones(7), np.array([np.nan] * 9)):
-        with pytest.raises(ValueError, match="noise_scale"):
-            noise_scale(residuals, parameters=7)
+        refuses(ValueError, "noise_scale", noise_scale, residuals, parameters=7)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.conftest import refuses
 from tests.epipolar.pairs import make_pair
 from thesisrecon.api.pairs import epipolar_lines
 from thesisrecon.epipolar.configuration import Configuration
@@ -105,5 +106,4 @@ def test_distances_and_epipoles_move_as_their_derivatives_say():
 def test_wrong_calls():
     pair = make_pair(20, np.random.default_rng(0))
     X = np.random.default_rng(1).uniform((-1.0, -1.0, 4.0), (1.0, 1.0, 6.0), (20, 3))
-    with pytest.raises(ValueError, match="different centres"):
-        fundamental_bound(pair.P1, pair.P1, X, sigma_px=1.0)
+    refuses(ValueError, "different centres", fundamental_bound, pair.P1, pair.P1, X, sigma_px=1.0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import thesisrecon
+from tests.conftest import refuses
 from tests.geometry.properties import holds_for_every, incidence_sine, random_camera, random_points
 from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -15,8 +16,7 @@ def test_3_16_and_3_17_the_calibration_matrix_takes_image_to_pixel_coordinates(r
     x, y = rng.normal(size=2)
     K = matrix.calibration_matrix(f_u, f_v, u_0, v_0, skew=s)
     np.testing.assert_allclose(K @ [x, y, 1.0], [f_u * x + s * y + u_0, f_v * y + v_0, 1.0])
-    with pytest.raises(ValueError, match="positive focals"):
-        matrix.calibration_matrix(-f_u, f_v, u_0, v_0)
+    refuses(ValueError, "positive focals", matrix.calibration_matrix, -f_u, f_v, u_0, v_0)
 
 
 @holds_for_every()
@@ -82,8 +82,7 @@ def test_3_5_1_cameras_at_infinity_cannot_be_normalised():
     _, R = matrix.rq(np.diag([2.0, 1.0, 0.0]))
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     for refuse in (matrix.normalize_camera, matrix.decompose_camera):
-        with pytest.raises(ValueError, match="finite"):
-            refuse(np.full((3, 4), np.nan))
+        refuses(ValueError, "finite", refuse, np.full((3, 4), np.nan))
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e-4, 1.0, 1e6])

@@ -151,22 +151,6 @@ def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
     np.testing.assert_allclose(cameras["a.jpg"].centre, ONE["centre"])
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ({"cameras": []}, "holds no camera"),
-        ({"cameras": [{**ONE, "K": [[1.0, 0], [0, 1.0]]}]}, "does not hold cameras; it must list"),
-        ({"cameras": [{**ONE, "t": [None, 0, 0]}]}, "does not hold cameras"),
-        ({"cameras": [{"name": "a.jpg"}]}, "does not hold cameras"),
-        ({"cameras": {"0000.jpg": {}}}, "does not hold cameras"),
-        ([], "does not hold cameras"),
-        ("text", "does not hold cameras"),
-    ],
-)
-def test_other_files_are_rejected(content, words, tmp_path):
-    refuses(UsageError, words, read_cameras, written(tmp_path, content))
-
-
 def test_an_absent_or_damaged_file_is_reported(tmp_path):
     refuses(UsageError, r"there is no cameras\.json", read_cameras, tmp_path / "cameras.json")
     (tmp_path / "cameras.json").write_text("{", encoding="utf-8")

@@ -69,14 +69,6 @@ def test_deep_grey_keeps_its_contrast(tmp_path, bits):
     assert np.abs(image.rgb[..., 0] - expected).max() <= 1
 
 
-def test_transparent_pixels_become_grey(tmp_path):
-    rgba = np.dstack([picture(), np.full((80, 96), 255, np.uint8)])
-    rgba[:40, :, 3] = 0
-    image = read_one(save(tmp_path / "a.png", rgba))
-    assert (image.rgb[:40] == 128).all()
-    np.testing.assert_array_equal(image.rgb[40:], picture()[40:])
-
-
 def test_equal_names_are_numbered(tmp_path):
     path = save(tmp_path / "frame", picture(3), format="PNG")
     records = [Image("frame", picture(n), (96, 80)) for n in range(2)] + [

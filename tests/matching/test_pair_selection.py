@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from tests.conftest import refuses
 from tests.synthetic import one_by_one, photograph, texture
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
@@ -113,8 +114,7 @@ def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
     ],
 )
 def test_meaningless_options_are_rejected(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
+    refuses(ValueError, words, make)
 
 
 # ---------------------------------------------------------------- the estimate of the overlap

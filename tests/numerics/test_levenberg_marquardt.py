@@ -5,6 +5,7 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from thesisrecon.numerics._levenberg_marquardt import invert_information, minimize_residuals
 from thesisrecon.numerics._noise import best_huber_width, effective_noise, huber, soft_l1
 from thesisrecon.numerics._observations import cached_pair_order
@@ -119,10 +120,8 @@ def test_states_outside_the_domain_are_refused_not_raised():
 
     answer = minimize_residuals(residual, np.array([0.01]), max_iterations=100)
     np.testing.assert_allclose(answer.x, np.exp(2.0), rtol=1e-6)
-    with pytest.raises(ValueError, match="finite"):
-        minimize_residuals(residual, np.array([-1.0]))
-    with pytest.raises(ValueError, match="finite"):
-        minimize_residuals(lambda x: x[:1], np.array([1.0, np.nan]))
+    refuses(ValueError, "finite", minimize_residuals, residual, np.array([-1.0]))
+    refuses(ValueError, "finite", minimize_residuals, lambda x: x[:1], np.array([1.0, np.nan]))
 
 
 def test_guards_of_the_linear_algebra():

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.numerics.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -147,8 +148,7 @@ def test_degenerate_input_is_guarded():
 
 @pytest.mark.parametrize("field", ["sigma_px", "loss_px"])
 def test_options_and_observations_that_mean_nothing_are_refused(field):
-    with pytest.raises(ValueError, match="positive"):
-        BundleOptions(**{field: 0})
+    refuses(ValueError, "positive", BundleOptions, **{field: 0})
     block = make_block(views=4, points=20)
     with pytest.raises(ValueError, match="observations need"):
         _refine(block.cameras, block.X, Observations(block.view, block.point[1:], block.xy), free=FOCAL)

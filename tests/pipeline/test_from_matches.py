@@ -148,8 +148,7 @@ WRONG = {
 
 @pytest.mark.parametrize("sentence", WRONG)
 def test_wrong_input_gets_one_sentence(sentence):
-    with pytest.raises(UsageError, match=sentence):
-        reconstruct_from_matches(*WRONG[sentence])
+    refuses(UsageError, sentence, reconstruct_from_matches, *WRONG[sentence])
 
 
 def test_the_model_needs_images():
@@ -220,10 +219,8 @@ def test_a_database_gives_the_same_cameras(verified, tmp_path, from_rows):
 
 def test_other_files_are_no_database(tmp_path):
     (tmp_path / "text.db").write_text("no database")
-    with pytest.raises(UsageError, match="is not a valid COLMAP database"):
-        reconstruct_from_colmap(tmp_path / "text.db")
-    with pytest.raises(UsageError, match="there is no COLMAP database or model"):
-        reconstruct_from_colmap(tmp_path / "none.db")
+    refuses(UsageError, "is not a valid COLMAP database", reconstruct_from_colmap, tmp_path / "text.db")
+    refuses(UsageError, "there is no COLMAP database or model", reconstruct_from_colmap, tmp_path / "none.db")
 
 
 def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, capsys):

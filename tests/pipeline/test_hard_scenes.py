@@ -14,6 +14,7 @@ import PIL.Image
 import pytest
 import trimesh
 
+from tests.conftest import refuses
 from tests.pipeline.fake_stages import FakeMetric, fake_config
 from tests.stereo import hard_scenes as scenes
 from tests.stereo.depth_scenes import photograph_scene
@@ -93,8 +94,7 @@ def test_no_depths_are_one_sentence_and_the_cameras_stay(name, tmp_path):
 
 
 def test_a_requested_model_without_depths_is_a_failure(tmp_path):
-    with pytest.raises(StageFailure, match="no depth was found"):
-        run("no texture", tmp_path, until="model")
+    refuses(StageFailure, "no depth was found", run, "no texture", tmp_path, until="model")
     assert "no depth" in summary(tmp_path)["failure"]
 
 

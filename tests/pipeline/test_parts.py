@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy
 
+from tests.conftest import refuses
 from tests.matching.test_repeated_structure import pair
 from tests.matching.test_repeated_structure import street as street_pairs
 from tests.metric.test_metric_refinement import centre_error
@@ -177,8 +178,7 @@ def test_similarities_of_common_cameras_need_no_centres_off_a_line():
 
 
 def test_the_number_of_views_of_a_part_is_checked():
-    with pytest.raises(ValueError, match="part_views must be at least 0; got -1"):
-        ImageOptions(part_views=-1)
+    refuses(ValueError, "part_views must be at least 0; got -1", ImageOptions, part_views=-1)
 
 
 @pytest.mark.parametrize("order", [1, -1])

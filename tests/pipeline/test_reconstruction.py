@@ -18,7 +18,6 @@ from thesisrecon.api.reconstruct import _exif_warnings, reconstruct
 from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.cli.runs import summary_text
-from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._meshes import read_mesh
@@ -473,15 +472,6 @@ def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path):
     assert "calibrate prior=True" in CALLS
 
 
-def test_a_request_for_exif_without_exif_data_is_reported(tmp_path):
-    knowledge = IntrinsicsOptions(exif=True, focal_std_rel=0.1)
-    result = run(tmp_path, config=fake_config(intrinsics=knowledge))
-    assert "calibrate prior=False" in CALLS
-    sentence = "No EXIF focal length was found in 4 images: no focal prior is used"
-    assert sentence in result.summary["warnings"]
-    assert sentence in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize(
     ("knowledge", "focal_px", "words"),
     [
@@ -494,21 +484,6 @@ def test_a_request_for_exif_without_exif_data_is_reported(tmp_path):
 def test_only_an_ignored_option_gives_a_warning(knowledge, focal_px, words):
     warnings = _exif_warnings(knowledge, np.array(focal_px))
     assert [words in warning for warning in warnings] == ([True] if words else [])
-
-
-def test_photographs_are_reduced_to_the_size_of_the_config(tmp_path):
-    big = [np.array(i.rgb).repeat(3, 0).repeat(3, 1) for i in photographs(2)]
-    config = replace(fake_config(), images=ImageOptions(max_size_px=144), features=NamelessDetector())
-    result = reconstruct(big, tmp_path, config=config, until="features")
-    assert [image.size for image in result.images] == [(144, 120)] * 2
-    assert result.images[0].scale == 0.5
-
-
-class NamelessDetector(fakes.FakeDetector):
-    """Images given as arrays have no number in their names."""
-
-    def detect(self, image):
-        return super().detect(replace(image, name="00"))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import doctest
 import importlib
 import io
 import runpy
+import sys
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -15,18 +16,9 @@ CHECK = runpy.run_path(str(ROOT / "scripts" / "check_docstrings"))
 CHAPTERS_WITH_EXAMPLES = ("geometry", "epipolar", "selfcalibration")
 
 
-def test_most_public_functions_have_complete_docstrings():
-    public = [p for p in sorted(PACKAGE.rglob("*.py")) if not CHECK["is_internal"](p)]
-    found = {p: CHECK["problems"](p) for p in public}
-    every = [bool(faults) for names in found.values() for faults in names.values()]
-    incomplete = [
-        f"{path.relative_to(ROOT)}: {name}: {'; '.join(faults)}"
-        for path, names in found.items()
-        for name, faults in names.items()
-        if faults
-    ]
-    assert len(every) > 200
-    assert every.count(False) >= CHECK["BAR"] * len(every), incomplete
+def test_most_public_functions_have_complete_docstrings(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["check_docstrings", "--summary"])
+    assert CHECK["main"]() == 0, capsys.readouterr().out
 
 
 def test_every_exported_function_has_a_complete_docstring():

@@ -80,10 +80,6 @@ RUN_BY = {
     "start/first-reconstruction.md": (1, "project/test_site.py"),
 }
 """Page -> its blocks of Python and the tests that run all of them."""
-TABLE = re.compile(r"^\|.*\n\| ---", re.M)
-STAMP = re.compile(r"^Command: `([^`]+)`[^.]*\. Commit ([0-9a-f]{8});", re.M)
-NOT_MEASURED = {"data.md", "index.md", "validation.md"}
-"""Pages of evidence whose tables say what there is, not how large it is."""
 
 
 def test_every_block_of_python_is_run_by_a_test():
@@ -122,18 +118,6 @@ def test_the_calls_of_the_readme_fit_the_functions():
             attributes += 1
     assert len(calls) >= 15
     assert attributes >= 15
-
-
-def test_lines_of_code_fit_the_page():
-    made = {DOCS / "development" / "architecture.md", DOCS / "evidence" / "scaling.md"}
-    long = [
-        f"{path.relative_to(DOCS)}: {line}"
-        for path in PAGES
-        for _, text in CODE.findall(path.read_text("utf-8"))
-        for line in text.splitlines()
-        if len(line) > 92 and path not in made
-    ]
-    assert long == []
 
 
 def commands_of(text):
@@ -196,37 +180,6 @@ def test_all_studies_run_with_the_options_of_the_pages():
         given = words[: words.index("-o")] if "-o" in words else words
         run = [options(name, all_options) for all_options in OF_PAGES.get(name, [[]])]
         assert options(name, given) in run, (name, words)
-
-
-def sections_with_tables(text):
-    """The sections of a page that have a table, and the number of the tables."""
-    for section in re.split(r"^(?=##? )", text, flags=re.M):
-        if count := len(TABLE.findall(section)):
-            yield section, count
-
-
-@pytest.mark.parametrize("page", sorted((DOCS / "evidence").glob("*.md")), ids=lambda page: page.stem)
-def test_every_table_of_evidence_names_its_command(page):
-    for section, count in sections_with_tables(page.read_text("utf-8")):
-        title = section.partition("\n")[0]
-        if page.name in NOT_MEASURED or title in ("## Complexity", "## Rules", "## Tests"):
-            continue
-        assert STAMP.search(section), (title, count)
-
-
-def test_papers_that_pages_name_are_among_the_references():
-    listed = re.split(r"^- ", (DOCS / "reference" / "literature.md").read_text("utf-8"), flags=re.M)
-    named = {
-        (path.name, found[1], found[2])
-        for path in PAGES
-        for found in re.finditer(r"\(([A-Z]\w+)[^()]{0,50}? ((?:19|20)\d\d)\b", path.read_text("utf-8"))
-        if path.parent.name in ("theory", "recipes", "start") and path.name != "literature.md"
-    }
-    assert len(named) > 8
-    missing = {
-        (page, name, year) for page, name, year in named if not any(name in r and year in r for r in listed)
-    }
-    assert missing == set()
 
 
 def block(page, number=0):

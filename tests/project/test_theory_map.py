@@ -62,19 +62,6 @@ def test_rows_name_code_and_tests_that_exist():
         assert re.search(rf"^def {test}\(", (Path(__file__).parents[1] / file).read_text("utf-8"), re.M)
 
 
-def test_references_are_read_from_docstrings():
-    def labels(doc):
-        return [r.label for r in theory.references_of(doc)]
-
-    assert labels("Return P = K [R t] (3.18 - 3.21), table 3.1.") == [
-        *["(3.18)", "(3.19)", "(3.20)", "(3.21)"],
-        "table 3.1",
-    ]
-    assert labels("Match (4.2.2); section 5.4, (5.4); HZ 11.4 (HZ 3.2).") == ["4.2.2", "5.4", "(5.4)"]
-    assert labels("Two views (2.5). f(2.0, 3.0)\n\nExamples\n--------\n>>> f(3.4)") == ["2.5"]
-    assert labels("Only chapter 7.") == ["chapter 7"]
-
-
 @pytest.mark.parametrize("page", sorted(theory.PAGES))
 def test_a_page_has_its_table_and_names_what_exists(page):
     text = (PAGES / f"{page}.md").read_text("utf-8")

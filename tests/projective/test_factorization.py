@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.projective.test_reconstruction import residuals
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.errors import StageFailure
@@ -74,8 +75,7 @@ def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_beg
 
 
 def test_too_few_core_points_are_refused():
-    with pytest.raises(ValueError, match="core_points"):
-        Factorization(core_points=3)
+    refuses(ValueError, "core_points", Factorization, core_points=3)
 
 
 def test_points_that_disagree_are_left_out():

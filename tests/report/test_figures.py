@@ -50,13 +50,6 @@ def test_many_views_are_shown_in_blocks_of_neighbours(monkeypatch):
     assert accepted["customdata"][0][0] == inside
 
 
-def test_histogram_bars_stand_on_the_ground():
-    path = figures._histogram_path(np.array([0.5, 0.0, 1.0, 0.25]), 1.0, 40, 10)
-    assert path.count("M") == 3
-    assert path.startswith("M0.0 10.0v-5.0")
-    assert "M20.0 10.0v-10.0" in path
-
-
 def opened(uri):
     head, text = uri.split(",", 1)
     assert head == "data:image/jpeg;base64"
@@ -116,14 +109,6 @@ def test_spread_matches_are_different_and_far_apart():
     assert len(drawing._spread_matches(np.zeros((0, 2)), 12)) == 0
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3)])
-def test_odd_pictures_have_thumbnails(shape):
-    image = replace(made_up_run(points=50).images[0], rgb=np.zeros(shape, dtype=np.uint8))
-    drawn = drawing.thumbnail(image, 3)
-    assert opened(drawn.uri).size == (drawn.width, drawn.height)
-    assert drawn.width >= drawn.height >= 1
-
-
 def lightness(rgb):
     """CIE L* (...) of sRGB (..., 3)."""
     v = rgb / 255.0
@@ -165,13 +150,6 @@ def test_depth_maps_without_depth_or_relief_are_accepted(value):
     drawn = drawing.draw_depth(np.full((30, 40), value, dtype=np.float32), side=360)
     assert drawn.share == float(np.isfinite(value))
     np.testing.assert_equal((drawn.near, drawn.far), (value, value))
-
-
-def test_depth_pictures_shrink_when_there_are_many():
-    rng = np.random.default_rng(1)
-    noise = rng.uniform(1, 5, (480, 640)).astype(np.float32)  # the hardest picture for a JPEG
-    assert drawing.draw_depth(noise, side=drawing.depth_side(10)).picture.width == 360
-    assert 300 * len(drawing.draw_depth(noise, side=drawing.depth_side(300)).picture.uri) < 4_000_000
 
 
 def test_the_comparison_shows_the_differences():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
+from tests.conftest import refuses
 from tests.report import synthetic
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
@@ -257,8 +258,7 @@ def strip():
 
 def test_a_strip_has_its_notes_and_at_least_one_frame():
     assert "all is well." in strip()
-    with pytest.raises(ValueError, match="at least one"):
-        strip_page("nothing", [])
+    refuses(ValueError, "at least one", strip_page, "nothing", [])
 
 
 @pytest.mark.browser

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import LOCAL, address
+from tests.conftest import LOCAL, address, refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import fake_config, photographs
 from thesisrecon.api.reconstruct import reconstruct
@@ -309,13 +309,11 @@ def test_an_unreachable_scheduler_is_reported_on_the_command_line(monkeypatch, t
 
 
 def test_workers_of_other_code_unknown_tasks_and_invalid_executors_are_refused():
-    with pytest.raises(UsageError, match="another version of thesisrecon"):
-        workers._answer("another", b"")
+    refuses(UsageError, "another version of thesisrecon", workers._answer, "another", b"")
     missing = b"cno_such_module\nfunction\n."
     with pytest.raises(UsageError, match="cannot load its task: No module named 'no_such_module'"):
         workers._answer(workers.package_key(), missing)
-    with pytest.raises(UsageError, match="or a concurrent"):
-        Workers(1, 3)
+    refuses(UsageError, "or a concurrent", Workers, 1, 3)
 
 
 def test_an_executor_is_given_few_tasks_at_a_time():

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.pipeline.fake_stages import fake_config, photographs
-from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.runtime._executors import ProcessPool
 from thesisrecon.runtime._signals import CODES, with_resume_advice
@@ -154,21 +152,6 @@ def test_an_interrupt_carries_advice():
         with_resume_advice("go on"),
     ):
         raise KeyboardInterrupt
-
-
-def test_a_callers_own_program_is_interrupted_as_any_other(tmp_path):
-    """The library leaves signals alone: Ctrl-C is an exception there, and the run goes on afterwards."""
-
-    def interrupt(stage, done, _):
-        if (stage, done) == ("matches", 2):
-            raise KeyboardInterrupt
-
-    config = fake_config()
-    with pytest.raises(KeyboardInterrupt):
-        reconstruct(photographs(4), tmp_path / "out", config=config, progress=interrupt, until="metric")
-    reconstruct(photographs(4), tmp_path / "out", config=config, until="metric")
-    reconstruct(photographs(4), tmp_path / "whole", config=config, until="metric")
-    assert different(outputs(tmp_path / "out"), outputs(tmp_path / "whole")) == ()
 
 
 def test_the_check_names_the_fault():

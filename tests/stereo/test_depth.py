@@ -169,10 +169,8 @@ def test_views_without_a_camera_are_omitted_and_cannot_be_requested(walled):
     scene = STEREO.prepare(walled.images, reconstruction)
     assert sorted(scene.views) == [0, 1]
     assert scene.neighbours == {0: (1,), 1: (0,)}
-    with pytest.raises(ValueError, match="no camera"):
-        STEREO.depth_map(scene, 2)
-    with pytest.raises(ValueError, match="as many images"):
-        STEREO.prepare(walled.images[:2], reconstruction)
+    refuses(ValueError, "no camera", STEREO.depth_map, scene, 2)
+    refuses(ValueError, "as many images", STEREO.prepare, walled.images[:2], reconstruction)
     with pytest.raises(ValueError, match="metric"):
         STEREO.prepare(walled.images, replace(reconstruction, stratum="projective"))
 

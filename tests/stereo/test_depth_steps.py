@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
@@ -57,8 +58,7 @@ def test_a_smaller_view_has_the_camera_of_its_pixels(walled):
 
 def test_views_are_refused_with_a_sentence(walled):
     image, reconstruction = walled.images[0], walled.reconstruction
-    with pytest.raises(ValueError, match="metric"):
-        pinhole_view(image, replace(reconstruction, K=None), 0)
+    refuses(ValueError, "metric", pinhole_view, image, replace(reconstruction, K=None), 0)
     with pytest.raises(ValueError, match="px; got"):
         pinhole_view(image, replace(reconstruction, sizes=reconstruction.sizes + 1), 0)
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
 
+from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, sphere_map
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap
@@ -150,5 +151,4 @@ def test_the_same_map_gives_the_same_bytes():
 
 
 def test_cells_of_one_pixel_are_refused():
-    with pytest.raises(ValueError, match="must be"):
-        BSplineSurface(knot_px=1)
+    refuses(ValueError, "must be", BSplineSurface, knot_px=1)

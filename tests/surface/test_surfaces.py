@@ -64,12 +64,6 @@ def test_fusion_averages_noise(ring):
     assert abs(np.mean(error)) < 0.2 * noise
 
 
-def test_threads_change_nothing(ring):
-    one, two = (VolumetricFusion().fuse(ring[:3], threads=n) for n in (1, 2))
-    np.testing.assert_array_equal(one.vertices, two.vertices)
-    np.testing.assert_array_equal(one.faces, two.faces)
-
-
 def test_a_surface_is_the_same_slab_by_slab_and_needs_the_memory_of_its_faces(ring, monkeypatch):
     whole = VolumetricFusion(voxel_px=0.6, tolerance=0.0).fuse(ring)
     monkeypatch.setattr(fusion, "SLAB_BLOCKS", 256)

@@ -118,8 +118,7 @@ def test_an_atlas_that_cannot_be_small_enough_is_rejected(sphere):
     views = [photograph(m) for m in ring_of()]
     with pytest.raises(StageFailure, match=r"too large; \d+ charts need \d+ texels, the limit is 40"):
         TextureAtlas(max_texels=40).texture(sphere, views)
-    with pytest.raises(ValueError, match="max_texels must be >= 1"):
-        TextureAtlas(max_texels=0)
+    refuses(ValueError, "max_texels must be >= 1", TextureAtlas, max_texels=0)
 
 
 def test_unseen_faces_take_the_colour_of_their_surroundings(sphere):

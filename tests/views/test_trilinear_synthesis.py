@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refuses
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import dehomogenize
@@ -146,8 +147,7 @@ def test_shapes_and_places_that_do_not_fit_are_refused():
     image, places = np.zeros((6, 8, 3)), np.full((6, 8, 2), np.nan, np.float32)
     with pytest.raises(StageFailure, match="no dense correspondence"):
         prepare_synthesis(PAIR, (image, image), (places, places))
-    with pytest.raises(ValueError, match="at least 1 x 1"):
-        VirtualCamera(np.eye(3), np.zeros(3), K, (0, 5))
+    refuses(ValueError, "at least 1 x 1", VirtualCamera, np.eye(3), np.zeros(3), K, (0, 5))
 
 
 def test_the_tensor_of_a_moved_camera_contains_it():

@@ -367,5 +367,3 @@ def _line_moves(ends: F64) -> F64:
     # Weight of the other end in a point of the line, as a function of the point.
     share = np.column_stack([along, -np.sum(along * ends[:, 0, :2], axis=1)])
     return np.stack([np.eye(3)[2] - share, share], axis=1)
-
-

@@ -57,9 +57,7 @@ class Resection:
     covariance: F64
 
 
-def resect_robust(
-    X: F64, xy: F64, K: F64 | None, threshold_px: float | None, rng: Generator
-) -> Resection:
+def resect_robust(X: F64, xy: F64, K: F64 | None, threshold_px: float | None, rng: Generator) -> Resection:
     """Resect a camera; arguments as for :func:`thesisrecon.resect`."""
     needed, unknown = (6, 11) if K is None else (4, 6)
     if len(X) < needed:
