@@ -57,7 +57,8 @@ def render_drive(folder: Path, seed: int, lens: Lens, views: int = 14, width: in
     The rendered samples are interpolated for k1 and the aspect ratio of the lens.
     """
     R, C, ahead = _corner(np.random.default_rng([7, seed]), views)
-    world, size, n, sensor = build_corner(C, ahead), (width, width * CAR[1] // CAR[0]), PER_PIXEL, Sensor()
+    world, n, sensor = build_corner(C, ahead), PER_PIXEL, Sensor()
+    size = (width, round(width * CAR[1] / CAR[0]))
     f, (cx, cy) = 718.9 * width / CAR[0], (np.array(size) - 1) / 2
     K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
     pixels = (np.indices((n * size[1], n * size[0]))[::-1] + 0.5) / n - 0.5
