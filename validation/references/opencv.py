@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import decompose_camera
 from thesisrecon.records import Image
 from thesisrecon.stereo._planar import PlanarRectification
 from validation.references.libraries import cv2
@@ -52,19 +51,6 @@ def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectifi
     if not done:
         return None
     return PlanarRectification(np.stack([_positive(np.asarray(H), size) for H in (H1, H2)]), size)
-
-
-def opencv_calibrated(P1: F64, P2: F64, size: Size) -> PlanarRectification:
-    """``cv2.stereoRectify`` of two metric cameras without distortion, its defaults, the frame of the
-    image's size."""
-    (K1, R1, t1), (K2, R2, t2) = decompose_camera(P1), decompose_camera(P2)
-    R = R2 @ R1.T
-    none = np.zeros(5)
-    found = cv2.stereoRectify(K1, none, K2, none, size, R, (t2 - R @ t1)[:, None])
-    turn1, turn2, new1, new2 = (np.asarray(part, dtype=np.float64) for part in found[:4])
-    H1 = new1[:, :3] @ turn1 @ np.linalg.inv(K1)
-    H2 = new2[:, :3] @ turn2 @ np.linalg.inv(K2)
-    return PlanarRectification(np.stack([_positive(H, size) for H in (H1, H2)]), size)
 
 
 def warp_perspective(image: NDArray[Any], H: F64, size: Size) -> NDArray[Any]:

@@ -84,7 +84,6 @@ HELP = {
     "moments": "moments spread over the time of a run",
     "motions": "names of motions (default: all)",
     "noise": "standard deviations of image coordinates in px",
-    "one_run": "kill one run again and again as it goes on",
     "parts": "parts of the study (default: all)",
     "points": "numbers of points or matches",
     "presets": "presets of the runs",

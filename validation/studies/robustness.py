@@ -159,14 +159,6 @@ def kill_runs(runs: Runs, kills: int, writes: int) -> Iterator[Kill]:
         yield runs.resumed(f"in the middle of file {write}", out, died, wanted)
 
 
-def kill_one_run(runs: Runs, kills: int) -> Iterator[Kill]:
-    """Kill one run again and again as it goes on, and compare what it ends with."""
-    seconds = runs.whole(runs.place / "whole")
-    wanted = outputs(runs.place / "whole")
-    died = sum(runs.killed("killed", seconds / (kills + 1))[1] for _ in range(kills))
-    yield runs.resumed(f"{died} times in one run", runs.place / "killed", died == kills, wanted)
-
-
 def kill_table(rows: Sequence[Kill]) -> str:
     cells = []
     for row in rows:
@@ -431,13 +423,12 @@ def kill_anywhere_study(
     max_size: int = 640,
     until: str = "model",
     threads: int = 2,
-    one_run: bool = False,
 ) -> Iterator[Part]:
     """Kill runs anywhere, resume them and compare all bytes with an undisturbed run."""
     options = ["--max-size", str(max_size), "--until", until, "--threads", str(threads)]
     with TemporaryDirectory() as place:
         runs = Runs(Path(place), options, images)
-        rows = _printed(kill_one_run(runs, kills) if one_run else kill_runs(runs, kills, writes))
+        rows = _printed(kill_runs(runs, kills, writes))
     yield kill_table(rows)
     yield _count("killed runs", "runs that differ", sum(bool(r.different) for r in rows), len(rows))
 

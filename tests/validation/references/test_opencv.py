@@ -5,7 +5,7 @@ import PIL.Image
 import pytest
 
 from tests.synthetic import texture
-from tests.validation.references.conftest import Looked, skip_without
+from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import Image
 from thesisrecon.stereo._planar import PlanarRectification
@@ -13,7 +13,6 @@ from validation.references.opencv import (
     MODES,
     OpenCVSemiGlobal,
     harris_corners,
-    opencv_calibrated,
     sift_corners,
     warp_perspective,
 )
@@ -87,12 +86,3 @@ def test_a_disparity_is_the_shift_to_the_left_in_the_right_image(mode, widened):
     # The columns that a disparity of 31 would take out of the photograph.
     assert np.isfinite(found[8:-8, 10:31]).any() == widened
     assert not (found < 0.0).any()
-
-
-def test_rows_of_rectified_cameras_agree(looked):
-    same = looked.K[:1].repeat(2, axis=0)
-    pair = Looked(same, looked.R, looked.t, looked.X)
-    found = opencv_calibrated(*pair.P, (640, 480))
-    one, two = (found.rectified_from_original(i, pair.xy[i], within=False) for i in range(2))
-    assert np.abs(one - two)[:, 1].max() < 1e-6
-    assert np.ptp(one[:, 1]) > 50.0
