@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64, I64, rows_of_views
 from thesisrecon.camera import Camera
 from thesisrecon.records import (
     DepthMap,
@@ -229,6 +230,18 @@ class RunResult:
             sigma_px=r.sigma_px / float(np.median(scale)),
         )
 
+    @cached_property
+    def _seen(self) -> list[I64]:
+        """Inlier observations of each image."""
+        r = self._metric_result("observations").reconstruction
+        used = np.flatnonzero(r.used)
+        return [used[k] for k in rows_of_views(r.tracks.view_index[used], len(self.images))]
+
+    @cached_property
+    def _row(self) -> I64:
+        """The row of each valid point in ``points``."""
+        return np.cumsum(self._metric_result("observations").reconstruction.valid) - 1
+
     def observations(self, image: str | int) -> SeenPoints:
         """Return the inlier observations of one image.
 
@@ -244,7 +257,6 @@ class RunResult:
         """
         r = self._metric_result("observations").reconstruction
         i = _number_of(image, self.images)
-        seen = r.used & (r.tracks.view_index == i)
-        row = np.cumsum(r.valid) - 1
+        seen = self._seen[i]
         xy = (r.tracks.xy[seen] + 0.5) / self.images[i].scale - 0.5
-        return SeenPoints(xy, row[r.tracks.point_index[seen]])
+        return SeenPoints(xy, self._row[r.tracks.point_index[seen]])

@@ -22,6 +22,7 @@ STAGES = {
 }  # fmt: skip
 FOUNDATIONS = {
     "_code_digest",
+    "_threads",
     "arrays",
     "camera",
     "errors",

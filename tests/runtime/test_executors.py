@@ -3,6 +3,7 @@
 import builtins
 import concurrent.futures as futures
 import hashlib
+import multiprocessing
 import os
 import pickle
 import signal
@@ -18,6 +19,7 @@ import pytest
 from tests.conftest import LOCAL, address, refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import fake_config, photographs
+from thesisrecon._threads import ThreadPool
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
@@ -387,3 +389,57 @@ def test_batches_of_a_band_of_pairs_have_near_the_fewest_views():
         views = [len({view for n in batch for view in band[n]}) for batch in batches]
         fewest = len(batches[0]) / 8.0 + 4.5
         assert sum(views) <= 1.5 * fewest * len(batches)
+
+
+def refuse(*_):
+    raise RuntimeError("can't start new thread")
+
+
+def refuse_processes(*_):
+    raise BlockingIOError(11, "Resource temporarily unavailable")
+
+
+def test_without_further_threads_the_calling_thread_does_the_work(tmp_path, monkeypatch):
+    """As with RLIMIT_NPROC and in containers: every stage, to the textured surface."""
+    config = replace(PipelineConfig(), images=ImageOptions(max_size_px=160))
+    images = sorted(COURTYARD.iterdir())[4:8]
+    reconstruct(images, tmp_path / "usual", config=config, threads=2)
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    reconstruct(images, tmp_path / "alone", config=config, threads=2)
+    assert results(tmp_path / "alone") == results(tmp_path / "usual")
+    assert results(tmp_path / "alone")["model"] != ""
+
+
+@pytest.mark.parametrize("refused", ["processes", "threads"])
+def test_without_worker_processes_this_process_does_the_work(refused, serial, tmp_path, monkeypatch, caplog):
+    if refused == "threads":
+        monkeypatch.setattr(threading.Thread, "start", refuse)
+    else:
+        monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", refuse_processes)
+    small_job(serial[0], tmp_path, threads=2, executor="processes")
+    assert results(tmp_path) == results(serial[1])
+    assert caplog.text.count("no worker processes can be started") == 1
+
+
+def test_some_threads_do_the_work_of_all(monkeypatch):
+    started, start = [], threading.Thread.start
+
+    def one_only(thread):
+        if started:
+            refuse()
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", one_only)
+    with ThreadPool(3) as pool:
+        assert list(pool.map(lambda n: (n, threading.get_ident()), range(20))) == [
+            (n, started[0].ident) for n in range(20)
+        ]
+
+
+def test_the_calling_thread_passes_errors_and_nested_tasks_on(monkeypatch):
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    with ThreadPool(2) as pool:
+        assert list(pool.map(lambda n: sum(pool.map(abs, [-n, n])), range(3))) == [0, 2, 4]
+        with pytest.raises(ZeroDivisionError):
+            pool.submit(lambda: 1 / 0).result()

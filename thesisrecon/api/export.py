@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 
 import numpy as np
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.api.models import as_sparse_model
 from thesisrecon.arrays import F64, rows_of_views
 from thesisrecon.errors import UsageError, unknown_word
@@ -411,7 +411,7 @@ def _write_images(
                 write_image(folder / mask_names[i], np.where(used, 255, 0).astype(np.uint8))
             return mask is not None
 
-    with ThreadPoolExecutor(threads or available_threads()) as pool:
+    with ThreadPool(threads or available_threads()) as pool:
         return list(pool.map(write, range(len(paths))))
 
 

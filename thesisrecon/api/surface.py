@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from thesisrecon._settings import Config, as_config
+from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
@@ -114,7 +114,7 @@ def confirmed_depth_maps(
 ) -> dict[int, DepthMap]:
     """Depth maps of all views by number, confirmed by each other; the result does not depend on threads."""
     order = sorted(scene.views)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    with ThreadPool(threads) as pool:
         each = pool.map(lambda i: dense.depth_map(scene, i, pool=pool), order)
         found = dict(zip(order, each, strict=True))
         return dict(zip(order, pool.map(lambda i: dense.confirm(scene, found, i), order), strict=True))

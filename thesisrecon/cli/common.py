@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
 from thesisrecon.io._files import printable, shorten_middle, shortened
 from thesisrecon.runtime._executors import available_threads
@@ -95,12 +96,14 @@ def progress_bars() -> Iterator[Any]:
     label, left = TextColumn("{task.description:>22}"), TextColumn("left")
     columns = (label, BarColumn(), MofNCompleteColumn(), Elapsed(), Left(), left)
     tasks: dict[str, Any] = {}
-    with Progress(*columns, console=Console(stderr=True)) as bars:
+    with ThreadPool(1) as threads:
+        alone = threads.alone
+    with Progress(*columns, console=Console(stderr=True), auto_refresh=not alone) as bars:
 
         def update(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task(_STAGE_LABELS.get(stage, stage), total=total)
-            bars.update(tasks[stage], completed=done, total=total)
+            bars.update(tasks[stage], completed=done, total=total, refresh=alone)
 
         yield update
 

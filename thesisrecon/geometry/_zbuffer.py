@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.kernels import empty, kernel
@@ -216,5 +216,5 @@ def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads:
     if len(strips) == 1:
         work(strips[0])
         return
-    with ThreadPoolExecutor(len(strips)) as pool:
+    with ThreadPool(len(strips)) as pool:
         list(pool.map(work, strips))

@@ -394,7 +394,11 @@ def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView],
     subsets = {v: _subsets(f.seeds) for v, f in enumerate(features) if f.seeds is not None and between}
     evidence = {n: _evidence(subsets[two_views[n].i], subsets[two_views[n].j]) for n in between}
     chosen = set[int]()
-    for view in np.flatnonzero(group != np.argmax(np.bincount(group))):
-        of_view = [n for n in between if view in (two_views[n].i, two_views[n].j)]
-        chosen.update(sorted(of_view, key=lambda n: -evidence[n])[:most])
+    outside = np.flatnonzero(group != np.argmax(np.bincount(group))).tolist()
+    of_view: dict[int, list[int]] = {view: [] for view in outside}
+    for n in between:
+        for view in of_view.keys() & {two_views[n].i, two_views[n].j}:
+            of_view[view].append(n)
+    for numbers in of_view.values():
+        chosen.update(sorted(numbers, key=lambda n: -evidence[n])[:most])
     return sorted(chosen)

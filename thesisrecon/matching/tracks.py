@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import MapAll, PreparedImage
@@ -336,8 +336,7 @@ def _number_positions(
 ) -> tuple[list[F64], list[I64]]:
     """Corners of every view, and the corner (M,) of each position of the ``ends`` (view, xy)."""
     index, corners = [np.empty(0, np.int64)] * len(ends), []
-    for view in range(n_views):
-        here = [n for n, end in enumerate(ends) if end[0] == view]
+    for here in rows_of_views(np.array([view for view, _ in ends], dtype=np.int64), n_views):
         xy = np.concatenate([np.empty((0, 2)), *(ends[n][1] for n in here)])
         found, number = _merge_positions(xy, merge_px)
         corners.append(found)

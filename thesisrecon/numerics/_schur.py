@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F64, I64
 from thesisrecon.numerics._elimination import (
     BlockIndex,
@@ -66,9 +66,9 @@ class BundleLayout:
         return len(self.index.pair) * self.width + self.border
 
     @cached_property
-    def _pool(self) -> ThreadPoolExecutor:
+    def _pool(self) -> ThreadPool:
         """Threads that live as long as the problem: an iteration may take less time than their start."""
-        return ThreadPoolExecutor(self.threads)
+        return ThreadPool(self.threads)
 
     def sum_over_observations(self, work: Callable[[slice, Observations], float]) -> float:
         """Return the sum of work(rows, observations) over the observations of every range of points."""

@@ -269,8 +269,8 @@ def outside_masks(given: Given, images: Sequence[Image]) -> Given:
     if t is None:
         return replace(given, matches=matches)
     kept = np.zeros(len(t.xy), bool)
-    for i, here in enumerate(clear):
-        kept[t.view_index == i] = here
+    for rows, here in zip(rows_of_views(t.view_index, t.n_views), clear, strict=True):
+        kept[rows] = here
     kept &= np.bincount(t.point_index[kept], minlength=t.n_points)[t.point_index] >= 2
     numbers, point = np.unique(t.point_index[kept], return_inverse=True)
     tracks = Tracks(t.view_index[kept], point, t.xy[kept], t.n_views, len(numbers))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon.arrays import rows_of_views
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import Notice, counted
 from thesisrecon.matching._prepared import strongest_corners, strongest_share
@@ -235,7 +236,7 @@ def split_groups(state: PipelineState) -> None:
 def _groups(views: int, links: Sequence[tuple[int, int]], fewest: int) -> list[list[int]]:
     """The groups of ``fewest`` or more views, the largest first."""
     label = connected_groups(views, links)
-    groups = [np.flatnonzero(label == k).tolist() for k in range(label.max() + 1)]
+    groups = [group.tolist() for group in rows_of_views(label, label.max() + 1)]
     return sorted((group for group in groups if len(group) >= fewest), key=lambda group: -len(group))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -14,6 +14,7 @@ import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon._settings import toml_from_config
+from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, U8
 from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, counted, made
 from thesisrecon.geometry.camera_matrix import finite_cameras
@@ -120,7 +121,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     result = _described(run, result, until, failure)
     _write_records(run.directory, result)
     write_text(out / CONFIG, config)
-    with run.clock("outputs"), ThreadPoolExecutor(1) as beside:
+    with run.clock("outputs"), ThreadPool(1) as beside:
         # The file of the model is written while that of the page is made.
         for_page = beside.submit(_model_for_page, result, max(run.workers.threads - 1, 1))
         if run.workers.threads == 1:

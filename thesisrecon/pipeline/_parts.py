@@ -96,7 +96,7 @@ def has_narrow_cut(tracks: Tracks) -> bool:
 
 def _connected_views(graph: scipy.sparse.csr_array) -> list[I64]:
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    return [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+    return rows_of_views(label, label.max() + 1)
 
 
 def divide_views(graph: scipy.sparse.csr_array, part_views: int) -> list[I64]:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy.sparse
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.geometry.triangulation import triangulate_points
@@ -121,22 +122,23 @@ _CELLS = 8
 
 def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView]) -> B8:
     """Select tracks (N,) seen from several positions; undetermined depths of others distort the frame."""
-    apart = np.ones((tracks.n_views, tracks.n_views), dtype=np.float32)
-    np.fill_diagonal(apart, 0.0)
-    for pair in pairs:
-        if pair.accepted and pair.homography_inlier_ratio >= NO_PARALLAX:
-            apart[pair.i, pair.j] = apart[pair.j, pair.i] = 0.0
-    seen = np.zeros((tracks.n_views, tracks.n_points), dtype=np.float32)
-    seen[tracks.view_index, tracks.point_index] = 1.0
-    return np.asarray(((apart @ seen) * seen).any(axis=0))
+    n, K = tracks.n_views, len(tracks.xy)
+    i, j = np.array(
+        [(p.i, p.j) for p in pairs if p.accepted and p.homography_inlier_ratio >= NO_PARALLAX], dtype=np.int64
+    ).reshape(-1, 2).T  # fmt: skip
+    rows, columns = np.concatenate([i, j, np.arange(n)]), np.concatenate([j, i, np.arange(n)])
+    near = scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), (n, n))
+    seen = scipy.sparse.csr_array((np.ones(K), (tracks.view_index, tracks.point_index)), (n, tracks.n_points))
+    # Ordered pairs of the views of a track, less those without parallax.
+    return np.asarray(seen.sum(axis=0) ** 2 > (near @ seen).multiply(seen).sum(axis=0))
 
 
 def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int) -> B8:
     """Select the longest ``usable`` tracks (N,), cell by cell of a grid over the points of each image."""
     length = np.bincount(tracks.point_index, minlength=tracks.n_points)
     keep = np.zeros(tracks.n_points, dtype=bool)
-    for view in range(tracks.n_views):
-        k = np.flatnonzero((tracks.view_index == view) & usable[tracks.point_index])
+    for rows in rows_of_views(tracks.view_index, tracks.n_views):
+        k = rows[usable[tracks.point_index[rows]]]
         keep[tracks.point_index[k][_by_cell_and_length(tracks, k, length)[:points_per_view]]] = True
     return keep
 

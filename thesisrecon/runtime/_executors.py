@@ -27,6 +27,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.errors import UsageError, WorkersLost, unknown_word
 from thesisrecon.runtime._signals import CODES, starting_processes
 
@@ -49,6 +50,9 @@ WORKERLESS_S = 60.0
 """Time a cluster may be without workers during a run, so that they can be restarted."""
 REACH_S = 2.0
 """Timeout of a connection from this machine to a worker."""
+START_S = 60.0
+"""Time in which worker processes start."""
+_log = logging.getLogger(__name__)
 _ADDRESS = re.compile(r"(?P<host>[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 
 
@@ -249,7 +253,7 @@ class Workers:
 
     def map_all(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Map a function over items in threads, for short tasks such as reading files."""
-        with futures.ThreadPoolExecutor(self.threads) as pool:
+        with ThreadPool(self.threads) as pool:
             return list(pool.map(function, items))
 
     @contextmanager
@@ -257,19 +261,36 @@ class Workers:
         if isinstance(self.executor, futures.Executor):
             yield _Remote(self.executor, lambda: self.threads)
         elif self.executor == "local":
-            with futures.ThreadPoolExecutor(self.threads) as threads:
+            with ThreadPool(self.threads) as threads:
                 yield _Remote(threads, lambda: self.threads)
         elif is_dask_address(self.executor):
             with connect_dask(self.executor) as cluster:
                 yield _Remote(cluster.executor, cluster.parallel, cluster)
+        elif (pool := _processes(self.threads)) is None:
+            with ThreadPool(self.threads) as threads:
+                yield _Remote(threads, lambda: self.threads)
         else:
-            pool = ProcessPool(self.threads)
             try:
                 yield _Remote(pool, lambda: self.threads)
                 pool.shutdown(wait=True)
             finally:
                 # After an error the processes end at once.
                 pool.abandon()
+
+
+def _processes(count: int) -> ProcessPool | None:
+    """Start worker processes; None, with a warning, if the system starts none."""
+    with ExitStack() as opened:
+        try:
+            pool = ProcessPool(count)
+            opened.callback(pool.abandon)
+            for started in [pool.submit(int) for _ in range(count)]:
+                started.result(START_S)
+        except (OSError, RuntimeError) as error:
+            _log.warning("no worker processes can be started (%s): this process does their work", error)
+            return None
+        opened.pop_all()
+        return pool
 
 
 @dataclass(frozen=True)
@@ -360,7 +381,9 @@ class ProcessPool(futures.ProcessPoolExecutor):
     def abandon(self) -> None:
         """Kill the processes at once."""
         self._held.close()
-        self.shutdown(wait=True, cancel_futures=True)
+        # The thread that a pool waits for may not have been started.
+        with suppress(RuntimeError):
+            self.shutdown(wait=True, cancel_futures=True)
 
 
 def _end_with_parent(watched: multiprocessing.connection.Connection) -> None:

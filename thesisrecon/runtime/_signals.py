@@ -45,7 +45,11 @@ def install_signal_handlers(program: str, advice: str = "repeat the command to r
     # The resource tracker of multiprocessing would warn about what it cleans up afterwards.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
     os.register_at_fork(after_in_child=_forget)
-    threading.Thread(target=_watch, args=(program, pipe), daemon=True).start()
+    try:
+        threading.Thread(target=_watch, args=(program, pipe), daemon=True).start()
+    except RuntimeError:
+        # Without a thread that watches, the signals end the program as usual.
+        _forget()
 
 
 def set_error_stream(descriptor: int) -> None:

@@ -7,13 +7,13 @@ moves by the mean distance of the original vertices from the faces around it.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, F64, I32, I64, U8
 from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.records import TexturedMesh
@@ -359,7 +359,7 @@ def simplify_surface(
         np.full(size, -1, np.int32), np.arange(size, dtype=np.int32),
     ))  # fmt: skip
     sum_planes(state)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    with ThreadPool(threads) as pool:
         for axis in np.argsort(-np.ptp(points, axis=0), kind="stable")[:ROUNDS]:
             starts = _sort_into_blocks(state, int(axis))
             state = _linked(state)

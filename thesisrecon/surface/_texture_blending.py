@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from itertools import combinations, pairwise
 
 import numpy as np
 import scipy
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import B8, F32, F64, I32, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry._zbuffer import rasterize, rasterize_corners
@@ -135,7 +136,7 @@ def choose_views(
             spread, other = other, spread
         return spread.max(axis=1), first + spread.argmax(axis=1)
 
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    with ThreadPool(threads) as pool:
         # Faces that the diffusion leaves without shares keep their best view.
         for highest, work in ((best, see), (most, spread_shares)):
             for value, view in pool.map(work, range(0, len(views), 8)):
@@ -227,7 +228,7 @@ def paint_texture(
     normals = vertex_normals(mesh)
     texture = cut_out.copy()
     drawn = np.zeros(texture.shape[:2], dtype=bool)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    with ThreadPool(threads) as pool:
         pixels = sum(camera.size[0] * camera.size[1] for camera in cameras)
         texels = PART_TEXELS if PREPARED_BYTES * pixels <= SURFACE_BYTES else LARGE_PART_TEXELS
         for at, face, weights in _surface_parts(mesh, uv, texture.shape[:2], texels, pool):
@@ -255,7 +256,7 @@ def prepare_views(
     def observe(v: int) -> None:
         observe_points(points, normals, prepared[v], weight[v], color[v])
 
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    with ThreadPool(threads) as pool:
         list(pool.map(observe, range(len(views))))
     gains = _equalizing_gains(weight, color)
     return OnDemand(len(views), lambda v: prepared[v]._replace(gain=gains[v]))

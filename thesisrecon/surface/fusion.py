@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import B8, F32, F64, I32, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import decompose_camera, project
@@ -120,7 +120,7 @@ class VolumetricFusion:
 
     def _fused(self, depth_maps: Sequence[DepthMap], threads: int) -> tuple[TexturedMesh, F64, float]:
         """The surface of all voxels, the standard deviation at its vertices, and the voxel size."""
-        with ThreadPoolExecutor(max(threads, 1)) as pool:
+        with ThreadPool(threads) as pool:
             measured = _PreparedMaps(depth_maps, pool)
             grid = self._lay_out(measured)
             return *_Extraction(grid, measured, pool).surface(), grid.voxel
@@ -174,7 +174,7 @@ class _FusionMap:
 class _PreparedMaps:
     """Depth maps prepared for fusion, in groups of ``GROUP_BYTES``; several groups are made for each use."""
 
-    def __init__(self, maps: Sequence[DepthMap], pool: ThreadPoolExecutor) -> None:
+    def __init__(self, maps: Sequence[DepthMap], pool: ThreadPool) -> None:
         self.maps, self.pool, self.truncation = maps, pool, np.inf
         self.pixels = maps[0].depth.size if len(maps) else 0
         self.size = max(1, GROUP_BYTES // (12 * max(self.pixels, 1)))
@@ -291,7 +291,7 @@ class _Extraction:
     too: its faces use vertices of the former, and its cells voxels of the latter.
     """
 
-    def __init__(self, grid: _Grid, measured: _PreparedMaps, pool: ThreadPoolExecutor) -> None:
+    def __init__(self, grid: _Grid, measured: _PreparedMaps, pool: ThreadPool) -> None:
         self.grid, self.measured, self.pool = grid, measured, pool
 
     def surface(self) -> tuple[TexturedMesh, F64]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
+from thesisrecon._threads import ThreadPool
 from thesisrecon.numerics._on_demand import OnDemand
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from thesisrecon.surface.bspline import BSplineSurface
@@ -55,7 +55,7 @@ class SurfaceModel:
         TexturedMesh
         """
         if isinstance(self.surface, BSplineSurface):
-            with ThreadPoolExecutor(max(threads, 1)) as pool:
+            with ThreadPool(threads) as pool:
                 depth_maps = list(pool.map(self.surface.smooth, depth_maps))
         return self.fusion.fuse(depth_maps, threads=threads)
 
