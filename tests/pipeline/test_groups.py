@@ -1,5 +1,6 @@
 """Folders with several groups of images that do not overlap, with fake stages: one model for each."""
 
+import re
 from dataclasses import dataclass, replace
 
 import pytest
@@ -63,8 +64,9 @@ def test_each_group_has_a_model_and_the_largest_is_first(tmp_path):
     assert result.refused["08.png"] == "sees 0 points"
     summary = read(tmp_path / "summary.json")
     entry = {"folder": "group-2", "images": 3, "registered": 3, "trusted": True, "failure": None}
-    assert summary["groups"] == [entry | {"names": ["00.png", "01.png", "02.png"]}]
-    sentence = "The images form 2 models without a common scale: 4 images in this model, 3 in group-2"
+    assert summary["groups"] == [entry | {"names": ["00.png", "01.png", "02.png"], "missing": []}]
+    models = "The images form 2 models without a common scale"
+    sentence = f"{models}: 4 images in this model, 3 in group-2, 2 in none"
     assert sentence in summary["warnings"]
     said = summary_text(summary, tmp_path)
     assert f"group-2: 3 of 3 images registered; report: {tmp_path}" in said
@@ -154,8 +156,11 @@ def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
     config = fake_config(projective=ProjectiveOfAFew())
     result = reconstruct.reconstruct(photographs(8), tmp_path, config=config, until="metric")
     assert [group["registered"] for group in result.summary["groups"]] == [3]
-    sentence = "The images form 2 models without a common scale: 3 images in this model, 3 in group-2"
+    models = "The images form 2 models without a common scale"
+    sentence = f"{models}: 3 images in this model, 3 in group-2, 2 in none"
     assert sentence in result.summary["warnings"]
+    said = summary_text(result.summary, tmp_path)
+    assert re.findall("not registered: (.*):", said) == ["06.png", "07.png"]
     assert "is reconstructed in group-2" in result.refused["03.png"]
     assert result.refused["07.png"] == "sees 5 points"
     off = replace(config, images=ImageOptions(groups=False))

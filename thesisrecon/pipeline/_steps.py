@@ -113,10 +113,12 @@ def _run_groups(state: PipelineState, steps: Sequence[Step], *, surface_required
         RunDirectory(folder / f"group-{number}").remove(RESULT_FILES)
     if run.groups:
         here = state.result.best_reconstruction
-        registered = counted(0 if here is None else int(here.registered.sum()), "image")
+        registered = 0 if here is None else int(here.registered.sum())
+        none = len(state.names) - registered - len(places)
         others = ", ".join(f"{group['registered']} in {group['folder']}" for group in run.groups)
+        others += f", {none} in none" if none else ""
         models = Notice("several-models", len(run.groups) + 1)
-        run.warnings.append(Notice("sizes-of-models", models, registered, others))
+        run.warnings.append(Notice("sizes-of-models", models, counted(registered, "image"), others))
         state.result = _with_group_reasons(state.result, places)
 
 
@@ -158,7 +160,10 @@ def _run_group(
         state.prepared = None
         state.result = write_outputs(run, state.result, until=state.until, failure=failure)
     facts = {fact: state.result.summary[fact] for fact in ("images", "registered", "trusted", "failure")}
-    whole.run.groups.append({"folder": name, "names": state.names, **facts})
+    model = state.result.best_reconstruction
+    there = [model is not None and bool(model.registered[k]) for k in range(len(views))]
+    missing = [image for image, registered in zip(state.names, there, strict=True) if not registered]
+    whole.run.groups.append({"folder": name, "names": state.names, "missing": missing, **facts})
     return state
 
 
